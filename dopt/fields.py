@@ -1,0 +1,107 @@
+"""Dataclass fields that know their unit and bounds, and check what they are given."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, Literal
+
+from dopt.errors import SpecificationError
+
+Bound = Literal["any", "positive", "nonnegative"]
+
+_BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
+    "any": (lambda value: True, "any finite number"),
+    "positive": (lambda value: value > 0, "above 0"),
+    "nonnegative": (lambda value: value >= 0, "0 or above"),
+}
+
+
+def quantity(
+    default: Any, unit: str = "1", bound: Bound = "any", *, size: int | None = None
+) -> Any:
+    """Declare a field with a unit and a bound.
+
+    Parameters
+    ----------
+    default : number, tuple of numbers, str or None
+        Default value. Its type is the type that the field accepts.
+    unit : str
+        Unit in the SI, ``"1"`` when dimensionless.
+    bound : {"any", "positive", "nonnegative"}
+        What every number of the field has to satisfy.
+    size : int, optional
+        Number of entries that a tuple has to have.
+    """
+    return dataclasses.field(default=default, metadata={"unit": unit, "bound": bound, "size": size})
+
+
+@dataclasses.dataclass(frozen=True)
+class Checked:
+    """Base of the frozen specification dataclasses: types and bounds hold once one exists.
+
+    Raises
+    ------
+    SpecificationError
+        If a value has the wrong type, is not finite or lies outside its bound.
+    """
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = _converted(self._path(field.name), field, getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
+
+    @classmethod
+    def _path(cls, field: str) -> str:
+        return f"{getattr(cls, 'section', 'trial')}.{field}"
+
+
+def _converted(path: str, field: dataclasses.Field[Any], value: object) -> object:
+    """Return ``value`` as the type that the annotation of ``field`` names."""
+    kind = str(field.type)
+    if value is None and "None" in kind:
+        return None
+    if kind.startswith("tuple"):
+        return _converted_tuple(path, field, kind, value)
+    if kind.startswith("str"):
+        if isinstance(value, str):
+            return value
+        raise _wrong_type(path, value, "a text")
+    return _converted_number(path, field, kind.startswith("int"), value)
+
+
+def _converted_tuple(
+    path: str, field: dataclasses.Field[Any], kind: str, value: object
+) -> tuple[float, ...]:
+    size = field.metadata.get("size")
+    expected = f"a list of {size} numbers" if size else "a list of numbers"
+    if not isinstance(value, list | tuple) or (size and len(value) != size):
+        raise _wrong_type(path, value, expected)
+    whole = "int" in kind
+    return tuple(
+        _converted_number(f"{path}[{i}]", field, whole, entry) for i, entry in enumerate(value)
+    )
+
+
+def _converted_number(
+    path: str, field: dataclasses.Field[Any], whole: bool, value: object
+) -> float:
+    expected = "a whole number" if whole else "a number"
+    if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
+        raise _wrong_type(path, value, expected)
+    number = value if whole else float(value)
+    holds, words = _BOUNDS[field.metadata.get("bound", "any")]
+    if not math.isfinite(number) or not holds(number):
+        unit = field.metadata.get("unit", "1")
+        suffix = "" if unit == "1" else f" {unit}"
+        raise SpecificationError(
+            f"{path} is {number}{suffix}, but it has to be finite and {words}: set it so."
+        )
+    return number
+
+
+def _wrong_type(path: str, value: object, expected: str) -> SpecificationError:
+    return SpecificationError(
+        f"{path} is {value!r} ({type(value).__name__}), but {expected} is expected: set it so."
+    )

@@ -1,0 +1,49 @@
+"""Adam on the newest sample (Algorithm 1 as printed) or on a window of recent samples.
+
+One step per time step t on the mean over the samples of ‖a_θ(x) - y‖², with y the observed
+accelerations (x_{t+1} - x_t)/dt less their known part. Reference: D. Kingma and J. Ba, "Adam: a
+method for stochastic optimization" (2015).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dopt.fields import quantity
+from dopt.learning.base import Learner
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adam(Learner):
+    """One Adam step on the newest sample at each time step.
+
+    Parameters
+    ----------
+    learning_rate : float
+        Step size η.
+    beta_1, beta_2 : float
+        Decay rates of the first and the second moment.
+    epsilon : float
+        Regulariser of the denominator.
+    window : int
+        Number of newest samples in the loss; while fewer have been seen, those.
+    """
+
+    name: ClassVar[str] = "adam"
+
+    learning_rate: float = quantity(2e-3, bound="positive")
+    beta_1: float = quantity(0.9, bound="nonnegative")
+    beta_2: float = quantity(0.999, bound="nonnegative")
+    epsilon: float = quantity(1e-8, bound="positive")
+    window: int = quantity(1, "samples", "positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdamWindow(Adam):
+    """One Adam step on the newest 100 samples, as in the authors' released code."""
+
+    name: ClassVar[str] = "adam_window"
+
+    learning_rate: float = quantity(1e-2, bound="positive")
+    window: int = quantity(100, "samples", "positive")

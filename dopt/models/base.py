@@ -1,0 +1,31 @@
+"""What every model specification declares."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.fields import Checked
+from dopt.systems.base import System
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model(Checked):
+    """A parametric model of the r learned accelerations of a system."""
+
+    section: ClassVar[str] = "model"
+    name: ClassVar[str]
+
+    @abstractmethod
+    def n_parameters(self, system: System) -> int:
+        """Return the number q of parameters for a system."""
+
+    @abstractmethod
+    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
+        """Draw the initial parameters, (q,)."""

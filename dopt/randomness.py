@@ -1,0 +1,72 @@
+"""All the randomness of a trial, drawn before it starts.
+
+One seed gives named child streams, so that a draw for one purpose never moves another: policies
+that are compared at the same seed share the initial weights and the process noise (common random
+numbers), and both execution paths use the very same numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.policies.base import OpenLoop, on_sphere
+
+if TYPE_CHECKING:
+    from dopt.spec import TrialSpec
+
+Array = npt.NDArray[np.float64]
+
+_STREAMS = {"noise": 0, "weights": 1, "inputs": 2, "components": 3, "ties": 4}
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """Return the named child stream of a trial's seed."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAMS[name],)))
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Random numbers of one trial.
+
+    Attributes
+    ----------
+    noise : (T, d)
+        w_t, variance dt σ².
+    weights : (q,)
+        Initial parameters.
+    inputs : (T, m)
+        The whole input sequence of an open-loop policy; otherwise uniform on the sphere ‖u‖ = γ,
+        of which a closed-loop policy takes the first.
+    components : (T,)
+        Index among the r learned accelerations of the component k of Algorithm 2.
+    ties : (T, m)
+        Unit vectors that decide between inputs of equal value.
+    """
+
+    noise: Array
+    weights: Array
+    inputs: Array
+    components: npt.NDArray[np.int64]
+    ties: Array
+
+
+def draw(spec: TrialSpec) -> Draws:
+    """Draw the random numbers of a trial."""
+    system, policy, seed = spec.system, spec.policy, spec.seed
+    sphere = (system.horizon, system.n_inputs)
+    if isinstance(policy, OpenLoop):
+        inputs = policy.inputs(system, stream(seed, "inputs"))
+    else:
+        inputs = on_sphere(stream(seed, "inputs").standard_normal(sphere), system.gamma)
+    noise = stream(seed, "noise").standard_normal((system.horizon, system.n_states))
+    return Draws(
+        noise=np.sqrt(system.dt) * system.noise * noise,
+        weights=spec.model.initial_parameters(system, stream(seed, "weights")),
+        inputs=np.ascontiguousarray(inputs),
+        components=stream(seed, "components").integers(system.n_learned, size=system.horizon),
+        ties=on_sphere(stream(seed, "ties").standard_normal(sphere), 1.0),
+    )

@@ -1,0 +1,65 @@
+"""What a trial returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """Everything that is measured in one trial of T steps.
+
+    Attributes
+    ----------
+    loss, reachable_loss : (T,)
+        L2 norm of the model error over the evaluation grid and over the reachable set, after
+        the learning step of time t.
+    plan_us, learn_us, evaluate_us : (T,)
+        Microseconds spent on planning (with the update of the information matrix), on learning
+        and on the evaluation.
+    states : (T + 1, d)
+        States x_0 ... x_T.
+    inputs : (T, m)
+        Inputs u_0 ... u_{T-1}.
+    parameters : (q,)
+        Parameters of the model at the end.
+    diverged_at : int or None
+        First step at which the state left the system's limit or a number was not finite. All rows
+        from there on are NaN.
+    wall_seconds, cpu_seconds : float
+        Duration of the whole trial.
+    """
+
+    loss: Array
+    reachable_loss: Array
+    plan_us: Array
+    learn_us: Array
+    evaluate_us: Array
+    states: Array
+    inputs: Array
+    parameters: Array
+    diverged_at: int | None
+    wall_seconds: float
+    cpu_seconds: float
+
+    @property
+    def diverged(self) -> bool:
+        return self.diverged_at is not None
+
+    @property
+    def n_steps(self) -> int:
+        """Number of steps with a finite loss."""
+        return len(self.loss) if self.diverged_at is None else self.diverged_at
+
+    @property
+    def final_loss(self) -> float | None:
+        return None if self.diverged or not len(self.loss) else float(self.loss[-1])
+
+    @property
+    def best_loss(self) -> float | None:
+        return float(np.min(self.loss[: self.n_steps])) if self.n_steps else None

@@ -1,0 +1,191 @@
+"""A trial is a value: everything that it depends on, and a key made from that."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import ClassVar
+
+from dopt.errors import IncompatibleError, SpecificationError, unknown_name
+from dopt.fields import Checked, quantity
+from dopt.learning import LEARNERS, Learner
+from dopt.learning.recursive_least_squares import RecursiveLeastSquares
+from dopt.models import MODELS, Linear, Model
+from dopt.models.mlp import MLP
+from dopt.policies import POLICIES, DOptimal, Oracle, Policy
+from dopt.registry import build, section_of
+from dopt.systems import SYSTEMS, System
+
+CODE_VERSION = 1
+"""Raised whenever a change of the code changes the numbers of a trial."""
+
+_SECTIONS = ("env", "policy", "model", "learner")
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A trial without its seed: one cell of a grid."""
+
+    system: System
+    policy: Policy
+    model: Model
+    learner: Learner
+
+    def __post_init__(self) -> None:
+        self.policy.check(self.system)
+        linear = isinstance(self.model, Linear)
+        if isinstance(self.policy, Oracle) and not linear:
+            raise _mismatch("policy 'oracle'", "model 'linear'", f"model '{self.model.name}'")
+        if linear and not isinstance(self.policy, DOptimal):
+            raise _mismatch("model 'linear'", "policy 'oracle'", f"policy '{self.policy.name}'")
+        if linear and not self.system.linear_parameters:
+            raise _mismatch("model 'linear'", "linear parameters", f"env '{self.system.name}'")
+        if isinstance(self.learner, RecursiveLeastSquares) != linear:
+            raise _mismatch(
+                "learner 'recursive_least_squares'",
+                "model 'linear' and the other way round",
+                f"learner '{self.learner.name}' with model '{self.model.name}'",
+            )
+
+    @functools.cached_property
+    def canonical_json(self) -> str:
+        """Sorted, compact JSON of the content and the code version, without the seed."""
+        parts = (self.system, self.policy, self.model, self.learner)
+        content: dict[str, object] = {"code_version": CODE_VERSION}
+        content |= {key: section_of(part) for key, part in zip(_SECTIONS, parts, strict=True)}
+        return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+    @functools.cached_property
+    def key(self) -> str:
+        return hashlib.sha256(self.canonical_json.encode()).hexdigest()
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialSpec(Checked):
+    """One trial: a cell of the grid and a seed.
+
+    ``trial_key`` is the SHA-256 of the canonical JSON; equal keys are the same trial. Where it runs
+    and how it is stored is not part of it.
+    """
+
+    section: ClassVar[str] = "trial"
+
+    cell: Cell
+    seed: int = quantity(0, bound="nonnegative")
+
+    def __post_init__(self) -> None:
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise SpecificationError(
+                f"seed is {self.seed!r}, but a whole number of 0 or above is expected: set it so."
+            )
+
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, object]) -> TrialSpec:
+        """Return the trial that a configuration describes.
+
+        Parameters
+        ----------
+        given : mapping
+            Sections ``env``, ``policy``, ``model`` and ``learner``, each with a ``name`` and the
+            fields that differ from their defaults, and the ``seed``.
+
+        Raises
+        ------
+        SpecificationError
+            If a name is unknown, a type is wrong or a value is outside its bound.
+        IncompatibleError
+            If the choices are valid one by one but make no sense together.
+        """
+        for key in given:
+            if key not in (*_SECTIONS, "seed"):
+                raise unknown_name("configuration key", key, (*_SECTIONS, "seed"))
+        sections = {key: _section(given, key) for key in _SECTIONS}
+        cell = Cell(
+            build("env", SYSTEMS, sections["env"]),
+            build("policy", POLICIES, sections["policy"]),
+            build("model", MODELS, sections["model"]),
+            build("learner", LEARNERS, sections["learner"]),
+        )
+        return cls(cell, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
+
+    def with_seed(self, seed: int) -> TrialSpec:
+        """Return the same cell with another seed."""
+        return TrialSpec(self.cell, seed)
+
+    @property
+    def system(self) -> System:
+        return self.cell.system
+
+    @property
+    def policy(self) -> Policy:
+        return self.cell.policy
+
+    @property
+    def model(self) -> Model:
+        return self.cell.model
+
+    @property
+    def learner(self) -> Learner:
+        return self.cell.learner
+
+    @property
+    def config_json(self) -> str:
+        """Canonical JSON without the seed."""
+        return self.cell.canonical_json
+
+    @property
+    def config_key(self) -> str:
+        """SHA-256 of :attr:`config_json`: the trial without its seed."""
+        return self.cell.key
+
+    @functools.cached_property
+    def trial_key(self) -> str:
+        """SHA-256 of :meth:`canonical_json`."""
+        return hashlib.sha256(self.canonical_json().encode()).hexdigest()
+
+    def canonical_json(self) -> str:
+        """Return the sorted, compact JSON of the content; "seed" sorts last."""
+        return f'{self.config_json[:-1]},"seed":{self.seed}}}'
+
+    def to_mapping(self) -> dict[str, object]:
+        """Return the mapping that :meth:`from_mapping` turns into this trial."""
+        content: dict[str, object] = json.loads(self.canonical_json())
+        del content["code_version"]
+        return content
+
+    def columns(self) -> dict[str, str | int | float | None]:
+        """Return what a table of configurations shows in columns of its own."""
+        mlp = self.model if isinstance(self.model, MLP) else None
+        return {
+            "env": self.system.name,
+            "policy": self.policy.name,
+            "model": self.model.name,
+            "learner": self.learner.name,
+            "width": mlp.width if mlp else None,
+            "depth": mlp.depth if mlp else None,
+            "horizon": self.system.horizon,
+            "dt": self.system.dt,
+            "gamma": self.system.gamma,
+        }
+
+
+def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:
+    section = given.get(key)
+    if not isinstance(section, Mapping):
+        raise SpecificationError(
+            f"configuration key '{key}' is {section!r}, but a section with a name and fields is "
+            f"expected: choose one, for instance {key}={_EXAMPLES[key]}."
+        )
+    return section
+
+
+_EXAMPLES = {"env": "pendulum", "policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
+
+
+def _mismatch(what: str, expected: str, given: str) -> IncompatibleError:
+    return IncompatibleError(
+        f"{what} goes with {expected}, but {given} was given: change one of them."
+    )

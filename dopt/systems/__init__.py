@@ -1,0 +1,34 @@
+"""Physical systems: one file each, and the registry that names them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dopt.registry import build
+from dopt.systems.arm import Arm
+from dopt.systems.base import System
+from dopt.systems.cartpole import Cartpole
+from dopt.systems.features import Feature
+from dopt.systems.pendulum import Pendulum
+from dopt.systems.quadrotor import Quadrotor
+
+SYSTEMS: dict[str, type[System]] = {
+    system.name: system for system in (Pendulum, Cartpole, Arm, Quadrotor)
+}
+
+
+def system_from_mapping(section: Mapping[str, object]) -> System:
+    """Return the system that a configuration section describes: ``name`` plus its fields."""
+    return build("env", SYSTEMS, section)
+
+
+__all__ = [
+    "SYSTEMS",
+    "Arm",
+    "Cartpole",
+    "Feature",
+    "Pendulum",
+    "Quadrotor",
+    "System",
+    "system_from_mapping",
+]

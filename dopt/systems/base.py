@@ -1,0 +1,176 @@
+"""What every physical system declares.
+
+All systems are control-affine with known kinematics and a known input term,
+
+    dx/dt = known(x, u) + E a(x),
+
+where a(x), r accelerations at u = 0, is what the exploration learns and E puts them into the r
+``learned_rows`` of the state derivative (design note to equation 1 of the paper).
+
+=========  ==========================================  ============
+symbol     meaning                                     shape
+=========  ==========================================  ============
+x          state                                       d
+u          input                                       m
+p          physical parameters, in declared order      number of them
+a          learned accelerations                       r
+=========  ==========================================  ============
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.errors import SpecificationError
+from dopt.fields import Checked, quantity
+from dopt.systems.features import Feature, feature_values
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class System(Checked):
+    """A physical system with its exploration setting; subclasses add the physical parameters.
+
+    The two equations are static methods over sequences of scalars, arrays or tensors, so that one
+    definition serves the simulator, the evaluation, automatic differentiation and the compiled
+    kernel.
+    """
+
+    section: ClassVar[str] = "env"
+    name: ClassVar[str]
+    physical: ClassVar[tuple[str, ...]]
+    linear_parameters: ClassVar[tuple[str, ...]] = ()
+    state_labels: ClassVar[tuple[str, ...]]
+    input_labels: ClassVar[tuple[str, ...]]
+    learned_rows: ClassVar[tuple[int, ...]]
+    features: ClassVar[tuple[Feature, ...]]
+    angle_indices: ClassVar[tuple[int, ...]] = ()
+    phase_plane: ClassVar[tuple[int, int]]
+    grid_indices: ClassVar[tuple[int, ...]]
+    equilibrium: ClassVar[tuple[float, ...] | None] = None
+
+    gamma: float = quantity(1.0, bound="positive")
+    dt: float = quantity(0.02, "s", "positive")
+    noise: float = quantity(1e-3, bound="nonnegative")
+    horizon: int = quantity(500, "steps", "positive")
+    initial_state: tuple[float, ...] = ()
+    grid_half_widths: tuple[float, ...] = quantity((), bound="positive")
+    grid_points: tuple[int, ...] = quantity((), bound="positive")
+    state_limit: float = quantity(1e4, bound="positive")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        axes = len(self.grid_indices)
+        self._check_size("initial_state", self.n_states)
+        self._check_size("grid_half_widths", axes)
+        self._check_size("grid_points", axes)
+
+    def _check_size(self, field: str, size: int) -> None:
+        given = getattr(self, field)
+        if len(given) != size:
+            raise SpecificationError(
+                f"env.{field} has {len(given)} entries, but {self.name} needs {size}: "
+                f"give one for each of them."
+            )
+
+    @staticmethod
+    @abstractmethod
+    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+        """Return the known part of dx/dt: d scalars."""
+
+    @staticmethod
+    @abstractmethod
+    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+        """Return the learned accelerations at zero input: r scalars."""
+
+    @property
+    def n_states(self) -> int:
+        """State dimension d."""
+        return len(self.state_labels)
+
+    @property
+    def n_inputs(self) -> int:
+        """Input dimension m."""
+        return len(self.input_labels)
+
+    @property
+    def n_learned(self) -> int:
+        """Number of learned accelerations r."""
+        return len(self.learned_rows)
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Physical parameters in the order of ``physical``."""
+        return tuple(getattr(self, name) for name in self.physical)
+
+    @property
+    def feature_scales(self) -> tuple[float, ...]:
+        """Divisor of each feature: the grid's half-width for an identity, 1 otherwise."""
+        widths = dict(zip(self.grid_indices, self.grid_half_widths, strict=True))
+        return tuple(
+            widths.get(feature.index, 1.0) if feature.kind == "identity" else 1.0
+            for feature in self.features
+        )
+
+    def grid_box(self) -> dict[int, tuple[float, float]]:
+        """Return the evaluation box: state index -> (low, high)."""
+        return {
+            index: (-half, half)
+            for index, half in zip(self.grid_indices, self.grid_half_widths, strict=True)
+        }
+
+    def grid(self) -> Array:
+        """Return the evaluation states, (N, d): midpoints of a regular partition of the box.
+
+        The mean over them is the midpoint rule for the mean over the box. Components that the
+        learned accelerations do not depend on are zero.
+        """
+        axes = [
+            (low + (high - low) * (np.arange(n) + 0.5) / n)
+            for (low, high), n in zip(self.grid_box().values(), self.grid_points, strict=True)
+        ]
+        states = np.zeros((math.prod(self.grid_points), self.n_states))
+        mesh = np.meshgrid(*axes, indexing="ij")
+        states[:, list(self.grid_indices)] = np.stack([axis.ravel() for axis in mesh], axis=1)
+        return states
+
+    def featurize(self, states: Array) -> Array:
+        """Return the network's inputs, (N, n_features), of states, (N, d)."""
+        values = feature_values(self.features, self.feature_scales, np.moveaxis(states, -1, 0))
+        return np.stack(values, axis=-1)
+
+    def learned(self, states: Array) -> Array:
+        """Return the true accelerations, (N, r), of states, (N, d)."""
+        values = self.accelerations(tuple(states.T), self.parameters)
+        return np.stack(np.broadcast_arrays(*values), axis=-1)
+
+    def derivative(self, state: npt.ArrayLike, inputs: npt.ArrayLike) -> npt.NDArray[Any]:
+        """Return dx/dt = f(x, u), equation 1, of one state (d,) and input (m,)."""
+        x, u = tuple(np.asarray(state)), tuple(np.asarray(inputs))
+        flow = np.array(self.known(x, u, self.parameters))
+        rows = np.array(self.accelerations(x, self.parameters))
+        kind = np.result_type(flow, rows)
+        flow = flow.astype(kind)
+        flow[list(self.learned_rows)] += rows
+        return flow
+
+    @functools.cached_property
+    def linear_form(self) -> tuple[tuple[float, ...], ...]:
+        """Physical parameters at which :meth:`accelerations` yields the offset and the regressors.
+
+        The accelerations are affine in the parameters named in ``linear_parameters``,
+        a(x) = offset(x) + Psi(x) theta: the first entry sets all of these to 0, entry 1 + j sets
+        the j-th of them to 1.
+        """
+        values = dict(zip(self.physical, self.parameters, strict=True))
+        zero = values | dict.fromkeys(self.linear_parameters, 0.0)
+        points = [zero] + [zero | {name: 1.0} for name in self.linear_parameters]
+        return tuple(tuple(point[name] for name in self.physical) for point in points)

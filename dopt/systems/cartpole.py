@@ -1,0 +1,93 @@
+"""Cartpole with linear friction: a point mass on a massless rod, hinged to a cart."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from dopt.fields import quantity
+from dopt.systems.base import System
+from dopt.systems.elementary import cos, sin
+from dopt.systems.features import Feature
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cartpole(System):
+    """Cart on a track with a point mass on a rod, pushed by a force on the cart.
+
+    State: cart position y [m], ẏ [m/s], angle φ from upright [rad], φ̇ [rad/s]. Input: force u [N].
+
+    With M = m_c + m_p:
+    M ÿ + m_p l (φ̈ cos φ - φ̇² sin φ) = u - β ẏ,
+    m_p l² φ̈ + m_p l ÿ cos φ - m_p g l sin φ = -α φ̇.
+    Learned: ÿ and φ̈ at u = 0. Known: the input column.
+
+    Parameters
+    ----------
+    cart_mass, pole_mass : float
+        Masses m_c and m_p [kg].
+    length : float
+        Length l of the rod [m].
+    gravity : float
+        Gravitational acceleration g [m/s²].
+    pivot_friction : float
+        Viscous friction coefficient α of the hinge [N m s].
+    cart_friction : float
+        Viscous friction coefficient β of the track [N s/m].
+    """
+
+    name: ClassVar[str] = "cartpole"
+    physical: ClassVar[tuple[str, ...]] = (
+        "cart_mass",
+        "pole_mass",
+        "length",
+        "gravity",
+        "pivot_friction",
+        "cart_friction",
+    )
+    linear_parameters: ClassVar[tuple[str, ...]] = ("gravity", "pivot_friction", "cart_friction")
+    state_labels: ClassVar[tuple[str, ...]] = ("y [m]", "ẏ [m/s]", "φ [rad]", "φ̇ [rad/s]")
+    input_labels: ClassVar[tuple[str, ...]] = ("u [N]",)
+    learned_rows: ClassVar[tuple[int, ...]] = (1, 3)
+    features: ClassVar[tuple[Feature, ...]] = (
+        Feature("identity", 1),
+        Feature("cos", 2),
+        Feature("sin", 2),
+        Feature("identity", 3),
+    )
+    angle_indices: ClassVar[tuple[int, ...]] = (2,)
+    phase_plane: ClassVar[tuple[int, int]] = (2, 3)
+    grid_indices: ClassVar[tuple[int, ...]] = (1, 2, 3)
+    equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0, math.pi, 0.0)
+
+    cart_mass: float = quantity(1.0, "kg", "positive")
+    pole_mass: float = quantity(0.1, "kg", "positive")
+    length: float = quantity(1.0, "m", "positive")
+    gravity: float = quantity(10.0, "m/s²", "nonnegative")
+    pivot_friction: float = quantity(0.01, "N m s", "nonnegative")
+    cart_friction: float = quantity(0.5, "N s/m", "nonnegative")
+    gamma: float = quantity(5.0, "N", "positive")
+    initial_state: tuple[float, ...] = quantity((0.0, 0.0, math.pi, 0.0))
+    grid_half_widths: tuple[float, ...] = quantity((4.0, math.pi, 8.0), bound="positive")
+    grid_points: tuple[int, ...] = quantity((8, 16, 8), bound="positive")
+
+    @staticmethod
+    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+        cart_mass, pole_mass, length, _, _, _ = parameters
+        cosine = cos(state[2])
+        push = inputs[0] / (cart_mass + pole_mass - pole_mass * cosine**2)
+        return state[1], push, state[3], -push * cosine / length
+
+    @staticmethod
+    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+        cart_mass, pole_mass, length, gravity, alpha, beta = parameters
+        _, speed, angle, rate = state
+        sine, cosine = sin(angle), cos(angle)
+        hinge = alpha * rate / length
+        force = (
+            pole_mass * sine * (length * rate**2 - gravity * cosine) + hinge * cosine - beta * speed
+        )
+        cart = force / (cart_mass + pole_mass - pole_mass * cosine**2)
+        pole = (gravity * sine - cart * cosine - hinge / pole_mass) / length
+        return cart, pole

@@ -1,0 +1,71 @@
+"""Damped pendulum: a uniform rod that swings about one end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from dopt.fields import quantity
+from dopt.systems.base import System
+from dopt.systems.elementary import sin
+from dopt.systems.features import Feature
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pendulum(System):
+    """Uniform rod of mass m and length l on a pivot with viscous friction, driven by a torque.
+
+    State: angle φ from hanging [rad], angular rate φ̇ [rad/s]. Input: torque u [N m].
+
+    I φ̈ = -(m g l / 2) sin φ - b φ̇ + u with I = m l² / 3. Learned: φ̈ at u = 0. Known: u / I.
+    Eigenfrequency at rest without friction: ω₀² = 3 g / (2 l).
+
+    Parameters
+    ----------
+    mass : float
+        Mass m [kg].
+    length : float
+        Length l [m].
+    gravity : float
+        Gravitational acceleration g [m/s²].
+    friction : float
+        Viscous friction coefficient b of the pivot [N m s].
+    """
+
+    name: ClassVar[str] = "pendulum"
+    physical: ClassVar[tuple[str, ...]] = ("mass", "length", "gravity", "friction")
+    linear_parameters: ClassVar[tuple[str, ...]] = ("gravity", "friction")
+    state_labels: ClassVar[tuple[str, ...]] = ("φ [rad]", "φ̇ [rad/s]")
+    input_labels: ClassVar[tuple[str, ...]] = ("u [N m]",)
+    learned_rows: ClassVar[tuple[int, ...]] = (1,)
+    features: ClassVar[tuple[Feature, ...]] = (
+        Feature("cos", 0),
+        Feature("sin", 0),
+        Feature("identity", 1),
+    )
+    angle_indices: ClassVar[tuple[int, ...]] = (0,)
+    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
+    grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
+    equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0)
+
+    mass: float = quantity(1.0, "kg", "positive")
+    length: float = quantity(1.0, "m", "positive")
+    gravity: float = quantity(10.0, "m/s²", "nonnegative")
+    friction: float = quantity(1.0 / 6.0, "N m s", "nonnegative")
+    gamma: float = quantity(1.5, "N m", "positive")
+    initial_state: tuple[float, ...] = quantity((1e-3, 0.0))
+    grid_half_widths: tuple[float, ...] = quantity((math.pi, 8.0), bound="positive")
+    grid_points: tuple[int, ...] = quantity((32, 32), bound="positive")
+
+    @staticmethod
+    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+        mass, length, _, _ = parameters
+        return state[1], 3.0 * inputs[0] / (mass * length**2)
+
+    @staticmethod
+    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+        mass, length, gravity, friction = parameters
+        inertia = mass * length**2 / 3.0
+        torque = mass * gravity * length / 2.0 * sin(state[0]) + friction * state[1]
+        return (-torque / inertia,)
