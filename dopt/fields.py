@@ -12,7 +12,7 @@ from dopt.errors import SpecificationError
 Bound = Literal["any", "positive", "nonnegative"]
 
 _BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
-    "any": (lambda value: True, "any finite number"),
+    "any": (lambda _: True, "any finite number"),
     "positive": (lambda value: value > 0, "above 0"),
     "nonnegative": (lambda value: value >= 0, "0 or above"),
 }

@@ -26,7 +26,7 @@ class Policy(Checked):
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
 
-    def check(self, system: System) -> None:  # noqa: B027 - most policies suit every system
+    def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
 
 
@@ -46,4 +46,5 @@ class ClosedLoop(Policy):
 
 def on_sphere(vectors: Array, radius: float) -> Array:
     """Return vectors, (..., m), scaled to a norm."""
-    return radius * vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    scaled: Array = radius * vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return scaled

@@ -41,4 +41,5 @@ class Periodic(OpenLoop):
         assert mode is not None, "check() is called before"
         frequency = mode.frequency if self.frequency is None else self.frequency
         times = system.dt * np.arange(system.horizon)
-        return system.gamma * np.sin(frequency * times)[:, None] * mode.direction
+        wave: Array = system.gamma * np.sin(frequency * times)[:, None] * mode.direction
+        return wave

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -23,7 +24,8 @@ class RandomGaussian(OpenLoop):
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         shape = (system.horizon, system.n_inputs)
-        return system.gamma / np.sqrt(system.n_inputs) * rng.standard_normal(shape)
+        deviation = system.gamma / math.sqrt(system.n_inputs)
+        return deviation * rng.standard_normal(shape)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,103 @@
+"""Where a model is judged: the evaluation grid and the reachable set of a system."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.policies.base import on_sphere
+from dopt.systems.base import System
+from dopt.systems.equilibrium import eigenmode
+
+Array = npt.NDArray[np.float64]
+
+REACHABLE_POINTS = 512
+HELD_STEPS = (5, 10, 20, 40)
+FREQUENCY_RATIOS = (0.8, 1.0, 1.2)
+CHIRP_RANGE = (0.2, 2.0)
+_SEED = 20_230_131
+
+
+@dataclass(frozen=True)
+class EvaluationSet:
+    """States and the true accelerations there, the grid's first.
+
+    Attributes
+    ----------
+    states : (N, d)
+    accelerations : (N, r)
+    n_grid : int
+        Number of grid points; the other points are the reachable set.
+    """
+
+    states: Array
+    accelerations: Array
+    n_grid: int
+
+
+@functools.lru_cache(maxsize=64)
+def evaluation_set(system: System) -> EvaluationSet:
+    """Return the points of a system; a function of its parameters alone."""
+    grid = system.grid()
+    states = np.concatenate([grid, reachable_states(system)])
+    return EvaluationSet(states, system.learned(states), len(grid))
+
+
+def reachable_states(system: System) -> Array:
+    """Return states, (512, d), that the true system visits under strong inputs of full energy.
+
+    The inputs are random ones held for 5, 10, 20 and 40 steps, sinusoids at and around the
+    eigenfrequency and a chirp, each over the whole horizon without process noise. The sample is
+    drawn without replacement from all states visited, with a fixed seed.
+    """
+    rng = np.random.default_rng(_SEED)
+    inputs = np.stack(_held(system, rng) + _waves(system), axis=1)
+    visited = simulate(system, inputs).reshape(-1, system.n_states)
+    visited = visited[np.all(np.abs(visited) <= system.state_limit, axis=1)]
+    chosen = rng.choice(len(visited), min(REACHABLE_POINTS, len(visited)), replace=False)
+    return np.ascontiguousarray(visited[np.sort(chosen)])
+
+
+def simulate(system: System, inputs: Array) -> Array:
+    """Return the noise-free states, (T + 1, n, d), under inputs (T, n, m), by the Euler map."""
+    steps, n, _ = inputs.shape
+    states = np.empty((steps + 1, n, system.n_states))
+    states[0] = system.initial_state
+    for t in range(steps):
+        x = tuple(states[t].T)
+        flow = np.stack(
+            np.broadcast_arrays(*system.known(x, tuple(inputs[t].T), system.parameters)), axis=-1
+        )
+        flow[:, list(system.learned_rows)] += system.learned(states[t])
+        states[t + 1] = states[t] + system.dt * flow
+    return states
+
+
+def _held(system: System, rng: np.random.Generator) -> list[Array]:
+    """Return random inputs on the sphere, held for several spans: each (T, m)."""
+    sequences = []
+    for hold in HELD_STEPS:
+        draws = rng.standard_normal((-(-system.horizon // hold), system.n_inputs))
+        held = np.repeat(on_sphere(draws, system.gamma), hold, axis=0)
+        sequences.append(held[: system.horizon])
+    return sequences
+
+
+def _waves(system: System) -> list[Array]:
+    """Return sinusoids about the eigenfrequency and a chirp: each (T, m).
+
+    A system without a mode is excited at ten periods in the horizon, along the first input.
+    """
+    mode = eigenmode(system)
+    duration = system.dt * system.horizon
+    frequency = mode.frequency if mode else 20.0 * math.pi / duration
+    direction = mode.direction if mode else np.eye(system.n_inputs)[0]
+    times = system.dt * np.arange(system.horizon)
+    low, high = (ratio * frequency for ratio in CHIRP_RANGE)
+    phases = [ratio * frequency * times for ratio in FREQUENCY_RATIOS]
+    phases.append(low * times + 0.5 * (high - low) / duration * times**2)
+    return [system.gamma * np.sign(np.sin(p))[:, None] * direction for p in phases]

@@ -1,0 +1,25 @@
+"""The compiled twin of the inner loop: one trial on one core.
+
+It computes what :mod:`dopt.reference` defines, for the models, policies and learners of the
+registries and every system whose equations compile.
+"""
+
+from __future__ import annotations
+
+
+def warm_up() -> None:
+    """Compile the kernel for all registered systems, or load it from the disk cache.
+
+    Called once before worker processes start, so that they find compiled code.
+    """
+    from dopt.kernel.equations import compiled_equations
+    from dopt.kernel.run import run_trial_in_kernel
+    from dopt.spec import TrialSpec
+    from dopt.systems import SYSTEMS
+
+    for system in SYSTEMS.values():
+        compiled_equations(system)
+    section = {"name": "pendulum", "horizon": 2, "grid_points": [2, 2]}
+    names = {"policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
+    sections = {key: {"name": name} for key, name in names.items()}
+    run_trial_in_kernel(TrialSpec.from_mapping({"env": section, **sections, "seed": 0}))

@@ -1,0 +1,96 @@
+"""What the compiled functions are given: constants, mutable state and records, by name.
+
+Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
+w units in each hidden layer, L hidden layers, N evaluation points.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+MLP_MODEL, LINEAR_MODEL = 0, 1
+OPEN_LOOP, UNIFORM, D_OPTIMAL = 0, 1, 2
+ADAM, LEAST_SQUARES = 0, 1
+
+
+class World(NamedTuple):
+    """The system's constants."""
+
+    parameters: Floats  # physical parameters
+    linear_form: Floats  # (1 + n_linear, number of physical parameters)
+    learned_rows: Integers  # (r,)
+    n_inputs: int  # m
+    dt: float
+    gamma: float
+    state_limit: float
+
+
+class Network(NamedTuple):
+    """Architecture of the model."""
+
+    kind: int  # MLP_MODEL or LINEAR_MODEL
+    sizes: Integers  # (L + 2,) units of each layer, from p to r
+    offsets: Integers  # (L + 1,) where each layer's weights start in the parameter vector
+    feature_kinds: Integers  # (p,) 0 identity, 1 cos, 2 sin
+    feature_indices: Integers  # (p,)
+    feature_scales: Floats  # (p,)
+
+
+class Rules(NamedTuple):
+    """Policy and learner."""
+
+    policy: int  # OPEN_LOOP, UNIFORM or D_OPTIMAL
+    ascent_steps: int  # of the uniform policy
+    learner: int  # ADAM or LEAST_SQUARES
+    learning_rate: float
+    beta_1: float
+    beta_2: float
+    epsilon: float
+    window: int
+
+
+class Randomness(NamedTuple):
+    """Numbers of :class:`dopt.randomness.Draws`."""
+
+    noise: Floats  # (T, d)
+    inputs: Floats  # (T, m)
+    components: Integers  # (T,)
+    ties: Floats  # (T, m)
+
+
+class Evaluation(NamedTuple):
+    """Points at which the model is compared with the truth, the grid's first."""
+
+    features: Floats  # (N, p) for the network
+    regressors: Floats  # (N, r, q) for the linear model
+    targets: Floats  # (N, r), less the offset for the linear model
+    n_grid: int
+
+
+class State(NamedTuple):
+    """Everything that changes from step to step; written in place."""
+
+    theta: Floats  # (q,) parameters
+    moment_1: Floats  # (q,) of Adam
+    moment_2: Floats  # (q,)
+    covariance: Floats  # (q, q) M⁻¹, or (0, 0) where no plan and no learner needs it
+    window_features: Floats  # (window, p) newest samples, a ring
+    window_targets: Floats  # (window, r)
+
+
+class Record(NamedTuple):
+    """What a trial leaves behind."""
+
+    states: Floats  # (T + 1, d)
+    inputs: Floats  # (T, m)
+    loss: Floats  # (T,)
+    reachable_loss: Floats  # (T,)
+    plan_us: Floats  # (T,)
+    learn_us: Floats  # (T,)
+    evaluate_us: Floats  # (T,)

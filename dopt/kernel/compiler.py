@@ -1,0 +1,101 @@
+"""How the kernel is compiled: once per source and machine, cached on disk, shared by processes."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+CACHE_VARIABLE = "DOPT_CACHE"
+_PACKAGE = Path(__file__).resolve().parent.parent
+_COMPILED_SOURCES = ("kernel", "systems", "planning")
+
+
+def _source_digest() -> str:
+    """Return a digest of every source that ends up in compiled code.
+
+    Numba checks only the file of the outermost function of what it finds in its cache, so a change
+    in a file further in would go unnoticed: each state of the sources gets a folder of its own.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    for folder in _COMPILED_SOURCES:
+        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    """Return a writable folder for compiled code."""
+    base = os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME")
+    root = Path(base) if base else Path.home() / ".cache"
+    folder = root / "dopt" / f"kernel-{_source_digest()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="dopt-kernel-"))
+
+
+numba.config.CACHE_DIR = str(_cache_folder())
+
+
+def compiled(function: F) -> F:
+    """Compile a function on its first call, with NumPy's rules for division by zero."""
+    decorated: F = numba.njit(cache=True, error_model="numpy")(function)
+    return decorated
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def float_from_bits(typing_context: Any, bits: Any) -> Any:  # noqa: ARG001
+    """Reinterpret the bits of an int64 as a float64."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        return builder.bitcast(arguments[0], ir.DoubleType())
+
+    return types.float64(types.int64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def bits_from_float(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
+    """Reinterpret the bits of a float64 as an int64."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        return builder.bitcast(arguments[0], ir.IntType(64))
+
+    return types.int64(types.float64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def monotonic_microseconds(typing_context: Any) -> Any:  # noqa: ARG001
+    """Read the system's monotonic clock [µs] (POSIX clock_gettime)."""
+    monotonic = 6 if os.uname().sysname == "Darwin" else 1
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+        word = ir.IntType(64)
+        timespec = ir.LiteralStructType([word, word])
+        kind = ir.FunctionType(ir.IntType(32), [ir.IntType(32), timespec.as_pointer()])
+        clock = cgutils.get_or_insert_function(builder.module, kind, "clock_gettime")
+        slot = cgutils.alloca_once(builder, timespec)
+        builder.call(clock, [ir.Constant(ir.IntType(32), monotonic), slot])
+        seconds = builder.load(cgutils.gep_inbounds(builder, slot, 0, 0))
+        nanoseconds = builder.load(cgutils.gep_inbounds(builder, slot, 0, 1))
+        double = ir.DoubleType()
+        return builder.fadd(
+            builder.fmul(builder.sitofp(seconds, double), ir.Constant(double, 1e6)),
+            builder.fmul(builder.sitofp(nanoseconds, double), ir.Constant(double, 1e-3)),
+        )
+
+    return types.float64(), generate

@@ -1,0 +1,113 @@
+"""The equations of a system as compiled functions that write into arrays.
+
+The very functions of :mod:`dopt.systems` are compiled, for float64 and, where a complex step takes
+their derivative, for complex128. The kernel calls them through pointers, so that it is compiled
+once for all systems.
+"""
+
+from __future__ import annotations
+
+import cmath
+import functools
+import math
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any, NamedTuple
+
+import numba
+from numba import complex128, float64, types
+from numba.extending import overload, register_jitable
+from numba.np.unsafe.ndarray import to_fixed_tuple
+
+from dopt.systems import elementary
+from dopt.systems.base import System
+
+KNOWN = types.void(float64[::1], float64[::1], float64[::1], float64[::1])
+ACCELERATIONS = types.void(float64[::1], float64[::1], float64[::1])
+COMPLEX_ACCELERATIONS = types.void(complex128[::1], complex128[::1], complex128[::1])
+
+
+@overload(elementary.sin, strict=False)  # type: ignore[untyped-decorator]
+def _sin(x: Any) -> Any:
+    if isinstance(x, types.Complex):
+        return lambda x: cmath.sin(x)
+    return lambda x: math.sin(x)
+
+
+@overload(elementary.cos, strict=False)  # type: ignore[untyped-decorator]
+def _cos(x: Any) -> Any:
+    if isinstance(x, types.Complex):
+        return lambda x: cmath.cos(x)
+    return lambda x: math.cos(x)
+
+
+@overload(elementary.magnitude, strict=False)  # type: ignore[untyped-decorator]
+def _magnitude(x: Any) -> Any:
+    if isinstance(x, types.Complex):
+        return lambda x: x if x.real >= 0 else -x
+    return lambda x: abs(x)
+
+
+class Equations(NamedTuple):
+    """Compiled equations of one class of systems, each writing into its last argument.
+
+    Attributes
+    ----------
+    known : (x, u, p, out)
+        Known part of dx/dt.
+    accelerations : (x, p, out)
+        Learned accelerations.
+    complex_accelerations : (x, p, out)
+        The same for complex arguments.
+    """
+
+    known: Any
+    accelerations: Any
+    complex_accelerations: Any
+
+
+@functools.cache
+def compiled_equations(system: type[System]) -> Equations:
+    """Compile the equations of a class of systems (from the disk cache where it has them)."""
+    n_states, n_inputs = len(system.state_labels), len(system.input_labels)
+    n_parameters = len(system.physical)
+    known, accelerations = _compilable(system.known), _compilable(system.accelerations)
+    return Equations(
+        _known_into(known, n_states, n_inputs, n_parameters),
+        _accelerations_into(accelerations, n_states, n_parameters, ACCELERATIONS),
+        _accelerations_into(accelerations, n_states, n_parameters, COMPLEX_ACCELERATIONS),
+    )
+
+
+def _compilable(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Let compiled code call a plain function and the helpers that it uses from its own module."""
+    for name in function.__code__.co_names:
+        helper = function.__globals__.get(name)
+        if isinstance(helper, FunctionType) and helper.__module__ == function.__module__:
+            _compilable(helper)
+    register_jitable(function)
+    return function
+
+
+def _known_into(
+    function: Callable[..., Any], n_states: int, n_inputs: int, n_parameters: int
+) -> Any:
+    def into(x: Any, u: Any, p: Any, out: Any) -> None:
+        values = function(
+            to_fixed_tuple(x, n_states), to_fixed_tuple(u, n_inputs), to_fixed_tuple(p, n_parameters)
+        )
+        for i in range(len(values)):
+            out[i] = values[i]
+
+    return numba.njit(KNOWN, cache=True, error_model="numpy")(into)
+
+
+def _accelerations_into(
+    function: Callable[..., Any], n_states: int, n_parameters: int, signature: Any
+) -> Any:
+    def into(x: Any, p: Any, out: Any) -> None:
+        values = function(to_fixed_tuple(x, n_states), to_fixed_tuple(p, n_parameters))
+        for i in range(len(values)):
+            out[i] = values[i]
+
+    return numba.njit(signature, cache=True, error_model="numpy")(into)

@@ -1,0 +1,240 @@
+"""The model in compiled code: values and gradients, for batches and single states.
+
+Twin of the ``torch.nn.Module`` of the reference. In the backward passes δ is the derivative of an
+output with respect to the pre-activations of a layer, h the activations, and a dot marks the
+derivative along a direction of the state (forward over reverse).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from dopt.kernel.arguments import Network
+from dopt.kernel.compiler import compiled
+from dopt.kernel.elementwise import tanh
+
+contracted = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+
+
+@compiled
+def features_at(network: Network, x: Any, out: Any) -> None:
+    """Write the features of a state."""
+    for i in range(out.shape[0]):
+        value = x[network.feature_indices[i]]
+        kind = network.feature_kinds[i]
+        if kind == 1:
+            value = math.cos(value)
+        elif kind == 2:
+            value = math.sin(value)
+        out[i] = value / network.feature_scales[i]
+
+
+@compiled
+def features_along(network: Network, x: Any, direction: Any, out: Any) -> None:
+    """Write the derivative of the features along a direction of the state."""
+    for i in range(out.shape[0]):
+        index = network.feature_indices[i]
+        kind = network.feature_kinds[i]
+        slope = 1.0
+        if kind == 1:
+            slope = -math.sin(x[index])
+        elif kind == 2:
+            slope = math.cos(x[index])
+        out[i] = slope * direction[index] / network.feature_scales[i]
+
+
+@compiled
+def layer(network: Network, theta: Any, index: int) -> Any:
+    """Return views of the weights, (outputs, inputs), and biases of a layer."""
+    n_in, n_out = network.sizes[index], network.sizes[index + 1]
+    start = network.offsets[index]
+    middle = start + n_in * n_out
+    return theta[start:middle].reshape(n_out, n_in), theta[middle : middle + n_out]
+
+
+@contracted  # type: ignore[untyped-decorator]
+def _activate(values: Any, bias: Any) -> None:
+    for n in range(values.shape[0]):
+        row = values[n]
+        for i in range(bias.shape[0]):
+            row[i] = tanh(row[i] + bias[i])
+
+
+@compiled
+def forward(network: Network, theta: Any, inputs: Any, hidden: Any, outputs: Any) -> None:
+    """Evaluate the network at n points.
+
+    ``inputs`` (n, p), ``hidden`` (L, at least n, w), ``outputs`` (n, r); the last two are written.
+    """
+    n, depth = inputs.shape[0], network.offsets.shape[0] - 1
+    W, b = layer(network, theta, 0)
+    np.dot(inputs, W.T, hidden[0, :n])
+    _activate(hidden[0, :n], b)
+    for index in range(1, depth):
+        W, b = layer(network, theta, index)
+        np.dot(hidden[index - 1, :n], W.T, hidden[index, :n])
+        _activate(hidden[index, :n], b)
+    W, b = layer(network, theta, depth)
+    np.dot(hidden[depth - 1, :n], W.T, outputs)
+    for i in range(n):
+        for k in range(b.shape[0]):
+            outputs[i, k] += b[k]
+
+
+@contracted  # type: ignore[untyped-decorator]
+def _column_sums(values: Any, out: Any) -> None:
+    out[:] = 0.0
+    for n in range(values.shape[0]):
+        for i in range(out.shape[0]):
+            out[i] += values[n, i]
+
+
+@contracted  # type: ignore[untyped-decorator]
+def _through_tanh(delta: Any, activations: Any) -> None:
+    for n in range(delta.shape[0]):
+        for i in range(delta.shape[1]):
+            delta[n, i] *= 1.0 - activations[n, i] * activations[n, i]
+
+
+@compiled
+def loss_gradient(
+    network: Network,
+    theta: Any,
+    inputs: Any,
+    targets: Any,
+    hidden: Any,
+    outputs: Any,
+    deltas: Any,
+    gradient: Any,
+) -> None:
+    """Write the gradient of mean_n ‖a_θ(x_n) - y_n‖² over a batch.
+
+    ``deltas`` (2, at least n, w) is scratch; ``gradient`` (q,) is written.
+    """
+    n, depth = inputs.shape[0], network.offsets.shape[0] - 1
+    forward(network, theta, inputs, hidden, outputs)
+    for i in range(n):
+        for k in range(outputs.shape[1]):
+            outputs[i, k] = 2.0 / n * (outputs[i, k] - targets[i, k])
+    W, _ = layer(network, theta, depth)
+    dW, db = layer(network, gradient, depth)
+    np.dot(outputs.T, hidden[depth - 1, :n], dW)
+    _column_sums(outputs, db)
+    delta = deltas[0, :n]
+    np.dot(outputs, W, delta)
+    _through_tanh(delta, hidden[depth - 1, :n])
+    for index in range(depth - 1, 0, -1):
+        W, _ = layer(network, theta, index)
+        dW, db = layer(network, gradient, index)
+        np.dot(delta.T, hidden[index - 1, :n], dW)
+        _column_sums(delta, db)
+        below = deltas[(depth - index) % 2, :n]
+        np.dot(delta, W, below)
+        delta = below
+        _through_tanh(delta, hidden[index - 1, :n])
+    dW, db = layer(network, gradient, 0)
+    np.dot(delta.T, inputs, dW)
+    _column_sums(delta, db)
+
+
+@contracted  # type: ignore[untyped-decorator]
+def activations_at(network: Network, theta: Any, phi: Any, hidden: Any, output: Any) -> None:
+    """Evaluate the network at one point: ``hidden`` (L, w) and ``output`` (r,) are written."""
+    depth = network.offsets.shape[0] - 1
+    below = phi
+    for index in range(depth):
+        W, b = layer(network, theta, index)
+        for i in range(b.shape[0]):
+            total = b[i]
+            for j in range(below.shape[0]):
+                total += W[i, j] * below[j]
+            hidden[index, i] = total
+        for i in range(b.shape[0]):
+            hidden[index, i] = tanh(hidden[index, i])
+        below = hidden[index]
+    W, b = layer(network, theta, depth)
+    for k in range(b.shape[0]):
+        total = b[k]
+        for j in range(below.shape[0]):
+            total += W[k, j] * below[j]
+        output[k] = total
+
+
+@contracted  # type: ignore[untyped-decorator]
+def tangents_at(network: Network, theta: Any, phi_dot: Any, hidden: Any, hidden_dot: Any) -> None:
+    """Write the derivative of the activations along a direction of the features."""
+    below = phi_dot
+    for index in range(network.offsets.shape[0] - 1):
+        W, _ = layer(network, theta, index)
+        for i in range(W.shape[0]):
+            total = 0.0
+            for j in range(below.shape[0]):
+                total += W[i, j] * below[j]
+            hidden_dot[index, i] = (1.0 - hidden[index, i] ** 2) * total
+        below = hidden_dot[index]
+
+
+@contracted  # type: ignore[untyped-decorator]
+def parameter_gradient(
+    network: Network, theta: Any, phi: Any, hidden: Any, component: int, out: Any
+) -> None:
+    """Write g = ∂a_k/∂θ, (q,), at one point."""
+    depth = network.offsets.shape[0] - 1
+    W, _ = layer(network, theta, depth)
+    dW, db = layer(network, out, depth)
+    dW[:] = 0.0
+    db[:] = 0.0
+    dW[component] = hidden[depth - 1]
+    db[component] = 1.0
+    delta = W[component] * (1.0 - hidden[depth - 1] ** 2)
+    for index in range(depth - 1, -1, -1):
+        below = phi if index == 0 else hidden[index - 1]
+        dW, db = layer(network, out, index)
+        for i in range(delta.shape[0]):
+            db[i] = delta[i]
+            for j in range(below.shape[0]):
+                dW[i, j] = delta[i] * below[j]
+        if index:
+            W, _ = layer(network, theta, index)
+            delta = np.dot(delta, W) * (1.0 - below**2)
+
+
+@contracted  # type: ignore[untyped-decorator]
+def gradient_along(
+    network: Network,
+    theta: Any,
+    phi: Any,
+    phi_dot: Any,
+    hidden: Any,
+    hidden_dot: Any,
+    component: int,
+    out: Any,
+) -> None:
+    """Write the derivative of g, (q,), along a direction of the features: one column of D B."""
+    depth = network.offsets.shape[0] - 1
+    W, _ = layer(network, theta, depth)
+    dW, db = layer(network, out, depth)
+    dW[:] = 0.0
+    db[:] = 0.0
+    dW[component] = hidden_dot[depth - 1]
+    h, h_dot = hidden[depth - 1], hidden_dot[depth - 1]
+    delta = W[component] * (1.0 - h**2)
+    delta_dot = W[component] * (-2.0 * h * h_dot)
+    for index in range(depth - 1, -1, -1):
+        below = phi if index == 0 else hidden[index - 1]
+        below_dot = phi_dot if index == 0 else hidden_dot[index - 1]
+        dW, db = layer(network, out, index)
+        for i in range(delta.shape[0]):
+            db[i] = delta_dot[i]
+            for j in range(below.shape[0]):
+                dW[i, j] = delta_dot[i] * below[j] + delta[i] * below_dot[j]
+        if index:
+            W, _ = layer(network, theta, index)
+            back = np.dot(delta, W)
+            slope = 1.0 - below**2
+            delta_dot = np.dot(delta_dot, W) * slope - 2.0 * back * below * below_dot
+            delta = back * slope

@@ -1,0 +1,194 @@
+"""From a trial's specification to the compiled loop and back."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import time
+from typing import Any
+
+import numba
+import numpy as np
+
+from dopt.evaluation import EvaluationSet, evaluation_set
+from dopt.kernel import arguments as args
+from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
+from dopt.kernel.trial import advance
+from dopt.learning import Adam
+from dopt.models import MLP
+from dopt.policies import DOptimal, Uniform
+from dopt.policies.base import OpenLoop
+from dopt.randomness import draw
+from dopt.result import TrialResult
+from dopt.spec import Cell, TrialSpec
+from dopt.systems.base import System
+from dopt.systems.features import KINDS
+
+
+class KernelTrial:
+    """A trial in the compiled kernel, which can be advanced in pieces and looked at in between.
+
+    Attributes
+    ----------
+    state, record : State, Record
+        Arrays that :meth:`advance` writes in place.
+    done : int
+        Number of steps done.
+    diverged_at : int or None
+        Step at which the trial diverged.
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        self.spec = spec
+        self.constants = _constants(spec.cell)
+        self.randomness = args.Randomness(*_fields(draw(spec), args.Randomness))
+        self.state = _initial_state(spec, draw(spec).weights)
+        self.record = _empty_record(spec.system)
+        self.done = 0
+        self.diverged_at: int | None = None
+
+    def advance(self, last: int) -> None:
+        """Run the steps up to ``last``, unless the trial has diverged."""
+        if self.diverged_at is not None:
+            return
+        world, network, rules, points = self.constants
+        equations = compiled_equations(type(self.spec.system))
+        call = (world, network, rules, self.randomness, points, self.state, self.record)
+        _compile(*call)
+        self.done = int(advance(*equations, *call, self.done, last))
+        if self.done < last:
+            self.diverged_at = self.done
+
+
+def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
+    """Run a whole trial in compiled code."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    trial = KernelTrial(spec)
+    trial.advance(spec.system.horizon)
+    record, end = trial.record, trial.diverged_at
+    if end is not None:
+        for rows in record:
+            rows[end:] = np.nan
+    return TrialResult(
+        **record._asdict(),
+        parameters=trial.state.theta.copy(),
+        diverged_at=end,
+        wall_seconds=time.perf_counter() - wall,
+        cpu_seconds=time.process_time() - cpu,
+    )
+
+
+_compiled_for: set[Any] = set()
+
+
+def _compile(*call: Any) -> None:
+    """Compile the loop for function pointers, once for all systems, before its first call."""
+    kinds = tuple(numba.typeof(argument) for argument in call)
+    if kinds in _compiled_for:
+        return
+    pointers = [numba.types.FunctionType(s) for s in (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)]
+    advance.compile((*pointers, *kinds, numba.int64, numba.int64))
+    advance.disable_compile()
+    _compiled_for.add(kinds)
+
+
+def _fields(source: object, kind: Any) -> list[Any]:
+    return [getattr(source, name) for name in kind._fields]
+
+
+@functools.lru_cache(maxsize=64)
+def _constants(
+    cell: Cell,
+) -> tuple[args.World, args.Network, args.Rules, args.Evaluation]:
+    """Return everything that the trials of a cell share."""
+    system = cell.system
+    world = args.World(
+        np.array(system.parameters),
+        np.array(system.linear_form),
+        np.array(system.learned_rows),
+        system.n_inputs,
+        system.dt,
+        system.gamma,
+        system.state_limit,
+    )
+    network = _network(cell)
+    return world, network, _rules(cell), _evaluation(system, network, evaluation_set(system))
+
+
+def _network(cell: Cell) -> args.Network:
+    system = cell.system
+    if isinstance(cell.model, MLP):
+        kind, sizes = args.MLP_MODEL, cell.model.layer_sizes(system)
+    else:
+        kind, sizes = args.LINEAR_MODEL, (len(system.features), 1, system.n_learned)
+    lengths = [(n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes)]
+    return args.Network(
+        kind,
+        np.array(sizes),
+        np.cumsum([0, *lengths[:-1]]),
+        np.array([KINDS.index(feature.kind) for feature in system.features]),
+        np.array([feature.index for feature in system.features]),
+        np.array(system.feature_scales),
+    )
+
+
+def _rules(cell: Cell) -> args.Rules:
+    policies = {OpenLoop: args.OPEN_LOOP, Uniform: args.UNIFORM, DOptimal: args.D_OPTIMAL}
+    policy = next(code for kind, code in policies.items() if isinstance(cell.policy, kind))
+    steps = cell.policy.iterations if isinstance(cell.policy, Uniform) else 0
+    if not isinstance(cell.learner, Adam):
+        return args.Rules(policy, steps, args.LEAST_SQUARES, 0.0, 0.0, 0.0, 0.0, 1)
+    adam = cell.learner
+    return args.Rules(
+        policy,
+        steps,
+        args.ADAM,
+        adam.learning_rate,
+        adam.beta_1,
+        adam.beta_2,
+        adam.epsilon,
+        adam.window,
+    )
+
+
+def _evaluation(system: System, network: args.Network, points: EvaluationSet) -> args.Evaluation:
+    states = points.states
+    if network.kind == args.MLP_MODEL:
+        none = np.zeros((0, 0, 0))
+        features = np.ascontiguousarray(system.featurize(states))
+        return args.Evaluation(features, none, points.accelerations, points.n_grid)
+    offset, *units = (
+        np.stack(np.broadcast_arrays(*system.accelerations(tuple(states.T), form)), axis=-1)
+        for form in system.linear_form
+    )
+    regressors = np.stack([unit - offset for unit in units], axis=-1)
+    targets = np.ascontiguousarray(points.accelerations - offset)
+    return args.Evaluation(
+        np.zeros((0, 0)), np.ascontiguousarray(regressors), targets, points.n_grid
+    )
+
+
+def _initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:
+    system, policy, learner = spec.system, spec.policy, spec.learner
+    q = len(weights)
+    window = learner.window if isinstance(learner, Adam) else 0
+    if isinstance(policy, DOptimal):
+        covariance = np.eye(q) / policy.regularization
+    else:
+        covariance = np.zeros((0, 0))
+    return args.State(
+        weights.copy(),
+        np.zeros(q),
+        np.zeros(q),
+        covariance,
+        np.zeros((window, len(system.features))),
+        np.zeros((window, system.n_learned)),
+    )
+
+
+def _empty_record(system: System) -> args.Record:
+    steps = system.horizon
+    states = np.zeros((steps + 1, system.n_states))
+    states[0] = system.initial_state
+    rows = (np.full(steps, np.nan) for _ in range(5))
+    return args.Record(states, np.zeros((steps, system.n_inputs)), *rows)

@@ -1,0 +1,1 @@
+"""From an information objective to the input that maximises it."""
