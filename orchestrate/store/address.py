@@ -1,0 +1,53 @@
+"""Database URLs: read, made safe to print, refused with a sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError
+
+from orchestrate.store.errors import StoreError
+
+_EXAMPLES = "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name"
+_SECRETS = ("password", "sslpassword", "passfile")
+
+
+def parse(url: str) -> URL:
+    """Return the URL with its driver; raise ``StoreError`` where it names no usable database.
+
+    The message never repeats the URL, because a mistyped one may hold a password.
+    """
+    try:
+        parsed = make_url(url)
+    except ArgumentError:
+        raise StoreError(
+            f"The database URL cannot be read: expected something like {_EXAMPLES}."
+        ) from None
+    backend = parsed.get_backend_name()
+    if backend == "postgresql":
+        return parsed.set(drivername="postgresql+psycopg")
+    if backend != "sqlite":
+        raise StoreError(
+            f"A database of kind '{parsed.drivername}' is not supported: give {_EXAMPLES}."
+        )
+    return parsed.set(drivername="sqlite")
+
+
+def safe(url: URL) -> str:
+    """Return the URL without anything secret."""
+    public = {key: value for key, value in url.query.items() if key not in _SECRETS}
+    return url.set(password=None, query=public).render_as_string()
+
+
+def sqlite_path(url: URL) -> Path:
+    """Return the absolute path of a SQLite database, links resolved.
+
+    The lock files lie beside the file itself, so that two names of one database share them.
+    """
+    if url.database in (None, "", ":memory:"):
+        raise StoreError(
+            "A SQLite database in memory cannot be shared between processes: "
+            "give a file, such as sqlite:///results/results.db."
+        )
+    return Path(str(url.database)).resolve()

@@ -1,0 +1,109 @@
+"""Trials change hands: pending to a launch, back to pending, and again after a failure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Select, delete, insert, select, update
+
+from orchestrate.store.backend import Backend
+from orchestrate.store.records import Claim
+from orchestrate.store.schema import attempt, step, trajectory, trial
+from orchestrate.store.values import now
+
+_RETRIED = {
+    "failed": ("failed",),
+    "diverged": ("diverged",),
+    "cancelled": ("cancelled",),
+    "all": ("failed", "diverged", "cancelled"),
+}
+
+_OUTCOME = (
+    "n_steps",
+    "final_loss",
+    "best_loss",
+    "diverged_at",
+    "wall_seconds",
+    "cpu_seconds",
+    "peak_memory_bytes",
+    "node",
+    "launch_id",
+    "error_id",
+)
+
+
+def claim(
+    connection: Connection, backend: Backend, launch_id: int, trial_keys: Sequence[str]
+) -> list[Claim]:
+    """Take those of the trials that are pending, in the given order."""
+    free = (
+        select(trial.c.trial_id)
+        .where(trial.c.trial_key.in_(backend.members(trial_keys)), trial.c.status == "pending")
+        .with_for_update(skip_locked=True)
+    )
+    statement = (
+        update(trial)
+        .where(trial.c.trial_id.in_(free))
+        .values(status="running", owner=launch_id, attempt=trial.c.attempt + 1)
+        .returning(trial.c.trial_key, trial.c.trial_id, trial.c.attempt)
+    )
+    rows = connection.execute(statement).all()
+    claims = {key: Claim(key, trial_id, number, launch_id) for key, trial_id, number in rows}
+    _begin_attempts(connection, list(claims.values()))
+    return [claims[key] for key in dict.fromkeys(trial_keys) if key in claims]
+
+
+def _begin_attempts(connection: Connection, claims: Sequence[Claim]) -> None:
+    moment = now()
+    rows = [
+        {
+            "trial_id": one.trial_id,
+            "attempt": one.attempt,
+            "launch_id": one.launch,
+            "claimed": moment,
+        }
+        for one in claims
+    ]
+    if rows:
+        connection.execute(insert(attempt), rows)
+
+
+def free_claims(
+    connection: Connection,
+    launch_ids: Sequence[int],
+    outcome: str,
+    only: Select[Any] | None = None,
+) -> int:
+    """Put running trials of the launches back to pending, those with a key in ``only`` if given."""
+    if not launch_ids:
+        return 0
+    held = trial.c.owner.in_(launch_ids) & (trial.c.status == "running")
+    open_attempt = attempt.c.launch_id.in_(launch_ids) & attempt.c.outcome.is_(None)
+    if only is not None:
+        chosen = select(trial.c.trial_id).where(trial.c.trial_key.in_(only))
+        held = held & trial.c.trial_id.in_(chosen)
+        open_attempt = open_attempt & attempt.c.trial_id.in_(chosen)
+    # Trials first, as a commit does, so that the two cannot wait for each other.
+    freed = connection.execute(update(trial).where(held).values(status="pending", owner=None))
+    connection.execute(update(attempt).where(open_attempt).values(outcome=outcome, ended=now()))
+    return freed.rowcount
+
+
+def retry(
+    connection: Connection, backend: Backend, status: str, trial_keys: Sequence[str] | None
+) -> int:
+    """Put finished but unsuccessful trials back to pending, without what they had written."""
+    if status not in _RETRIED:
+        raise ValueError(
+            f"Trials cannot be retried by the status '{status}': give {', '.join(_RETRIED)}."
+        )
+    backend.exclusive(connection)
+    which: ColumnElement[bool] = trial.c.status.in_(_RETRIED[status])
+    if trial_keys is not None:
+        which = which & trial.c.trial_key.in_(backend.members(trial_keys))
+    chosen = select(trial.c.trial_id).where(which)
+    for table in (step, trajectory):
+        connection.execute(delete(table).where(table.c.trial_id.in_(chosen)))
+    pending = {"status": "pending", **dict.fromkeys(_OUTCOME)}
+    return connection.execute(update(trial).where(which).values(pending)).rowcount

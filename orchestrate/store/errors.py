@@ -1,0 +1,29 @@
+"""What can go wrong between a trial and the database; each message is a sentence with advice."""
+
+from __future__ import annotations
+
+from dopt.errors import DoptError
+
+
+class StoreError(DoptError):
+    """Base of everything that the store raises on purpose."""
+
+
+class StoreUnavailableError(StoreError):
+    """The database cannot be reached, is full, locked or damaged: infrastructure, not a trial."""
+
+
+class NoDatabaseError(StoreError):
+    """There is nothing to read at the given URL."""
+
+
+class SchemaVersionError(StoreError):
+    """The database was written by an older or a newer program."""
+
+
+class InvalidResultError(StoreError, ValueError):
+    """A trial's result has the wrong shape or contradicts itself; nothing of it was written."""
+
+
+class QueryError(StoreError, ValueError):
+    """A question that the database cannot answer: unknown column, wrong SQL, missing trial."""

@@ -1,0 +1,122 @@
+"""A whole grid is written down before its first trial runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any
+
+from sqlalchemy import Connection, insert, select
+
+from orchestrate.store.backend import Backend
+from orchestrate.store.records import Registrable, Registration
+from orchestrate.store.schema import CONFIG_COLUMNS, config, trial
+from orchestrate.store.values import plain
+
+_CHUNK = 10_000
+
+
+class Grid:
+    """The distinct trials of a grid, reduced to what the database needs."""
+
+    def __init__(self, specs: Iterable[Registrable]) -> None:
+        self.trials: dict[str, tuple[str, int]] = {}  # trial_key -> config_key, seed
+        self.configs: dict[str, dict[str, Any]] = {}
+        for spec in specs:
+            self._add(spec)
+
+    def _add(self, spec: Registrable) -> None:
+        config_key = spec.config_key
+        known = self.configs.get(config_key)
+        if known is None:
+            known = self.configs[config_key] = _config_row(spec)
+        # The row's own string, so that 100,000 trials share it.
+        self.trials.setdefault(spec.trial_key, (known["config_key"], int(plain(spec.seed))))
+
+
+def _config_row(spec: Registrable) -> dict[str, Any]:
+    columns = spec.columns()
+    if set(columns) != set(CONFIG_COLUMNS):
+        raise ValueError(
+            f"A configuration has the columns {', '.join(columns)}: "
+            f"expected {', '.join(CONFIG_COLUMNS)}."
+        )
+    values = {name: plain(value) for name, value in columns.items()}
+    return {"config_key": spec.config_key, "config_json": spec.config_json, **values}
+
+
+def register(connection: Connection, backend: Backend, launch_id: int, grid: Grid) -> Registration:
+    """Insert what is new and return the state of every trial of the grid."""
+    backend.exclusive(connection)
+    config_ids = _insert_configs(connection, backend, grid.configs)
+    found: dict[str, tuple[str, int | None]] = {}
+    for keys in _chunks(grid.trials):
+        known = _known_trials(connection, backend, keys)
+        new = [key for key in keys if key not in known]
+        _insert_trials(connection, grid, new, config_ids)
+        found.update({key: known.get(key, ("pending", None)) for key in keys})
+    return _summary(found, launch_id)
+
+
+def _insert_configs(
+    connection: Connection, backend: Backend, configs: Mapping[str, dict[str, Any]]
+) -> dict[str, int]:
+    known = _config_ids(connection, backend, list(configs))
+    rows = [row for key, row in configs.items() if key not in known]
+    if rows:
+        connection.execute(insert(config), rows)
+        known = _config_ids(connection, backend, list(configs))
+    return known
+
+
+def _config_ids(connection: Connection, backend: Backend, keys: Sequence[str]) -> dict[str, int]:
+    statement = select(config.c.config_key, config.c.config_id).where(
+        config.c.config_key.in_(backend.members(keys))
+    )
+    return {row[0]: row[1] for row in connection.execute(statement)}
+
+
+def _known_trials(
+    connection: Connection, backend: Backend, keys: Sequence[str]
+) -> dict[str, tuple[str, int | None]]:
+    statement = select(trial.c.trial_key, trial.c.status, trial.c.owner).where(
+        trial.c.trial_key.in_(backend.members(keys))
+    )
+    return {key: (status, owner) for key, status, owner in connection.execute(statement)}
+
+
+def _insert_trials(
+    connection: Connection, grid: Grid, keys: Sequence[str], config_ids: Mapping[str, int]
+) -> None:
+    rows = [
+        {
+            "trial_key": key,
+            "config_id": config_ids[grid.trials[key][0]],
+            "seed": grid.trials[key][1],
+            "status": "pending",
+            "attempt": 0,
+        }
+        for key in keys
+    ]
+    if rows:
+        connection.execute(insert(trial), rows)
+
+
+def _summary(found: Mapping[str, tuple[str, int | None]], launch_id: int) -> Registration:
+    counts = dict.fromkeys(("done", "diverged", "failed", "cancelled"), 0)
+    elsewhere = 0
+    todo = []
+    for key, (status, owner) in found.items():
+        if status in counts:
+            counts[status] += 1
+        elif status == "running" and owner != launch_id:
+            elsewhere += 1
+        else:
+            todo.append(key)
+    return Registration(total=len(found), **counts, running_elsewhere=elsewhere, todo=todo)
+
+
+def _chunks(keys: Iterable[str]) -> Iterator[list[str]]:
+    iterator = iter(keys)
+    while chunk := list(islice(iterator, _CHUNK)):
+        yield chunk

@@ -1,0 +1,177 @@
+"""Tables of the results database: one definition for SQLite (STRICT) and PostgreSQL.
+
+Times are UTC text of fixed width (``2026-01-31T12:00:00.000000Z``) and flags are 0 or 1, so that
+the same SQL gives the same answer on both databases. A number that is not finite is NULL: SQLite
+would store NaN as NULL and PostgreSQL as NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import (
+    REAL,
+    BigInteger,
+    CheckConstraint,
+    Column,
+    Double,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    Table,
+    Text,
+    UniqueConstraint,
+)
+from sqlalchemy.types import TypeEngine
+
+SCHEMA_VERSION = 1
+
+STATUSES = ("pending", "running", "done", "diverged", "failed", "cancelled")
+LAUNCH_STATES = ("running", "done", "failed", "interrupted", "lost")
+CONFIG_COLUMNS = (
+    "env",
+    "policy",
+    "model",
+    "learner",
+    "width",
+    "depth",
+    "horizon",
+    "dt",
+    "gamma",
+)
+STEP_VALUES = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
+
+metadata = MetaData()
+
+# STRICT tables know five type names; INTEGER is 64 bits wide in SQLite already.
+_Real: TypeEngine[float] = Double().with_variant(REAL(), "sqlite")
+_Long: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
+
+
+def _one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
+    listed = ", ".join(f"'{value}'" for value in values)
+    return CheckConstraint(f"{column} IN ({listed})", name=f"{column}_is_known")
+
+
+def _table(name: str, *items: Any, rowid: bool = True) -> Table:
+    return Table(name, metadata, *items, sqlite_strict=True, sqlite_with_rowid=rowid)
+
+
+def _text(name: str, nullable: bool = False) -> Column[str]:
+    return Column(name, Text, nullable=nullable)
+
+
+def _trial_key(**options: Any) -> Column[int]:
+    return Column("trial_id", _Long, ForeignKey("trial.trial_id"), **options)
+
+
+schema_version = _table("schema_version", Column("version", Integer, nullable=False))
+
+launch = _table(
+    "launch",
+    Column("launch_id", _Long, primary_key=True),
+    _text("token"),  # names the lock file: a launch_id comes back when a database is made anew
+    _text("state"),
+    _text("started"),
+    _text("ended", nullable=True),
+    Column("lease_until", _Real),  # PostgreSQL only, seconds since 1970 on the server's clock
+    _text("host"),
+    Column("pid", Integer, nullable=False),
+    _text("argv"),
+    _text("overrides"),
+    _text("git_commit", nullable=True),
+    Column("git_dirty", Integer),
+    _text("git_diff_hash", nullable=True),
+    _text("versions"),
+    _one_of("state", LAUNCH_STATES),
+)
+
+config = _table(
+    "config",
+    Column("config_id", _Long, primary_key=True),
+    Column("config_key", Text, nullable=False, unique=True),
+    _text("env"),
+    _text("policy"),
+    _text("model"),
+    _text("learner"),
+    Column("width", Integer),
+    Column("depth", Integer),
+    Column("horizon", Integer, nullable=False),
+    Column("dt", _Real, nullable=False),
+    Column("gamma", _Real, nullable=False),
+    _text("config_json"),
+)
+
+error = _table(
+    "error",
+    Column("error_id", _Long, primary_key=True),
+    Column("hash", Text, nullable=False, unique=True),
+    _text("type"),
+    _text("message"),
+    _text("traceback"),
+)
+
+trial = _table(
+    "trial",
+    Column("trial_id", _Long, primary_key=True),
+    Column("trial_key", Text, nullable=False, unique=True),
+    Column("config_id", _Long, ForeignKey("config.config_id"), nullable=False),
+    Column("seed", _Long, nullable=False),
+    Column("status", Text, nullable=False),
+    Column("owner", _Long, ForeignKey("launch.launch_id")),  # launch with the claim while running
+    Column("attempt", Integer, nullable=False),
+    Column("n_steps", Integer),
+    Column("final_loss", _Real),
+    Column("best_loss", _Real),
+    Column("diverged_at", Integer),
+    Column("wall_seconds", _Real),
+    Column("cpu_seconds", _Real),
+    Column("peak_memory_bytes", _Long),
+    _text("node", nullable=True),
+    Column("launch_id", _Long, ForeignKey("launch.launch_id")),  # launch of the outcome
+    Column("error_id", _Long, ForeignKey("error.error_id")),
+    _one_of("status", STATUSES),
+    UniqueConstraint("config_id", "seed"),
+    Index("trial_by_owner", "owner"),
+)
+
+step = _table(
+    "step",
+    _trial_key(primary_key=True),
+    Column("t", Integer, primary_key=True, autoincrement=False),
+    *(Column(name, _Real) for name in STEP_VALUES),
+    rowid=False,
+)
+
+trajectory = _table(
+    "trajectory",
+    _trial_key(primary_key=True, autoincrement=False),
+    _text("dtype"),
+    _text("states_shape"),
+    Column("states", LargeBinary, nullable=False),
+    _text("inputs_shape"),
+    Column("inputs", LargeBinary, nullable=False),
+    _text("parameters_shape"),
+    Column("parameters", LargeBinary, nullable=False),
+)
+
+attempt = _table(
+    "attempt",
+    _trial_key(primary_key=True),
+    Column("attempt", Integer, primary_key=True, autoincrement=False),
+    Column("launch_id", _Long, ForeignKey("launch.launch_id"), nullable=False),
+    _text("outcome", nullable=True),  # NULL while it runs
+    _text("cause", nullable=True),
+    _text("node", nullable=True),
+    Column("pid", Integer),
+    _text("claimed"),
+    _text("started", nullable=True),
+    _text("ended", nullable=True),
+    Column("wall_seconds", _Real),
+    Column("cpu_seconds", _Real),
+    Column("peak_memory_bytes", _Long),
+    Column("error_id", _Long, ForeignKey("error.error_id")),
+    rowid=False,
+)
