@@ -7,13 +7,14 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeVar
 
 import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -56,6 +57,16 @@ def compiled(function: F) -> F:
     """Compile a function on its first call, with NumPy's rules for division by zero."""
     decorated: F = numba.njit(cache=True, error_model="numpy")(function)
     return decorated
+
+
+def compilable(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Let compiled code call a plain function and the helpers that it uses from its own module."""
+    for name in function.__code__.co_names:
+        helper = function.__globals__.get(name)
+        if isinstance(helper, FunctionType) and helper.__module__ == function.__module__:
+            compilable(helper)
+    register_jitable(function)
+    return function
 
 
 @intrinsic  # type: ignore[untyped-decorator]

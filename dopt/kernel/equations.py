@@ -11,14 +11,14 @@ import cmath
 import functools
 import math
 from collections.abc import Callable
-from types import FunctionType
 from typing import Any, NamedTuple
 
 import numba
 from numba import complex128, float64, types
-from numba.extending import overload, register_jitable
+from numba.extending import overload
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
+from dopt.kernel.compiler import compilable
 from dopt.systems import elementary
 from dopt.systems.base import System
 
@@ -71,7 +71,7 @@ def compiled_equations(system: type[System]) -> Equations:
     """Compile the equations of a class of systems (from the disk cache where it has them)."""
     n_states, n_inputs = len(system.state_labels), len(system.input_labels)
     n_parameters = len(system.physical)
-    known, accelerations = _compilable(system.known), _compilable(system.accelerations)
+    known, accelerations = compilable(system.known), compilable(system.accelerations)
     return Equations(
         _known_into(known, n_states, n_inputs, n_parameters),
         _accelerations_into(accelerations, n_states, n_parameters, ACCELERATIONS),
@@ -79,22 +79,14 @@ def compiled_equations(system: type[System]) -> Equations:
     )
 
 
-def _compilable(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Let compiled code call a plain function and the helpers that it uses from its own module."""
-    for name in function.__code__.co_names:
-        helper = function.__globals__.get(name)
-        if isinstance(helper, FunctionType) and helper.__module__ == function.__module__:
-            _compilable(helper)
-    register_jitable(function)
-    return function
-
-
 def _known_into(
     function: Callable[..., Any], n_states: int, n_inputs: int, n_parameters: int
 ) -> Any:
     def into(x: Any, u: Any, p: Any, out: Any) -> None:
         values = function(
-            to_fixed_tuple(x, n_states), to_fixed_tuple(u, n_inputs), to_fixed_tuple(p, n_parameters)
+            to_fixed_tuple(x, n_states),
+            to_fixed_tuple(u, n_inputs),
+            to_fixed_tuple(p, n_parameters),
         )
         for i in range(len(values)):
             out[i] = values[i]

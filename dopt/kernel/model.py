@@ -33,48 +33,61 @@ def regressors_along(
     complex_accelerations: Any, world: World, x: Any, direction: Any, component: int, out: Any
 ) -> None:
     """Write the derivative of row ``component`` of Ψ, (q,), along a direction of the state."""
-    z = x + direction * (1j * STEP)
-    offset = np.empty(world.learned_rows.shape[0], np.complex128)
-    value = np.empty_like(offset)
-    complex_accelerations(z, world.linear_form[0].astype(np.complex128), offset)
-    for j in range(out.shape[0]):
-        complex_accelerations(z, world.linear_form[1 + j].astype(np.complex128), value)
-        out[j] = (value[component] - offset[component]).imag / STEP
+    z = np.empty(x.shape[0], np.complex128)
+    for i in range(x.shape[0]):
+        z[i] = complex(x[i], STEP * direction[i])
+    parameters = np.empty(world.linear_form.shape[1], np.complex128)
+    value = np.empty(world.learned_rows.shape[0], np.complex128)
+    offset = 0.0
+    for j in range(1 + out.shape[0]):
+        for i in range(parameters.shape[0]):
+            parameters[i] = complex(world.linear_form[j, i], 0.0)
+        complex_accelerations(z, parameters, value)
+        slope = value[component].imag / STEP
+        if j == 0:
+            offset = slope
+        else:
+            out[j - 1] = slope - offset
+
+
+@compiled
+def add_linear(rows: Any, theta: Any, out: Any) -> None:
+    """Add Ψ θ to the offset."""
+    for k in range(out.shape[0]):
+        for j in range(theta.shape[0]):
+            out[k] += rows[k, j] * theta[j]
 
 
 @compiled
 def model_accelerations(
-    accelerations: Any, world: World, network: Network, theta: Any, x: Any
-) -> Any:
-    """Return a_θ(x), (r,)."""
-    out = np.empty(world.learned_rows.shape[0])
+    accelerations: Any, world: World, network: Network, theta: Any, x: Any, out: Any
+) -> None:
+    """Write a_θ(x), (r,)."""
     if network.kind == LINEAR_MODEL:
         rows = np.empty((out.shape[0], theta.shape[0]))
         regressors(accelerations, world, x, rows, out)
-        out += np.dot(rows, theta)
-        return out
-    phi, hidden = _point_buffers(network)
+        add_linear(rows, theta, out)
+        return
+    phi, hidden, _ = _point_buffers(network)
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
-    return out
 
 
 @compiled
 def jacobian_rows(
-    accelerations: Any, world: World, network: Network, theta: Any, x: Any, rows: Any
-) -> Any:
-    """Write the learned rows of J(x), (r, q), and return a_θ(x), (r,)."""
-    out = np.empty(world.learned_rows.shape[0])
+    accelerations: Any, world: World, network: Network, theta: Any, x: Any, rows: Any, out: Any
+) -> None:
+    """Write the learned rows of J(x), (r, q), and a_θ(x), (r,)."""
     if network.kind == LINEAR_MODEL:
         regressors(accelerations, world, x, rows, out)
-        out += np.dot(rows, theta)
-        return out
-    phi, hidden = _point_buffers(network)
+        add_linear(rows, theta, out)
+        return
+    phi, hidden, deltas = _point_buffers(network)
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
     for k in range(out.shape[0]):
-        nn.parameter_gradient(network, theta, phi, hidden, k, rows[k])
-    return out
+        nn.back_signals(network, theta, hidden, k, deltas)
+        nn.parameter_gradient(network, phi, hidden, deltas, k, rows[k])
 
 
 @compiled
@@ -90,31 +103,31 @@ def gradient_and_changes(
     out: Any,
 ) -> None:
     """Write g and D B for one component: ``out`` (1 + m, q), ``directions`` (m, d)."""
-    if network.kind == LINEAR_MODEL:
-        rows = np.empty((world.learned_rows.shape[0], theta.shape[0]))
-        regressors(accelerations, world, x, rows, np.empty(rows.shape[0]))
-        out[0] = rows[component]
-        for j in range(directions.shape[0]):
-            regressors_along(
-                complex_accelerations, world, x, directions[j], component, out[1 + j]
-            )
-        return
-    phi, hidden = _point_buffers(network)
-    phi_dot, hidden_dot = _point_buffers(network)
-    nn.features_at(network, x, phi)
     output = np.empty(world.learned_rows.shape[0])
+    if network.kind == LINEAR_MODEL:
+        rows = np.empty((output.shape[0], theta.shape[0]))
+        regressors(accelerations, world, x, rows, output)
+        for i in range(theta.shape[0]):
+            out[0, i] = rows[component, i]
+        for j in range(directions.shape[0]):
+            regressors_along(complex_accelerations, world, x, directions[j], component, out[1 + j])
+        return
+    phi, hidden, deltas = _point_buffers(network)
+    phi_dot, hidden_dot, deltas_dot = _point_buffers(network)
+    nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, output)
-    nn.parameter_gradient(network, theta, phi, hidden, component, out[0])
+    nn.back_signals(network, theta, hidden, component, deltas)
+    nn.parameter_gradient(network, phi, hidden, deltas, component, out[0])
     for j in range(directions.shape[0]):
         nn.features_along(network, x, directions[j], phi_dot)
-        nn.tangents_at(network, theta, phi_dot, hidden, hidden_dot)
+        nn.tangents_at(network, theta, phi_dot, hidden, component, deltas, hidden_dot, deltas_dot)
         nn.gradient_along(
-            network, theta, phi, phi_dot, hidden, hidden_dot, component, out[1 + j]
+            network, phi, phi_dot, hidden, hidden_dot, deltas, deltas_dot, component, out[1 + j]
         )
 
 
 @compiled
 def _point_buffers(network: Network) -> Any:
-    """Return room for the features, (p,), and the activations, (L, w), of one point."""
-    depth = network.offsets.shape[0] - 1
-    return np.empty(network.sizes[0]), np.empty((depth, network.sizes[1]))
+    """Return room for the features, (p,), the activations and the δ, (L, w), of one point."""
+    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
+    return np.empty(network.sizes[0]), np.empty((depth, width)), np.empty((depth, width))

@@ -148,93 +148,133 @@ def activations_at(network: Network, theta: Any, phi: Any, hidden: Any, output: 
     below = phi
     for index in range(depth):
         W, b = layer(network, theta, index)
-        for i in range(b.shape[0]):
-            total = b[i]
-            for j in range(below.shape[0]):
-                total += W[i, j] * below[j]
-            hidden[index, i] = total
-        for i in range(b.shape[0]):
-            hidden[index, i] = tanh(hidden[index, i])
-        below = hidden[index]
+        values = hidden[index]
+        _affine(W, b, below, values)
+        for i in range(values.shape[0]):
+            values[i] = tanh(values[i])
+        below = values
     W, b = layer(network, theta, depth)
-    for k in range(b.shape[0]):
-        total = b[k]
-        for j in range(below.shape[0]):
-            total += W[k, j] * below[j]
-        output[k] = total
+    _affine(W, b, below, output)
 
 
 @contracted  # type: ignore[untyped-decorator]
-def tangents_at(network: Network, theta: Any, phi_dot: Any, hidden: Any, hidden_dot: Any) -> None:
-    """Write the derivative of the activations along a direction of the features."""
-    below = phi_dot
-    for index in range(network.offsets.shape[0] - 1):
+def _affine(W: Any, b: Any, x: Any, out: Any) -> None:
+    for i in range(out.shape[0]):
+        total = b[i]
+        for j in range(x.shape[0]):
+            total += W[i, j] * x[j]
+        out[i] = total
+
+
+@contracted  # type: ignore[untyped-decorator]
+def _transposed_product(W: Any, delta: Any, out: Any) -> None:
+    for j in range(out.shape[0]):
+        out[j] = 0.0
+    for i in range(delta.shape[0]):
+        for j in range(out.shape[0]):
+            out[j] += delta[i] * W[i, j]
+
+
+@contracted  # type: ignore[untyped-decorator]
+def back_signals(network: Network, theta: Any, hidden: Any, component: int, deltas: Any) -> None:
+    """Write δ, (L, w): the derivative of output k with respect to every pre-activation."""
+    depth = network.offsets.shape[0] - 1
+    W, _ = layer(network, theta, depth)
+    for i in range(deltas.shape[1]):
+        deltas[depth - 1, i] = W[component, i] * (1.0 - hidden[depth - 1, i] ** 2)
+    for index in range(depth - 1, 0, -1):
         W, _ = layer(network, theta, index)
-        for i in range(W.shape[0]):
+        _transposed_product(W, deltas[index], deltas[index - 1])
+        for i in range(deltas.shape[1]):
+            deltas[index - 1, i] *= 1.0 - hidden[index - 1, i] ** 2
+
+
+@contracted  # type: ignore[untyped-decorator]
+def parameter_gradient(
+    network: Network, phi: Any, hidden: Any, deltas: Any, component: int, out: Any
+) -> None:
+    """Write g = ∂a_k/∂θ, (q,): in each layer δ ⊗ (activations below, 1)."""
+    depth = network.offsets.shape[0] - 1
+    for index in range(depth):
+        below = phi if index == 0 else hidden[index - 1]
+        dW, db = layer(network, out, index)
+        for i in range(db.shape[0]):
+            delta = deltas[index, i]
+            db[i] = delta
+            for j in range(below.shape[0]):
+                dW[i, j] = delta * below[j]
+    dW, db = layer(network, out, depth)
+    for k in range(db.shape[0]):
+        chosen = 1.0 if k == component else 0.0
+        db[k] = chosen
+        for j in range(dW.shape[1]):
+            dW[k, j] = chosen * hidden[depth - 1, j]
+
+
+@contracted  # type: ignore[untyped-decorator]
+def tangents_at(
+    network: Network,
+    theta: Any,
+    phi_dot: Any,
+    hidden: Any,
+    component: int,
+    deltas: Any,
+    hidden_dot: Any,
+    deltas_dot: Any,
+) -> None:
+    """Write the derivatives of the activations and of δ, (L, w) each, along a direction."""
+    depth, width = network.offsets.shape[0] - 1, hidden.shape[1]
+    below = phi_dot
+    for index in range(depth):
+        W, _ = layer(network, theta, index)
+        for i in range(width):
             total = 0.0
             for j in range(below.shape[0]):
                 total += W[i, j] * below[j]
             hidden_dot[index, i] = (1.0 - hidden[index, i] ** 2) * total
         below = hidden_dot[index]
-
-
-@contracted  # type: ignore[untyped-decorator]
-def parameter_gradient(
-    network: Network, theta: Any, phi: Any, hidden: Any, component: int, out: Any
-) -> None:
-    """Write g = ∂a_k/∂θ, (q,), at one point."""
-    depth = network.offsets.shape[0] - 1
     W, _ = layer(network, theta, depth)
-    dW, db = layer(network, out, depth)
-    dW[:] = 0.0
-    db[:] = 0.0
-    dW[component] = hidden[depth - 1]
-    db[component] = 1.0
-    delta = W[component] * (1.0 - hidden[depth - 1] ** 2)
-    for index in range(depth - 1, -1, -1):
-        below = phi if index == 0 else hidden[index - 1]
-        dW, db = layer(network, out, index)
-        for i in range(delta.shape[0]):
-            db[i] = delta[i]
-            for j in range(below.shape[0]):
-                dW[i, j] = delta[i] * below[j]
-        if index:
-            W, _ = layer(network, theta, index)
-            delta = np.dot(delta, W) * (1.0 - below**2)
+    for i in range(width):
+        bend = -2.0 * hidden[depth - 1, i] * hidden_dot[depth - 1, i]
+        deltas_dot[depth - 1, i] = W[component, i] * bend
+    for index in range(depth - 1, 0, -1):
+        W, _ = layer(network, theta, index)
+        _transposed_product(W, deltas_dot[index], deltas_dot[index - 1])
+        for j in range(width):
+            back = 0.0
+            for i in range(width):
+                back += W[i, j] * deltas[index, i]
+            h = hidden[index - 1, j]
+            bend = -2.0 * h * hidden_dot[index - 1, j]
+            deltas_dot[index - 1, j] = deltas_dot[index - 1, j] * (1.0 - h * h) + back * bend
 
 
 @contracted  # type: ignore[untyped-decorator]
 def gradient_along(
     network: Network,
-    theta: Any,
     phi: Any,
     phi_dot: Any,
     hidden: Any,
     hidden_dot: Any,
+    deltas: Any,
+    deltas_dot: Any,
     component: int,
     out: Any,
 ) -> None:
-    """Write the derivative of g, (q,), along a direction of the features: one column of D B."""
+    """Write the derivative of g, (q,), along a direction: one column of D B."""
     depth = network.offsets.shape[0] - 1
-    W, _ = layer(network, theta, depth)
-    dW, db = layer(network, out, depth)
-    dW[:] = 0.0
-    db[:] = 0.0
-    dW[component] = hidden_dot[depth - 1]
-    h, h_dot = hidden[depth - 1], hidden_dot[depth - 1]
-    delta = W[component] * (1.0 - h**2)
-    delta_dot = W[component] * (-2.0 * h * h_dot)
-    for index in range(depth - 1, -1, -1):
+    for index in range(depth):
         below = phi if index == 0 else hidden[index - 1]
         below_dot = phi_dot if index == 0 else hidden_dot[index - 1]
         dW, db = layer(network, out, index)
-        for i in range(delta.shape[0]):
-            db[i] = delta_dot[i]
+        for i in range(db.shape[0]):
+            delta, delta_dot = deltas[index, i], deltas_dot[index, i]
+            db[i] = delta_dot
             for j in range(below.shape[0]):
-                dW[i, j] = delta_dot[i] * below[j] + delta[i] * below_dot[j]
-        if index:
-            W, _ = layer(network, theta, index)
-            back = np.dot(delta, W)
-            slope = 1.0 - below**2
-            delta_dot = np.dot(delta_dot, W) * slope - 2.0 * back * below * below_dot
-            delta = back * slope
+                dW[i, j] = delta_dot * below[j] + delta * below_dot[j]
+    dW, db = layer(network, out, depth)
+    for k in range(db.shape[0]):
+        chosen = 1.0 if k == component else 0.0
+        db[k] = 0.0
+        for j in range(dW.shape[1]):
+            dW[k, j] = chosen * hidden_dot[depth - 1, j]

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from dopt.kernel.arguments import Network, State, World
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compilable, compiled
+from dopt.kernel.information import quadratic_forms
 from dopt.kernel.model import gradient_and_changes, model_accelerations
-from dopt.planning import sphere
+from dopt.planning.sphere import sphere_maximizer
 
-for _helper in (sphere._easy_case, sphere._hard_case, sphere._with_norm, sphere.sphere_maximizer):
-    numba.extending.register_jitable(_helper)
+compilable(sphere_maximizer)
 
 TIE_MARGIN = 1e-9
 """A second optimum has to be better by this relative margin: rounding must not choose."""
@@ -24,27 +23,29 @@ def predicted_state(
     known: Any, accelerations: Any, world: World, network: Network, theta: Any, x: Any
 ) -> Any:
     """Return x̄ = x + dt f_θ(x, 0), (d,)."""
-    flow = np.empty_like(x)
+    flow = np.empty(x.shape[0])
+    a = np.empty(world.learned_rows.shape[0])
     known(x, np.zeros(world.n_inputs), world.parameters, flow)
-    a = model_accelerations(accelerations, world, network, theta, x)
+    model_accelerations(accelerations, world, network, theta, x, a)
     for k in range(a.shape[0]):
         flow[world.learned_rows[k]] += a[k]
-    return x + world.dt * flow
+    for i in range(flow.shape[0]):
+        flow[i] = x[i] + world.dt * flow[i]
+    return flow
 
 
 @compiled
 def input_columns(known: Any, world: World, x: Any) -> Any:
     """Return the rows of Bᵀ = dt (∂f/∂u)ᵀ, (m, d), at a state; the input term is linear."""
-    m = world.n_inputs
-    base, flow = np.empty_like(x), np.empty_like(x)
-    u = np.zeros(m)
+    base, u = np.empty(x.shape[0]), np.zeros(world.n_inputs)
     known(x, u, world.parameters, base)
-    columns = np.empty((m, x.shape[0]))
-    for j in range(m):
-        u[:] = 0.0
+    columns = np.empty((world.n_inputs, x.shape[0]))
+    for j in range(world.n_inputs):
         u[j] = 1.0
-        known(x, u, world.parameters, flow)
-        columns[j] = world.dt * (flow - base)
+        known(x, u, world.parameters, columns[j])
+        u[j] = 0.0
+        for i in range(x.shape[0]):
+            columns[j, i] = world.dt * (columns[j, i] - base[i])
     return columns
 
 
@@ -59,8 +60,9 @@ def d_optimal_input(
     x: Any,
     component: int,
     tie: Any,
-) -> Any:
-    """Return the maximiser of (g + D B u)ᵀ M⁻¹ (g + D B u) on the sphere, (m,)."""
+    u: Any,
+) -> None:
+    """Write the maximiser of (g + D B u)ᵀ M⁻¹ (g + D B u) on the sphere, (m,)."""
     bar = predicted_state(known, accelerations, world, network, state.theta, x)
     columns = input_columns(known, world, bar)
     m = columns.shape[0]
@@ -76,15 +78,21 @@ def d_optimal_input(
         component,
         G,
     )
+    # With one input the quadratic term is constant on the sphere: one product with M⁻¹ is enough.
+    multiplied = G[: 1 if m == 1 else 1 + m]
+    S = quadratic_forms(state.covariance, multiplied, G)
     if m == 1:
-        slope = np.dot(G[1], np.dot(state.covariance, G[0]))
-        sign = 1.0 if slope > 0.0 or (slope == 0.0 and tie[0] > 0.0) else -1.0
-        return np.full(1, sign * world.gamma)
-    S = np.dot(np.dot(G, state.covariance), G.T)
-    if not np.all(np.isfinite(S)):
-        return np.full(m, np.nan)
-    Q = np.ascontiguousarray(S[1:, 1:])
-    return sphere.sphere_maximizer(Q, -S[0, 1:].copy(), world.gamma, tie)
+        up = S[0, 1] > 0.0 or (S[0, 1] == 0.0 and tie[0] > 0.0)
+        u[0] = world.gamma if up else -world.gamma
+        return
+    Q, v = np.empty((m, m)), np.empty(m)
+    for i in range(m):
+        v[i] = -S[0, 1 + i]
+        for j in range(m):
+            Q[i, j] = S[1 + i, 1 + j]
+    chosen = sphere_maximizer(Q, v, world.gamma, tie)
+    for i in range(m):
+        u[i] = chosen[i]
 
 
 @compiled
@@ -97,52 +105,56 @@ def uniform_input(
     states: Any,
     t: int,
     steps: int,
-) -> Any:
-    """Return the best end point of gradient ascents of Σ_{s≤t} ‖x(u) - x_s‖ on the sphere."""
+    best: Any,
+) -> None:
+    """Write the best end point of gradient ascents of Σ_{s≤t} ‖x(u) - x_s‖ on the sphere."""
     x = states[t]
     center = predicted_state(known, accelerations, world, network, state.theta, x)
     columns = input_columns(known, world, x)
     m = columns.shape[0]
-    best, best_value = np.zeros(m), -1.0
+    best_value = -1.0
+    u, gradient = np.empty(m), np.empty(m)
     for start in range(2 * m):
-        u = np.zeros(m)
+        for j in range(m):
+            u[j] = 0.0
         u[start // 2] = world.gamma if start % 2 == 0 else -world.gamma
-        if m > 1:
-            for _ in range(steps):
-                gradient = _distance_gradient(center, columns, u, states, t)
-                norm = np.sqrt(np.sum(gradient * gradient))
-                if norm == 0.0:
-                    break
-                u = gradient * (world.gamma / norm)
-        value = _total_distance(center, columns, u, states, t)
+        for _ in range(steps if m > 1 else 0):
+            _distances(center, columns, u, states, t, gradient)
+            norm = 0.0
+            for j in range(m):
+                norm += gradient[j] * gradient[j]
+            if norm == 0.0:
+                break
+            for j in range(m):
+                u[j] = gradient[j] * (world.gamma / np.sqrt(norm))
+        value = _distances(center, columns, u, states, t, gradient)
         if value > best_value * (1.0 + TIE_MARGIN):
-            best, best_value = u, value
-    return best
+            best_value = value
+            for j in range(m):
+                best[j] = u[j]
 
 
 @compiled
-def _total_distance(center: Any, columns: Any, u: Any, states: Any, t: int) -> float:
-    point = center + np.dot(u, columns)
+def _distances(center: Any, columns: Any, u: Any, states: Any, t: int, gradient: Any) -> float:
+    """Return Σ_{s≤t} ‖x(u) - x_s‖ and write its gradient B Σ (x(u) - x_s)/‖x(u) - x_s‖, (m,)."""
+    m, d = columns.shape
+    point, direction = np.empty(d), np.zeros(d)
+    for i in range(d):
+        point[i] = center[i]
+        for j in range(m):
+            point[i] += u[j] * columns[j, i]
     total = 0.0
     for s in range(t + 1):
         square = 0.0
-        for i in range(point.shape[0]):
-            square += (point[i] - states[s, i]) ** 2
-        total += np.sqrt(square)
-    return total
-
-
-@compiled
-def _distance_gradient(center: Any, columns: Any, u: Any, states: Any, t: int) -> Any:
-    """Return ∇_u Σ_{s≤t} ‖x(u) - x_s‖ = B Σ (x(u) - x_s)/‖x(u) - x_s‖, (m,)."""
-    point = center + np.dot(u, columns)
-    total = np.zeros_like(point)
-    for s in range(t + 1):
-        square = 0.0
-        for i in range(point.shape[0]):
+        for i in range(d):
             square += (point[i] - states[s, i]) ** 2
         if square > 0.0:
-            weight = 1.0 / np.sqrt(square)
-            for i in range(point.shape[0]):
-                total[i] += (point[i] - states[s, i]) * weight
-    return np.dot(columns, total)
+            norm = np.sqrt(square)
+            total += norm
+            for i in range(d):
+                direction[i] += (point[i] - states[s, i]) / norm
+    for j in range(m):
+        gradient[j] = 0.0
+        for i in range(d):
+            gradient[j] += columns[j, i] * direction[i]
+    return total

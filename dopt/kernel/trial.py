@@ -41,12 +41,15 @@ def plan(
     state: State,
     states: Any,
     t: int,
-) -> Any:
-    """Return the input u_t, (m,); the first of a closed-loop policy is random."""
+    u: Any,
+) -> None:
+    """Write the input u_t, (m,); the first of a closed-loop policy is random."""
     if rules.policy == OPEN_LOOP or t == 0:
-        return randomness.inputs[t].copy()
-    if rules.policy == D_OPTIMAL:
-        return d_optimal_input(
+        for j in range(u.shape[0]):
+            u[j] = randomness.inputs[t, j]
+    elif rules.policy == D_OPTIMAL:
+        component, tie = randomness.components[t], randomness.ties[t]
+        d_optimal_input(
             known,
             accelerations,
             complex_accelerations,
@@ -54,37 +57,48 @@ def plan(
             network,
             state,
             states[t],
-            randomness.components[t],
-            randomness.ties[t],
+            component,
+            tie,
+            u,
         )
-    return uniform_input(
-        known, accelerations, world, network, state, states, t, rules.ascent_steps
-    )
+    else:
+        steps = rules.ascent_steps
+        uniform_input(known, accelerations, world, network, state, states, t, steps, u)
 
 
 @compiled
 def observe(
-    known: Any, accelerations: Any, world: World, x: Any, u: Any, noise: Any, following: Any
-) -> Any:
-    """Write x_{t+1} (equation 2) and return the observed accelerations, (r,)."""
-    flow = np.empty_like(x)
+    known: Any,
+    accelerations: Any,
+    world: World,
+    x: Any,
+    u: Any,
+    noise: Any,
+    following: Any,
+    target: Any,
+) -> None:
+    """Write x_{t+1} (equation 2) and the observed accelerations, (r,)."""
+    flow = np.empty(x.shape[0])
     known(x, u, world.parameters, flow)
-    a = np.empty(world.learned_rows.shape[0])
-    accelerations(x, world.parameters, a)
-    total = flow.copy()
-    for k in range(a.shape[0]):
-        total[world.learned_rows[k]] += a[k]
-    following[:] = x + world.dt * total + noise
-    for k in range(a.shape[0]):
+    accelerations(x, world.parameters, target)
+    for i in range(x.shape[0]):
+        following[i] = flow[i]
+    for k in range(target.shape[0]):
+        following[world.learned_rows[k]] += target[k]
+    for i in range(x.shape[0]):
+        following[i] = x[i] + world.dt * following[i] + noise[i]
+    for k in range(target.shape[0]):
         row = world.learned_rows[k]
-        a[k] = (following[row] - x[row]) / world.dt - flow[row]
-    return a
+        target[k] = (following[row] - x[row]) / world.dt - flow[row]
 
 
 @compiled
 def within(x: Any, limit: float) -> bool:
     """Tell whether every entry is finite and within the limit."""
-    return bool(np.all(np.abs(x) <= limit))
+    for i in range(x.shape[0]):
+        if not abs(x[i]) <= limit:
+            return False
+    return True
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -116,10 +130,12 @@ def advance(
     )
     evaluating = (np.empty((depth, BLOCK, width)), np.empty((BLOCK, r)))
     gradient, rows, scratch = np.empty(q), np.empty((r, q)), np.empty((r, q))
-    informed = rules.policy == D_OPTIMAL or rules.learner == LEAST_SQUARES
+    target, residuals = np.empty(r), np.empty(r)
+    n_points = points.targets.shape[0]
     for t in range(first, last):
         clock_0 = monotonic_microseconds()
-        u = plan(
+        x, following, u = record.states[t], record.states[t + 1], record.inputs[t]
+        plan(
             known,
             accelerations,
             complex_accelerations,
@@ -130,36 +146,35 @@ def advance(
             state,
             record.states,
             t,
+            u,
         )
         clock_1 = monotonic_microseconds()
-        x, following = record.states[t], record.states[t + 1]
-        target = observe(known, accelerations, world, x, u, randomness.noise[t], following)
-        record.inputs[t] = u
+        observe(known, accelerations, world, x, u, randomness.noise[t], following, target)
         if not within(following, world.state_limit):
             return t
         clock_2 = monotonic_microseconds()
         if rules.learner == ADAM:
             slot = t % rules.window
             features_at(network, x, state.window_features[slot])
-            state.window_targets[slot] = target
+            for k in range(r):
+                state.window_targets[slot, k] = target[k]
             adam_step(network, rules, state, t, learning, gradient)
         clock_3 = monotonic_microseconds()
         if not within(state.theta, np.inf):
             return t
-        if informed:
-            predicted = jacobian_rows(accelerations, world, network, state.theta, x, rows)
-            residuals = target - predicted
+        if rules.policy == D_OPTIMAL or rules.learner == LEAST_SQUARES:
+            jacobian_rows(accelerations, world, network, state.theta, x, rows, residuals)
+            for k in range(r):
+                residuals[k] = target[k] - residuals[k]
             absorb(state.covariance, rows, residuals, scratch)
-            if rules.learner == LEAST_SQUARES:
-                for k in range(r):
-                    for i in range(q):
-                        state.theta[i] += residuals[k] * scratch[k, i]
+            for k in range(r if rules.learner == LEAST_SQUARES else 0):
+                for i in range(q):
+                    state.theta[i] += residuals[k] * scratch[k, i]
         clock_4 = monotonic_microseconds()
-        end = points.targets.shape[0]
         loss = model_error(network, state.theta, points, 0, points.n_grid, evaluating)
         record.loss[t] = loss
         record.reachable_loss[t] = model_error(
-            network, state.theta, points, points.n_grid, end, evaluating
+            network, state.theta, points, points.n_grid, n_points, evaluating
         )
         clock_5 = monotonic_microseconds()
         record.plan_us[t] = (clock_1 - clock_0) + (clock_4 - clock_3)

@@ -7,7 +7,8 @@ which is nearly linear, is kept inside a bracket. Working in s and not in μ los
 the root lies close to the pole. Reference: J. Moré and D. Sorensen, "Computing a trust region
 step", SIAM J. Sci. Stat. Comput. 4 (1983).
 
-The code is plain NumPy and the compiled kernel compiles this very function.
+The compiled kernel compiles this very function: hence loops, which cost nothing there, in place of
+array expressions.
 
 ======  =======================================  =====
 symbol  meaning                                  shape
@@ -67,71 +68,107 @@ def maximize_on_sphere(Q: Array, v: Array, radius: float, tie: Array) -> Array:
 def sphere_maximizer(Q: Array, v: Array, radius: float, tie: Array) -> Array:
     """Return the maximiser for finite arguments (see :func:`maximize_on_sphere`)."""
     m = v.shape[0]
-    scale = max(radius * np.max(np.abs(Q)), np.max(np.abs(v)))
-    if scale == 0.0:
-        return _with_norm(tie, radius)
-    values, axes = np.linalg.eigh((Q + Q.T) * (0.5 * radius / scale))
-    w = np.dot(np.ascontiguousarray(axes.T), v / scale)
-    gaps = values[m - 1] - values
-    # Eigenvalues that differ by rounding alone are one: their directions must not be told apart.
+    scale = 0.0
     for i in range(m):
-        if gaps[i] <= ROUNDING * m * max(abs(values[0]), abs(values[m - 1])):
-            gaps[i] = 0.0
+        scale = max(scale, abs(v[i]))
+        for j in range(m):
+            scale = max(scale, radius * abs(Q[i, j]))
+    if scale == 0.0:
+        return _with_norm(tie.copy(), radius)
+    A = np.empty((m, m))
+    for i in range(m):
+        for j in range(m):
+            A[i, j] = 0.5 * radius / scale * (Q[i, j] + Q[j, i])
+    values, axes = np.linalg.eigh(A)
+    w, preferred, gaps = np.zeros(m), np.zeros(m), np.zeros(m)
+    largest = max(abs(values[0]), abs(values[m - 1]))
     top = 0.0
     for i in range(m):
-        if gaps[i] == 0.0:
+        for j in range(m):
+            w[i] += axes[j, i] * v[j] / scale
+            preferred[i] += axes[j, i] * tie[j]
+        # Eigenvalues that differ by rounding alone are one: no direction of theirs stands out.
+        gaps[i] = values[m - 1] - values[i]
+        if gaps[i] <= ROUNDING * m * largest:
+            gaps[i] = 0.0
             top += w[i] * w[i]
-    top = np.sqrt(top)
-    unit = _easy_case(w, gaps, top) if top > TINY else _hard_case(w, gaps, axes, tie)
-    return _with_norm(np.dot(axes, unit), radius)
+    if np.sqrt(top) > TINY:
+        unit = _easy_case(w, gaps, np.sqrt(top))
+    else:
+        unit = _hard_case(w, gaps, preferred)
+    u = np.zeros(m)
+    for i in range(m):
+        for j in range(m):
+            u[i] += axes[i, j] * unit[j]
+    return _with_norm(u, radius)
 
 
 def _easy_case(w: Array, gaps: Array, top: float) -> Array:
-    """Solve the secular equation for a unit vector; ``top`` = norm of w in the top eigenspace."""
-    low, high = top, np.sqrt(np.sum(w * w))
+    """Return the unit vector -w/(gaps + s) at the root s of the secular equation.
+
+    ``top``, the norm of w in the top eigenspace, bounds s from below, ‖w‖ from above.
+    """
+    low, high = top, _norm(w)
     s = low
+    u = np.empty_like(w)
     for _ in range(NEWTON_STEPS):
-        u = w / (gaps + s)
-        norm = np.sqrt(np.sum(u * u))
+        curvature = 0.0
+        for i in range(w.shape[0]):
+            u[i] = -w[i] / (gaps[i] + s)
+            curvature += u[i] * u[i] / (gaps[i] + s)
+        norm = _norm(u)
         if norm >= 1.0:
             low = s
         else:
             high = s
-        step = (norm - 1.0) * norm * norm / np.sum(u * u / (gaps + s))
+        step = (norm - 1.0) * norm * norm / curvature
         if abs(step) <= ROUNDING * s or high <= low:
             break
         s = s + step
         if not low < s < high:
             s = 0.5 * (low + high)
-    return -w / (gaps + s)
+    return u
 
 
-def _hard_case(w: Array, gaps: Array, axes: Array, tie: Array) -> Array:
-    """Solve where v has no part in the top eigenspace.
+def _hard_case(w: Array, gaps: Array, preferred: Array) -> Array:
+    """Return the unit maximiser where w has no part in the top eigenspace.
 
     Either the root s is positive all the same, or s = 0 and the missing length goes along the top
-    eigenspace, in the direction of ``tie``.
+    eigenspace, in the direction of ``preferred``.
     """
-    below = np.where(gaps > 0.0, gaps, 1.0)
-    inside = np.where(gaps > 0.0, w, 0.0)
-    u = -inside / below
-    norm = np.sqrt(np.sum(u * u))
+    m = w.shape[0]
+    inside, u, along = np.zeros(m), np.zeros(m), np.zeros(m)
+    for i in range(m):
+        if gaps[i] > 0.0:
+            inside[i] = w[i]
+            u[i] = -w[i] / gaps[i]
+        else:
+            along[i] = preferred[i]
+    norm = _norm(u)
     if norm > 1.0:
         return _easy_case(inside, gaps, TINY)
-    preferred = np.dot(np.ascontiguousarray(axes.T), tie)
-    preferred = np.where(gaps > 0.0, 0.0, preferred)
-    length = np.sqrt(np.sum(preferred * preferred))
+    length = _norm(along)
     if length <= TINY:
-        preferred[preferred.shape[0] - 1] = 1.0
+        along[m - 1] = 1.0
         length = 1.0
-    return u + preferred * (np.sqrt(1.0 - norm * norm) / length)
+    for i in range(m):
+        u[i] += along[i] * (np.sqrt(1.0 - norm * norm) / length)
+    return u
+
+
+def _norm(u: Array) -> float:
+    total = 0.0
+    for i in range(u.shape[0]):
+        total += u[i] * u[i]
+    return float(np.sqrt(total))
 
 
 def _with_norm(u: Array, radius: float) -> Array:
-    """Return ``u`` scaled to a norm; the first axis if it is zero."""
-    length = np.sqrt(np.sum(u * u))
+    """Return ``u``, overwritten, with a norm; along the first axis if it is zero."""
+    length = _norm(u)
     if length == 0.0:
-        u = np.zeros_like(u)
         u[0] = 1.0
         length = 1.0
-    return u * (radius / length)
+    for i in range(u.shape[0]):
+        u[i] *= radius / length
+    return u
