@@ -24,7 +24,7 @@ from orchestrate.store.records import (
     Result,
     RunRecord,
 )
-from orchestrate.store.rows import Cell, Curves, Trajectory, TrialRow
+from orchestrate.store.rows import Cell, Curves, Table, Trajectory, TrialRow
 from orchestrate.store.store import LEASE_SECONDS, Store
 
 __all__ = [
@@ -46,6 +46,7 @@ __all__ = [
     "Store",
     "StoreError",
     "StoreUnavailableError",
+    "Table",
     "Trajectory",
     "TrialRow",
 ]

@@ -37,7 +37,7 @@ def parse(url: str) -> URL:
 def safe(url: URL) -> str:
     """Return the URL without anything secret."""
     public = {key: value for key, value in url.query.items() if key not in _SECRETS}
-    return url.set(password=None, query=public).render_as_string()
+    return url.set(query=public).render_as_string(hide_password=True)
 
 
 def sqlite_path(url: URL) -> Path:

@@ -10,14 +10,14 @@ from itertools import chain
 from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import Connection, CursorResult, Engine, Row, select, text
+from sqlalchemy import Connection, CursorResult, Engine, select, text
 
 from orchestrate.store import address, postgresql, sqlite, versioning
 from orchestrate.store.errors import QueryError
 from orchestrate.store.faults import translated, translated_query
 from orchestrate.store.packing import unpack
 from orchestrate.store.records import Array
-from orchestrate.store.rows import Cell, Curves, Trajectory, TrialRow
+from orchestrate.store.rows import Cell, Curves, Table, Trajectory, TrialRow
 from orchestrate.store.schema import STEP_VALUES, config, step, trajectory, trial
 
 _CELLS = text(
@@ -129,15 +129,15 @@ class Reader:
         dtype, *packed = row
         return Trajectory(*(unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)))
 
-    def query(self, sql: str) -> list[Row[Any]]:
-        """Return the rows of one SELECT; each can be indexed by place or by name of column.
+    def query(self, sql: str) -> Table:
+        """Return the rows of one SELECT, each with its values by place and by name of column.
 
         Raises ``QueryError`` where the database refuses the statement, as it does any that writes.
         """
         with translated_query(self.safe_url), self._engine.begin() as connection:
             # Without parameters, so that a % in the statement needs no escape.
             result = connection.exec_driver_sql(sql, execution_options={"no_parameters": True})
-            return list(result) if result.returns_rows else []
+            return Table(result.keys(), result) if result.returns_rows else Table((), ())
 
     @contextmanager
     def _snapshot(self) -> Iterator[Connection]:

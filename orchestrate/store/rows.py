@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import namedtuple
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,6 +93,19 @@ class TrialRow:
     launch: int | None
     error_type: str | None
     error_message: str | None
+
+
+class Table(list[Any]):
+    """Rows of a query, each a tuple that knows its columns by name too.
+
+    ``columns`` are the names as the database gave them, also where there is no row. In a row, a
+    name that Python cannot use, such as ``count(*)``, is its place with an underscore: ``_0``.
+    """
+
+    def __init__(self, columns: Iterable[str], rows: Iterable[Sequence[Any]]) -> None:
+        self.columns = tuple(columns)
+        row_type = namedtuple("Row", self.columns, rename=True)  # type: ignore[misc]
+        super().__init__(map(row_type._make, rows))
 
 
 @dataclass(frozen=True)

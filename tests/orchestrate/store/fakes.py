@@ -1,0 +1,120 @@
+"""Trials without physics: what the store needs of a specification and of a result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from orchestrate.store import LaunchRecord, RunRecord
+
+Array = npt.NDArray[np.float64]
+
+HORIZON = 7
+MOMENT = datetime(2026, 1, 31, 12, 0, 0, 250, tzinfo=UTC)
+LAUNCH = LaunchRecord(
+    argv=("launch.py", "-m"),
+    overrides=("env=glob(*)",),
+    host="here",
+    pid=17,
+    git_commit="0" * 40,
+    git_dirty=True,
+    git_diff_hash="1" * 64,
+    versions={"numpy": np.__version__},
+)
+RUN = RunRecord(
+    node="here",
+    pid=18,
+    wall_seconds=0.5,
+    cpu_seconds=0.25,
+    peak_memory_bytes=2**33,
+    started=MOMENT,
+    ended=MOMENT,
+)
+
+
+@dataclass(frozen=True)
+class Spec:
+    seed: int = 0
+    env: str = "pendulum"
+    policy: str = "random"
+    width: int | None = 16
+    horizon: int = HORIZON
+
+    def columns(self) -> Mapping[str, Any]:
+        return {
+            "env": self.env,
+            "policy": self.policy,
+            "model": "mlp",
+            "learner": "adam_window",
+            "width": self.width,
+            "depth": 2,
+            "horizon": self.horizon,
+            "dt": 0.01,
+            "gamma": 1.5,
+        }
+
+    @property
+    def config_json(self) -> str:
+        return json.dumps(self.columns(), sort_keys=True, default=int)
+
+    @property
+    def config_key(self) -> str:
+        return _digest(self.config_json)
+
+    @property
+    def trial_key(self) -> str:
+        return _digest(f"{self.config_json} {int(self.seed)}")
+
+
+@dataclass(frozen=True)
+class FakeResult:
+    loss: Array
+    reachable_loss: Array
+    plan_us: Array
+    learn_us: Array
+    evaluate_us: Array
+    states: Array
+    inputs: Array
+    parameters: Array
+    diverged_at: int | None
+    n_steps: int
+    final_loss: float | None
+    best_loss: float | None
+
+
+def result(seed: int = 0, horizon: int = HORIZON) -> FakeResult:
+    """Return a result whose every number depends on the seed."""
+    random = np.random.default_rng(seed)
+    steps = [random.random(horizon) for _ in range(5)]
+    return FakeResult(
+        *steps,
+        states=random.random((horizon + 1, 4)),
+        inputs=random.random((horizon, 2)),
+        parameters=random.random(11),
+        diverged_at=None,
+        n_steps=horizon,
+        final_loss=float(steps[0][-1]),
+        best_loss=float(steps[0].min()),
+    )
+
+
+def diverged(at: int, seed: int = 0, value: float = np.nan) -> FakeResult:
+    """Return a result with the value, not finite, in each row from the given one on."""
+    whole = result(seed)
+    steps = {
+        name: np.where(np.arange(HORIZON) < at, getattr(whole, name), value)
+        for name in ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
+    }
+    best = float(steps["loss"][:at].min()) if at else None
+    return replace(whole, **steps, diverged_at=at, n_steps=at, final_loss=None, best_loss=best)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,167 @@
+"""Registration, claims and their way back: one contract, every database."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from orchestrate.store import Claim, Failure, Reader, Store
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
+
+OpenStore = Callable[..., Store]
+Take = Callable[..., list[Claim]]
+FAILURE = Failure("ValueError", "no", "Traceback: no")
+
+
+class TestRegistration:
+    def test_todo_keeps_the_order_and_counts_each_trial_once(
+        self, store: Store, launch: int
+    ) -> None:
+        specs = [Spec(seed) for seed in (3, 1, 2, 1)]
+        registration = store.register(launch, specs)
+        assert registration.todo == [spec.trial_key for spec in specs[:3]]
+        assert registration.total == 3
+
+    def test_again_changes_nothing(self, store: Store, launch: int, reader: Reader) -> None:
+        specs = [Spec(seed, policy=policy) for policy in ("a", "b") for seed in range(3)]
+        first = store.register(launch, iter(specs))
+        rows = reader.query("SELECT * FROM trial ORDER BY trial_id")
+        assert store.register(launch, specs) == first
+        assert reader.query("SELECT * FROM trial ORDER BY trial_id") == rows
+
+    def test_counts_every_status(self, store: Store, launch: int, take: Take) -> None:
+        specs = [Spec(seed) for seed in range(5)]
+        done, bad, failed, _ = take(*specs[:4])
+        store.commit(done, result(), RUN)
+        store.commit(bad, diverged(2), RUN)
+        store.fail(failed, FAILURE, RUN)
+        other = store.begin_launch(LAUNCH)
+        seen = store.register(other, specs)
+        assert (seen.total, seen.done, seen.diverged, seen.failed) == (5, 1, 1, 1)
+        assert (seen.cancelled, seen.running_elsewhere) == (0, 1)
+        assert seen.todo == [specs[4].trial_key]
+        assert store.register(launch, specs).running_elsewhere == 0
+
+    def test_takes_numpy_integers(self, store: Store, launch: int, reader: Reader) -> None:
+        spec = Spec(np.int64(3), width=np.int64(8))  # type: ignore[arg-type]
+        store.register(launch, [spec])
+        (row,) = reader.query("SELECT seed, width FROM v_trial WHERE seed = 3 AND width = 8")
+        assert tuple(row) == (3, 8)
+
+    def test_of_an_empty_grid(self, store: Store, launch: int) -> None:
+        assert store.register(launch, []).total == 0
+
+    def test_refuses_a_configuration_without_its_columns(self, store: Store, launch: int) -> None:
+        class Incomplete(Spec):
+            def columns(self) -> dict[str, str]:
+                return {"env": "pendulum"}
+
+        with pytest.raises(ValueError, match="expected env, policy"):
+            store.register(launch, [Incomplete()])
+
+
+class TestClaims:
+    def test_go_to_one_launch_only(self, store: Store, open_store: OpenStore, launch: int) -> None:
+        keys = store.register(launch, [Spec(seed) for seed in range(4)]).todo
+        mine = store.claim(launch, [keys[2], keys[0]])
+        assert [claim.trial_key for claim in mine] == [keys[2], keys[0]]
+        other = open_store()
+        theirs = other.claim(other.begin_launch(LAUNCH), keys)
+        assert [claim.trial_key for claim in theirs] == [keys[1], keys[3]]
+        assert store.claim(launch, keys) == []
+
+    def test_of_unknown_trials_are_none(self, store: Store, launch: int) -> None:
+        assert store.claim(launch, ["0" * 64]) == []
+        assert store.claim(launch, []) == []
+
+    def test_count_attempts(self, store: Store, launch: int, take: Take) -> None:
+        (first,) = take(Spec())
+        assert store.release(launch) == 1
+        (second,) = take(Spec())
+        assert (first.attempt, second.attempt) == (1, 2)
+
+    def test_are_released_one_by_one(self, store: Store, launch: int, take: Take) -> None:
+        one, two = take(Spec(1), Spec(2))
+        assert store.release(launch, [one.trial_key]) == 1
+        assert store.commit(two, result(), RUN)
+        assert not store.commit(one, result(), RUN)
+
+    def test_end_with_their_launch(
+        self, store: Store, launch: int, take: Take, reader: Reader
+    ) -> None:
+        take(Spec())
+        store.end_launch(launch, "interrupted")
+        (row,) = reader.query("SELECT state, ended IS NOT NULL FROM launch")
+        assert tuple(row) == ("interrupted", True)
+        (row,) = reader.query(
+            "SELECT r.status, a.outcome FROM trial r JOIN attempt a USING (trial_id)"
+        )
+        assert tuple(row) == ("pending", "released")
+
+    def test_a_launch_ends_in_a_known_state(self, store: Store, launch: int) -> None:
+        with pytest.raises(ValueError, match="give done, failed, interrupted, lost"):
+            store.end_launch(launch, "fine")
+        with pytest.raises(ValueError, match="no launch 99"):
+            store.end_launch(99, "done")
+
+
+class TestRecovery:
+    def test_leaves_a_living_launch_alone(
+        self, store: Store, take: Take, open_store: OpenStore
+    ) -> None:
+        (claim,) = take(Spec())
+        assert open_store().recover() == 0
+        assert store.commit(claim, result(), RUN)
+
+    def test_leaves_other_statuses_alone(
+        self, store: Store, launch: int, take: Take, reader: Reader
+    ) -> None:
+        done, failed = take(Spec(1), Spec(2))
+        store.commit(done, result(), RUN)
+        store.fail(failed, FAILURE, RUN)
+        store.end_launch(launch, "done")
+        assert store.recover() == 0
+        assert [tuple(r) for r in reader.query("SELECT status FROM trial ORDER BY seed")] == [
+            ("done",),
+            ("failed",),
+        ]
+
+
+class TestRetry:
+    @pytest.mark.parametrize(
+        ("status", "expected"), [("failed", [1]), ("diverged", [2]), ("all", [1, 2])]
+    )
+    def test_takes_back_what_was_not_done(
+        self, store: Store, launch: int, take: Take, status: str, expected: list[int]
+    ) -> None:
+        specs = [Spec(seed) for seed in range(3)]
+        done, failed, bad = take(*specs)
+        store.commit(done, result(), RUN)
+        store.fail(failed, FAILURE, RUN)
+        store.commit(bad, diverged(2), RUN)
+        assert store.retry(status) == len(expected)
+        assert store.register(launch, specs).todo == [specs[seed].trial_key for seed in expected]
+
+    def test_forgets_a_divergence(self, store: Store, take: Take, reader: Reader) -> None:
+        (claim,) = take(Spec())
+        store.commit(claim, diverged(2), RUN)
+        store.retry("diverged")
+        assert reader.query("SELECT * FROM step") == []
+        assert reader.query("SELECT * FROM trajectory") == []
+        (again,) = take(Spec())
+        assert store.commit(again, result(), RUN)
+        (row,) = reader.trials(Spec().config_key)
+        assert (row.status, row.attempt, row.diverged_at) == ("done", 2, None)
+
+    def test_stays_inside_a_grid(self, store: Store, launch: int, take: Take) -> None:
+        specs = [Spec(seed) for seed in range(3)]
+        for claim in take(*specs):
+            store.fail(claim, FAILURE, RUN)
+        assert store.retry("failed", [specs[1].trial_key]) == 1
+        assert store.register(launch, specs).todo == [specs[1].trial_key]
+
+    def test_refuses_other_statuses(self, store: Store) -> None:
+        with pytest.raises(ValueError, match="by the status 'done': give failed"):
+            store.retry("done")
