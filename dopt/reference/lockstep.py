@@ -1,0 +1,205 @@
+"""Algorithm 1 in torch: the trials of one cell in lockstep, or a single one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+from torch.func import jacrev, vmap
+
+from dopt.errors import SpecificationError
+from dopt.evaluation import evaluation_set
+from dopt.policies import DOptimal, Uniform
+from dopt.policies.base import OpenLoop
+from dopt.randomness import draw
+from dopt.reference.dynamics import flow, known_flow, true_accelerations
+from dopt.reference.learning import learner_for
+from dopt.reference.models import model_function, network_function
+from dopt.reference.planning import d_optimal_inputs, quadratic_problem, uniform_inputs
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+
+Column = Literal["loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us"]
+
+
+class Lockstep:
+    """A batch of n trials of one cell that take each step together.
+
+    Parameters
+    ----------
+    specs : sequence of TrialSpec
+        Trials that differ in the seed alone.
+    device : str
+        Torch device, ``"cpu"`` or ``"cuda"``.
+    module : torch.nn.Module, optional
+        Network from features to accelerations in place of the registered model; its parameters at
+        the time of the call are the initial ones of every trial.
+
+    Raises
+    ------
+    SpecificationError
+        If the trials belong to different cells.
+    """
+
+    def __init__(
+        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
+    ) -> None:
+        if len({spec.config_key for spec in specs}) != 1:
+            raise SpecificationError(
+                f"{len(specs)} trials of different configurations were given, but those of a "
+                f"batch may differ in the seed alone: run one batch for each configuration."
+            )
+        self.specs, self.device = list(specs), device
+        self.system, self.cell = specs[0].system, specs[0].cell
+        draws = [draw(spec) for spec in specs]
+        self.noise = self._tensor(np.stack([d.noise for d in draws]))
+        self.open_loop = self._tensor(np.stack([d.inputs for d in draws]))
+        self.ties = self._tensor(np.stack([d.ties for d in draws]))
+        self.components = torch.tensor(np.stack([d.components for d in draws]), device=device)
+        self.theta = self._tensor(np.stack([d.weights for d in draws]))
+        self.model = model_function(self.system, self.cell.model)
+        if module is not None:
+            self.model = network_function(self.system, module)
+            flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
+            self.theta = flat.to(device).repeat(len(specs), 1)
+        self._allocate()
+        self.learner = learner_for(
+            self.cell.learner, self.model, self.theta, self._regularization()
+        )
+        self._rows = vmap(jacrev(self.model))
+
+    def _tensor(self, values: npt.NDArray[np.float64]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64, device=self.device)
+
+    def _regularization(self) -> float:
+        policy = self.cell.policy
+        return policy.regularization if isinstance(policy, DOptimal) else 1.0
+
+    def _allocate(self) -> None:
+        n, T = len(self.specs), self.system.horizon
+        q = self.theta.shape[1]
+        empty = {"dtype": torch.float64, "device": self.device}
+        self.states = torch.full((n, T + 1, self.system.n_states), torch.nan, **empty)  # type: ignore[arg-type]
+        self.states[:, 0] = self._tensor(np.array(self.system.initial_state))
+        self.inputs = torch.full((n, T, self.system.n_inputs), torch.nan, **empty)  # type: ignore[arg-type]
+        self.targets = torch.full((n, T, self.system.n_learned), torch.nan, **empty)  # type: ignore[arg-type]
+        self.columns = {name: np.full((n, T), np.nan) for name in Column.__args__}  # type: ignore[attr-defined]
+        self.information: Tensor | None = None
+        if isinstance(self.cell.policy, DOptimal):
+            self.information = self._regularization() * torch.eye(q, **empty).repeat(n, 1, 1)  # type: ignore[call-overload]
+        points = evaluation_set(self.system)
+        self.points = self._tensor(points.states)
+        self.truth = self._tensor(points.accelerations)
+        self.n_grid = points.n_grid
+
+    def plan(self, t: int) -> Tensor:
+        """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
+        policy, x = self.cell.policy, self.states[:, t]
+        if isinstance(policy, OpenLoop) or t == 0:
+            return self.open_loop[:, t]
+        if isinstance(policy, Uniform):
+            seen = self.states[:, : t + 1]
+            return uniform_inputs(self.system, self.model, self.theta, seen, policy.iterations)
+        assert self.information is not None
+        problem = quadratic_problem(
+            self.system, self.model, self.theta, self.information, x, self.components[:, t]
+        )
+        return d_optimal_inputs(problem, self.system.gamma, self.ties[:, t])
+
+    def act(self, t: int, u: Tensor) -> None:
+        """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""
+        x = self.states[:, t]
+        step = flow(self.system, x, u, true_accelerations(self.system, x))
+        following = x + self.system.dt * step + self.noise[:, t]
+        observed = (following - x) / self.system.dt - known_flow(self.system, x, u)
+        self.inputs[:, t] = u
+        self.states[:, t + 1] = following
+        self.targets[:, t] = observed[:, list(self.system.learned_rows)]
+
+    def learn(self, t: int) -> None:
+        """Update the parameters with the samples up to time t."""
+        self.learner.learn(self.states[:, : t + 1], self.targets[:, : t + 1])
+
+    def inform(self, t: int) -> None:
+        """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
+        if self.information is not None:
+            J = self._rows(self.theta, self.states[:, t])
+            self.information = self.information + J.mT @ J
+
+    def evaluate(self) -> tuple[Tensor, Tensor]:
+        """Return the L2 errors over the grid and over the reachable set, (n,) each."""
+        over_points = vmap(self.model, in_dims=(None, 0))
+        errors = vmap(over_points, in_dims=(0, None))(self.theta, self.points) - self.truth
+        squares = errors.square().sum(dim=-1)
+        grid, reachable = squares[:, : self.n_grid], squares[:, self.n_grid :]
+        return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
+
+    def step(self, t: int) -> None:
+        """Take step t of every trial and record it."""
+        clocks = [self._clock()]
+        u = self.plan(t)
+        clocks.append(self._clock())
+        self.act(t, u)
+        clocks.append(self._clock())
+        self.learn(t)
+        clocks.append(self._clock())
+        self.inform(t)
+        clocks.append(self._clock())
+        loss, reachable = self.evaluate()
+        clocks.append(self._clock())
+        planned, _, learned, informed, evaluated = np.diff(clocks) * 1e6 / len(self.specs)
+        self.columns["loss"][:, t] = loss.cpu().numpy()
+        self.columns["reachable_loss"][:, t] = reachable.cpu().numpy()
+        self.columns["plan_us"][:, t] = planned + informed
+        self.columns["learn_us"][:, t] = learned
+        self.columns["evaluate_us"][:, t] = evaluated
+
+    def _clock(self) -> float:
+        if self.device != "cpu":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+@torch.no_grad()
+def run_trials(
+    specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
+) -> list[TrialResult]:
+    """Run trials of one cell in lockstep; each result is that of the trial run alone.
+
+    Parameters and errors are those of :class:`Lockstep`. The seconds and microseconds of a result
+    are the batch's divided by its size.
+    """
+    wall, cpu = time.perf_counter(), time.process_time()
+    batch = Lockstep(specs, device, module)
+    for t in range(batch.system.horizon):
+        batch.step(t)
+    n = len(specs)
+    seconds = ((time.perf_counter() - wall) / n, (time.process_time() - cpu) / n)
+    return [_result(batch, i, *seconds) for i in range(n)]
+
+
+def _result(batch: Lockstep, i: int, wall: float, cpu: float) -> TrialResult:
+    """Cut trial i out of the batch; its rows end where it diverged."""
+    states, inputs = batch.states[i].cpu().numpy(), batch.inputs[i].cpu().numpy()
+    columns = {name: rows[i].copy() for name, rows in batch.columns.items()}
+    inside = np.all(np.abs(states[1:]) <= batch.system.state_limit, axis=1)
+    wrong = np.flatnonzero(~(inside & np.isfinite(columns["loss"])))
+    end = int(wrong[0]) if len(wrong) else None
+    if end is not None:
+        for rows in (*columns.values(), inputs):
+            rows[end:] = np.nan
+        states[end:] = np.nan
+    return TrialResult(
+        **columns,
+        states=states,
+        inputs=inputs,
+        parameters=batch.theta[i].cpu().numpy().copy(),
+        diverged_at=end,
+        wall_seconds=wall,
+        cpu_seconds=cpu,
+    )

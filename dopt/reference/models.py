@@ -1,0 +1,74 @@
+"""Models as functions of a flat parameter vector, for ``torch.func``."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from dopt.models import MLP, Linear, Model
+from dopt.systems.base import System
+from dopt.systems.features import feature_values
+
+Accelerations = Callable[[Tensor, Tensor], Tensor]
+"""a_θ(x): parameters (q,) and state (d,) to accelerations (r,)."""
+
+
+def model_function(system: System, model: Model) -> Accelerations:
+    """Return a_θ of a registered model."""
+    if isinstance(model, MLP):
+        return network_function(system, tanh_network(model.layer_sizes(system)))
+    if isinstance(model, Linear):
+        return linear_function(system)
+    raise TypeError(f"model {model!r} is neither MLP nor Linear: give its module instead.")
+
+
+def tanh_network(sizes: tuple[int, ...]) -> nn.Module:
+    """Return a stack of linear layers with tanh between them."""
+    layers: list[nn.Module] = []
+    for n_in, n_out in itertools.pairwise(sizes):
+        layers += [nn.Linear(n_in, n_out, dtype=torch.float64), nn.Tanh()]
+    return nn.Sequential(*layers[:-1])
+
+
+def network_function(system: System, module: nn.Module) -> Accelerations:
+    """Return a_θ for any module that maps the features, (p,), to accelerations, (r,).
+
+    The flat vector holds the module's parameters in the order of ``module.named_parameters()``.
+    """
+    shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
+    lengths = [shape.numel() for shape in shapes.values()]
+
+    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
+        parts = theta.split(lengths)
+        weights = {
+            name: part.view(shape)
+            for (name, shape), part in zip(shapes.items(), parts, strict=True)
+        }
+        phi = feature_values(system.features, system.feature_scales, x.unbind(-1))
+        out: Tensor = functional_call(module, weights, (torch.stack(phi, dim=-1),))
+        return out
+
+    return accelerations
+
+
+def linear_function(system: System) -> Accelerations:
+    """Return offset(x) + Ψ(x) θ in the system's ``linear_parameters``."""
+
+    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
+        offset, *units = (stack(system.accelerations(x.unbind(-1), p)) for p in system.linear_form)
+        psi = torch.stack([unit - offset for unit in units], dim=-1)
+        return offset + psi @ theta
+
+    return accelerations
+
+
+def stack(values: tuple[Any, ...]) -> Tensor:
+    """Stack scalars, some of which may be plain numbers, along a new last axis."""
+    like = next(value for value in values if isinstance(value, Tensor))
+    tensors = [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]
+    return torch.stack(list(torch.broadcast_tensors(*tensors)), dim=-1)

@@ -1,0 +1,119 @@
+"""Closed-loop plans by automatic differentiation, for a batch of trials.
+
+======  ==================================================  =========
+symbol  meaning (Proposition 1)                             shape
+======  ==================================================  =========
+x̄       predicted state x_t + dt f_θ(x_t, 0)                d
+B       dt ∂f/∂u at x̄                                       d × m
+g       ∂a_θ^k/∂θ at x̄                                      q
+D B     derivative of g along the columns of B              q × m
+M       information matrix                                  q × q
+======  ==================================================  =========
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import grad, jvp, vmap
+
+from dopt.planning.sphere import maximize_on_sphere
+from dopt.reference.dynamics import flow, input_matrix
+from dopt.reference.models import Accelerations
+from dopt.systems.base import System
+
+TIE_MARGIN = 1e-9
+
+
+class QuadraticProblem(NamedTuple):
+    """Equation 7 for a batch of n trials: maximise uᵀQu - 2vᵀu on the sphere."""
+
+    Q: Tensor  # (n, m, m)
+    v: Tensor  # (n, m)
+
+
+def predicted_states(system: System, model: Accelerations, theta: Tensor, x: Tensor) -> Tensor:
+    """Return x̄ of every trial, (n, d), for parameters (n, q) and states (n, d)."""
+    zero = torch.zeros(len(x), system.n_inputs, dtype=x.dtype, device=x.device)
+    return x + system.dt * flow(system, x, zero, vmap(model)(theta, x))
+
+
+def quadratic_problem(
+    system: System,
+    model: Accelerations,
+    theta: Tensor,
+    information: Tensor,
+    x: Tensor,
+    components: Tensor,
+) -> QuadraticProblem:
+    """Return Q and v for parameters (n, q), M (n, q, q), states (n, d), components k (n,)."""
+    bar = predicted_states(system, model, theta, x)
+    g, DB = vmap(lambda p, z, k: _gradient_and_changes(system, model, p, z, k))(
+        theta, bar, components
+    )
+    factor = torch.linalg.cholesky(information)
+    solved = torch.cholesky_solve(torch.cat([g.unsqueeze(-1), DB], dim=-1), factor)
+    Q = DB.mT @ solved[..., 1:]
+    v = -(DB.mT @ solved[..., :1]).squeeze(-1)
+    return QuadraticProblem(Q, v)
+
+
+def _gradient_and_changes(
+    system: System, model: Accelerations, theta: Tensor, bar: Tensor, component: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return g, (q,), and D B, (q, m), by forward over reverse differentiation."""
+
+    def gradient(z: Tensor) -> Tensor:
+        chosen = lambda p: model(p, z).gather(-1, component.view(1)).squeeze(-1)  # noqa: E731
+        return grad(chosen)(theta)
+
+    columns = input_matrix(system, bar)
+    change = vmap(lambda column: jvp(gradient, (bar,), (column,))[1], in_dims=1, out_dims=1)
+    return gradient(bar), change(columns)
+
+
+def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:
+    """Return the maximisers, (n, m); ``ties`` (n, m) decide between equal ones."""
+    solutions = [
+        torch.from_numpy(maximize_on_sphere(Q.numpy(), v.numpy(), gamma, tie.numpy()))
+        for Q, v, tie in zip(problem.Q.cpu(), problem.v.cpu(), ties.cpu(), strict=True)
+    ]
+    return torch.stack(solutions).to(problem.v)
+
+
+def uniform_inputs(
+    system: System,
+    model: Accelerations,
+    theta: Tensor,
+    states: Tensor,
+    steps: int,
+) -> Tensor:
+    """Return the inputs, (n, m), that lead farthest from all states seen, (n, t + 1, d).
+
+    Gradient ascent on the sphere from ±γ along every input axis, by automatic differentiation.
+    """
+    x = states[:, -1]
+    center = predicted_states(system, model, theta, x)
+    B = vmap(lambda z: input_matrix(system, z))(x)
+    axes = torch.eye(system.n_inputs, dtype=x.dtype, device=x.device)
+    starts = system.gamma * torch.stack([axes, -axes], dim=1).flatten(0, 1)
+
+    def distance(u: Tensor, c: Tensor, columns: Tensor, seen: Tensor) -> Tensor:
+        return torch.linalg.vector_norm(c + columns @ u - seen, dim=-1).sum()
+
+    def ascent(u: Tensor, c: Tensor, columns: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        for _ in range(steps if system.n_inputs > 1 else 0):
+            slope = grad(distance)(u, c, columns, seen)
+            u = system.gamma * slope / torch.linalg.vector_norm(slope)
+        return u, distance(u, c, columns, seen)
+
+    over_starts = vmap(ascent, in_dims=(0, None, None, None))
+    u, value = vmap(over_starts, in_dims=(None, 0, 0, 0))(starts, center, B, states)
+    best, best_value = u[:, 0], value[:, 0]
+    for i in range(1, len(starts)):
+        better = value[:, i] > best_value * (1 + TIE_MARGIN)
+        best = torch.where(better.unsqueeze(-1), u[:, i], best)
+        best_value = torch.where(better, value[:, i], best_value)
+    return best
