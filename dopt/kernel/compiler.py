@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 from llvmlite import ir
@@ -55,8 +55,21 @@ numba.config.CACHE_DIR = str(_cache_folder())
 
 def compiled(function: F) -> F:
     """Compile a function on its first call, with NumPy's rules for division by zero."""
-    decorated: F = numba.njit(cache=True, error_model="numpy")(function)
-    return decorated
+    return _njit(function)
+
+
+def contracted(function: F) -> F:
+    """Compile a function whose products and sums may be fused: a·b + c rounds once."""
+    return _njit(function, fastmath={"contract"})
+
+
+def vectorized(function: F) -> F:
+    """Compile a function whose sums may also be taken in another order, as vector lanes need."""
+    return _njit(function, fastmath={"contract", "reassoc"})
+
+
+def _njit(function: F, **options: Any) -> F:
+    return cast(F, numba.njit(cache=True, error_model="numpy", **options)(function))
 
 
 def compilable(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -69,7 +82,7 @@ def compilable(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def float_from_bits(typing_context: Any, bits: Any) -> Any:  # noqa: ARG001
     """Reinterpret the bits of an int64 as a float64."""
 
@@ -79,7 +92,7 @@ def float_from_bits(typing_context: Any, bits: Any) -> Any:  # noqa: ARG001
     return types.float64(types.int64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def bits_from_float(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
     """Reinterpret the bits of a float64 as an int64."""
 
@@ -89,7 +102,7 @@ def bits_from_float(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
     return types.int64(types.float64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
+@intrinsic
 def monotonic_microseconds(typing_context: Any) -> Any:  # noqa: ARG001
     """Read the system's monotonic clock [µs] (POSIX clock_gettime)."""
     monotonic = 6 if os.uname().sysname == "Darwin" else 1

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numba
-
-from dopt.kernel.compiler import bits_from_float, float_from_bits
+from dopt.kernel.compiler import bits_from_float, contracted, float_from_bits
 
 LOG2_E = 1.4426950408889634
 LN2_HIGH = 6.93147180369123816490e-01
@@ -13,7 +11,7 @@ ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it leaves the nearest integer i
 SATURATION = 20.0
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")  # type: ignore[untyped-decorator]
+@contracted
 def tanh(x: float) -> float:
     """Return tanh x = -e/(2 + e), e = exp(-2|x|) - 1, with the sign of x.
 
@@ -39,7 +37,7 @@ def tanh(x: float) -> float:
     poly = poly * r + 1.0 / 6.0
     poly = poly * r + 0.5
     poly = poly * r * r + r
-    power = float_from_bits((bits_from_float(shifted) << 52) + (1023 << 52))
-    e = power * poly + (power - 1.0)
+    power: float = float_from_bits((bits_from_float(shifted) << 52) + (1023 << 52))
+    e: float = power * poly + (power - 1.0)
     value = -e / (2.0 + e)
     return value if x >= 0.0 else -value

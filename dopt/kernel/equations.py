@@ -20,28 +20,27 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from dopt.kernel.compiler import compilable
 from dopt.systems import elementary
-from dopt.systems.base import System
 
 KNOWN = types.void(float64[::1], float64[::1], float64[::1], float64[::1])
 ACCELERATIONS = types.void(float64[::1], float64[::1], float64[::1])
 COMPLEX_ACCELERATIONS = types.void(complex128[::1], complex128[::1], complex128[::1])
 
 
-@overload(elementary.sin, strict=False)  # type: ignore[untyped-decorator]
+@overload(elementary.sin, strict=False)
 def _sin(x: Any) -> Any:
     if isinstance(x, types.Complex):
         return lambda x: cmath.sin(x)
     return lambda x: math.sin(x)
 
 
-@overload(elementary.cos, strict=False)  # type: ignore[untyped-decorator]
+@overload(elementary.cos, strict=False)
 def _cos(x: Any) -> Any:
     if isinstance(x, types.Complex):
         return lambda x: cmath.cos(x)
     return lambda x: math.cos(x)
 
 
-@overload(elementary.magnitude, strict=False)  # type: ignore[untyped-decorator]
+@overload(elementary.magnitude, strict=False)
 def _magnitude(x: Any) -> Any:
     if isinstance(x, types.Complex):
         return lambda x: x if x.real >= 0 else -x
@@ -67,8 +66,8 @@ class Equations(NamedTuple):
 
 
 @functools.cache
-def compiled_equations(system: type[System]) -> Equations:
-    """Compile the equations of a class of systems (from the disk cache where it has them)."""
+def compiled_equations(system: Any) -> Equations:
+    """Compile the equations of a system, given by its class, or load them from the disk cache."""
     n_states, n_inputs = len(system.state_labels), len(system.input_labels)
     n_parameters = len(system.physical)
     known, accelerations = compilable(system.known), compilable(system.accelerations)

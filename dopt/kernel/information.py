@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
-vectorized = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+from dopt.kernel.compiler import vectorized
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def symmetric_product(upper: Any, x: Any, y: Any) -> None:
     """Write y = A x, (q,), for a symmetric A given by its upper triangle, (q, q)."""
     y[:] = 0.0
@@ -22,7 +21,7 @@ def symmetric_product(upper: Any, x: Any, y: Any) -> None:
         y[i] += total + upper[i, i] * x[i]
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def _dot_and_add(row: Any, x: Any, factor: float, y: Any) -> float:
     """Return rowᵀx and add ``factor`` times the row to y."""
     total = 0.0
@@ -32,7 +31,7 @@ def _dot_and_add(row: Any, x: Any, factor: float, y: Any) -> float:
     return total
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def symmetric_products(upper: Any, x_1: Any, x_2: Any, y_1: Any, y_2: Any) -> None:
     """Write y₁ = A x₁ and y₂ = A x₂ in one pass over the upper triangle of A."""
     y_1[:] = 0.0
@@ -51,7 +50,7 @@ def symmetric_products(upper: Any, x_1: Any, x_2: Any, y_1: Any, y_2: Any) -> No
         y_2[i] += total_2 + upper[i, i] * x_2[i]
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def _dots_and_adds(
     row: Any, x_1: Any, x_2: Any, factor_1: float, factor_2: float, y_1: Any, y_2: Any
 ) -> Any:
@@ -65,7 +64,7 @@ def _dots_and_adds(
     return total_1, total_2
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def multiply_rows(upper: Any, rows: Any, out: Any) -> None:
     """Write the products of A with each row of ``rows``, (k, q), two at a time."""
     k = rows.shape[0]
@@ -75,7 +74,7 @@ def multiply_rows(upper: Any, rows: Any, out: Any) -> None:
         symmetric_product(upper, rows[k - 1], out[k - 1])
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def inner(a: Any, b: Any) -> float:
     """Return aᵀb."""
     total = 0.0
@@ -84,7 +83,7 @@ def inner(a: Any, b: Any) -> float:
     return total
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def quadratic_forms(upper: Any, left: Any, right: Any) -> Any:
     """Return left A rightᵀ for ``left`` (k, q) and ``right`` (n, q)."""
     products = np.empty(left.shape)
@@ -96,7 +95,7 @@ def quadratic_forms(upper: Any, left: Any, right: Any) -> Any:
     return out
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def absorb(upper: Any, rows: Any, residuals: Any, scratch: Any) -> None:
     """Turn M⁻¹ into (M + JᵀJ)⁻¹ and the residuals e into L⁻¹e (Woodbury identity).
 
@@ -131,7 +130,7 @@ def absorb(upper: Any, rows: Any, residuals: Any, scratch: Any) -> None:
     _subtract_products(upper, scratch)
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def _factorize(L: Any) -> None:
     """Replace the lower triangle of a positive definite matrix, (r, r), by its Cholesky factor."""
     for k in range(L.shape[0]):
@@ -142,7 +141,7 @@ def _factorize(L: Any) -> None:
             L[k, i] = np.sqrt(value) if i == k else value / L[i, i]
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def _subtract_products(upper: Any, V: Any) -> None:
     """Subtract VᵀV from the upper triangle, two rows of V in one pass."""
     r, q = V.shape
@@ -154,13 +153,13 @@ def _subtract_products(upper: Any, V: Any) -> None:
             _subtract_one(upper[i, i:], V[r - 1, i], V[r - 1, i:])
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def _subtract_two(row: Any, a: float, first: Any, b: float, second: Any) -> None:
     for j in range(row.shape[0]):
         row[j] -= a * first[j] + b * second[j]
 
 
-@vectorized  # type: ignore[untyped-decorator]
+@vectorized
 def _subtract_one(row: Any, a: float, values: Any) -> None:
     for j in range(row.shape[0]):
         row[j] -= a * values[j]

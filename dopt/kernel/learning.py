@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from dopt.kernel.arguments import Network, Rules, State
+from dopt.kernel.compiler import compiled
 from dopt.kernel.network import loss_gradient
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def adam_step(
     network: Network, rules: Rules, state: State, t: int, buffers: Any, gradient: Any
 ) -> None:

@@ -10,14 +10,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
 
 from dopt.kernel.arguments import Network
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compiled, contracted
 from dopt.kernel.elementwise import tanh
-
-contracted = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 
 
 @compiled
@@ -56,7 +53,7 @@ def layer(network: Network, theta: Any, index: int) -> Any:
     return theta[start:middle].reshape(n_out, n_in), theta[middle : middle + n_out]
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def _activate(values: Any, bias: Any) -> None:
     for n in range(values.shape[0]):
         row = values[n]
@@ -85,7 +82,7 @@ def forward(network: Network, theta: Any, inputs: Any, hidden: Any, outputs: Any
             outputs[i, k] += b[k]
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def _column_sums(values: Any, out: Any) -> None:
     out[:] = 0.0
     for n in range(values.shape[0]):
@@ -93,7 +90,7 @@ def _column_sums(values: Any, out: Any) -> None:
             out[i] += values[n, i]
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def _through_tanh(delta: Any, activations: Any) -> None:
     for n in range(delta.shape[0]):
         for i in range(delta.shape[1]):
@@ -141,7 +138,7 @@ def loss_gradient(
     _column_sums(delta, db)
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def activations_at(network: Network, theta: Any, phi: Any, hidden: Any, output: Any) -> None:
     """Evaluate the network at one point: ``hidden`` (L, w) and ``output`` (r,) are written."""
     depth = network.offsets.shape[0] - 1
@@ -157,7 +154,7 @@ def activations_at(network: Network, theta: Any, phi: Any, hidden: Any, output: 
     _affine(W, b, below, output)
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def _affine(W: Any, b: Any, x: Any, out: Any) -> None:
     for i in range(out.shape[0]):
         total = b[i]
@@ -166,7 +163,7 @@ def _affine(W: Any, b: Any, x: Any, out: Any) -> None:
         out[i] = total
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def _transposed_product(W: Any, delta: Any, out: Any) -> None:
     for j in range(out.shape[0]):
         out[j] = 0.0
@@ -175,7 +172,7 @@ def _transposed_product(W: Any, delta: Any, out: Any) -> None:
             out[j] += delta[i] * W[i, j]
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def back_signals(network: Network, theta: Any, hidden: Any, component: int, deltas: Any) -> None:
     """Write δ, (L, w): the derivative of output k with respect to every pre-activation."""
     depth = network.offsets.shape[0] - 1
@@ -189,7 +186,7 @@ def back_signals(network: Network, theta: Any, hidden: Any, component: int, delt
             deltas[index - 1, i] *= 1.0 - hidden[index - 1, i] ** 2
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def parameter_gradient(
     network: Network, phi: Any, hidden: Any, deltas: Any, component: int, out: Any
 ) -> None:
@@ -211,7 +208,7 @@ def parameter_gradient(
             dW[k, j] = chosen * hidden[depth - 1, j]
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def tangents_at(
     network: Network,
     theta: Any,
@@ -249,7 +246,7 @@ def tangents_at(
             deltas_dot[index - 1, j] = deltas_dot[index - 1, j] * (1.0 - h * h) + back * bend
 
 
-@contracted  # type: ignore[untyped-decorator]
+@contracted
 def gradient_along(
     network: Network,
     phi: Any,

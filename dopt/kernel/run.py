@@ -54,8 +54,7 @@ class KernelTrial:
         world, network, rules, points = self.constants
         equations = compiled_equations(type(self.spec.system))
         call = (world, network, rules, self.randomness, points, self.state, self.record)
-        _compile(*call)
-        self.done = int(advance(*equations, *call, self.done, last))
+        self.done = int(_loop_for(*call)(*equations, *call, self.done, last))
         if self.done < last:
             self.diverged_at = self.done
 
@@ -78,18 +77,20 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     )
 
 
-_compiled_for: set[Any] = set()
-
-
-def _compile(*call: Any) -> None:
-    """Compile the loop for function pointers, once for all systems, before its first call."""
+def _loop_for(*call: Any) -> Any:
+    """Return the loop, compiled for function pointers: once for all systems."""
+    loop: Any = advance
     kinds = tuple(numba.typeof(argument) for argument in call)
-    if kinds in _compiled_for:
-        return
-    pointers = [numba.types.FunctionType(s) for s in (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)]
-    advance.compile((*pointers, *kinds, numba.int64, numba.int64))
-    advance.disable_compile()
-    _compiled_for.add(kinds)
+    if kinds not in _compiled_for:
+        signatures = (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)
+        pointers = [numba.types.FunctionType(signature) for signature in signatures]
+        loop.compile((*pointers, *kinds, numba.int64, numba.int64))
+        loop.disable_compile()
+        _compiled_for.add(kinds)
+    return loop
+
+
+_compiled_for: set[tuple[Any, ...]] = set()
 
 
 def _fields(source: object, kind: Any) -> list[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from dopt.kernel.arguments import (
@@ -95,13 +94,13 @@ def observe(
 @compiled
 def within(x: Any, limit: float) -> bool:
     """Tell whether every entry is finite and within the limit."""
+    inside = True
     for i in range(x.shape[0]):
-        if not abs(x[i]) <= limit:
-            return False
-    return True
+        inside = inside and abs(x[i]) <= limit
+    return inside
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@compiled
 def advance(
     known: Any,
     accelerations: Any,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +23,7 @@ from dopt.reference.planning import d_optimal_inputs, quadratic_problem, uniform
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
 
-Column = Literal["loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us"]
+COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 
 class Lockstep:
@@ -76,22 +75,24 @@ class Lockstep:
     def _tensor(self, values: npt.NDArray[np.float64]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
 
+    def _unset(self, *shape: int) -> Tensor:
+        return torch.full(shape, torch.nan, dtype=torch.float64, device=self.device)
+
     def _regularization(self) -> float:
         policy = self.cell.policy
         return policy.regularization if isinstance(policy, DOptimal) else 1.0
 
     def _allocate(self) -> None:
         n, T = len(self.specs), self.system.horizon
-        q = self.theta.shape[1]
-        empty = {"dtype": torch.float64, "device": self.device}
-        self.states = torch.full((n, T + 1, self.system.n_states), torch.nan, **empty)  # type: ignore[arg-type]
+        self.states = self._unset(n, T + 1, self.system.n_states)
         self.states[:, 0] = self._tensor(np.array(self.system.initial_state))
-        self.inputs = torch.full((n, T, self.system.n_inputs), torch.nan, **empty)  # type: ignore[arg-type]
-        self.targets = torch.full((n, T, self.system.n_learned), torch.nan, **empty)  # type: ignore[arg-type]
-        self.columns = {name: np.full((n, T), np.nan) for name in Column.__args__}  # type: ignore[attr-defined]
+        self.inputs = self._unset(n, T, self.system.n_inputs)
+        self.targets = self._unset(n, T, self.system.n_learned)
+        self.columns = {name: np.full((n, T), np.nan) for name in COLUMNS}
         self.information: Tensor | None = None
         if isinstance(self.cell.policy, DOptimal):
-            self.information = self._regularization() * torch.eye(q, **empty).repeat(n, 1, 1)  # type: ignore[call-overload]
+            prior = self._regularization() * torch.eye(self.theta.shape[1]).to(self.theta)
+            self.information = prior.repeat(n, 1, 1)
         points = evaluation_set(self.system)
         self.points = self._tensor(points.states)
         self.truth = self._tensor(points.accelerations)

@@ -65,9 +65,12 @@ def _gradient_and_changes(
 ) -> tuple[Tensor, Tensor]:
     """Return g, (q,), and D B, (q, m), by forward over reverse differentiation."""
 
+    def chosen(parameters: Tensor, z: Tensor) -> Tensor:
+        return model(parameters, z).gather(-1, component.view(1)).squeeze(-1)
+
     def gradient(z: Tensor) -> Tensor:
-        chosen = lambda p: model(p, z).gather(-1, component.view(1)).squeeze(-1)  # noqa: E731
-        return grad(chosen)(theta)
+        g: Tensor = grad(chosen)(theta, z)
+        return g
 
     columns = input_matrix(system, bar)
     change = vmap(lambda column: jvp(gradient, (bar,), (column,))[1], in_dims=1, out_dims=1)
@@ -101,7 +104,8 @@ def uniform_inputs(
     starts = system.gamma * torch.stack([axes, -axes], dim=1).flatten(0, 1)
 
     def distance(u: Tensor, c: Tensor, columns: Tensor, seen: Tensor) -> Tensor:
-        return torch.linalg.vector_norm(c + columns @ u - seen, dim=-1).sum()
+        total: Tensor = torch.linalg.vector_norm(c + columns @ u - seen, dim=-1).sum()
+        return total
 
     def ascent(u: Tensor, c: Tensor, columns: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
         for _ in range(steps if system.n_inputs > 1 else 0):
