@@ -8,18 +8,31 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, bindparam, insert, select, text, update
+from sqlalchemy import (
+    Connection,
+    Integer,
+    bindparam,
+    insert,
+    literal_column,
+    select,
+    text,
+    update,
+)
 
 from orchestrate.store.backend import Backend
 from orchestrate.store.checking import check_horizon, check_result
 from orchestrate.store.packing import DTYPE, pack
 from orchestrate.store.records import Array, Claim, Failure, Result, RunRecord
-from orchestrate.store.schema import STEP_VALUES, attempt, config, error, trajectory, trial
+from orchestrate.store.schema import STEP_VALUES, attempt, error, trajectory, trial
 from orchestrate.store.values import finite, plain, utc_text
 
 _RUN_COLUMNS = ("node", "wall_seconds", "cpu_seconds", "peak_memory_bytes")
 
-_HORIZON = select(config.c.horizon).where(config.c.config_id == trial.c.config_id)
+# As text, because SQLAlchemy leaves table names out of RETURNING on SQLite, and a bare config_id
+# would be that of the inner table.
+_HORIZON = literal_column(
+    "(SELECT config.horizon FROM config WHERE config.config_id = trial.config_id)", Integer
+)
 
 # The fence: only the launch that still owns this very attempt may write.
 _FENCED = (
@@ -41,7 +54,7 @@ _FENCED = (
         error_id=None,
         **{name: bindparam(name) for name in _RUN_COLUMNS},
     )
-    .returning(_HORIZON.correlate(trial).scalar_subquery())
+    .returning(_HORIZON)
 )
 _END_ATTEMPT = (
     update(attempt)

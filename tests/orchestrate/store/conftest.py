@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, text
+from sqlalchemy import Engine, create_engine, text
 from sqlalchemy.exc import OperationalError
 
 from orchestrate.store import Claim, Reader, Store
@@ -24,20 +24,26 @@ def sqlite_url(tmp_path: Path) -> str:
     return f"sqlite:///{tmp_path}/results/results.db"
 
 
-@pytest.fixture
-def postgresql_url() -> Iterator[str]:
-    """URL of a new schema on a running server, dropped afterwards."""
-    schema = f"test_{uuid.uuid4().hex}"
+@pytest.fixture(scope="session")
+def server() -> Iterator[Engine]:
     engine = create_engine(SERVER, connect_args={"connect_timeout": 3})
     try:
-        with engine.begin() as connection:
-            connection.execute(text(f"CREATE SCHEMA {schema}"))
+        engine.connect().close()
     except OperationalError as error:
-        _no_server(str(error.orig).strip())
-    yield f"{SERVER}?options=-csearch_path%3D{schema}"
-    with engine.begin() as connection:
-        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+        _no_server(str(error.orig).splitlines()[0])
+    yield engine
     engine.dispose()
+
+
+@pytest.fixture
+def postgresql_url(server: Engine) -> Iterator[str]:
+    """URL of a new schema on a running server, dropped afterwards."""
+    schema = f"test_{uuid.uuid4().hex}"
+    with server.begin() as connection:
+        connection.execute(text(f"CREATE SCHEMA {schema}"))
+    yield f"{SERVER}?options=-csearch_path%3D{schema}"
+    with server.begin() as connection:
+        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
 
 
 def _no_server(reason: str) -> None:

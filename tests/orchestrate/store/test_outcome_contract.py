@@ -38,6 +38,13 @@ class TestCommit:
         assert [row.t for row in rows] == list(range(horizon))
         assert [row.evaluate_us for row in rows] == sent.evaluate_us.tolist()
 
+    def test_knows_the_horizon_of_each_configuration(self, store: Store, take: Take) -> None:
+        long, short = take(Spec(horizon=20), Spec(horizon=10))
+        with pytest.raises(InvalidResultError, match="20 steps, expected the horizon 10"):
+            store.commit(short, result(horizon=20), RUN)
+        assert store.commit(short, result(horizon=10), RUN)
+        assert store.commit(long, result(horizon=20), RUN)
+
     def test_writes_the_summary(
         self, store: Store, launch: int, take: Take, reader: Reader
     ) -> None:

@@ -1,0 +1,101 @@
+"""What other processes do to a database in the tests of faults; each forked from a clean server."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection as Pipe
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+import sqlalchemy
+
+from orchestrate.store import Claim, Store
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
+
+# Forked from a process that has imported everything and opened nothing: starts in milliseconds.
+CLEAN = multiprocessing.get_context("forkserver")
+CLEAN.set_forkserver_preload(["pytest", __name__])
+PATIENCE_SECONDS = 60.0
+
+
+@contextmanager
+def running(target: Callable[..., None], *arguments: Any) -> Iterator[tuple[BaseProcess, Pipe]]:
+    """Run ``target(pipe, *arguments)`` in a process that is dead after the block."""
+    here, there = CLEAN.Pipe()
+    process = CLEAN.Process(target=target, args=(there, *arguments), daemon=True)
+    process.start()
+    there.close()
+    try:
+        yield process, here
+    finally:
+        kill(process)
+        here.close()
+
+
+def kill(process: BaseProcess) -> None:
+    """Kill -9, and wait until the kernel has taken everything back."""
+    process.kill()
+    process.join(PATIENCE_SECONDS)
+
+
+def hear(pipe: Pipe) -> Any:
+    assert pipe.poll(PATIENCE_SECONDS), "the other process says nothing"
+    return pipe.recv()
+
+
+def open_together(pipe: Pipe, url: str) -> None:
+    """Say ready, wait for the word, open the database, say how it went."""
+    pipe.send("ready")
+    pipe.recv()
+    try:
+        with Store.open(url) as store:
+            pipe.send(store.begin_launch(LAUNCH))
+    except Exception as error:
+        pipe.send(repr(error))
+
+
+def hold_claims(pipe: Pipe, url: str, n: int, lease_seconds: float = 60.0) -> None:
+    """Claim n trials, tell which, and do nothing more."""
+    with Store.open(url, lease_seconds=lease_seconds) as store:
+        pipe.send(_claims(store, n))
+        pipe.recv()
+
+
+def die_in_commit(pipe: Pipe, url: str, lease_seconds: float = 60.0) -> None:
+    """Commit one trial, then stop for ever with half of the next one's steps written."""
+    store = Store.open(url, lease_seconds=lease_seconds)
+    first, second = _claims(store, 2)
+    store.commit(first, result(first.trial_id), RUN)
+    backend = store._backend
+    insert_steps = backend.insert_steps
+
+    def half(connection: sqlalchemy.Connection, trial_id: int, values: Array) -> None:
+        insert_steps(connection, trial_id, values[: HORIZON // 2])
+        pipe.send("half")
+        time.sleep(PATIENCE_SECONDS)
+
+    backend.insert_steps = half  # type: ignore[method-assign]
+    store.commit(second, result(second.trial_id), RUN)
+
+
+def run_grid(pipe: Pipe, url: str, n: int, lease_seconds: float = 60.0) -> None:
+    """Run a grid of n trials, one claim and one commit at a time; tell how many were mine."""
+    with Store.open(url, lease_seconds=lease_seconds) as store:
+        launch = store.begin_launch(LAUNCH)
+        keys = store.register(launch, [Spec(seed) for seed in range(n)]).todo
+        pipe.send("ready")
+        pipe.recv()
+        mine = 0
+        for key in keys:
+            for claim in store.claim(launch, [key]):
+                mine += store.commit(claim, result(claim.trial_id), RUN)
+        store.end_launch(launch, "done")
+        pipe.send(mine)
+
+
+def _claims(store: Store, n: int) -> list[Claim]:
+    launch = store.begin_launch(LAUNCH)
+    return store.claim(launch, store.register(launch, [Spec(seed) for seed in range(n)]).todo)

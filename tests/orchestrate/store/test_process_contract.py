@@ -1,0 +1,120 @@
+"""Several processes, and the death of some of them, on every database."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import numpy as np
+
+from orchestrate.store import Claim, Reader, Store
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.processes import (
+    die_in_commit,
+    hear,
+    hold_claims,
+    kill,
+    open_together,
+    run_grid,
+    running,
+)
+
+LEASE_SECONDS = 1.0
+KEY = Spec().config_key
+
+
+def _recover_from_the_dead(store: Store) -> int:
+    """Recover as soon as the leases have run out; a kernel lock ends with its process."""
+    for _ in range(100):
+        freed = store.recover()
+        if freed:
+            return freed
+        time.sleep(0.05)
+    return 0
+
+
+def _is_whole(reader: Reader) -> bool:
+    """Tell whether each finished trial has all of its rows, and every other one none."""
+    rows = reader.query(
+        "SELECT r.status IN ('done', 'diverged') AS finished, "
+        "(SELECT count(*) FROM step s WHERE s.trial_id = r.trial_id) AS steps, "
+        "(SELECT count(*) FROM trajectory p WHERE p.trial_id = r.trial_id) AS arrays FROM trial r"
+    )
+    return all(tuple(row[1:]) == ((HORIZON, 1) if row.finished else (0, 0)) for row in rows)
+
+
+def test_eight_processes_create_one_database(url: str) -> None:
+    with ExitStack() as stack:
+        pipes = [stack.enter_context(running(open_together, url))[1] for _ in range(8)]
+        for pipe in pipes:
+            hear(pipe)
+        for pipe in pipes:
+            pipe.send("now")
+        assert sorted(hear(pipe) for pipe in pipes) == list(range(1, 9))
+
+
+def test_two_launches_share_a_grid(url: str) -> None:
+    n = 60
+    with ExitStack() as stack:
+        pipes = [stack.enter_context(running(run_grid, url, n))[1] for _ in range(2)]
+        for pipe in pipes:
+            hear(pipe)
+        for pipe in pipes:
+            pipe.send("now")
+        shares = [hear(pipe) for pipe in pipes]
+    assert sum(shares) == n
+    with Reader.open(url) as reader:
+        assert _is_whole(reader)
+        assert len(reader.query("SELECT * FROM attempt")) == n
+
+
+def test_death_in_a_commit_leaves_no_partial_curve(store: Store, reader: Reader, url: str) -> None:
+    with running(die_in_commit, url, LEASE_SECONDS) as (process, pipe):
+        assert hear(pipe) == "half"
+        kill(process)
+    assert _is_whole(reader)
+    assert _recover_from_the_dead(store) == 1
+    assert [row.status for row in reader.trials(KEY)] == ["done", "pending"]
+    (attempt,) = reader.query("SELECT outcome FROM attempt a WHERE outcome <> 'done'")
+    assert attempt.outcome == "lost"
+    launch = store.begin_launch(LAUNCH)
+    (claim,) = store.claim(launch, [Spec(1).trial_key])
+    assert store.commit(claim, result(claim.trial_id), RUN)
+    np.testing.assert_array_equal(
+        reader.curves(KEY).values, [result(trial_id).loss for trial_id in (1, 2)]
+    )
+
+
+def test_death_at_any_moment_is_made_good(store: Store, reader: Reader, url: str) -> None:
+    moments = random.Random(0)
+    for _ in range(3):
+        with running(run_grid, url, 400, LEASE_SECONDS) as (process, pipe):
+            hear(pipe)
+            pipe.send("now")
+            time.sleep(moments.uniform(0.0, 0.2))
+            kill(process)
+        assert _is_whole(reader)
+    time.sleep(LEASE_SECONDS)
+    store.recover()
+    with running(run_grid, url, 400) as (_, pipe):
+        hear(pipe)
+        pipe.send("now")
+        hear(pipe)
+    assert _is_whole(reader)
+    losses = [result(trial_id).loss for trial_id in range(1, 401)]
+    np.testing.assert_array_equal(reader.curves(KEY).values, losses)
+
+
+def test_only_the_claims_of_the_dead_are_freed(
+    store: Store, url: str, take: Callable[..., list[Claim]]
+) -> None:
+    with running(hold_claims, url, 3, LEASE_SECONDS) as (process, pipe):
+        theirs = hear(pipe)
+        (mine,) = take(Spec(99))
+        assert store.recover() == 0
+        kill(process)
+        assert _recover_from_the_dead(store) == 3
+    assert store.commit(mine, result(), RUN)
+    assert not store.commit(theirs[0], result(), RUN)
