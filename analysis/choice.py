@@ -1,0 +1,150 @@
+"""Which stored configuration stands for a policy in an environment.
+
+A database may hold the paper's grid beside other widths, bounds and learners. A picture compares
+policies under one setting, the triple (env, model, learner) of an environment: the one with most
+trials of the reference policy. A policy that exists only with a model of its own (the oracle) is
+taken with that model, in the same env section. What was left out is said; a tie is an error.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from analysis.errors import AnalysisError
+from orchestrate.store import Cell
+
+REFERENCE = "d_optimal"
+"""The policy that all others are compared with."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A configuration and the number of its registered trials."""
+
+    cell: Cell
+    n_trials: int
+
+
+@dataclass(frozen=True)
+class Filter:
+    """What a user asked for; empty means everything.
+
+    ``where`` maps a dotted path of the configuration, such as ``model.width``, to a value; it says
+    nothing of a configuration that has no such path, such as the linear model of the oracle.
+    """
+
+    environments: tuple[str, ...] = ()
+    policies: tuple[str, ...] = ()
+    where: Mapping[str, object] = field(default_factory=dict)
+
+    def accepts(self, cell: Cell) -> bool:
+        return (
+            (not self.environments or cell.env in self.environments)
+            and (not self.policies or cell.policy in self.policies)
+            and all(
+                flatten(cell.config).get(path, value) == value for path, value in self.where.items()
+            )
+        )
+
+    def check_where(self, cells: Sequence[Cell]) -> None:
+        """Raise AnalysisError for a condition that no stored configuration meets."""
+        flat = [flatten(cell.config) for cell in cells]
+        for path, value in self.where.items():
+            stored = {json.dumps(entry[path]) for entry in flat if path in entry}
+            if not stored:
+                near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
+                raise AnalysisError(
+                    f"--where {path} names no value of a stored configuration: "
+                    f"choose for instance one of {', '.join(near) or 'model.width, env.gamma'}."
+                )
+            if not any(entry.get(path) == value for entry in flat if path in entry):
+                raise AnalysisError(
+                    f"--where {path}={json.dumps(value)} fits no stored configuration, "
+                    f"stored are {', '.join(sorted(stored))}: choose one of these."
+                )
+
+
+def choose(candidates: Iterable[Candidate]) -> list[Cell]:
+    """Return one configuration for each (environment, policy); raise AnalysisError on a tie."""
+    by_environment: dict[str, list[Candidate]] = {}
+    for candidate in candidates:
+        by_environment.setdefault(candidate.cell.env, []).append(candidate)
+    return [cell for group in by_environment.values() for cell in _choose_policies(group)]
+
+
+def _choose_policies(group: Sequence[Candidate]) -> list[Cell]:
+    setting = _setting(_reference(group).cell)
+    chosen = []
+    for policy in sorted({candidate.cell.policy for candidate in group}):
+        own = [candidate for candidate in group if candidate.cell.policy == policy]
+        same = [candidate for candidate in own if _setting(candidate.cell) == setting]
+        world = [candidate for candidate in own if _setting(candidate.cell)[0] == setting[0]]
+        if same or world:
+            chosen.append(_most(same or world).cell)
+    return chosen
+
+
+def _reference(group: Sequence[Candidate]) -> Candidate:
+    """Return the candidate that fixes the setting: most trials of the reference policy."""
+    totals: dict[tuple[str, str, str], int] = {}
+    for candidate in group:
+        setting = _setting(candidate.cell)
+        totals[setting] = totals.get(setting, 0) + candidate.n_trials
+    pool = [candidate for candidate in group if candidate.cell.policy == REFERENCE] or group
+    most = max(candidate.n_trials for candidate in pool)
+    pool = [candidate for candidate in pool if candidate.n_trials == most]
+    widest = max(totals[_setting(candidate.cell)] for candidate in pool)
+    pool = [candidate for candidate in pool if totals[_setting(candidate.cell)] == widest]
+    if len({_setting(candidate.cell) for candidate in pool}) > 1:
+        raise _tie(pool)
+    return pool[0]
+
+
+def _most(candidates: Sequence[Candidate]) -> Candidate:
+    most = max(candidate.n_trials for candidate in candidates)
+    pool = [candidate for candidate in candidates if candidate.n_trials == most]
+    if len(pool) > 1:
+        raise _tie(pool)
+    return pool[0]
+
+
+def _tie(pool: Sequence[Candidate]) -> AnalysisError:
+    first = pool[0]
+    path, values = difference([candidate.cell.config for candidate in pool])
+    listed = ", ".join(json.dumps(value, ensure_ascii=False) for value in values)
+    return AnalysisError(
+        f"{len(pool)} configurations of {first.cell.env} × {first.cell.policy} have "
+        f"{first.n_trials} trials each and differ in {path} ({listed}): "
+        f"choose one with --where {path}={json.dumps(values[0], ensure_ascii=False)}."
+    )
+
+
+def _setting(cell: Cell) -> tuple[str, str, str]:
+    env, model, learner = (
+        json.dumps(cell.config.get(section), sort_keys=True)
+        for section in ("env", "model", "learner")
+    )
+    return env, model, learner
+
+
+def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]:
+    """Return the first dotted path in which configurations differ, and its values."""
+    flat = [flatten(config) for config in configs]
+    for path in sorted(set().union(*flat)):
+        values = [entry.get(path) for entry in flat]
+        if any(value != values[0] for value in values):
+            return path, values
+    return "config_key", [None for _ in configs]
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, object]:
+    """Return a nested mapping as dotted paths."""
+    flat: dict[str, object] = {}
+    for key, value in config.items():
+        path = f"{prefix}{key}"
+        flat.update(flatten(value, f"{path}.") if isinstance(value, Mapping) else {path: value})
+    return flat

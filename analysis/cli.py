@@ -1,0 +1,162 @@
+"""The command line: what to read, what to make of it, and exit codes.
+
+0: made; 1: something of the request has no data; 2: the request cannot be answered; 3: trials are
+missing and ``--allow-partial`` was not given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from analysis.choice import Filter
+from analysis.divergence import DivergenceRule
+from analysis.errors import AnalysisError, IncompleteError
+from analysis.figures.plot import Request
+from analysis.figures.registry import NAMES, build, partial_warning
+from analysis.loss_curves import Axis
+from analysis.markdown import comparison_markdown, gaps_markdown, summary_markdown
+from analysis.selection import Selection, select
+from analysis.tables import compare_policies, summarise
+from dopt.errors import DoptError
+from orchestrate.store import Reader
+
+DEFAULT_URL = "sqlite:///results/results.db"
+COLUMNS = ("loss", "reachable_loss")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code."""
+    options = parser().parse_args(arguments)
+    try:
+        with Reader.open(options.db) as reader:
+            selection = select(reader, _filter(options))
+            _check_complete(selection, options.allow_partial)
+            for note in selection.notes:
+                say(f"note: {note}")
+            return int(options.run(reader, selection, options))
+    except IncompleteError as error:
+        sys.stderr.write(f"{error}\n")
+        return 3
+    except (AnalysisError, DoptError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    except OSError as error:
+        sys.stderr.write(f"error: {error.filename}: {error.strerror}: choose another --out.\n")
+        return 2
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    top = argparse.ArgumentParser(prog="python -m analysis", description=__doc__)
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+    figures = _command(commands, "figures", _figures, "draw the paper's figures and tables")
+    figures.add_argument("--out", type=Path, default=Path("figures"), help="folder (figures/)")
+    figures.add_argument("--only", action="append", choices=NAMES, help="this output (repeat)")
+    figures.add_argument("--x", choices=list(Axis), default=Axis.STEPS, help="axis of figure 1")
+    figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
+    summary = _command(commands, "summary", _summary, "mean final losses ± 2 SE, n")
+    compare = _command(commands, "compare", _compare, "D-optimal against every baseline, paired")
+    compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
+    for table in (summary, compare):
+        table.add_argument("--format", choices=("markdown", "csv"), default="markdown")
+    return top
+
+
+def _command(
+    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: object,
+    help_text: str,
+) -> argparse.ArgumentParser:
+    command = commands.add_parser(name, help=help_text, description=help_text)
+    command.set_defaults(run=run)
+    url = os.environ.get("DOPT_DB", DEFAULT_URL)
+    command.add_argument("--db", default=url, help=f"database (DOPT_DB, {DEFAULT_URL})")
+    command.add_argument("--env", nargs="+", default=(), help="only these environments")
+    command.add_argument("--policy", nargs="+", default=(), help="only these policies")
+    command.add_argument(
+        "--where",
+        nargs="+",
+        default=(),
+        metavar="PATH=VALUE",
+        help="only configurations with this value, such as model.width=32",
+    )
+    command.add_argument(
+        "--diverged",
+        choices=list(DivergenceRule),
+        default=DivergenceRule.EXCLUDE,
+        help="what a diverged trial counts as",
+    )
+    command.add_argument("--allow-partial", action="store_true", help="go on without the missing")
+    return command
+
+
+def _filter(options: argparse.Namespace) -> Filter:
+    where = dict(_condition(text) for text in options.where)
+    return Filter(tuple(options.env), tuple(options.policy), where)
+
+
+def _condition(text: str) -> tuple[str, object]:
+    path, equals, value = text.partition("=")
+    if not equals or not path:
+        raise AnalysisError(
+            f"--where {text} is no condition, PATH=VALUE is expected: "
+            f"write for instance --where model.width=32."
+        )
+    try:
+        return path, json.loads(value)
+    except ValueError:
+        return path, value
+
+
+def _check_complete(selection: Selection, allow_partial: bool) -> None:
+    if selection.gaps and not allow_partial:
+        missing = sum(len(gap.seeds) for gap in selection.gaps)
+        raise IncompleteError(
+            f"{gaps_markdown(selection.gaps)}\n\nerror: {missing} trials are missing, a complete "
+            f"grid is expected: run the launch again, narrow the request by --env and --policy, "
+            f"or give --allow-partial to go on with what there is."
+        )
+
+
+def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    request = Request(DivergenceRule(options.diverged), Axis(options.x))
+    names = tuple(options.only or NAMES)
+    empty = 0
+    for outcome in build(reader, selection, request, options.out, names, force=options.force):
+        say(f"{options.out / outcome.name}: {outcome.state}")
+        empty += bool(options.only) and outcome.state.startswith("not drawn")
+    return 1 if empty else 0
+
+
+def _summary(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    table = summarise(reader, selection, DivergenceRule(options.diverged))
+    text = table.to_csv(index=False) if options.format == "csv" else summary_markdown(table)
+    return _print_table(text, selection)
+
+
+def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    rule = DivergenceRule(options.diverged)
+    table = compare_policies(reader, selection, options.column, rule)
+    markdown = options.format == "markdown"
+    return _print_table(
+        comparison_markdown(table, rule) if markdown else table.to_csv(index=False), selection
+    )
+
+
+def _print_table(text: str, selection: Selection) -> int:
+    if selection.gaps:
+        sys.stderr.write(f"{partial_warning(selection)}\n")
+    sys.stdout.write(text)
+    return 0
+
+
+def say(text: str) -> None:
+    """Print one line of progress."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()

@@ -1,0 +1,67 @@
+"""Trials that a complete grid would have and the database has not finished."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.spec import TrialSpec
+from orchestrate.store import Cell
+
+Compatible = Callable[[Cell, Cell], bool]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Seeds of one environment and policy that are not finished, and in which state they are."""
+
+    env: str
+    policy: str
+    seeds: tuple[int, ...]
+    states: str
+
+    def describe_seeds(self) -> str:
+        """Return the seeds as ranges, such as ``0-4, 7``."""
+        return ranges(self.seeds)
+
+
+def ranges(seeds: Iterable[int]) -> str:
+    """Return whole numbers as a short text of ranges."""
+    runs: list[list[int]] = []
+    for seed in sorted(seeds):
+        if runs and seed == runs[-1][1] + 1:
+            runs[-1][1] = seed
+        else:
+            runs.append([seed, seed])
+    return ", ".join(str(low) if low == high else f"{low}-{high}" for low, high in runs)
+
+
+def is_possible(policy: Cell, environment: Cell) -> bool:
+    """Whether a policy's configuration makes sense with another environment's section."""
+    config = {key: value for key, value in policy.config.items() if key in _SECTIONS}
+    try:
+        TrialSpec.from_mapping({**config, "env": environment.config["env"], "seed": 0})
+    except IncompatibleError:
+        return False
+    except SpecificationError:
+        return True
+    return True
+
+
+_SECTIONS = ("env", "policy", "model", "learner")
+
+
+def absent_cells(
+    cells: Sequence[Cell], compatible: Compatible = is_possible
+) -> list[tuple[str, str]]:
+    """Return the (environment, policy) pairs of which nothing is stored though they make sense."""
+    stored = {(cell.env, cell.policy) for cell in cells}
+    environments = {cell.env: cell for cell in cells}
+    policies = {cell.policy: cell for cell in cells}
+    return [
+        (env, policy)
+        for env in environments
+        for policy in policies
+        if (env, policy) not in stored and compatible(policies[policy], environments[env])
+    ]

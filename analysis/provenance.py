@@ -1,0 +1,86 @@
+"""Where the numbers of a figure or a table come from; no clock, so that bytes are the same."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from analysis.selection import Selection
+from orchestrate.store import Reader
+
+LIBRARIES = ("dopt", "matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")
+PACKAGE = Path(__file__).parent
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of Python and the libraries; None where one is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for library in LIBRARIES:
+        try:
+            found[library] = importlib.metadata.version(library)
+        except importlib.metadata.PackageNotFoundError:
+            found[library] = None
+    return found
+
+
+def git_state() -> dict[str, str | bool | None]:
+    """Return commit and dirty flag of the code; None outside a repository."""
+    commit = _git("rev-parse", "HEAD")
+    changes = _git("status", "--porcelain", "--untracked-files=no")
+    return {"commit": commit, "dirty": bool(changes) if commit else None}
+
+
+def _git(*arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", *arguments], cwd=PACKAGE, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def code_hash() -> str:
+    """Return the SHA-256 of this package's files: a changed drawing is drawn again."""
+    digest = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def describe(reader: Reader, selection: Selection) -> dict[str, Any]:
+    """Return what every output says of its origin."""
+    missing = {(gap.env, gap.policy): len(gap.seeds) for gap in selection.gaps}
+    return {
+        "database": reader.safe_url,
+        "schema": reader.schema_version(),
+        "selection": selection.fingerprint(),
+        "git": git_state(),
+        "versions": versions(),
+        "cells": [
+            {
+                "env": entry.cell.env,
+                "policy": entry.cell.policy,
+                "model": entry.cell.model,
+                "learner": entry.cell.learner,
+                "width": entry.cell.width,
+                "config_key": entry.cell.config_key,
+                "n_registered": len(entry.trials),
+                "n_finished": len(entry.finished),
+                "n_diverged": sum(trial.status == "diverged" for trial in entry.trials),
+                "n_missing": missing.get((entry.cell.env, entry.cell.policy), 0),
+            }
+            for entry in selection.entries
+        ],
+        "absent": [
+            [env, policy]
+            for env, policy in missing
+            if all((e.cell.env, e.cell.policy) != (env, policy) for e in selection.entries)
+        ],
+        "notes": list(selection.notes),
+    }

@@ -1,0 +1,140 @@
+"""A small database that looks like a real one: true systems, made-up losses, the real store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.errors import IncompatibleError
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+from dopt.systems import System
+from dopt.systems.equilibrium import eigenmode
+from orchestrate.store import LaunchRecord, RunRecord, Store
+
+Array = npt.NDArray[np.float64]
+
+ENVIRONMENTS = ("pendulum", "cartpole", "arm", "quadrotor")
+POLICIES = ("d_optimal", "oracle", "uniform", "periodic", "random")
+RATES = {"d_optimal": 5.0, "oracle": 7.0, "uniform": 3.5, "periodic": 3.0, "random": 1.5}
+
+
+def make_spec(system: str, name: str, seed: int, **sections: Mapping[str, object]) -> TrialSpec:
+    """Return a trial of the paper's setting; ``sections`` override fields of env, model, ..."""
+    linear = name == "oracle"
+    mapping: dict[str, object] = {
+        "env": {"name": system},
+        "policy": {"name": name},
+        "model": {"name": "linear" if linear else "mlp"},
+        "learner": {"name": "recursive_least_squares" if linear else "adam_window"},
+        "seed": seed,
+    }
+    for key, fields in sections.items():
+        mapping[key] = {**mapping[key], **fields}  # type: ignore[dict-item]
+    return TrialSpec.from_mapping(mapping)
+
+
+def make_grid(
+    environments: Iterable[str] = ENVIRONMENTS,
+    policies: Iterable[str] = POLICIES,
+    seeds: Iterable[int] = range(4),
+    **sections: Mapping[str, object],
+) -> list[TrialSpec]:
+    """Return the trials of a grid, incompatible pairs left out."""
+    specs = []
+    for env in environments:
+        for policy in policies:
+            try:
+                specs += [make_spec(env, policy, seed, **sections) for seed in seeds]
+            except IncompatibleError:
+                continue
+    return specs
+
+
+def fake_result(spec: TrialSpec, diverged_at: int | None = None) -> TrialResult:
+    """Simulate the true system under a stand-in for the policy; the losses fall exponentially."""
+    system, policy = spec.system, spec.policy.name
+    rng = np.random.default_rng([spec.seed, *policy.encode(), *system.name.encode()])
+    inputs = _inputs(system, policy, rng)
+    states = _simulate(system, inputs, np.random.default_rng(spec.seed))
+    loss = _losses(system.horizon, RATES.get(policy, 2.0), rng)
+    columns = {
+        "loss": loss,
+        "reachable_loss": 0.5 * loss,
+        "plan_us": rng.gamma(5, 4, system.horizon),
+        "learn_us": rng.gamma(5, 8, system.horizon),
+        "evaluate_us": rng.gamma(5, 2, system.horizon),
+    }
+    if diverged_at is not None:
+        for values in (*columns.values(), inputs, states[1:]):
+            values[diverged_at:] = np.nan
+    return TrialResult(
+        **columns,
+        states=states,
+        inputs=inputs,
+        parameters=rng.normal(size=8),
+        diverged_at=diverged_at,
+        wall_seconds=0.1,
+        cpu_seconds=0.1,
+    )
+
+
+def _inputs(system: System, policy: str, rng: np.random.Generator) -> Array:
+    T, m, time = system.horizon, system.n_inputs, system.dt * np.arange(system.horizon)
+    mode = eigenmode(system)
+    if policy == "random" or mode is None:
+        noise: Array = system.gamma / np.sqrt(m) * rng.normal(size=(T, m))
+        return noise
+    wave = np.sin(mode.frequency * time)
+    if policy == "d_optimal":
+        wave = np.where(rng.random(T) < 0.1, -1.0, 1.0) * np.where(wave < 0, -1.0, 1.0)
+    elif policy != "periodic":
+        wave = np.sign(wave + rng.normal(size=T))
+    inputs: Array = system.gamma * wave[:, None] * mode.direction
+    return inputs
+
+
+def _simulate(system: System, inputs: Array, rng: np.random.Generator) -> Array:
+    states = np.empty((system.horizon + 1, system.n_states))
+    states[0] = system.initial_state
+    noise = np.sqrt(system.dt) * system.noise * rng.normal(size=(system.horizon, system.n_states))
+    for t, u in enumerate(inputs):
+        states[t + 1] = states[t] + system.dt * system.derivative(states[t], u) + noise[t]
+    return states
+
+
+def _losses(horizon: int, rate: float, rng: np.random.Generator) -> Array:
+    level = np.exp(rng.normal(scale=0.4))
+    floor = 0.3 * np.exp(rng.normal(scale=0.3))
+    ripple = np.exp(np.cumsum(rng.normal(scale=0.02, size=horizon)))
+    curve: Array = (12 * level * np.exp(-rate * np.arange(horizon) / horizon) + floor) * ripple
+    return curve
+
+
+def fill(
+    url: str,
+    specs: list[TrialSpec],
+    skipped: Iterable[TrialSpec] = (),
+    diverged: Mapping[str, int] | None = None,
+) -> None:
+    """Register all trials and run all but the skipped; ``diverged`` maps trial keys to steps."""
+    left = {spec.trial_key for spec in skipped}
+    with Store.open(url) as store:
+        launch = store.begin_launch(LaunchRecord(argv=["test"], overrides=[], host="h", pid=1))
+        store.register(launch, specs)
+        todo = [spec for spec in specs if spec.trial_key not in left]
+        claims = {
+            claim.trial_key: claim for claim in store.claim(launch, [s.trial_key for s in todo])
+        }
+        now = datetime(2026, 1, 1, tzinfo=UTC)
+        run = RunRecord("h", 1, 0.1, 0.1, 1, now, now)
+        items = [
+            (claims[spec.trial_key], fake_result(spec, (diverged or {}).get(spec.trial_key)), run)
+            for spec in todo
+            if spec.trial_key in claims
+        ]
+        assert all(store.commit_many(items))
+        store.end_launch(launch, "done")

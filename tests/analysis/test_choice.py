@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import pytest
+
+from analysis.choice import Candidate, Filter, choose, difference, flatten
+from analysis.errors import AnalysisError
+from orchestrate.store import Cell
+from tests.analysis.synthetic import make_spec
+
+
+def cell(system: str, name: str, **sections: Mapping[str, object]) -> Cell:
+    spec = make_spec(system, name, 0, **sections)
+    counts = dict.fromkeys(
+        ("n_done", "n_diverged", "n_failed", "n_cancelled", "n_pending", "n_running"), 0
+    )
+    config = json.loads(spec.config_json)
+    return Cell(spec.config_key, **spec.columns(), **counts, config=config)  # type: ignore[arg-type]
+
+
+WIDE = {"model": {"width": 64}}
+NARROW = {"model": {"width": 8}}
+
+
+def test_the_setting_with_most_trials_of_the_reference_decides_for_all_policies() -> None:
+    usual, wide = cell("pendulum", "d_optimal"), cell("pendulum", "d_optimal", **WIDE)
+    random, more = cell("pendulum", "random"), cell("pendulum", "random", **WIDE)
+    chosen = choose(
+        [Candidate(wide, 20), Candidate(usual, 100), Candidate(random, 10), Candidate(more, 50)]
+    )
+    assert {entry.config_key for entry in chosen} == {usual.config_key, random.config_key}
+
+
+def test_the_oracle_comes_with_the_model_of_its_own() -> None:
+    usual, oracle = cell("pendulum", "d_optimal"), cell("pendulum", "oracle")
+    assert choose([Candidate(usual, 5), Candidate(oracle, 9)]) == [usual, oracle]
+
+
+def test_another_world_is_never_mixed_in() -> None:
+    usual = cell("pendulum", "d_optimal")
+    oracle = cell("pendulum", "oracle", env={"gamma": 3.0})
+    assert choose([Candidate(usual, 5), Candidate(oracle, 9)]) == [usual]
+
+
+def test_without_the_reference_the_commonest_setting_is_taken() -> None:
+    few, many = cell("pendulum", "random", **WIDE), cell("pendulum", "random")
+    assert choose([Candidate(few, 3), Candidate(many, 4)]) == [many]
+
+
+def test_a_tie_names_the_difference_and_the_way_out() -> None:
+    wide, narrow = (cell("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
+    with pytest.raises(AnalysisError, match=r"20 trials each.*model\.width.*--where model\.width="):
+        choose([Candidate(wide, 20), Candidate(narrow, 20)])
+
+
+def test_a_tie_between_variants_of_one_policy_is_an_error_too() -> None:
+    mild, strong = (
+        cell("pendulum", "d_optimal", policy={"regularization": value}) for value in (1e-2, 1e-4)
+    )
+    with pytest.raises(AnalysisError, match=r"policy\.regularization"):
+        choose([Candidate(mild, 5), Candidate(strong, 5)])
+
+
+def test_more_trials_of_the_baselines_settle_a_tie_of_the_reference() -> None:
+    wide, narrow = (cell("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
+    random = cell("pendulum", "random", **NARROW)
+    chosen = choose([Candidate(wide, 20), Candidate(narrow, 20), Candidate(random, 20)])
+    assert chosen == [narrow, random]
+
+
+def test_filter_by_value() -> None:
+    wide = cell("pendulum", "d_optimal", **WIDE)
+    assert Filter(where={"model.width": 64}).accepts(wide)
+    assert Filter(where={"env.gamma": int(wide.gamma)}).accepts(wide) == wide.gamma.is_integer()
+    assert not Filter(where={"model.width": 16}).accepts(wide)
+    assert not Filter(environments=("arm",)).accepts(wide)
+    assert not Filter(policies=("random",)).accepts(wide)
+
+
+def test_a_condition_says_nothing_of_a_model_without_the_value() -> None:
+    assert Filter(where={"model.width": 64}).accepts(cell("pendulum", "oracle"))
+
+
+def test_a_condition_that_nothing_meets_is_a_sentence() -> None:
+    cells = [cell("pendulum", "oracle"), cell("pendulum", "random")]
+    with pytest.raises(AnalysisError, match=r"model\.with names no value .* model\.width"):
+        Filter(where={"model.with": 16}).check_where(cells)
+    with pytest.raises(AnalysisError, match=r"model\.width=9 fits no .* stored are 16"):
+        Filter(where={"model.width": 9}).check_where(cells)
+
+
+def test_flatten() -> None:
+    assert flatten({"a": {"b": 1, "c": {"d": 2}}, "e": 3}) == {"a.b": 1, "a.c.d": 2, "e": 3}
+
+
+def test_difference_of_equal_configurations_is_their_key() -> None:
+    same = cell("pendulum", "random").config
+    assert difference([same, same])[0] == "config_key"

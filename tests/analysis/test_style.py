@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from analysis.figures.axes import angle_text, log_limits, log_ticks, rows_and_columns
+from analysis.figures.style import mathematical, policy_style
+from dopt.policies import POLICIES
+
+
+def test_no_two_policies_look_alike() -> None:
+    for one, other in itertools.combinations(POLICIES, 2):
+        a, b = policy_style(one), policy_style(other)
+        assert a.line != b.line, (one, other)
+        assert math.dist(to_rgb(a.colour), to_rgb(b.colour)) > 0.25, (one, other)
+        assert a.label != b.label
+
+
+def test_every_colour_is_seen_on_white() -> None:
+    for policy in POLICIES:
+        luminance = np.dot(to_rgb(policy_style(policy).colour), (0.2126, 0.7152, 0.0722))
+        assert luminance < 0.75
+
+
+def test_a_policy_of_the_user_has_a_style() -> None:
+    assert policy_style("my_policy").label == "my policy"
+    assert policy_style("my_policy") == policy_style("my_policy")
+
+
+def test_dotted_letters_become_mathematics() -> None:
+    assert mathematical("φ̇ [rad/s]") == r"$\dot{\varphi}$ [rad/s]"
+    assert mathematical("ẏ [m/s]") == r"$\dot{y}$ [m/s]"
+    assert mathematical("x [m]") == "x [m]"
+
+
+@pytest.mark.parametrize(
+    ("quarters", "text"), [(0, "0"), (1, "π/2"), (-2, "−π"), (3, "3π/2"), (4, "2π"), (-6, "−3π")]
+)
+def test_angles_as_multiples(quarters: int, text: str) -> None:
+    assert angle_text(quarters * math.pi / 2) == text
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.3, 0.9), (0.2, 30.0), (1e-5, 10.0), (2.0, 2.2)])
+def test_a_logarithmic_axis_always_has_two_labels(low: float, high: float) -> None:
+    axes = Figure().subplots()
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    log_ticks(axes.yaxis, low, high)
+    shown = [tick for tick in axes.yaxis.get_majorticklocs() if low <= tick <= high]
+    assert len(shown) >= 2
+
+
+def test_log_limits_ignore_what_a_logarithm_cannot_show() -> None:
+    low, high = log_limits(np.array([np.nan, -1.0, 0.0, 2.0, 8.0]))
+    assert 0 < low < 2
+    assert high > 8
+    assert log_limits(np.array([np.nan])) == (0.1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("panels", "widest", "grid"), [(1, 3, (1, 1)), (4, 2, (2, 2)), (4, 3, (2, 2)), (5, 3, (2, 3))]
+)
+def test_rows_and_columns(panels: int, widest: int, grid: tuple[int, int]) -> None:
+    assert rows_and_columns(panels, widest) == grid

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from analysis.choice import Filter
+from analysis.counts import count_text
+from analysis.divergence import DivergenceRule
+from analysis.errors import AnalysisError
+from analysis.loss_curves import Axis, measure_curves, tabulate_curves
+from analysis.markdown import comparison_markdown, number, p_text, plus_minus, summary_markdown
+from analysis.selection import select
+from analysis.tables import compare_policies, summarise
+from orchestrate.store import Reader
+from tests.analysis.synthetic import fake_result, make_spec
+
+SEEDS = range(5)
+
+
+def final(env: str, policy: str, seed: int) -> float:
+    spec = make_spec(env, policy, seed, env={"horizon": 60})
+    return float(fake_result(spec).loss[-1])
+
+
+def test_summary_is_that_of_the_trials(reader: Reader) -> None:
+    table = summarise(reader, select(reader, Filter()))
+    row = table[(table.env == "pendulum") & (table.policy == "uniform")].iloc[0]
+    losses = np.array([final("pendulum", "uniform", seed) for seed in SEEDS])
+    assert row.loss == pytest.approx(losses.mean())
+    assert row.loss_2se == pytest.approx(2 * losses.std(ddof=1) / math.sqrt(5))
+    assert row.reachable_loss == pytest.approx(losses.mean() / 2)
+    assert row.n == 5
+
+
+def test_a_diverged_trial_is_left_out_counted_or_the_worst(reader: Reader) -> None:
+    selection = select(reader, Filter(("cartpole",), ("random",)))
+    losses = [final("cartpole", "random", seed) for seed in SEEDS if seed != 2]
+    left_out = summarise(reader, selection).iloc[0]
+    assert (left_out.n, left_out.n_diverged) == (4, 1)
+    assert left_out.loss == pytest.approx(np.mean(losses))
+    worst = summarise(reader, selection, DivergenceRule.WORST).iloc[0]
+    assert worst.n == 5
+    assert worst.loss == pytest.approx(np.mean([*losses, max(losses)]))
+
+
+def test_comparison_pairs_the_seeds(reader: Reader) -> None:
+    table = compare_policies(reader, select(reader, Filter()))
+    row = table[(table.env == "cartpole") & (table.baseline == "random")].iloc[0]
+    seeds = [seed for seed in SEEDS if seed != 2]
+    logs = [
+        math.log(final("cartpole", "d_optimal", seed) / final("cartpole", "random", seed))
+        for seed in seeds
+    ]
+    assert row.n_pairs == 4
+    assert row.ratio == pytest.approx(math.exp(np.mean(logs)))
+    assert row.low <= row.ratio <= row.high
+    assert row.p_adjusted >= row.p_value
+    assert len(table) == 4 + 4 + 3
+
+
+def test_a_row_does_not_depend_on_the_others(reader: Reader) -> None:
+    whole = compare_policies(reader, select(reader, Filter()))
+    part = compare_policies(
+        reader, select(reader, Filter(("cartpole",), ("d_optimal", "periodic")))
+    )
+    same = whole[(whole.env == "cartpole") & (whole.baseline == "periodic")]
+    columns = ["n_pairs", "ratio", "low", "high", "p_value"]
+    assert same[columns].to_numpy().tolist() == part[columns].to_numpy().tolist()
+
+
+def test_the_other_column(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",)))
+    loss, reachable = (
+        compare_policies(reader, selection, column) for column in ("loss", "reachable_loss")
+    )
+    assert reachable.ratio.to_numpy() == pytest.approx(loss.ratio.to_numpy())
+
+
+def test_nothing_to_compare_is_a_sentence(reader: Reader) -> None:
+    with pytest.raises(AnalysisError, match="only random is selected"):
+        compare_policies(reader, select(reader, Filter(policies=("random",))))
+
+
+def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",), ("random",)))
+    arguments = (reader, selection, "loss", DivergenceRule.EXCLUDE)
+    table = tabulate_curves(measure_curves(*arguments, Axis.STEPS))
+    losses = [
+        fake_result(make_spec("pendulum", "random", seed, env={"horizon": 60})).loss
+        for seed in SEEDS
+    ]
+    assert table["t"].tolist() == list(range(60))
+    assert table["mean"].to_numpy() == pytest.approx(np.mean(losses, axis=0))
+    seconds = tabulate_curves(measure_curves(*arguments, Axis.SECONDS))
+    dt = selection.entries[0].cell.dt
+    assert seconds["x"].to_numpy() == pytest.approx(dt * table["x"].to_numpy())
+
+
+@pytest.mark.parametrize(
+    ("mean", "error", "text"),
+    [
+        (12.345, 0.567, "12.35 ± 0.57"),
+        (1234.5, 56.7, "1234 ± 57"),
+        (0.01234, 0.00056, "0.01234 ± 0.00056"),
+        (2.0, math.nan, "2.00"),
+        (math.nan, math.nan, "–"),
+    ],
+)
+def test_plus_minus(mean: float, error: float, text: str) -> None:
+    assert plus_minus(mean, error) == text
+
+
+def test_numbers() -> None:
+    assert number(0.5) == "0.500"
+    assert number(1234.0) == "1.23e+03"
+    assert p_text(0.0123) == "0.012"
+    assert p_text(3.21e-9) == "3e-09"
+
+
+def test_markdown_shows_counts_and_dashes() -> None:
+    nothing = {"ratio": math.nan, "low": math.nan, "high": math.nan, "improvement": math.nan}
+    row = {"env": "arm", "baseline": "random", "n_pairs": 0, **nothing}
+    table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
+    line = comparison_markdown(table, "exclude").splitlines()[2]
+    assert [field.strip() for field in line.strip("|").split("|")] == [
+        "arm", "random", "–", "–", "–", "–", "0",
+    ]  # fmt: skip
+    values = {"loss": 1.0, "loss_2se": 0.1, "reachable_loss": 2.0, "reachable_loss_2se": 0.2}
+    counts = {"env": "arm", "policy": "random", "n": 98, "n_diverged": 2}
+    assert "1.00 ± 0.10" in summary_markdown(pd.DataFrame([counts | values]))
+
+
+def test_count_text() -> None:
+    assert count_text({"a": "5", "b": "5"}) == "n = 5"
+    assert count_text({"a": "5", "b": "4/5, 1 diverged", "c": "5"}) == ("n = 5; b: 4/5, 1 diverged")
