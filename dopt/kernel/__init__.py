@@ -18,7 +18,7 @@ def warm_up() -> None:
     from dopt.systems import SYSTEMS
 
     for system in SYSTEMS.values():
-        compiled_equations(system)
+        compiled_equations(system())
     section = {"name": "pendulum", "horizon": 2, "grid_points": [2, 2]}
     names = {"policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
     sections = {key: {"name": name} for key, name in names.items()}

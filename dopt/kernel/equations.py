@@ -20,6 +20,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from dopt.kernel.compiler import compilable
 from dopt.systems import elementary
+from dopt.systems.base import System
 
 KNOWN = types.void(float64[::1], float64[::1], float64[::1], float64[::1])
 ACCELERATIONS = types.void(float64[::1], float64[::1], float64[::1])
@@ -65,12 +66,21 @@ class Equations(NamedTuple):
     complex_accelerations: Any
 
 
+def compiled_equations(system: System) -> Equations:
+    """Compile the equations of a system's class, or load them from the disk cache."""
+    sizes = (system.n_states, system.n_inputs, len(system.physical))
+    return _compiled_functions(system.known, system.accelerations, *sizes)
+
+
 @functools.cache
-def compiled_equations(system: Any) -> Equations:
-    """Compile the equations of a system, given by its class, or load them from the disk cache."""
-    n_states, n_inputs = len(system.state_labels), len(system.input_labels)
-    n_parameters = len(system.physical)
-    known, accelerations = compilable(system.known), compilable(system.accelerations)
+def _compiled_functions(
+    known: Callable[..., Any],
+    accelerations: Callable[..., Any],
+    n_states: int,
+    n_inputs: int,
+    n_parameters: int,
+) -> Equations:
+    known, accelerations = compilable(known), compilable(accelerations)
     return Equations(
         _known_into(known, n_states, n_inputs, n_parameters),
         _accelerations_into(accelerations, n_states, n_parameters, ACCELERATIONS),

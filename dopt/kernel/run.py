@@ -52,7 +52,7 @@ class KernelTrial:
         if self.diverged_at is not None:
             return
         world, network, rules, points = self.constants
-        equations = compiled_equations(type(self.spec.system))
+        equations = compiled_equations(self.spec.system)
         call = (world, network, rules, self.randomness, points, self.state, self.record)
         self.done = int(_loop_for(*call)(*equations, *call, self.done, last))
         if self.done < last:
