@@ -1,0 +1,54 @@
+# One command each, the same by hand and in CI. Every target sets up .venv by itself when missing.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DB ?= sqlite:///results/results.db
+SMOKE_DB := sqlite:///results/smoke.db
+
+# One thread to a process: the grid runs one worker on each core.
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+export MKL_NUM_THREADS := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help setup test lint format grid figures smoke bench clean
+
+help:  ## show the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+setup: $(VENV)/ready  ## create .venv with the tested versions
+
+$(VENV)/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+test: setup  ## run the test suite
+	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadgroup
+
+lint: setup  ## check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup  ## apply the style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+grid: setup  ## run the paper's grid, or what is left of it
+	$(BIN)/python orchestrate/launch.py -m 'env=glob(*)' 'policy=glob(*)' store.url='$(DB)'
+
+figures: grid  ## run the paper's grid and draw its figures
+	$(BIN)/python -m analysis figures --db '$(DB)' --out figures
+
+smoke: setup  ## a small grid and its figures, in a database of their own
+	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'
+	$(BIN)/python -m analysis figures --db '$(SMOKE_DB)' --out figures/smoke
+
+bench: setup  ## print measured speed beside its targets
+	$(BIN)/python -m benchmarks
+
+clean:  ## remove what the targets made, except results
+	rm -rf $(VENV) figures .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
