@@ -1,0 +1,103 @@
+"""From the combinations of a command line to the trials of a grid."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.spec import TrialSpec
+
+TRIAL_SECTIONS = ("env", "policy", "model", "learner", "seed")
+"""The parts of a configuration that make a trial."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Combination:
+    """Settings of one cell of a grid, in plain types.
+
+    Attributes
+    ----------
+    settings
+        Sections of the resolved configuration.
+    inner
+        Seeds of the cell, or None for the one in ``settings``.
+    words
+        The swept overrides that made it, as they would be typed.
+    """
+
+    settings: Mapping[str, Any]
+    inner: Sequence[Any] | None = None
+    words: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The distinct trials of a launch, and what became of the rest.
+
+    Attributes
+    ----------
+    trials
+        In the order in which they run: every cell with its first seed, then with its second ...
+    asked
+        Number of trials that the command line spans, repeats and left-out ones included.
+    left_out
+        Sentence for each reason to leave trials out, with their number.
+    """
+
+    trials: list[TrialSpec]
+    asked: int
+    left_out: dict[str, int]
+
+    @property
+    def repeats(self) -> int:
+        """Number of trials that the command line names more than once."""
+        return self.asked - sum(self.left_out.values()) - len(self.trials)
+
+
+def build_grid(combinations: Iterable[Combination], *, alone: bool = False) -> Grid:
+    """Return the typed trials; pairs of choices that make no sense together are left out.
+
+    ``alone`` says that a single trial was asked for, and such a pair is an error then.
+
+    Raises
+    ------
+    SpecificationError
+        If a value is unknown, of the wrong type or out of bounds, or if nothing is left.
+    """
+    cells: list[list[TrialSpec]] = []
+    left_out: dict[str, int] = {}
+    asked = 0
+    for combination in combinations:
+        size = 1 if combination.inner is None else len(combination.inner)
+        asked += size
+        try:
+            cells.append(_trials(combination))
+        except IncompatibleError as error:
+            if alone:
+                raise
+            reason = f"{_choices(combination)}: {error}"
+            left_out[reason] = left_out.get(reason, 0) + size
+    trials = list({trial.trial_key: trial for trial in _seed_by_seed(cells)}.values())
+    if not trials:
+        raise SpecificationError(f"the grid is empty: {' '.join(left_out) or 'nothing was asked'}")
+    return Grid(trials, asked, left_out)
+
+
+def _trials(combination: Combination) -> list[TrialSpec]:
+    trial = TrialSpec.from_mapping(combination.settings)
+    if combination.inner is None:
+        return [trial]
+    return [trial.with_seed(seed) for seed in combination.inner]
+
+
+def _choices(combination: Combination) -> str:
+    """Return the options of the groups, such as ``env=quadrotor policy=periodic``."""
+    sections = combination.settings.items()
+    return " ".join(f"{key}={part['name']}" for key, part in sections if key in ("env", "policy"))
+
+
+def _seed_by_seed(cells: Sequence[Sequence[TrialSpec]]) -> Iterator[TrialSpec]:
+    for index in range(max(map(len, cells), default=0)):
+        yield from (cell[index] for cell in cells if index < len(cell))

@@ -1,0 +1,143 @@
+"""The axes of a grid: one for each override, with the values that it takes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob, Override, OverrideType, QuotedString
+from hydra.errors import ConfigCompositionException
+
+from dopt.errors import unknown_name
+
+NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
+"""Groups and sections that hold for a whole launch."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """One key of the command line and its values.
+
+    Attributes
+    ----------
+    key
+        Configuration key or group as typed, with the prefix ``+``, ``++`` or ``~`` and the package.
+    texts
+        The values as Hydra would write them after the equals sign.
+    values
+        The values themselves, of the types that Hydra's grammar gives them.
+    kind
+        A ``choice`` of a group, a ``scalar`` that replaces another one, or an ``edit``: anything
+        else that changes the composed configuration, such as ``+k=1``, a list or a deletion.
+    """
+
+    key: str
+    texts: tuple[str, ...]
+    values: tuple[object, ...]
+    kind: Literal["choice", "scalar", "edit"]
+
+    @property
+    def swept(self) -> bool:
+        return len(self.texts) > 1
+
+    def argument(self, index: int) -> str:
+        """Return the override that sets value ``index``."""
+        return f"{self.key}={self.texts[index]}"
+
+
+def read_axes(loader: ConfigLoader, arguments: Sequence[str]) -> list[Axis]:
+    """Return the axes that the overrides span; a later override of a key replaces an earlier one.
+
+    Raises
+    ------
+    HydraException
+        If an override does not follow Hydra's grammar, or its sweep is empty or endless.
+    SpecificationError
+        If a glob matches nothing.
+    """
+    parsed = OverridesParser.create(config_loader=loader).parse_overrides(list(arguments))
+    last = {override.get_key_element(): override for override in parsed}
+    axes = [_axis(loader, override) for override in last.values()]
+    return [_without_clash(axis, axes) for axis in axes]
+
+
+def _axis(loader: ConfigLoader, override: Override) -> Axis:
+    key = override.get_key_element()
+    texts: tuple[str, ...]
+    values: tuple[object, ...]
+    if not override.is_sweep_override():
+        texts, values = (override.get_value_element_as_str(),), (override.value(),)
+    else:
+        _check_sweep(loader, override)
+        texts = tuple(override.sweep_string_iterator())
+        values = tuple(_unquoted(value) for value in override.sweep_iterator())
+    if loader.get_group_options(override.key_or_group, results_filter=None) and not any(
+        isinstance(value, dict) for value in values
+    ):
+        return Axis(key, texts, values, "choice")
+    scalar = override.type == OverrideType.CHANGE and override.package is None
+    return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
+
+
+def _check_sweep(loader: ConfigLoader, override: Override) -> None:
+    key, line = override.key_or_group, override.input_line
+    if key.replace("/", ".").split(".")[0] in NOT_SWEPT:
+        raise ConfigCompositionException(
+            f"'{line}' sweeps a setting of the whole launch, only trials can be swept: give one "
+            "value."
+        )
+    if not override.is_discrete_sweep():
+        raise ConfigCompositionException(
+            f"'{line}' has no finite list of values: use a choice a,b or range(start,stop,step)."
+        )
+    if next(iter(override.sweep_iterator()), None) is None:
+        raise _empty(loader, override)
+
+
+def _empty(loader: ConfigLoader, override: Override) -> Exception:
+    key = override.key_or_group
+    glob: object = override.value()
+    options = loader.get_group_options(key, results_filter=ObjectType.CONFIG)
+    if not isinstance(glob, Glob):
+        return ConfigCompositionException(
+            f"'{override.input_line}' has no values, at least one is expected: check its bounds."
+        )
+    if options:
+        return unknown_name(f"glob of {key}", ",".join(glob.include), options)
+    names = sorted(name for name in loader.list_groups("") if name != "hydra")
+    return ConfigCompositionException(
+        f"'{override.input_line}' is a glob, but '{key}' is no group with options: groups are "
+        f"{', '.join(names)}."
+    )
+
+
+def _unquoted(value: object) -> object:
+    return value.text if isinstance(value, QuotedString) else value
+
+
+def _plain(value: object) -> bool:
+    """Return whether ``value`` stands for itself wherever it is put."""
+    if isinstance(value, str):
+        return "${" not in value and value != "???"
+    return value is None or isinstance(value, bool | int | float)
+
+
+def _without_clash(axis: Axis, axes: Sequence[Axis]) -> Axis:
+    """Take a scalar as an edit when another override touches the same part of the tree."""
+    edits = (other for other in axes if other is not axis and other.kind != "choice")
+    if axis.kind == "scalar" and any(_overlap(axis.key, other.key) for other in edits):
+        return dataclasses.replace(axis, kind="edit")
+    return axis
+
+
+def _overlap(one: str, other: str) -> bool:
+    pairs = zip(_path(one), _path(other), strict=False)
+    return all(a == b for a, b in pairs)
+
+
+def _path(key: str) -> list[str]:
+    return key.lstrip("+~").split("@")[0].split(".")

@@ -1,0 +1,48 @@
+"""What Hydra complains about, said in one sentence with the nearest valid name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from dopt.errors import DoptError, unknown_name
+
+_NOISE = re.compile(r"\s*(\^|See https?:|full_key:|object_type=|reference_type=|To append |$)")
+
+
+def sentence_for(error: Exception) -> str:
+    """Return one line that says what was given, what was expected and what to do."""
+    if isinstance(error, DoptError):
+        return _one_line(str(error))
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, option = str(error.missing_cfg_file).rpartition("/")
+        return _unknown(group or "configuration", option, error.options)
+    if isinstance(error, OverrideParseException):
+        return _one_line(f"cannot read the override '{error.override}': {error.message}")
+    cause = error.__cause__ if isinstance(error, ConfigCompositionException) else error
+    if isinstance(cause, ConfigAttributeError | ConfigKeyError) and cause.full_key:
+        return _unknown_key(cause)
+    if isinstance(cause, OmegaConfBaseException):
+        return _one_line(f"{error} {cause}")
+    return _one_line(str(error) or type(error).__name__)
+
+
+def _unknown_key(cause: OmegaConfBaseException) -> str:
+    parent = cause.parent_node
+    names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
+    holder, _, last = str(cause.full_key).rpartition(".")
+    names = [name for name in names if name not in ("hydra", "name")]
+    return _unknown(f"setting of {holder}" if holder else "setting", last, names)
+
+
+def _unknown(kind: str, given: str, valid: Iterable[str]) -> str:
+    return str(unknown_name(kind, given, valid))
+
+
+def _one_line(text: str) -> str:
+    """Join the lines, without those that only point, link or repeat."""
+    return " ".join(line.strip() for line in text.splitlines() if not _NOISE.match(line)).strip()
