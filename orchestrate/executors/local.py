@@ -1,0 +1,161 @@
+"""A pool of processes on this machine.
+
+``concurrent.futures`` gives up a whole pool when one process dies and cannot tell which task it
+was; here each worker has a socket of its own, so its end is seen and only its chunk is lost.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Sequence
+from multiprocessing.connection import Connection, wait
+
+from orchestrate.errors import InfrastructureError
+from orchestrate.executors.base import Event, Executor, Finished, Lost, Run, Task
+from orchestrate.surroundings import ONE_THREAD, module_path
+
+AHEAD = 2
+"""Chunks that a worker holds, so that it does not wait for the driver between two of them."""
+
+MAX_STILLBORN = 3
+"""Workers in a row that may end before they are ready to run anything."""
+
+
+class Worker:
+    """The driver's end of one process."""
+
+    def __init__(self, run: Run) -> None:
+        ours, theirs = socket.socketpair()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "orchestrate.executors.worker", str(theirs.fileno())],
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=sys.stderr.fileno() if _has_descriptor() else subprocess.DEVNULL,
+            env={**os.environ, **ONE_THREAD, **module_path()},
+            process_group=0,  # a Ctrl-C of the terminal reaches the driver only
+        )
+        theirs.close()
+        self.connection = Connection(ours.detach())
+        self.chunks: deque[deque[Task]] = deque()
+        self.ready = False
+        self.send(run)
+
+    def send(self, message: object) -> None:
+        """Send, and leave the discovery of a dead worker to the next receive."""
+        try:
+            self.connection.send(message)
+        except (BrokenPipeError, ConnectionError):
+            return
+
+    def assign(self, chunk: Sequence[Task]) -> None:
+        self.chunks.append(deque(chunk))
+        self.send(list(chunk))
+
+    def receive(self) -> list[Event]:
+        """Return the outcomes that have arrived.
+
+        Raises
+        ------
+        EOFError
+            If the process has ended.
+        """
+        events: list[Event] = []
+        try:
+            while self.connection.poll():
+                self._take(self.connection.recv(), events)
+        except (EOFError, OSError):
+            if not events:
+                raise EOFError from None
+        return events
+
+    def _take(self, message: Finished | None, events: list[Event]) -> None:
+        """Note an outcome, or None: first that the process is ready, then that a chunk is over."""
+        if message is not None:
+            self.chunks[0].popleft()
+            events.append(message)
+        elif self.ready:
+            self.chunks.popleft()
+        else:
+            self.ready = True
+
+    def end(self) -> str:
+        """Kill the process if it still runs, and say how it ended."""
+        self.connection.close()
+        self.process.kill()
+        code = self.process.wait()
+        return f"been killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+
+
+class LocalExecutor(Executor):
+    """Runs chunks on ``workers`` processes, by default one on each core that we may use."""
+
+    def __init__(self, run: Run, workers: int | None = None) -> None:
+        self._run = run
+        self.slots = workers or len(os.sched_getaffinity(0))
+        self._workers: list[Worker] = []
+        self._queue: deque[Sequence[Task]] = deque()
+        self._stillborn = 0
+
+    def start(self) -> None:
+        self._workers = [Worker(self._run) for _ in range(self.slots)]
+
+    def submit(self, chunk: Sequence[Task]) -> None:
+        if chunk:
+            self._queue.append(chunk)
+            self._feed()
+
+    def wait(self, timeout: float) -> list[Event]:
+        by_connection = {worker.connection: worker for worker in self._workers}
+        events: list[Event] = []
+        for ready in wait(list(by_connection), timeout):
+            worker = by_connection[ready]  # type: ignore[index]
+            try:
+                events += worker.receive()
+            except EOFError:
+                events += self._replace(worker)
+        self._feed()
+        return events
+
+    @property
+    def pending(self) -> int:
+        return len(self._queue) + sum(len(worker.chunks) for worker in self._workers)
+
+    def stop(self) -> None:
+        for worker in self._workers:
+            worker.end()
+        self._workers.clear()
+        self._queue.clear()
+
+    def _feed(self) -> None:
+        while self._queue:
+            worker = min(self._workers, key=lambda worker: len(worker.chunks))
+            if len(worker.chunks) >= AHEAD:
+                return
+            worker.assign(self._queue.popleft())
+
+    def _replace(self, worker: Worker) -> list[Event]:
+        """Start a new process for a dead one; only the chunk that it was running is lost."""
+        reason = worker.end()
+        self._stillborn = 0 if worker.ready else self._stillborn + 1
+        if self._stillborn >= MAX_STILLBORN:
+            raise InfrastructureError(
+                f"{self._stillborn} workers in a row have {reason} before they were ready: see "
+                "what they wrote above, then run the same command again."
+            )
+        chunks = [tuple(chunk) for chunk in worker.chunks]
+        running = chunks.pop(0) if worker.ready and chunks else ()
+        self._queue.extendleft(reversed(chunks))
+        self._workers[self._workers.index(worker)] = Worker(self._run)
+        return [Lost(tuple(task.key for task in running), reason)] if running else []
+
+
+def _has_descriptor() -> bool:
+    try:
+        sys.stderr.fileno()
+    except (OSError, ValueError):
+        return False
+    return True

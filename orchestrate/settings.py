@@ -1,0 +1,97 @@
+"""How a grid is run, as checked values; nothing of it is part of a trial."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+from dopt.errors import unknown_name
+from orchestrate.errors import LaunchError
+
+RETRY = ("failed", "diverged", "all")
+EXECUTORS = ("inprocess", "local", "ray")
+
+Retry = Literal["failed", "diverged", "all"]
+
+
+@dataclass(frozen=True)
+class LaunchSettings:
+    """Settings of one launch.
+
+    Attributes
+    ----------
+    executor
+        One of :data:`EXECUTORS`.
+    store_url
+        SQLAlchemy URL of the results database.
+    workers
+        Processes, or None for one on each core.
+    chunk_seconds
+        Work that a worker gets at once.
+    retry
+        Trials of the grid that are run again although they have an outcome.
+    """
+
+    executor: str
+    store_url: str
+    dry_run: bool = False
+    fail_fast: bool = False
+    retry: Retry | None = None
+    workers: int | None = None
+    chunk_seconds: float = 1.0
+    ray_address: str = "local"
+
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, Any]) -> LaunchSettings:
+        """Check the sections ``launch``, ``store`` and ``executor`` of a configuration.
+
+        Raises
+        ------
+        LaunchError
+            If a value has the wrong type or is out of bounds.
+        """
+        launch, name = given["launch"], given["executor"]["name"]
+        if name not in EXECUTORS:
+            raise unknown_name("executor.name", name, EXECUTORS)
+        retry = launch["retry"]
+        if retry is not None and retry not in RETRY:
+            raise unknown_name("launch.retry", retry, RETRY)
+        return cls(
+            executor=name,
+            store_url=_text("store.url", given["store"]["url"]),
+            dry_run=_flag("launch.dry_run", launch["dry_run"]),
+            fail_fast=_flag("launch.fail_fast", launch["fail_fast"]),
+            retry=cast("Retry | None", retry),
+            workers=_count("launch.workers", launch["workers"]),
+            chunk_seconds=_seconds("launch.chunk_seconds", launch["chunk_seconds"]),
+            ray_address=_text("launch.ray.address", launch["ray"]["address"]),
+        )
+
+
+def _flag(key: str, value: object) -> bool:
+    if isinstance(value, bool):
+        return value
+    raise _wrong(key, value, "true or false")
+
+
+def _text(key: str, value: object) -> str:
+    if isinstance(value, str) and value:
+        return value
+    raise _wrong(key, value, "a text")
+
+
+def _count(key: str, value: object) -> int | None:
+    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
+        return value
+    raise _wrong(key, value, "null or a whole number above 0")
+
+
+def _seconds(key: str, value: object) -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool) and value > 0:
+        return float(value)
+    raise _wrong(key, value, "a number of seconds above 0")
+
+
+def _wrong(key: str, value: object, expected: str) -> LaunchError:
+    return LaunchError(f"{key} is {value!r}, but {expected} is expected: set it so.")

@@ -1,0 +1,45 @@
+"""What every worker process starts with: the same modules, and one thread.
+
+With one thread for each process the workers share the cores, and sums keep their order.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "BLIS_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "NUMBA_NUM_THREADS",
+    ),
+    "1",
+)
+
+
+def pin_threads() -> None:
+    """Pin the numerical libraries of this process, and of those it starts, to one thread.
+
+    The environment binds libraries that are imported later; torch can be told afterwards too.
+    """
+    os.environ.update(ONE_THREAD)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
+
+
+def module_path() -> dict[str, str]:
+    """Return the environment in which another interpreter finds the modules that we find.
+
+    The folder of this package is left out: a launch has it on its path for Hydra's plugins, and
+    names such as ``errors`` would hide other people's modules there.
+    """
+    package = Path(__file__).resolve().parent
+    root = str(package.parent)
+    others = [path for path in sys.path if path and Path(path).resolve() != package]
+    return {"PYTHONPATH": os.pathsep.join([root, *(path for path in others if path != root)])}
