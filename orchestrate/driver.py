@@ -1,0 +1,154 @@
+"""The loop of a launch: claim, hand out, commit. The one place that writes outcomes."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from typing import Protocol
+
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+from orchestrate.chunks import Chunks
+from orchestrate.executors.base import Executor, Finished, Lost, Trouble
+from orchestrate.progress import Tally
+from orchestrate.store import Claim, Failure, InvalidResultError, RunRecord, Store
+
+POLL_SECONDS = 0.2
+HEARTBEAT_SECONDS = 5.0
+
+ATTEMPTS = 2
+"""Times that a trial may end its worker while it runs alone."""
+
+NODE_LOSSES = 5
+"""Times that a trial may be lost together with a whole node."""
+
+
+class Stop(Protocol):
+    """Says whether nothing more should start."""
+
+    @property
+    def draining(self) -> bool: ...
+
+
+@dataclass
+class Driver:
+    """Runs the waiting trials of one launch.
+
+    Attributes
+    ----------
+    elsewhere
+        Number of trials that turned out to be another launch's.
+    failures
+        How often each cause of failure was met.
+    """
+
+    store: Store
+    launch: int
+    executor: Executor
+    chunks: Chunks
+    tally: Tally
+    stop: Stop
+    fail_fast: bool = False
+    elsewhere: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
+    _running: dict[str, tuple[Claim, TrialSpec]] = field(default_factory=dict)
+    _strikes: Counter[str] = field(default_factory=Counter)
+    _node_losses: Counter[str] = field(default_factory=Counter)
+    _beat: float = field(default_factory=time.monotonic)
+
+    def step(self) -> bool:
+        """Hand out what there is room for and commit what has ended; False when nothing is left."""
+        self._fill()
+        if not self.executor.pending:
+            return False
+        events = self.executor.wait(POLL_SECONDS)
+        self._commit([event for event in events if isinstance(event, Finished)])
+        for event in events:
+            if isinstance(event, Lost):
+                self._recover(event)
+        if time.monotonic() - self._beat > HEARTBEAT_SECONDS:
+            self._beat = time.monotonic()
+            self.store.heartbeat(self.launch)
+        return True
+
+    @property
+    def ending(self) -> bool:
+        """Whether no further trial starts."""
+        return self.stop.draining or (self.fail_fast and bool(self.failures))
+
+    def _fill(self) -> None:
+        while not self.ending and len(self.chunks) and self.executor.pending < self._window:
+            tasks = self.chunks.next()
+            claims = self.store.claim(self.launch, [task.key for task in tasks])
+            held = {claim.trial_key: claim for claim in claims}
+            self.elsewhere += len(tasks) - len(held)
+            mine = [task for task in tasks if task.key in held]
+            self._running |= {task.key: (held[task.key], task.spec) for task in mine}
+            self.executor.submit(mine)
+
+    @property
+    def _window(self) -> int:
+        return 2 * self.executor.slots
+
+    def _commit(self, events: Sequence[Finished]) -> None:
+        results: list[tuple[Claim, TrialResult, RunRecord]] = []
+        for event in events:
+            claim, trial = self._running.pop(event.key)
+            self.chunks.observe(trial.config_key, event.usage.wall_seconds)
+            run = RunRecord(**asdict(event.usage))
+            if isinstance(event.outcome, Trouble):
+                trouble = event.outcome
+                self._fail(claim, Failure(trouble.type, trouble.message, trouble.traceback), run)
+            else:
+                results.append((claim, event.outcome, run))
+        if results:
+            self._write(results)
+
+    def _write(self, results: Sequence[tuple[Claim, TrialResult, RunRecord]]) -> None:
+        try:
+            written = self.store.commit_many(results)
+        except InvalidResultError as error:
+            if len(results) > 1:
+                for one in results:
+                    self._write([one])
+                return
+            claim, _, run = results[0]
+            self._fail(claim, Failure(type(error).__name__, str(error), "", "malformed"), run)
+            return
+        self.elsewhere += written.count(False)
+        for (_, result, _), accepted in zip(results, written, strict=True):
+            self.tally.diverged += accepted and result.diverged
+            self.tally.done += accepted and not result.diverged
+
+    def _fail(self, claim: Claim, failure: Failure, run: RunRecord) -> None:
+        if self.store.fail(claim, failure, run):
+            self.tally.failed += 1
+            self.failures[f"{failure.type}: {failure.message}"] += 1
+
+    def _recover(self, lost: Lost) -> None:
+        """Let lost trials wait again, each alone, but for one that ends its worker every time."""
+        counts = self._node_losses if lost.blameless else self._strikes
+        if lost.blameless or len(lost.keys) == 1:
+            counts.update(lost.keys)
+        limit = NODE_LOSSES if lost.blameless else ATTEMPTS
+        for key in lost.keys:
+            claim, trial = self._running.pop(key)
+            if counts[key] >= limit:
+                self._fail(claim, _death(lost, limit), _no_usage())
+            else:
+                self.store.release(self.launch, [key])
+                self.chunks.add([trial], alone=not lost.blameless)
+
+
+def _death(lost: Lost, times: int) -> Failure:
+    place = "with its node" if lost.blameless else "alone on its worker"
+    message = f"lost {times} times {place}, which has {lost.reason} the last time"
+    return Failure("WorkerLost", message, "", "node lost" if lost.blameless else "killed")
+
+
+def _no_usage() -> RunRecord:
+    now = datetime.now(UTC)
+    return RunRecord("unknown", 0, 0.0, 0.0, 0, now, now)
