@@ -65,12 +65,19 @@ class Randomness(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Points at which the model is compared with the truth, the grid's first."""
+    """Points at which the model is compared with the truth, the grid's first.
 
-    features: Floats  # (N, p) for the network
-    regressors: Floats  # (N, r, q) for the linear model
-    targets: Floats  # (N, r), less the offset for the linear model
-    n_grid: int
+    For the network they come in blocks of a fixed size, one point to a column, the last block of
+    the grid and that of the reachable set padded; for the linear model one after the other.
+    """
+
+    features: Floats  # (blocks, p, block size)
+    block_targets: Floats  # (blocks, r, block size)
+    block_sizes: Integers  # (blocks,) points that count
+    regressors: Floats  # (N, r, q) of the linear model
+    targets: Floats  # (N, r) less the offset, of the linear model
+    n_grid: int  # blocks of the grid, or its points for the linear model
+    n_all: int  # all blocks or points
 
 
 class State(NamedTuple):
@@ -80,8 +87,8 @@ class State(NamedTuple):
     moment_1: Floats  # (q,) of Adam
     moment_2: Floats  # (q,)
     covariance: Floats  # (q, q) M⁻¹, or (0, 0) where no plan and no learner needs it
-    window_features: Floats  # (window, p) newest samples, a ring
-    window_targets: Floats  # (window, r)
+    window_features: Floats  # (p, window) newest samples, a ring
+    window_targets: Floats  # (r, window)
 
 
 class Record(NamedTuple):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dopt.kernel.arguments import Network
-from dopt.kernel.compiler import compiled, contracted
+from dopt.kernel.compiler import compiled, contracted, vectorized
 from dopt.kernel.elementwise import tanh
 
 
@@ -55,46 +55,58 @@ def layer(network: Network, theta: Any, index: int) -> Any:
 
 @contracted
 def _activate(values: Any, bias: Any) -> None:
-    for n in range(values.shape[0]):
-        row = values[n]
-        for i in range(bias.shape[0]):
-            row[i] = tanh(row[i] + bias[i])
+    for i in range(values.shape[0]):
+        row, shift = values[i], bias[i]
+        for n in range(row.shape[0]):
+            row[n] = tanh(row[n] + shift)
+
+
+@compiled
+def units_by_points(buffer: Any, units: int, n: int) -> Any:
+    """Return the start of a flat buffer as a matrix, (units, n)."""
+    return buffer[: units * n].reshape(units, n)
 
 
 @compiled
 def forward(network: Network, theta: Any, inputs: Any, hidden: Any, outputs: Any) -> None:
-    """Evaluate the network at n points.
+    """Evaluate the network at n points, one to a column so that each unit's row is contiguous.
 
-    ``inputs`` (n, p), ``hidden`` (L, at least n, w), ``outputs`` (n, r); the last two are written.
+    ``inputs`` (p, n), ``hidden`` (L, at least w n) of flat buffers, ``outputs`` (r, n); the last
+    two are written.
     """
-    n, depth = inputs.shape[0], network.offsets.shape[0] - 1
+    n, depth, width = inputs.shape[1], network.offsets.shape[0] - 1, network.sizes[1]
     W, b = layer(network, theta, 0)
-    np.dot(inputs, W.T, hidden[0, :n])
-    _activate(hidden[0, :n], b)
+    values = units_by_points(hidden[0], width, n)
+    np.dot(W, inputs, values)
+    _activate(values, b)
     for index in range(1, depth):
         W, b = layer(network, theta, index)
-        np.dot(hidden[index - 1, :n], W.T, hidden[index, :n])
-        _activate(hidden[index, :n], b)
+        above = units_by_points(hidden[index], width, n)
+        np.dot(W, values, above)
+        _activate(above, b)
+        values = above
     W, b = layer(network, theta, depth)
-    np.dot(hidden[depth - 1, :n], W.T, outputs)
-    for i in range(n):
-        for k in range(b.shape[0]):
-            outputs[i, k] += b[k]
+    np.dot(W, values, outputs)
+    for k in range(b.shape[0]):
+        for i in range(n):
+            outputs[k, i] += b[k]
 
 
-@contracted
-def _column_sums(values: Any, out: Any) -> None:
-    out[:] = 0.0
-    for n in range(values.shape[0]):
-        for i in range(out.shape[0]):
-            out[i] += values[n, i]
+@vectorized
+def _row_sums(values: Any, out: Any) -> None:
+    for i in range(out.shape[0]):
+        row, total = values[i], 0.0
+        for n in range(row.shape[0]):
+            total += row[n]
+        out[i] = total
 
 
 @contracted
 def _through_tanh(delta: Any, activations: Any) -> None:
-    for n in range(delta.shape[0]):
-        for i in range(delta.shape[1]):
-            delta[n, i] *= 1.0 - activations[n, i] * activations[n, i]
+    for i in range(delta.shape[0]):
+        row, h = delta[i], activations[i]
+        for n in range(row.shape[0]):
+            row[n] *= 1.0 - h[n] * h[n]
 
 
 @compiled
@@ -104,38 +116,34 @@ def loss_gradient(
     inputs: Any,
     targets: Any,
     hidden: Any,
-    outputs: Any,
     deltas: Any,
     gradient: Any,
 ) -> None:
-    """Write the gradient of mean_n ‖a_θ(x_n) - y_n‖² over a batch.
+    """Write the gradient of mean_n ‖a_θ(x_n) - y_n‖² over a batch, (q,).
 
-    ``deltas`` (2, at least n, w) is scratch; ``gradient`` (q,) is written.
+    ``inputs`` (p, n), ``targets`` (r, n); ``hidden`` (L, ·) and ``deltas`` (3, ·) are flat scratch
+    buffers of at least max(w, r) n entries each.
     """
-    n, depth = inputs.shape[0], network.offsets.shape[0] - 1
-    forward(network, theta, inputs, hidden, outputs)
-    for i in range(n):
-        for k in range(outputs.shape[1]):
-            outputs[i, k] = 2.0 / n * (outputs[i, k] - targets[i, k])
-    W, _ = layer(network, theta, depth)
-    dW, db = layer(network, gradient, depth)
-    np.dot(outputs.T, hidden[depth - 1, :n], dW)
-    _column_sums(outputs, db)
-    delta = deltas[0, :n]
-    np.dot(outputs, W, delta)
-    _through_tanh(delta, hidden[depth - 1, :n])
-    for index in range(depth - 1, 0, -1):
-        W, _ = layer(network, theta, index)
+    n, depth, width = inputs.shape[1], network.offsets.shape[0] - 1, network.sizes[1]
+    errors = units_by_points(deltas[2], targets.shape[0], n)
+    forward(network, theta, inputs, hidden, errors)
+    for k in range(errors.shape[0]):
+        for i in range(n):
+            errors[k, i] = 2.0 / n * (errors[k, i] - targets[k, i])
+    delta = errors
+    for index in range(depth, -1, -1):
         dW, db = layer(network, gradient, index)
-        np.dot(delta.T, hidden[index - 1, :n], dW)
-        _column_sums(delta, db)
-        below = deltas[(depth - index) % 2, :n]
-        np.dot(delta, W, below)
-        delta = below
-        _through_tanh(delta, hidden[index - 1, :n])
-    dW, db = layer(network, gradient, 0)
-    np.dot(delta.T, inputs, dW)
-    _column_sums(delta, db)
+        _row_sums(delta, db)
+        if index == 0:
+            np.dot(delta, inputs.T, dW)
+        else:
+            W, _ = layer(network, theta, index)
+            values = units_by_points(hidden[index - 1], width, n)
+            np.dot(delta, values.T, dW)
+            below = units_by_points(deltas[index % 2], width, n)
+            np.dot(W.T, delta, below)
+            _through_tanh(below, values)
+            delta = below
 
 
 @contracted

@@ -13,6 +13,7 @@ import numpy as np
 from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import arguments as args
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
+from dopt.kernel.evaluation import BLOCK
 from dopt.kernel.trial import advance
 from dopt.learning import Adam
 from dopt.models import MLP
@@ -153,19 +154,52 @@ def _rules(cell: Cell) -> args.Rules:
 
 
 def _evaluation(system: System, network: args.Network, points: EvaluationSet) -> args.Evaluation:
-    states = points.states
-    if network.kind == args.MLP_MODEL:
-        none = np.zeros((0, 0, 0))
-        features = np.ascontiguousarray(system.featurize(states))
-        return args.Evaluation(features, none, points.accelerations, points.n_grid)
+    if network.kind == args.LINEAR_MODEL:
+        return _linear_evaluation(system, points)
+    columns = [system.featurize(points.states).T, points.accelerations.T]
+    parts = [slice(0, points.n_grid), slice(points.n_grid, None)]
+    features, targets, sizes = zip(
+        *(_blocks(columns[0][:, part], columns[1][:, part]) for part in parts), strict=True
+    )
+    return args.Evaluation(
+        np.concatenate(features),
+        np.concatenate(targets),
+        np.concatenate(sizes),
+        np.zeros((0, 0, 0)),
+        np.zeros((0, 0)),
+        len(sizes[0]),
+        len(sizes[0]) + len(sizes[1]),
+    )
+
+
+def _blocks(features: args.Floats, targets: args.Floats) -> tuple[Any, Any, Any]:
+    """Cut columns of points, (·, N), into padded blocks, (blocks, ·, BLOCK), and their sizes."""
+    n = features.shape[1]
+    starts = range(0, n, BLOCK)
+    sizes = np.array([min(BLOCK, n - start) for start in starts], dtype=np.int64)
+
+    def cut(columns: args.Floats) -> args.Floats:
+        padded = np.zeros((len(columns), BLOCK * len(starts)))
+        padded[:, :n] = columns
+        return np.ascontiguousarray(padded.reshape(len(columns), -1, BLOCK).swapaxes(0, 1))
+
+    return cut(features), cut(targets), sizes
+
+
+def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation:
     offset, *units = (
-        np.stack(np.broadcast_arrays(*system.accelerations(tuple(states.T), form)), axis=-1)
+        np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.states.T), form)), axis=-1)
         for form in system.linear_form
     )
     regressors = np.stack([unit - offset for unit in units], axis=-1)
-    targets = np.ascontiguousarray(points.accelerations - offset)
     return args.Evaluation(
-        np.zeros((0, 0)), np.ascontiguousarray(regressors), targets, points.n_grid
+        np.zeros((0, 0, 0)),
+        np.zeros((0, 0, 0)),
+        np.zeros(0, dtype=np.int64),
+        np.ascontiguousarray(regressors),
+        np.ascontiguousarray(points.accelerations - offset),
+        points.n_grid,
+        len(points.states),
     )
 
 
@@ -182,8 +216,8 @@ def _initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State
         np.zeros(q),
         np.zeros(q),
         covariance,
-        np.zeros((window, len(system.features))),
-        np.zeros((window, system.n_learned)),
+        np.zeros((len(system.features), window)),
+        np.zeros((system.n_learned, window)),
     )
 
 

@@ -22,9 +22,8 @@ from dopt.kernel.arguments import (
 from dopt.kernel.compiler import compiled, monotonic_microseconds
 from dopt.kernel.evaluation import BLOCK, model_error
 from dopt.kernel.information import absorb
-from dopt.kernel.learning import adam_step
+from dopt.kernel.learning import adam_step, remember
 from dopt.kernel.model import jacobian_rows
-from dopt.kernel.network import features_at
 from dopt.kernel.policies import d_optimal_input, uniform_input
 
 
@@ -122,15 +121,11 @@ def advance(
     """
     q, r = state.theta.shape[0], world.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    learning = (
-        np.empty((depth, rules.window, width)),
-        np.empty((rules.window, r)),
-        np.empty((2, rules.window, width)),
-    )
-    evaluating = (np.empty((depth, BLOCK, width)), np.empty((BLOCK, r)))
+    room = max(width, r) * rules.window
+    learning = (np.empty((depth, room)), np.empty((3, room)))
+    evaluating = (np.empty((depth, width * BLOCK)), np.empty((r, BLOCK)))
     gradient, rows, scratch = np.empty(q), np.empty((r, q)), np.empty((r, q))
     target, residuals = np.empty(r), np.empty(r)
-    n_points = points.targets.shape[0]
     for t in range(first, last):
         clock_0 = monotonic_microseconds()
         x, following, u = record.states[t], record.states[t + 1], record.inputs[t]
@@ -153,10 +148,7 @@ def advance(
             return t
         clock_2 = monotonic_microseconds()
         if rules.learner == ADAM:
-            slot = t % rules.window
-            features_at(network, x, state.window_features[slot])
-            for k in range(r):
-                state.window_targets[slot, k] = target[k]
+            remember(network, rules, state, t, x, target)
             adam_step(network, rules, state, t, learning, gradient)
         clock_3 = monotonic_microseconds()
         if not within(state.theta, np.inf):
@@ -173,7 +165,7 @@ def advance(
         loss = model_error(network, state.theta, points, 0, points.n_grid, evaluating)
         record.loss[t] = loss
         record.reachable_loss[t] = model_error(
-            network, state.theta, points, points.n_grid, n_points, evaluating
+            network, state.theta, points, points.n_grid, points.n_all, evaluating
         )
         clock_5 = monotonic_microseconds()
         record.plan_us[t] = (clock_1 - clock_0) + (clock_4 - clock_3)
