@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection as Pipe
 from multiprocessing.process import BaseProcess
+from multiprocessing.synchronize import Barrier
 from typing import Any
 
 import sqlalchemy
@@ -17,7 +18,7 @@ from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, res
 
 # Forked from a process that has imported everything and opened nothing: starts in milliseconds.
 CLEAN = multiprocessing.get_context("forkserver")
-CLEAN.set_forkserver_preload(["pytest", __name__])
+CLEAN.set_forkserver_preload(["pytest", "psycopg", __name__])
 PATIENCE_SECONDS = 60.0
 
 
@@ -46,15 +47,24 @@ def hear(pipe: Pipe) -> Any:
     return pipe.recv()
 
 
-def open_together(pipe: Pipe, url: str) -> None:
-    """Say ready, wait for the word, open the database, say how it went."""
-    pipe.send("ready")
-    pipe.recv()
+def open_together(pipe: Pipe, urls: Sequence[str], barrier: Barrier) -> None:
+    """Open each database at the same moment as the others do; say how it went."""
     try:
-        with Store.open(url) as store:
-            pipe.send(store.begin_launch(LAUNCH))
+        for url in urls:
+            barrier.wait(PATIENCE_SECONDS)
+            with Store.open(url) as store:
+                store.begin_launch(LAUNCH)
+        pipe.send("opened")
     except Exception as error:
         pipe.send(repr(error))
+
+
+def eight_open(urls: Sequence[str]) -> None:
+    """Let eight processes open each of the databases at once; all must succeed."""
+    barrier = CLEAN.Barrier(8)
+    with ExitStack() as stack:
+        pipes = [stack.enter_context(running(open_together, urls, barrier))[1] for _ in range(8)]
+        assert [hear(pipe) for pipe in pipes] == ["opened"] * 8
 
 
 def hold_claims(pipe: Pipe, url: str, n: int, lease_seconds: float = 60.0) -> None:

@@ -56,6 +56,7 @@ class TestCommit:
         assert (row.final_loss, row.best_loss) == (sent.final_loss, sent.best_loss)
         assert (row.wall_seconds, row.cpu_seconds) == (RUN.wall_seconds, RUN.cpu_seconds)
         assert (row.peak_memory_bytes, row.node, row.launch) == (2**33, "here", launch)
+        assert reader.query("SELECT owner FROM trial")[0].owner is None
         (attempt,) = reader.query("SELECT outcome, pid, started, launch_id FROM attempt")
         assert tuple(attempt) == ("done", 18, "2026-01-31T12:00:00.000250Z", launch)
 

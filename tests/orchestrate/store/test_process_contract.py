@@ -13,10 +13,10 @@ from orchestrate.store import Claim, Reader, Store
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import (
     die_in_commit,
+    eight_open,
     hear,
     hold_claims,
     kill,
-    open_together,
     run_grid,
     running,
 )
@@ -45,14 +45,9 @@ def _is_whole(reader: Reader) -> bool:
     return all(tuple(row[1:]) == ((HORIZON, 1) if row.finished else (0, 0)) for row in rows)
 
 
-def test_eight_processes_create_one_database(url: str) -> None:
-    with ExitStack() as stack:
-        pipes = [stack.enter_context(running(open_together, url))[1] for _ in range(8)]
-        for pipe in pipes:
-            hear(pipe)
-        for pipe in pipes:
-            pipe.send("now")
-        assert sorted(hear(pipe) for pipe in pipes) == list(range(1, 9))
+def test_eight_processes_create_one_database(url: str, open_store: Callable[..., Store]) -> None:
+    eight_open([url])
+    assert open_store().begin_launch(LAUNCH) == 9
 
 
 def test_two_launches_share_a_grid(url: str) -> None:

@@ -20,6 +20,7 @@ from orchestrate.store import (
 )
 from orchestrate.store.sqlite import _read_mode
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.processes import eight_open
 
 
 @pytest.fixture
@@ -63,6 +64,22 @@ def test_curves_are_read_without_a_sort(
         plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters).all()  # type: ignore[arg-type]
     assert len(plan) == 2
     assert "TEMP B-TREE" not in str(plan)
+
+
+def test_creation_is_safe_many_times_over(tmp_path: Path) -> None:
+    urls = [f"sqlite:///{tmp_path}/{i}.db" for i in range(15)]
+    eight_open(urls)
+    for url in urls:
+        with Store.open(url) as store:
+            assert store.begin_launch(LAUNCH) == 9
+
+
+def test_a_transaction_locks_before_it_reads(store: Store, path: Path) -> None:
+    other = sqlite3.connect(path, timeout=0.0, isolation_level=None)
+    with store._backend.transaction(), pytest.raises(sqlite3.OperationalError, match="locked"):
+        other.execute("BEGIN IMMEDIATE")
+    other.execute("BEGIN IMMEDIATE")
+    other.close()
 
 
 def test_a_closed_store_counts_as_dead(store: Store, url: str) -> None:
