@@ -50,8 +50,8 @@ def evaluation_set(system: System) -> EvaluationSet:
 def reachable_states(system: System) -> Array:
     """Return states, (512, d), that the true system visits under strong inputs of full energy.
 
-    The inputs are random ones held for 5, 10, 20 and 40 steps, sinusoids at and around the
-    eigenfrequency and a chirp, each over the whole horizon without process noise. The sample is
+    The inputs are random ones held for 5, 10, 20 and 40 steps, square waves at and around the
+    eigenfrequency and one of rising frequency, each over the whole horizon without process noise. The sample is
     drawn without replacement from all states visited, with a fixed seed.
     """
     rng = np.random.default_rng(_SEED)
@@ -63,18 +63,25 @@ def reachable_states(system: System) -> Array:
 
 
 def simulate(system: System, inputs: Array) -> Array:
-    """Return the noise-free states, (T + 1, n, d), under inputs (T, n, m), by the Euler map."""
+    """Return the noise-free states, (T + 1, n, d), under inputs (T, n, m), by the Euler map.
+
+    States that overflow become infinite or NaN, and stay so.
+    """
     steps, n, _ = inputs.shape
     states = np.empty((steps + 1, n, system.n_states))
     states[0] = system.initial_state
-    for t in range(steps):
-        x = tuple(states[t].T)
-        flow = np.stack(
-            np.broadcast_arrays(*system.known(x, tuple(inputs[t].T), system.parameters)), axis=-1
-        )
-        flow[:, list(system.learned_rows)] += system.learned(states[t])
-        states[t + 1] = states[t] + system.dt * flow
+    with np.errstate(over="ignore", invalid="ignore"):
+        for t in range(steps):
+            states[t + 1] = states[t] + system.dt * _flows(system, states[t], inputs[t])
     return states
+
+
+def _flows(system: System, states: Array, inputs: Array) -> Array:
+    """Return f(x, u), (n, d), for states (n, d) and inputs (n, m)."""
+    known = system.known(tuple(states.T), tuple(inputs.T), system.parameters)
+    flow = np.stack(np.broadcast_arrays(*known), axis=-1)
+    flow[:, list(system.learned_rows)] += system.learned(states)
+    return flow
 
 
 def _held(system: System, rng: np.random.Generator) -> list[Array]:
@@ -88,7 +95,7 @@ def _held(system: System, rng: np.random.Generator) -> list[Array]:
 
 
 def _waves(system: System) -> list[Array]:
-    """Return sinusoids about the eigenfrequency and a chirp: each (T, m).
+    """Return square waves about the eigenfrequency and one of rising frequency: each (T, m).
 
     A system without a mode is excited at ten periods in the horizon, along the first input.
     """

@@ -65,11 +65,11 @@ class Cartpole(System):
     pole_mass: float = quantity(0.1, "kg", "positive")
     length: float = quantity(1.0, "m", "positive")
     gravity: float = quantity(10.0, "m/s²", "nonnegative")
-    pivot_friction: float = quantity(0.01, "N m s", "nonnegative")
+    pivot_friction: float = quantity(0.02, "N m s", "nonnegative")
     cart_friction: float = quantity(0.5, "N s/m", "nonnegative")
-    gamma: float = quantity(5.0, "N", "positive")
+    gamma: float = quantity(7.0, "N", "positive")
     initial_state: tuple[float, ...] = quantity((0.0, 0.0, math.pi, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((4.0, math.pi, 8.0), bound="positive")
+    grid_half_widths: tuple[float, ...] = quantity((4.0, math.pi, 6.4), bound="positive")
     grid_points: tuple[int, ...] = quantity((8, 16, 8), bound="positive")
 
     @staticmethod

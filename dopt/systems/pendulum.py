@@ -53,7 +53,7 @@ class Pendulum(System):
     length: float = quantity(1.0, "m", "positive")
     gravity: float = quantity(10.0, "m/s²", "nonnegative")
     friction: float = quantity(1.0 / 6.0, "N m s", "nonnegative")
-    gamma: float = quantity(1.5, "N m", "positive")
+    gamma: float = quantity(2.0, "N m", "positive")
     initial_state: tuple[float, ...] = quantity((1e-3, 0.0))
     grid_half_widths: tuple[float, ...] = quantity((math.pi, 8.0), bound="positive")
     grid_points: tuple[int, ...] = quantity((32, 32), bound="positive")
