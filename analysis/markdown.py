@@ -15,8 +15,10 @@ def number(value: float, digits: int = 3) -> str:
     """Return a number with some significant digits, a dash for NaN."""
     if math.isnan(value):
         return "–"
-    text = f"{value:#.{digits}g}".rstrip(".")
-    return text if "e" not in text else f"{value:.{digits - 1}e}"
+    if value == 0 or not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}" if value else "0"
+    places = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{round(value, places):.{max(places, 0)}f}"
 
 
 def p_text(value: float) -> str:

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from analysis.figures.axes import angle_text, log_limits, log_ticks, rows_and_columns
+from analysis.figures.axes import angle_text, log_limits, log_text, log_ticks, rows_and_columns
 from analysis.figures.style import mathematical, policy_style
 from dopt.policies import POLICIES
 
@@ -53,6 +53,12 @@ def test_a_logarithmic_axis_always_has_two_labels(low: float, high: float) -> No
     log_ticks(axes.yaxis, low, high)
     shown = [tick for tick in axes.yaxis.get_majorticklocs() if low <= tick <= high]
     assert len(shown) >= 2
+
+
+def test_small_ticks_are_powers_of_ten() -> None:
+    assert log_text(0.03) == "0.03"
+    assert log_text(3e-4) == r"$3\times10^{-4}$"
+    assert log_text(1e-3) == r"$10^{-3}$"
 
 
 def test_log_limits_ignore_what_a_logarithm_cannot_show() -> None:

@@ -115,7 +115,10 @@ def test_plus_minus(mean: float, error: float, text: str) -> None:
 
 def test_numbers() -> None:
     assert number(0.5) == "0.500"
-    assert number(1234.0) == "1.23e+03"
+    assert number(1234.0) == "1230"
+    assert number(0.0123456) == "0.0123"
+    assert number(1.5e-7) == "1.50e-07"
+    assert number(0.0) == "0"
     assert p_text(0.0123) == "0.012"
     assert p_text(3.21e-9) == "3e-09"
 
