@@ -51,8 +51,8 @@ def reachable_states(system: System) -> Array:
     """Return states, (512, d), that the true system visits under strong inputs of full energy.
 
     The inputs are random ones held for 5, 10, 20 and 40 steps, square waves at and around the
-    eigenfrequency and one of rising frequency, each over the whole horizon without process noise. The sample is
-    drawn without replacement from all states visited, with a fixed seed.
+    eigenfrequency and one of rising frequency, each over the whole horizon without process noise.
+    The sample is drawn without replacement from all states visited, with a fixed seed.
     """
     rng = np.random.default_rng(_SEED)
     inputs = np.stack(_held(system, rng) + _waves(system), axis=1)
