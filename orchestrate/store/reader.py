@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import chain
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from sqlalchemy import Connection, CursorResult, Engine, select, text
@@ -154,8 +154,8 @@ def _numbers(result: CursorResult[Any]) -> Array:
 
     It comes from the driver's cursor, because a SQLAlchemy row for each number doubles the time.
     """
-    cursor = result.cursor
-    return np.fromiter(chain.from_iterable(cursor.fetchall()), np.float64)
+    rows = cast("Iterable[tuple[float | None]]", result.cursor)
+    return np.fromiter(chain.from_iterable(rows), np.float64)
 
 
 def _check_column(column: str) -> None:
