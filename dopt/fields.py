@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable
 from typing import Any, Literal
 
 from dopt.errors import SpecificationError
 
-Bound = Literal["any", "positive", "nonnegative"]
+Bound = Literal["any", "positive", "nonnegative", "fraction"]
 
 _BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
-    "any": (lambda _: True, "any finite number"),
-    "positive": (lambda value: value > 0, "above 0"),
-    "nonnegative": (lambda value: value >= 0, "0 or above"),
+    "any": (lambda _: True, ""),
+    "positive": (lambda value: value > 0, " and above 0"),
+    "nonnegative": (lambda value: value >= 0, " and 0 or above"),
+    "fraction": (lambda value: 0 <= value < 1, " and 0 or above, below 1"),
 }
 
 
@@ -29,7 +31,7 @@ def quantity(
         Default value. Its type is the type that the field accepts.
     unit : str
         Unit in the SI, ``"1"`` when dimensionless.
-    bound : {"any", "positive", "nonnegative"}
+    bound : {"any", "positive", "nonnegative", "fraction"}
         What every number of the field has to satisfy.
     size : int, optional
         Number of entries that a tuple has to have.
@@ -90,15 +92,23 @@ def _converted_number(
     expected = "a whole number" if whole else "a number"
     if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
         raise _wrong_type(path, value, expected)
-    number = value if whole else float(value)
+    number = value if whole else _real(value)
     holds, words = _BOUNDS[field.metadata.get("bound", "any")]
-    if not math.isfinite(number) or not holds(number):
+    if not abs(number) <= sys.float_info.max or not holds(number):
         unit = field.metadata.get("unit", "1")
         suffix = "" if unit == "1" else f" {unit}"
         raise SpecificationError(
-            f"{path} is {number}{suffix}, but it has to be finite and {words}: set it so."
+            f"{path} is {number}{suffix}, but it has to be finite{words}: set it so."
         )
     return number
+
+
+def _real(value: float) -> float:
+    """Return a float, never -0.0: equal values have one key; infinite when it is too large."""
+    try:
+        return float(value) + 0.0
+    except OverflowError:
+        return math.inf
 
 
 def _wrong_type(path: str, value: object, expected: str) -> SpecificationError:

@@ -33,8 +33,8 @@ class Adam(Learner):
     name: ClassVar[str] = "adam"
 
     learning_rate: float = quantity(2e-3, bound="positive")
-    beta_1: float = quantity(0.9, bound="nonnegative")
-    beta_2: float = quantity(0.999, bound="nonnegative")
+    beta_1: float = quantity(0.9, bound="fraction")
+    beta_2: float = quantity(0.999, bound="fraction")
     epsilon: float = quantity(1e-8, bound="positive")
     window: int = quantity(1, "samples", "positive")
 

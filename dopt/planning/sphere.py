@@ -78,14 +78,15 @@ def sphere_maximizer(Q: Array, v: Array, radius: float, tie: Array) -> Array:
     A = np.empty((m, m))
     for i in range(m):
         for j in range(m):
-            A[i, j] = 0.5 * radius / scale * (Q[i, j] + Q[j, i])
+            # Divided one by one: the inverse of a denormal scale is infinite.
+            A[i, j] = 0.5 * radius * (Q[i, j] / scale + Q[j, i] / scale)
     values, axes = np.linalg.eigh(A)
     w, preferred, gaps = np.zeros(m), np.zeros(m), np.zeros(m)
     largest = max(abs(values[0]), abs(values[m - 1]))
     top = 0.0
     for i in range(m):
         for j in range(m):
-            w[i] += axes[j, i] * v[j] / scale
+            w[i] += axes[j, i] * (v[j] / scale)
             preferred[i] += axes[j, i] * tie[j]
         # Eigenvalues that differ by rounding alone are one: no direction of theirs stands out.
         gaps[i] = values[m - 1] - values[i]
