@@ -1,0 +1,176 @@
+"""The systems as masses in a plane, from positions alone: what their equations are held against.
+
+A body is given by the positions of point masses, and every force by where it acts. Velocities,
+energies and, by the Euler-Lagrange equations, accelerations follow by automatic differentiation.
+A uniform rod is two masses at the Gauss points of its length, a rigid body two masses at its radius
+of gyration: their kinetic energies are the exact ones.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+from torch.func import grad, hessian, jacfwd, jacrev, jvp
+
+from dopt.systems import Arm, Cartpole, Pendulum, Quadrotor, System
+
+
+def _tensor(values: list[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+class Mechanics(ABC):
+    """Masses and forces of one system, over generalised coordinates q and their rates."""
+
+    coordinates: tuple[int, ...]  # indices of q in the state; the rates follow each by one
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+
+    @abstractmethod
+    def masses(self) -> list[float]:
+        """Return the point masses [kg]."""
+
+    @abstractmethod
+    def positions(self, q: Tensor) -> Tensor:
+        """Return their positions (horizontal, upward) [m], (number of masses, 2)."""
+
+    @abstractmethod
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
+        """Return the generalised forces of the input."""
+
+    @abstractmethod
+    def friction(self, rates: Tensor) -> Tensor:
+        """Return the generalised forces of friction."""
+
+    def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return q and its rates."""
+        indices = torch.tensor(self.coordinates)
+        return state[indices], state[indices + 1]
+
+    def kinetic(self, q: Tensor, rates: Tensor) -> Tensor:
+        velocity = jvp(self.positions, (q,), (rates,))[1]
+        return 0.5 * (_tensor(self.masses()) * velocity.square().sum(-1)).sum()
+
+    def potential(self, q: Tensor) -> Tensor:
+        heights = self.positions(q)[:, 1]
+        return self.system.gravity * (_tensor(self.masses()) * heights).sum()
+
+    def energy(self, state: Tensor) -> Tensor:
+        q, rates = self.split(state)
+        return self.kinetic(q, rates) + self.potential(q)
+
+    def power(self, state: Tensor, u: Tensor) -> Tensor:
+        """Return the power of the input less that of friction [W]."""
+        q, rates = self.split(state)
+        return (self.driving(q, rates, u) + self.friction(rates)) @ rates
+
+    def accelerations(self, state: Tensor, u: Tensor) -> Tensor:
+        """Return d²q/dt² by d/dt ∂L/∂q̇ - ∂L/∂q = forces."""
+        q, rates = self.split(state)
+        mass_matrix = hessian(self.kinetic, argnums=1)(q, rates)
+        momentum_by_q = jacfwd(grad(self.kinetic, argnums=1), argnums=0)(q, rates)
+        slope = grad(self.kinetic)(q, rates) - grad(self.potential)(q)
+        forces = self.driving(q, rates, u) + self.friction(rates)
+        return torch.linalg.solve(mass_matrix, forces + slope - momentum_by_q @ rates)
+
+
+class PendulumMechanics(Mechanics):
+    coordinates = (0,)
+
+    def masses(self) -> list[float]:
+        return [self.system.mass / 2, self.system.mass / 2]
+
+    def positions(self, q: Tensor) -> Tensor:
+        gauss = _tensor([0.5 - 0.5 / math.sqrt(3), 0.5 + 0.5 / math.sqrt(3)])
+        radius = self.system.length * gauss
+        return torch.stack([radius * q[0].sin(), -radius * q[0].cos()], dim=-1)
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        return u
+
+    def friction(self, rates: Tensor) -> Tensor:
+        return -self.system.friction * rates
+
+
+class CartpoleMechanics(Mechanics):
+    coordinates = (0, 2)
+
+    def masses(self) -> list[float]:
+        return [self.system.cart_mass, self.system.pole_mass]
+
+    def positions(self, q: Tensor) -> Tensor:
+        cart = torch.stack([q[0], torch.zeros_like(q[0])])
+        rod = self.system.length * torch.stack([q[1].sin(), q[1].cos()])
+        return torch.stack([cart, cart + rod])
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        """Return the force on the cart, by virtual work."""
+        return jacrev(self.positions)(q)[0, 0] * u[0]
+
+    def friction(self, rates: Tensor) -> Tensor:
+        coefficients = [self.system.cart_friction, self.system.pivot_friction]
+        return -_tensor(coefficients) * rates
+
+
+class ArmMechanics(Mechanics):
+    coordinates = (0, 2)
+
+    def masses(self) -> list[float]:
+        return [self.system.mass_1, self.system.mass_2]
+
+    def positions(self, q: Tensor) -> Tensor:
+        lengths = _tensor([self.system.length_1, self.system.length_2])
+        links = torch.stack([lengths * q.sin(), -lengths * q.cos()], dim=-1)
+        return links.cumsum(0)
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        return u
+
+    def friction(self, rates: Tensor) -> Tensor:
+        return -self.system.friction * rates
+
+
+class QuadrotorMechanics(Mechanics):
+    coordinates = (0, 2, 4)
+
+    def masses(self) -> list[float]:
+        return [self.system.mass / 2, self.system.mass / 2]
+
+    def along_span(self, q: Tensor, distances: Tensor) -> Tensor:
+        """Return the points of the body at distances from its centre along the span."""
+        span = torch.stack([q[2].cos(), q[2].sin()])
+        return q[:2] + distances.unsqueeze(-1) * span
+
+    def positions(self, q: Tensor) -> Tensor:
+        gyration = math.sqrt(self.system.inertia / self.system.mass)
+        return self.along_span(q, gyration * _tensor([-1.0, 1.0]))
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        """Return the two thrusts, each at its end of the span and upwards in the body's frame."""
+        ends = self.system.half_span * _tensor([1.0, -1.0])
+        moved = jacrev(lambda z: self.along_span(z, ends))(q)
+        upwards = torch.stack([-q[2].sin(), q[2].cos()])
+        return torch.einsum("iaq,a,i->q", moved, upwards, u)
+
+    def friction(self, rates: Tensor) -> Tensor:
+        drag = -self.system.drag * rates.abs() * rates
+        return drag * _tensor([1.0, 1.0, 0.0])
+
+
+MECHANICS: dict[type[System], type[Mechanics]] = {
+    Pendulum: PendulumMechanics,
+    Cartpole: CartpoleMechanics,
+    Arm: ArmMechanics,
+    Quadrotor: QuadrotorMechanics,
+}
+
+FRICTION = {
+    "pendulum": ("friction",),
+    "cartpole": ("pivot_friction", "cart_friction"),
+    "arm": ("friction",),
+    "quadrotor": ("drag",),
+}

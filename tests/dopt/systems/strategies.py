@@ -1,0 +1,33 @@
+"""Random systems, states and inputs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from dopt.systems import SYSTEMS, System
+
+NAMES = sorted(SYSTEMS)
+
+
+@st.composite
+def systems(draw: st.DrawFn, name: str, **fixed: Any) -> System:
+    """Draw a system with physical parameters between 0.2 and 5, but the fixed ones."""
+    cls = SYSTEMS[name]
+    drawn = {field: draw(st.floats(0.2, 5.0)) for field in cls.physical if field not in fixed}
+    return cls(**drawn, **fixed)
+
+
+def states(name: str, bound: float = 6.0) -> st.SearchStrategy[np.ndarray]:
+    return vectors(len(SYSTEMS[name].state_labels), bound)
+
+
+def inputs(name: str, bound: float = 10.0) -> st.SearchStrategy[np.ndarray]:
+    return vectors(len(SYSTEMS[name].input_labels), bound)
+
+
+def vectors(size: int, bound: float) -> st.SearchStrategy[np.ndarray]:
+    return arrays(np.float64, size, elements=st.floats(-bound, bound))

@@ -1,0 +1,71 @@
+"""The shipped configuration files hold valid values that make physical sense."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from dopt.learning import LEARNERS
+from dopt.models import MODELS
+from dopt.policies import POLICIES
+from dopt.registry import build
+from dopt.systems import SYSTEMS, System, system_from_mapping
+from dopt.systems.equilibrium import euler_spectral_radius
+
+CONF = Path(__file__).parents[2] / "conf"
+ENVS = sorted((CONF / "env").glob("*.yaml"))
+GROUPS: list[tuple[str, dict[str, Any]]] = [
+    ("policy", POLICIES),
+    ("model", MODELS),
+    ("learner", LEARNERS),
+]
+
+
+def section_in(path: Path) -> dict[str, object]:
+    section = OmegaConf.to_container(OmegaConf.merge({"width": 16}, OmegaConf.load(path)))
+    assert isinstance(section, dict)
+    section = section.get("policy", section)
+    return {k: v for k, v in section.items() if k not in ("width", "defaults")} | (
+        {"width": 16} if path.parent.name == "model" and section["name"] == "mlp" else {}
+    )
+
+
+def system_in(path: Path) -> System:
+    return system_from_mapping(section_in(path))
+
+
+def test_there_is_a_file_for_every_system() -> None:
+    assert {system_in(path).name for path in ENVS} == set(SYSTEMS)
+
+
+@pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
+def test_every_field_of_a_system_is_shown_in_its_file(path: Path) -> None:
+    system = system_in(path)
+    assert set(section_in(path)) == {"name"} | {field.name for field in dataclasses.fields(system)}
+
+
+@pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
+def test_the_euler_map_creates_no_energy(path: Path) -> None:
+    assert euler_spectral_radius(system_in(path)) <= 1.0 + 1e-12
+
+
+@pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
+def test_a_trial_starts_close_to_rest(path: Path) -> None:
+    system = system_in(path)
+    rest = system.equilibrium or np.zeros(system.n_states)
+    assert system.initial_state == pytest.approx(rest, abs=0.01)
+
+
+@pytest.mark.parametrize(("group", "registry"), GROUPS, ids=[group for group, _ in GROUPS])
+def test_every_registered_choice_has_a_file_that_loads(
+    group: str, registry: dict[str, Any]
+) -> None:
+    paths = sorted((CONF / group).rglob("*.yaml"))
+    assert paths
+    built = [build(group, registry, section_in(path)) for path in paths]
+    assert {item.name for item in built} == set(registry)

@@ -1,0 +1,195 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import string
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.spec import TrialSpec
+from tests.dopt.trials import PAIRS, trial
+
+SECTIONS = {"env": "system", "policy": "policy", "model": "model", "learner": "learner"}
+
+
+def every_field(spec: TrialSpec) -> list[tuple[str, str, Any]]:
+    """Return (section, field, another valid value) for every field of a trial."""
+    return [
+        (section, field.name, other(getattr(getattr(spec, attribute), field.name)))
+        for section, attribute in SECTIONS.items()
+        for field in dataclasses.fields(getattr(spec, attribute))
+    ]
+
+
+def other(value: Any) -> Any:
+    if value is None:
+        return 1.5
+    if isinstance(value, tuple):
+        return [other(value[0]), *value[1:]]
+    return 0.5 * value if 0 < value < 1 else value + 1
+
+
+def with_value(spec: TrialSpec, section: str, field: str, value: Any) -> TrialSpec:
+    mapping: dict[str, Any] = spec.to_mapping()
+    return TrialSpec.from_mapping(mapping | {section: mapping[section] | {field: value}})
+
+
+@pytest.mark.parametrize(("env", "policy"), PAIRS)
+def test_a_trial_comes_back_from_its_mapping_and_its_json(env: str, policy: str) -> None:
+    spec = trial(env, policy, 7)
+    again = TrialSpec.from_mapping(json.loads(json.dumps(spec.to_mapping())))
+    assert again == spec
+    assert again.trial_key == spec.trial_key
+    assert again.canonical_json() == spec.canonical_json()
+
+
+@pytest.mark.parametrize(("env", "policy"), PAIRS)
+def test_every_field_is_part_of_the_key(env: str, policy: str) -> None:
+    spec = trial(env, policy)
+    variants = [with_value(spec, *change) for change in every_field(spec)]
+    keys = [spec.config_key, *(variant.config_key for variant in variants)]
+    assert len(set(keys)) == len(keys) > len(dataclasses.fields(spec.system))
+    trial_keys = [spec.trial_key, *(variant.trial_key for variant in variants)]
+    assert len(set(trial_keys)) == len(trial_keys)
+
+
+def test_pairs_have_keys_of_their_own() -> None:
+    specs = [trial(env, policy, seed) for env, policy in PAIRS for seed in range(3)]
+    assert len({spec.trial_key for spec in specs}) == len(specs)
+    assert len({spec.config_key for spec in specs}) == len(PAIRS)
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))
+def test_only_the_trial_key_depends_on_the_seed(first: int, second: int) -> None:
+    one, two = trial("arm", "uniform", first), trial("arm", "uniform").with_seed(second)
+    assert one.config_key == two.config_key
+    assert one.config_json == two.config_json
+    assert (one.trial_key == two.trial_key) == (first == second)
+
+
+def test_keys_are_64_hexadecimal_digits() -> None:
+    spec = trial("pendulum", "random")
+    for key in (spec.trial_key, spec.config_key):
+        assert len(key) == 64
+        assert set(key) <= set(string.hexdigits.lower())
+
+
+def test_the_key_does_not_depend_on_how_a_value_is_written() -> None:
+    spec = trial("pendulum", "d_optimal", env={"mass": 1, "initial_state": [0, 0]})
+    same: dict[str, Any] = {
+        "seed": 0,
+        "learner": {"name": "adam_window"},
+        "model": {"depth": 2, "width": 16, "name": "mlp"},
+        "policy": {"regularization": 0.001, "name": "d_optimal"},
+        "env": {
+            "initial_state": (0.0, -0.0),
+            "grid_points": (4, 4),
+            "mass": 1.0,
+            "horizon": 30,
+            "name": "pendulum",
+        },
+    }
+    assert TrialSpec.from_mapping(same).trial_key == spec.trial_key
+
+
+def test_canonical_json_is_sorted_compact_json_of_the_content() -> None:
+    spec = trial("cartpole", "periodic", 5)
+    content = json.loads(spec.canonical_json())
+    assert content["seed"] == 5
+    assert {key: content[key] for key in spec.to_mapping()} == spec.to_mapping()
+    written = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    assert spec.canonical_json() == written
+    del content["seed"]
+    assert json.loads(spec.config_json) == content
+
+
+def test_columns_are_those_of_a_table_of_configurations() -> None:
+    assert trial("arm", "d_optimal", env={"gamma": 3, "dt": 0.01}).columns() == {
+        "env": "arm",
+        "policy": "d_optimal",
+        "model": "mlp",
+        "learner": "adam_window",
+        "width": 16,
+        "depth": 2,
+        "horizon": 30,
+        "dt": 0.01,
+        "gamma": 3.0,
+    }
+    oracle = trial("arm", "oracle").columns()
+    assert (oracle["width"], oracle["depth"]) == (None, None)
+
+
+@settings(max_examples=50)
+@given(
+    mass=st.floats(1e-3, 1e3),
+    start=st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=2),
+    width=st.integers(1, 300),
+    rate=st.floats(1e-12, 1e3),
+    seed=st.integers(0, 2**63 - 1),
+)
+def test_any_numbers_come_back(
+    mass: float, start: list[float], width: int, rate: float, seed: int
+) -> None:
+    env = {"mass": mass, "initial_state": start}
+    fields = {"env": env, "model": {"width": width}, "learner": {"learning_rate": rate}}
+    spec = trial("pendulum", "d_optimal", seed, **fields)
+    assert TrialSpec.from_mapping(spec.to_mapping()) == spec
+    assert (spec.system.mass, spec.model.width, spec.seed) == (mass, width, seed)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("seed", [-1, 1.0, True, "3", None, 0.5])
+def test_a_seed_is_a_whole_number(seed: Any) -> None:
+    with pytest.raises(SpecificationError, match=r"^seed is .* whole number of 0 or above"):
+        TrialSpec.from_mapping(trial("arm", "random").to_mapping() | {"seed": seed})
+
+
+def test_an_unknown_section_is_answered_with_the_nearest() -> None:
+    with pytest.raises(SpecificationError, match=r"'polcy' is unknown.*did you mean 'policy'\?"):
+        TrialSpec.from_mapping(trial("arm", "random").to_mapping() | {"polcy": {}})
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+@pytest.mark.parametrize("given_value", [None, "pendulum", 3])
+def test_a_section_has_to_be_one(section: str, given_value: Any) -> None:
+    mapping = trial("arm", "random").to_mapping() | {section: given_value}
+    with pytest.raises(SpecificationError, match=rf"'{section}' is .* a section"):
+        TrialSpec.from_mapping(mapping)
+
+
+LINEAR = {"name": "linear"}
+LEAST_SQUARES = {"name": "recursive_least_squares"}
+
+
+@pytest.mark.parametrize(
+    ("env", "policy", "changes"),
+    [
+        ("quadrotor", "periodic", {}),
+        ("pendulum", "periodic", {"env": {"name": "pendulum", "friction": 50.0}}),
+        ("pendulum", "oracle", {"model": {"name": "mlp"}}),
+        ("pendulum", "oracle", {"learner": {"name": "adam"}}),
+        ("pendulum", "d_optimal", {"learner": LEAST_SQUARES}),
+        ("pendulum", "random", {"model": LINEAR, "learner": LEAST_SQUARES}),
+        ("pendulum", "uniform", {"model": LINEAR}),
+    ],
+)
+def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
+    env: str, policy: str, changes: dict[str, Any]
+) -> None:
+    possible = "arm" if policy == "periodic" else env
+    mapping: dict[str, Any] = trial(possible, policy).to_mapping()
+    mapping |= {"env": {"name": env}} | changes
+    with pytest.raises(IncompatibleError) as caught:
+        TrialSpec.from_mapping(mapping)
+    assert isinstance(caught.value, SpecificationError)
+    assert str(caught.value).endswith((": change one of them.", ": choose another policy."))
+
+
+def test_the_linear_model_also_goes_with_d_optimal_inputs() -> None:
+    spec = trial("pendulum", "oracle")
+    mapping: dict[str, Any] = spec.to_mapping()
+    mixed = TrialSpec.from_mapping(mapping | {"policy": {"name": "d_optimal"}})
+    assert mixed.columns()["width"] is None

@@ -1,0 +1,38 @@
+"""Small trials for tests: named choices, few evaluation points, a short horizon."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dopt.errors import IncompatibleError
+from dopt.policies import POLICIES
+from dopt.spec import TrialSpec
+from dopt.systems import SYSTEMS
+
+SMALL_GRIDS = {"pendulum": (4, 4), "cartpole": (3, 4, 3), "arm": (2, 2, 2, 2), "quadrotor": (4, 4)}
+
+
+def trial(env: str, policy: str, seed: int = 0, /, **fields: Mapping[str, Any]) -> TrialSpec:
+    """Return a small trial; ``fields`` are the entries of the sections that differ from that."""
+    linear = policy == "oracle"
+    sections: dict[str, dict[str, Any]] = {
+        "env": {"name": env, "horizon": 30, "grid_points": SMALL_GRIDS[env]},
+        "policy": {"name": policy},
+        "model": {"name": "linear" if linear else "mlp"},
+        "learner": {"name": "recursive_least_squares" if linear else "adam_window"},
+    }
+    merged = {key: section | dict(fields.get(key, {})) for key, section in sections.items()}
+    return TrialSpec.from_mapping(merged | {"seed": seed})
+
+
+def compatible(env: str, policy: str) -> bool:
+    """Tell whether a policy makes sense for a system."""
+    try:
+        trial(env, policy)
+    except IncompatibleError:
+        return False
+    return True
+
+
+PAIRS = [(env, policy) for env in SYSTEMS for policy in POLICIES if compatible(env, policy)]
