@@ -1,0 +1,76 @@
+"""A grid of short trials, and a launch of it in this process."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orchestrate.campaign import Work, launch_grid
+from orchestrate.errors import ExitCode
+from orchestrate.executors.base import Run
+from orchestrate.grid import Grid
+from orchestrate.settings import LaunchSettings
+from orchestrate.store import LaunchRecord, Reader
+from tests.orchestrate.standins import quick, specification
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
+
+sys.path.append(str(ROOT / "orchestrate"))  # where a launch finds the plugin of Hydra
+
+
+class Launches:
+    """Launches stand-ins into one database and keeps what they said."""
+
+    def __init__(self, folder: Path) -> None:
+        self.url = f"sqlite:///{folder / 'results.db'}"
+        self.said: list[str] = []
+
+    def __call__(
+        self, run: Run = quick, seeds: int = 5, executor: str = "inprocess", **settings: Any
+    ) -> ExitCode:
+        grid = Grid([specification(seed) for seed in range(seeds)], asked=seeds, left_out={})
+        chosen = LaunchSettings(executor=executor, store_url=self.url, **{"workers": 2, **settings})
+        work = Work(run, prepare=lambda: None)
+        return launch_grid(grid, chosen, RECORD, work, self.said.append, stream=None)
+
+    def statuses(self) -> dict[int, str]:
+        """Return the status of each seed."""
+        with Reader.open(self.url) as reader:
+            return {row.seed: row.status for row in reader.trials(specification().config_key)}
+
+    def query(self, sql: str) -> list[tuple[Any, ...]]:
+        with Reader.open(self.url) as reader:
+            return [tuple(row) for row in reader.query(sql)]
+
+
+@pytest.fixture
+def launches(tmp_path: Path) -> Launches:
+    return Launches(tmp_path)
+
+
+@pytest.fixture
+def command_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """Return a function that runs ``launch.py`` in this process: exit code, output and errors."""
+    from orchestrate import launch
+
+    def run(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["launch.py", *arguments])
+        try:
+            code = int(launch.main())
+        except SystemExit as end:
+            code = int(end.code or 0)
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.delenv("DOPT_DB", raising=False)
+    monkeypatch.setattr(launch, "WORK", Work(quick, prepare=lambda: None))
+    return run

@@ -1,0 +1,145 @@
+"""One contract, run over every executor."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import pytest
+
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+from orchestrate.errors import InfrastructureError
+from orchestrate.executors.base import Event, Executor, Finished, Lost, Run, Task, Trouble
+from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.executors.local import LocalExecutor
+from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
+
+Make = Callable[[Run], Executor]
+
+
+def tasks(seeds: Sequence[int]) -> list[Task]:
+    trials = [specification(seed) for seed in seeds]
+    return [Task(trial.trial_key, trial) for trial in trials]
+
+
+def seed_of(key: str, among: int = 20) -> int:
+    return {specification(seed).trial_key: seed for seed in range(among)}[key]
+
+
+def drain(executor: Executor, seconds: float = 60.0) -> list[Event]:
+    events: list[Event] = []
+    end = time.monotonic() + seconds
+    while executor.pending:
+        assert time.monotonic() < end, f"after {seconds} s there is only {events}"
+        events += executor.wait(0.5)
+    return events
+
+
+def report_threads(_: TrialSpec) -> TrialResult:
+    raise RuntimeError(os.environ.get("OMP_NUM_THREADS", "none"))
+
+
+@pytest.fixture(scope="module")
+def ray_executor() -> Iterator[Executor]:
+    from orchestrate.executors.ray import RayExecutor
+
+    with RayExecutor(quick, workers=2) as executor:
+        yield executor
+
+
+@pytest.fixture(params=["inprocess", "local", "ray"])
+def make(request: pytest.FixtureRequest) -> Iterator[Make]:
+    """Return a function that gives a started executor for a stand-in."""
+    started: list[Executor] = []
+
+    def start(run: Run) -> Executor:
+        if request.param == "ray":
+            executor = request.getfixturevalue("ray_executor")
+            executor._run = run
+            return executor  # type: ignore[no-any-return]
+        local = request.param == "local"
+        started.append(LocalExecutor(run, workers=2) if local else InProcessExecutor(run))
+        started[-1].start()
+        return started[-1]
+
+    yield start
+    for executor in started:
+        executor.stop()
+
+
+def test_every_task_gets_its_result(make: Make) -> None:
+    executor = make(quick)
+    for seeds in ([0, 1, 2], [3], [], [4, 5]):
+        executor.submit(tasks(seeds))
+    events = drain(executor)
+    assert sorted(seed_of(event.key) for event in events if isinstance(event, Finished)) == [
+        *range(6)
+    ]
+    for event in events:
+        assert isinstance(event, Finished)
+        assert isinstance(event.outcome, TrialResult)
+        expected = quick(specification(seed_of(event.key)))
+        np.testing.assert_array_equal(event.outcome.states, expected.states)
+        assert event.usage.wall_seconds >= 0.0
+        assert event.usage.peak_memory_bytes > 2**20
+        assert event.usage.started <= event.usage.ended
+
+
+def test_an_exception_comes_back_with_its_traceback_and_the_rest_runs(make: Make) -> None:
+    executor = make(raising)
+    executor.submit(tasks(range(5)))
+    outcomes = {seed_of(e.key): e.outcome for e in drain(executor) if isinstance(e, Finished)}
+    trouble = outcomes.pop(BROKEN_SEED)
+    assert isinstance(trouble, Trouble)
+    assert (trouble.type, trouble.message) == ("ZeroDivisionError", "the seed is broken")
+    assert "in raising" in trouble.traceback
+    assert sorted(outcomes) == [0, 1, 3, 4]
+
+
+def test_waiting_ends_in_time_and_without_work_returns_nothing(make: Make) -> None:
+    executor = make(slow)
+    assert executor.wait(0.01) == []
+    assert executor.pending == 0
+
+
+def test_one_thread_for_each_worker(make: Make) -> None:
+    executor = make(report_threads)
+    executor.submit(tasks([0]))
+    [event] = drain(executor)
+    assert isinstance(event, Finished)
+    assert isinstance(event.outcome, Trouble)
+    assert event.outcome.message == "1"
+
+
+@pytest.mark.parametrize("make", ["local", "ray"], indirect=True)
+def test_the_chunk_of_a_killed_worker_is_lost_and_the_others_are_not(make: Make) -> None:
+    executor = make(deadly)
+    for seeds in ([0, 1], [BROKEN_SEED, 3], [4, 5], [6, 7]):
+        executor.submit(tasks(seeds))
+    events = drain(executor)
+    lost = {seed_of(key) for event in events if isinstance(event, Lost) for key in event.keys}
+    finished = {seed_of(event.key) for event in events if isinstance(event, Finished)}
+    assert lost == {BROKEN_SEED, 3}
+    assert finished == {0, 1, 4, 5, 6, 7}
+    assert not any(event.blameless for event in events if isinstance(event, Lost))
+
+
+def test_workers_that_cannot_even_start_are_no_fault_of_a_trial() -> None:
+    with LocalExecutor(_unknown_elsewhere(), 1) as executor:
+        executor.submit(tasks([0]))
+        with pytest.raises(InfrastructureError, match="before they were ready"):
+            drain(executor)
+
+
+def _unknown_elsewhere() -> Run:
+    """Return a function that pickles by a name which no other process knows."""
+
+    def run(spec: TrialSpec) -> TrialResult:
+        raise AssertionError(spec)
+
+    run.__module__, run.__qualname__ = "os", "getpid_of_nobody"
+    vars(os)["getpid_of_nobody"] = run
+    return run

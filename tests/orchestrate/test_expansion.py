@@ -1,0 +1,163 @@
+"""The fast expansion gives what Hydra's own sweeper gives, for every kind of override."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import initialize_config_dir
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from omegaconf import DictConfig, OmegaConf
+
+from dopt.errors import SpecificationError
+from orchestrate.hydra_plugins.dopt_grid import _composer
+from orchestrate.hydra_plugins.dopt_grid._expansion import expand
+
+SAMPLE = Path(__file__).parent / "sample"
+SECTIONS = (
+    "env", "policy", "model", "seed", "width", "scale", "label", "nothing", "nested", "new",
+)  # fmt: skip
+
+OVERRIDES = {
+    "env": ["env=first,second", "env=glob(*)", "env=glob([f*,s*],exclude=second)", "env=second"],
+    "policy": ["policy=plain,oracle", "policy=glob(*)", "policy=oracle"],
+    "model": ["model=mlp", "model=linear,mlp"],
+    "seed": ["seed=range(3)", "seed=7", "seed=choice(1,5)", "seed=sort(3,1,reverse=true)"],
+    "width": ["width=8,16", "width=range(4,9,2)", "width=choice(4)", "width=float(4,5)"],
+    "scale": ["scale=0.5,1e-3", "scale=range(0,0.3,0.1)", "scale=inf,-1.0"],
+    "env.dt": ["env.dt=0.01,0.02", "env.dt=null", "env.dt='${scale}',0.1", "env.dt=${width}"],
+    "env.gamma": ["env.gamma=1,2.5", "++env.gamma=4,5", "~env.gamma"],
+    "env.masses": ["env.masses=[1,2],[3]", "env.masses=[0.5,0.5]"],
+    "label": ["label='a,b',\"c d\"", "label=null,x", "label='it\\'s'", "label=a-b,1.0,true"],
+    "nothing": ["nothing=null,3", "nothing={a:1},{b:2}", "~nothing", "nothing=1,[2]"],
+    "new": ["+new=1,2", "++new=x", "+new={a:[1,2]}"],
+    "nested": [
+        "nested.inner.value=1,2", "nested.inner={value:3},{value:4}", "+nested.extra=0.1,0.2",
+        "nested.inner.items=[1],[2,'${seed}']", "~nested.inner.value",
+    ],
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Hydra over the sample configuration, and what it composes without overrides."""
+
+    loader: ConfigLoader
+    master: DictConfig
+
+
+@pytest.fixture(scope="module")
+def sample() -> Iterator[Sample]:
+    with initialize_config_dir(str(SAMPLE), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        yield Sample(loader, loader.load_configuration("config", [], RunMode.MULTIRUN))
+
+
+@st.composite
+def command_lines(draw: st.DrawFn) -> list[str]:
+    """Draw overrides of up to three keys, in any order, with at most 30 jobs or so."""
+    keys = draw(st.lists(st.sampled_from(sorted(OVERRIDES)), unique=True, max_size=3))
+    return [draw(st.sampled_from(OVERRIDES[key])) for key in keys]
+
+
+def by_hydra(sample: Sample, arguments: Sequence[str]) -> Counter[str]:
+    """Return the resolved jobs of the stock sweeper, each with its number."""
+    parsed = OverridesParser.create(config_loader=sample.loader).parse_overrides(list(arguments))
+    jobs = BasicSweeper.split_arguments(parsed, None)[0]
+    configs = (sample.loader.load_sweep_config(sample.master, list(job)) for job in jobs)
+    return Counter(
+        frozen({key: plain(one, key) for key in one if key != "hydra"}) for one in configs
+    )
+
+
+def plain(config: Any, key: Any) -> object:
+    value = config[key]
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+
+
+def by_us(sample: Sample, arguments: Sequence[str]) -> Counter[str]:
+    jobs: Counter[str] = Counter()
+    for combination in expand(sample.loader, sample.master, arguments, sections=SECTIONS):
+        inner = combination.inner or [combination.settings["seed"]]
+        jobs.update(frozen({**combination.settings, "seed": seed}) for seed in inner)
+    return jobs
+
+
+def frozen(settings: dict[Any, Any]) -> str:
+    """Tell 1 from 1.0 and from "1", and forget the order of keys."""
+    return json.dumps(settings, sort_keys=True)
+
+
+def same(sample: Sample, arguments: Sequence[str]) -> None:
+    try:
+        expected = by_hydra(sample, arguments)
+    except Exception as error:
+        with pytest.raises(type(error)):
+            by_us(sample, arguments)
+    else:
+        assert by_us(sample, arguments) == expected
+
+
+@pytest.mark.parametrize("override", [one for many in OVERRIDES.values() for one in many])
+def test_each_override_is_read_as_hydra_reads_it(sample: Sample, override: str) -> None:
+    same(sample, [override])
+
+
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(arguments=command_lines())
+def test_any_mixture_expands_as_by_hydra(sample: Sample, arguments: list[str]) -> None:
+    same(sample, arguments)
+
+
+def test_each_choice_of_groups_is_composed_once(
+    sample: Sample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    composed: list[Sequence[str]] = []
+    quick = _composer.Composer._quick
+
+    def counted(self: Any, files: Any, words: Sequence[str]) -> DictConfig:
+        composed.append(words)
+        return quick(self, files, words)
+
+    monkeypatch.setattr(_composer.Composer, "_quick", counted)
+    monkeypatch.setattr(_composer.Composer, "like_hydra", None)
+    jobs = by_us(sample, ["env=glob(*)", "model=mlp,linear", "scale=range(50)", "seed=range(9)"])
+    assert len(composed) == 4
+    assert sum(jobs.values()) == 4 * 50 * 9
+
+
+def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> None:
+    apart = expand(sample.loader, sample.master, ["seed=range(4)"], sections=SECTIONS)
+    together = expand(
+        sample.loader, sample.master, ["seed=range(4)", "model=linear"], sections=("policy", "seed")
+    )
+    assert [one.inner for one in apart] == [None] * 4
+    assert [one.inner for one in together] == [(0, 1, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("env=glob(frist)", "did you mean 'first'"),
+        ("seed=range(5,5)", "has no values"),
+        ("seed=range(5,1)", "has no values"),
+        ("scale=interval(0,1)", "no finite list"),
+        ("width=glob(*)", "is no group"),
+        ("launch.workers=1,2", "whole launch"),
+    ],
+)
+def test_sweeps_without_values_are_errors(sample: Sample, override: str, words: str) -> None:
+    with pytest.raises((SpecificationError, HydraException), match=words):
+        expand(sample.loader, sample.master, [override])
