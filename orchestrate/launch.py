@@ -55,14 +55,14 @@ def read_command_line() -> Request | None:
     Exception
         Hydra's own errors, and those of the grid.
     """
-    requests: list[Request] = []
+    tasks: list[DictConfig | tuple[DictConfig, list[Combination]]] = []
 
     @hydra.main(config_path=str(ROOT / "conf"), config_name="config", version_base="1.3")
     def capture(task: DictConfig | tuple[DictConfig, list[Combination]]) -> None:
-        requests.append(_request(task))
+        tasks.append(task)  # Hydra would add a line of its own to an error in here
 
     capture()
-    return requests[0] if requests else None
+    return _request(tasks[0]) if tasks else None
 
 
 def _request(task: DictConfig | tuple[DictConfig, list[Combination]]) -> Request:

@@ -94,7 +94,7 @@ def _check_sweep(loader: ConfigLoader, override: Override) -> None:
         raise ConfigCompositionException(
             f"'{line}' has no finite list of values: use a choice a,b or range(start,stop,step)."
         )
-    if next(iter(override.sweep_iterator()), None) is None:
+    if not any(True for _ in override.sweep_iterator()):
         raise _empty(loader, override)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 from collections.abc import Sequence
@@ -35,12 +36,8 @@ class Composer:
     def compose(self, words: Sequence[str]) -> DictConfig:
         """Return the configuration for overrides without sweeps."""
         if self._files is not None:
-            try:
-                config = self._quick(self._files, words)
-            except Exception:
-                config = None
-            if config is not None and "${hydra:" not in str(config):
-                return config
+            with contextlib.suppress(Exception):
+                return self._quick(self._files, words)
         return self.like_hydra(words)
 
     def like_hydra(self, words: Sequence[str]) -> DictConfig:
