@@ -80,13 +80,21 @@ class Evaluation(NamedTuple):
     n_all: int  # all blocks or points
 
 
+class Covariance(NamedTuple):
+    """M⁻¹ = A - VᵀV (:mod:`dopt.kernel.information`); all empty where nothing needs it."""
+
+    upper: Floats  # (q, q), A in the upper triangle
+    pending: Floats  # (PENDING_ROWS, q), V in the first n_pending rows
+    n_pending: Integers  # (1,)
+
+
 class State(NamedTuple):
     """Everything that changes from step to step; written in place."""
 
     theta: Floats  # (q,) parameters
     moment_1: Floats  # (q,) of Adam
     moment_2: Floats  # (q,)
-    covariance: Floats  # (q, q) M⁻¹, or (0, 0) where no plan and no learner needs it
+    covariance: Covariance
     window_features: Floats  # (p, window) newest samples, a ring
     window_targets: Floats  # (r, window)
 

@@ -1,6 +1,12 @@
 """The inverse M⁻¹ of the information matrix in compiled code.
 
-Only the upper triangle is stored and read: half the memory traffic, and symmetric by construction.
+M⁻¹ = A - VᵀV, with A a symmetric matrix of which only the upper triangle is stored and read, and V
+a few pending rows, (n, q). A step adds r rows to V; when V is full it is subtracted from A in one
+pass over the memory of A, which costs less than a pass in every step. All results are symmetric by
+construction.
+
+The loops take two or four rows of A at a time: each entry of a vector is then loaded once for
+several products. They run over slices, whose indices the compiler knows to be within bounds.
 """
 
 from __future__ import annotations
@@ -9,69 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from dopt.kernel.arguments import Covariance
 from dopt.kernel.compiler import vectorized
 
-
-@vectorized
-def symmetric_product(upper: Any, x: Any, y: Any) -> None:
-    """Write y = A x, (q,), for a symmetric A given by its upper triangle, (q, q)."""
-    y[:] = 0.0
-    for i in range(x.shape[0]):
-        total = _dot_and_add(upper[i, i + 1 :], x[i + 1 :], x[i], y[i + 1 :])
-        y[i] += total + upper[i, i] * x[i]
-
-
-@vectorized
-def _dot_and_add(row: Any, x: Any, factor: float, y: Any) -> float:
-    """Return rowᵀx and add ``factor`` times the row to y."""
-    total = 0.0
-    for j in range(row.shape[0]):
-        total += row[j] * x[j]
-        y[j] += row[j] * factor
-    return total
-
-
-@vectorized
-def symmetric_products(upper: Any, x_1: Any, x_2: Any, y_1: Any, y_2: Any) -> None:
-    """Write y₁ = A x₁ and y₂ = A x₂ in one pass over the upper triangle of A."""
-    y_1[:] = 0.0
-    y_2[:] = 0.0
-    for i in range(x_1.shape[0]):
-        total_1, total_2 = _dots_and_adds(
-            upper[i, i + 1 :],
-            x_1[i + 1 :],
-            x_2[i + 1 :],
-            x_1[i],
-            x_2[i],
-            y_1[i + 1 :],
-            y_2[i + 1 :],
-        )
-        y_1[i] += total_1 + upper[i, i] * x_1[i]
-        y_2[i] += total_2 + upper[i, i] * x_2[i]
-
-
-@vectorized
-def _dots_and_adds(
-    row: Any, x_1: Any, x_2: Any, factor_1: float, factor_2: float, y_1: Any, y_2: Any
-) -> Any:
-    total_1, total_2 = 0.0, 0.0
-    for j in range(row.shape[0]):
-        entry = row[j]
-        total_1 += entry * x_1[j]
-        total_2 += entry * x_2[j]
-        y_1[j] += entry * factor_1
-        y_2[j] += entry * factor_2
-    return total_1, total_2
-
-
-@vectorized
-def multiply_rows(upper: Any, rows: Any, out: Any) -> None:
-    """Write the products of A with each row of ``rows``, (k, q), two at a time."""
-    k = rows.shape[0]
-    for i in range(0, k - 1, 2):
-        symmetric_products(upper, rows[i], rows[i + 1], out[i], out[i + 1])
-    if k % 2:
-        symmetric_product(upper, rows[k - 1], out[k - 1])
+PENDING_ROWS = 16
+"""Room for pending rows: a multiple of 4."""
 
 
 @vectorized
@@ -84,10 +32,137 @@ def inner(a: Any, b: Any) -> float:
 
 
 @vectorized
-def quadratic_forms(upper: Any, left: Any, right: Any) -> Any:
-    """Return left A rightᵀ for ``left`` (k, q) and ``right`` (n, q)."""
+def _add_multiple(y: Any, factor: float, x: Any) -> None:
+    for i in range(x.shape[0]):
+        y[i] += factor * x[i]
+
+
+@vectorized
+def symmetric_product(upper: Any, x: Any, y: Any) -> None:
+    """Write y = A x, (q,), four rows of the upper triangle of A at a time."""
+    q = x.shape[0]
+    y[:] = 0.0
+    blocked = q - q % 4
+    for i in range(0, blocked, 4):
+        _four_rows(
+            upper[i, i + 4 :],
+            upper[i + 1, i + 4 :],
+            upper[i + 2, i + 4 :],
+            upper[i + 3, i + 4 :],
+            x[i : i + 4],
+            x[i + 4 :],
+            y[i : i + 4],
+            y[i + 4 :],
+        )
+        _triangle(upper, x, y, i, i + 4)
+    _triangle(upper, x, y, blocked, q)
+
+
+@vectorized
+def _triangle(upper: Any, x: Any, y: Any, start: int, stop: int) -> None:
+    """Add the product with the diagonal block from ``start`` to ``stop``."""
+    for i in range(start, stop):
+        y[i] += upper[i, i] * x[i]
+        for j in range(i + 1, stop):
+            y[i] += upper[i, j] * x[j]
+            y[j] += upper[i, j] * x[i]
+
+
+@vectorized
+def _four_rows(
+    row_0: Any, row_1: Any, row_2: Any, row_3: Any, factors: Any, x: Any, sums: Any, y: Any
+) -> None:
+    """Add rowᵀx to the sums of four rows and the rows' multiples to y."""
+    factor_0, factor_1, factor_2, factor_3 = factors[0], factors[1], factors[2], factors[3]
+    sum_0, sum_1, sum_2, sum_3 = 0.0, 0.0, 0.0, 0.0
+    for j in range(x.shape[0]):
+        entry_0, entry_1, entry_2, entry_3 = row_0[j], row_1[j], row_2[j], row_3[j]
+        sum_0 += entry_0 * x[j]
+        sum_1 += entry_1 * x[j]
+        sum_2 += entry_2 * x[j]
+        sum_3 += entry_3 * x[j]
+        y[j] += entry_0 * factor_0 + entry_1 * factor_1 + entry_2 * factor_2 + entry_3 * factor_3
+    sums[0] += sum_0
+    sums[1] += sum_1
+    sums[2] += sum_2
+    sums[3] += sum_3
+
+
+@vectorized
+def symmetric_products(upper: Any, x: Any, z: Any, y: Any, w: Any) -> None:
+    """Write y = A x and w = A z, (q,), in one pass over the upper triangle of A."""
+    q = x.shape[0]
+    y[:] = 0.0
+    w[:] = 0.0
+    blocked = q - q % 2
+    for i in range(0, blocked, 2):
+        _two_rows(
+            upper[i, i + 2 :],
+            upper[i + 1, i + 2 :],
+            x[i : i + 2],
+            z[i : i + 2],
+            x[i + 2 :],
+            z[i + 2 :],
+            y[i : i + 2],
+            w[i : i + 2],
+            y[i + 2 :],
+            w[i + 2 :],
+        )
+        _triangle(upper, x, y, i, i + 2)
+        _triangle(upper, z, w, i, i + 2)
+    _triangle(upper, x, y, blocked, q)
+    _triangle(upper, z, w, blocked, q)
+
+
+@vectorized
+def _two_rows(
+    row_0: Any,
+    row_1: Any,
+    x_head: Any,
+    z_head: Any,
+    x: Any,
+    z: Any,
+    y_head: Any,
+    w_head: Any,
+    y: Any,
+    w: Any,
+) -> None:
+    """Do for two rows and two vectors what :func:`_four_rows` does for four and one."""
+    x_0, x_1, z_0, z_1 = x_head[0], x_head[1], z_head[0], z_head[1]
+    sum_x0, sum_x1, sum_z0, sum_z1 = 0.0, 0.0, 0.0, 0.0
+    for j in range(x.shape[0]):
+        entry_0, entry_1 = row_0[j], row_1[j]
+        sum_x0 += entry_0 * x[j]
+        sum_x1 += entry_1 * x[j]
+        sum_z0 += entry_0 * z[j]
+        sum_z1 += entry_1 * z[j]
+        y[j] += entry_0 * x_0 + entry_1 * x_1
+        w[j] += entry_0 * z_0 + entry_1 * z_1
+    y_head[0] += sum_x0
+    y_head[1] += sum_x1
+    w_head[0] += sum_z0
+    w_head[1] += sum_z1
+
+
+@vectorized
+def multiply_rows(covariance: Covariance, rows: Any, out: Any) -> None:
+    """Write M⁻¹ times each row of ``rows``, (k, q)."""
+    k = rows.shape[0]
+    for i in range(0, k - 1, 2):
+        symmetric_products(covariance.upper, rows[i], rows[i + 1], out[i], out[i + 1])
+    if k % 2:
+        symmetric_product(covariance.upper, rows[k - 1], out[k - 1])
+    for n in range(covariance.n_pending[0]):
+        pending = covariance.pending[n]
+        for i in range(k):
+            _add_multiple(out[i], -inner(pending, rows[i]), pending)
+
+
+@vectorized
+def quadratic_forms(covariance: Covariance, left: Any, right: Any) -> Any:
+    """Return left M⁻¹ rightᵀ for ``left`` (k, q) and ``right`` (n, q)."""
     products = np.empty(left.shape)
-    multiply_rows(upper, left, products)
+    multiply_rows(covariance, left, products)
     out = np.empty((left.shape[0], right.shape[0]))
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -96,15 +171,15 @@ def quadratic_forms(upper: Any, left: Any, right: Any) -> Any:
 
 
 @vectorized
-def absorb(upper: Any, rows: Any, residuals: Any, scratch: Any) -> None:
+def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> None:
     """Turn M⁻¹ into (M + JᵀJ)⁻¹ and the residuals e into L⁻¹e (Woodbury identity).
 
     With V = J M⁻¹ and the Cholesky factor L of I + V Jᵀ, the update is M⁻¹ - (L⁻¹V)ᵀ(L⁻¹V).
 
     Parameters
     ----------
-    upper : (q, q)
-        M⁻¹, its upper triangle overwritten.
+    covariance : Covariance
+        M⁻¹, updated in place.
     rows : (r, q)
         J.
     residuals : (r,)
@@ -112,22 +187,22 @@ def absorb(upper: Any, rows: Any, residuals: Any, scratch: Any) -> None:
     scratch : (r, q)
         Overwritten by L⁻¹V.
     """
-    r, q = rows.shape
-    multiply_rows(upper, rows, scratch)
+    r = rows.shape[0]
+    multiply_rows(covariance, rows, scratch)
     L = np.zeros((r, r))
     for k in range(r):
         for i in range(k + 1):
             L[k, i] = inner(scratch[k], rows[i]) + (1.0 if i == k else 0.0)
     _factorize(L)
     for k in range(r):
+        row = scratch[k]
         for i in range(k):
             residuals[k] -= L[k, i] * residuals[i]
-            for j in range(q):
-                scratch[k, j] -= L[k, i] * scratch[i, j]
+            _add_multiple(row, -L[k, i], scratch[i])
         residuals[k] /= L[k, k]
-        for j in range(q):
-            scratch[k, j] /= L[k, k]
-    _subtract_products(upper, scratch)
+        for j in range(row.shape[0]):
+            row[j] /= L[k, k]
+        _append(covariance, row)
 
 
 @vectorized
@@ -142,24 +217,39 @@ def _factorize(L: Any) -> None:
 
 
 @vectorized
-def _subtract_products(upper: Any, V: Any) -> None:
-    """Subtract VᵀV from the upper triangle, two rows of V in one pass."""
-    r, q = V.shape
-    for k in range(0, r - 1, 2):
-        for i in range(q):
-            _subtract_two(upper[i, i:], V[k, i], V[k, i:], V[k + 1, i], V[k + 1, i:])
-    if r % 2:
-        for i in range(q):
-            _subtract_one(upper[i, i:], V[r - 1, i], V[r - 1, i:])
+def _append(covariance: Covariance, row: Any) -> None:
+    """Add a row to V, and subtract VᵀV from A when that fills it."""
+    n = covariance.n_pending[0]
+    pending = covariance.pending
+    target = pending[n]
+    for j in range(row.shape[0]):
+        target[j] = row[j]
+    n += 1
+    if n == pending.shape[0]:
+        for i in range(row.shape[0]):
+            for k in range(0, n, 4):
+                _subtract_four(
+                    covariance.upper[i, i:],
+                    pending[k : k + 4, i],
+                    pending[k, i:],
+                    pending[k + 1, i:],
+                    pending[k + 2, i:],
+                    pending[k + 3, i:],
+                )
+        n = 0
+    covariance.n_pending[0] = n
 
 
 @vectorized
-def _subtract_two(row: Any, a: float, first: Any, b: float, second: Any) -> None:
+def _subtract_four(row: Any, factors: Any, v_0: Any, v_1: Any, v_2: Any, v_3: Any) -> None:
+    factor_0, factor_1, factor_2, factor_3 = factors[0], factors[1], factors[2], factors[3]
     for j in range(row.shape[0]):
-        row[j] -= a * first[j] + b * second[j]
+        row[j] -= factor_0 * v_0[j] + factor_1 * v_1[j] + factor_2 * v_2[j] + factor_3 * v_3[j]
 
 
-@vectorized
-def _subtract_one(row: Any, a: float, values: Any) -> None:
-    for j in range(row.shape[0]):
-        row[j] -= a * values[j]
+def dense(covariance: Covariance) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return M⁻¹ as a full matrix, (q, q)."""
+    upper = np.triu(covariance.upper)
+    pending = covariance.pending[: covariance.n_pending[0]]
+    full: np.ndarray[Any, np.dtype[np.float64]] = upper + np.triu(upper, 1).T - pending.T @ pending
+    return full

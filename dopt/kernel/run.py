@@ -14,6 +14,7 @@ from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import arguments as args
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
 from dopt.kernel.evaluation import BLOCK
+from dopt.kernel.information import PENDING_ROWS
 from dopt.kernel.trial import advance
 from dopt.learning import Adam
 from dopt.models import MLP
@@ -207,10 +208,12 @@ def _initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State
     system, policy, learner = spec.system, spec.policy, spec.learner
     q = len(weights)
     window = learner.window if isinstance(learner, Adam) else 0
-    if isinstance(policy, DOptimal):
-        covariance = np.eye(q) / policy.regularization
-    else:
-        covariance = np.zeros((0, 0))
+    informed = isinstance(policy, DOptimal)
+    covariance = args.Covariance(
+        np.eye(q) / policy.regularization if isinstance(policy, DOptimal) else np.zeros((0, 0)),
+        np.zeros((PENDING_ROWS, q if informed else 0)),
+        np.zeros(1, dtype=np.int64),
+    )
     return args.State(
         weights.copy(),
         np.zeros(q),
