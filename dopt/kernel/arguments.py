@@ -71,6 +71,7 @@ class Evaluation(NamedTuple):
     the grid and that of the reachable set padded; for the linear model one after the other.
     """
 
+    single: npt.NDArray[np.float32]  # (blocks, p, block size), features in single precision
     features: Floats  # (blocks, p, block size)
     block_targets: Floats  # (blocks, r, block size)
     block_sizes: Integers  # (blocks,) points that count
@@ -78,6 +79,7 @@ class Evaluation(NamedTuple):
     targets: Floats  # (N, r) less the offset, of the linear model
     n_grid: int  # blocks of the grid, or its points for the linear model
     n_all: int  # all blocks or points
+    target_size: float  # root mean square of the targets
 
 
 class Covariance(NamedTuple):

@@ -83,23 +83,17 @@ def compilable(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @intrinsic
-def float_from_bits(typing_context: Any, bits: Any) -> Any:  # noqa: ARG001
-    """Reinterpret the bits of an int64 as a float64."""
+def power_of_two(typing_context: Any, shifted: Any) -> Any:  # noqa: ARG001
+    """Return 2^k for a float that holds the integer k in the lowest bits of its significand."""
+    bits, exponent_at, bias = (32, 23, 127) if shifted == types.float32 else (64, 52, 1023)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-        return builder.bitcast(arguments[0], ir.DoubleType())
+        word = ir.IntType(bits)
+        exponent = builder.shl(builder.bitcast(arguments[0], word), ir.Constant(word, exponent_at))
+        biased = builder.add(exponent, ir.Constant(word, bias << exponent_at))
+        return builder.bitcast(biased, arguments[0].type)
 
-    return types.float64(types.int64), generate
-
-
-@intrinsic
-def bits_from_float(typing_context: Any, value: Any) -> Any:  # noqa: ARG001
-    """Reinterpret the bits of a float64 as an int64."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
-        return builder.bitcast(arguments[0], ir.IntType(64))
-
-    return types.int64(types.float64), generate
+    return shifted(shifted), generate
 
 
 @intrinsic

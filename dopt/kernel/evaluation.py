@@ -13,6 +13,14 @@ from dopt.kernel.network import forward
 BLOCK = 256
 """Points evaluated at a time: the activations of a block stay in the first-level cache."""
 
+SINGLE_FLOOR = 1e-2
+"""Least loss, in units of the root mean square of the targets, that single precision settles.
+
+Rounding the network's values to single precision moves each of them by about 1e-7 of the targets'
+size, hence the loss by less than 1e-5 of itself above this floor (tested); below, the loss is
+evaluated in double precision.
+"""
+
 
 @compiled
 def model_error(
@@ -21,23 +29,39 @@ def model_error(
     """Return sqrt(mean ‖a_θ(x) - a(x)‖²) over the points from ``start`` to ``stop``.
 
     The network's points come in blocks, and both bounds lie between blocks or at the end.
+    ``buffers`` are the flat activations, (L, w BLOCK), and outputs, (r, BLOCK), in single and in
+    double precision, and room for the parameters, (q,), in single precision.
     """
-    total, count = 0.0, 0
     if network.kind == LINEAR_MODEL:
-        for i in range(start, stop):
-            for k in range(points.targets.shape[1]):
-                value = -points.targets[i, k]
-                for j in range(theta.shape[0]):
-                    value += points.regressors[i, k, j] * theta[j]
-                total += value * value
-        count = stop - start
-    else:
-        hidden, outputs = buffers
-        for block in range(start, stop):
-            forward(network, theta, points.features[block], hidden, outputs)
-            used = points.block_sizes[block]
-            total += _squared_errors(outputs, points.block_targets[block], used)
-            count += used
+        return _linear_error(theta, points, start, stop)
+    hidden_single, outputs_single, hidden, outputs, theta_single = buffers
+    for i in range(theta.shape[0]):
+        theta_single[i] = np.float32(theta[i])
+    loss = _network_error(
+        network, theta_single, points.single, points, start, stop, hidden_single, outputs_single
+    )
+    if loss >= SINGLE_FLOOR * points.target_size:
+        return loss
+    return _network_error(network, theta, points.features, points, start, stop, hidden, outputs)
+
+
+@compiled
+def _network_error(
+    network: Network,
+    theta: Any,
+    features: Any,
+    points: Evaluation,
+    start: int,
+    stop: int,
+    hidden: Any,
+    outputs: Any,
+) -> float:
+    total, count = 0.0, 0
+    for block in range(start, stop):
+        forward(network, theta, features[block], hidden, outputs)
+        used = points.block_sizes[block]
+        total += _squared_errors(outputs, points.block_targets[block], used)
+        count += used
     return float(np.sqrt(total / count)) if count else np.nan
 
 
@@ -46,8 +70,33 @@ def _squared_errors(outputs: Any, targets: Any, n: int) -> float:
     """Return Σ (output - target)² over the first n columns."""
     total = 0.0
     for k in range(outputs.shape[0]):
-        values, truth = outputs[k], targets[k]
-        for i in range(n):
+        values, truth = outputs[k, :n], targets[k, :n]
+        for i in range(values.shape[0]):
             error = values[i] - truth[i]
             total += error * error
     return total
+
+
+@compiled
+def _linear_error(theta: Any, points: Evaluation, start: int, stop: int) -> float:
+    total = 0.0
+    for i in range(start, stop):
+        for k in range(points.targets.shape[1]):
+            value = -points.targets[i, k]
+            for j in range(theta.shape[0]):
+                value += points.regressors[i, k, j] * theta[j]
+            total += value * value
+    return float(np.sqrt(total / (stop - start))) if stop > start else np.nan
+
+
+@compiled
+def evaluation_buffers(network: Network, q: int, r: int) -> Any:
+    """Return the scratch memory of :func:`model_error`."""
+    depth, room = network.offsets.shape[0] - 1, network.sizes[1] * BLOCK
+    return (
+        np.empty((depth, room), np.float32),
+        np.empty((r, BLOCK), np.float32),
+        np.empty((depth, room)),
+        np.empty((r, BLOCK)),
+        np.empty(q, np.float32),
+    )

@@ -21,6 +21,9 @@ from dopt.kernel.compiler import vectorized
 PENDING_ROWS = 16
 """Room for pending rows: a multiple of 4."""
 
+SMALL = 32
+"""Up to this q the matrix lies in the first-level cache and there is little to save: 4 rows."""
+
 
 @vectorized
 def inner(a: Any, b: Any) -> float:

@@ -14,7 +14,7 @@ from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import arguments as args
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
 from dopt.kernel.evaluation import BLOCK
-from dopt.kernel.information import PENDING_ROWS
+from dopt.kernel.information import PENDING_ROWS, SMALL
 from dopt.kernel.trial import advance
 from dopt.learning import Adam
 from dopt.models import MLP
@@ -162,14 +162,17 @@ def _evaluation(system: System, network: args.Network, points: EvaluationSet) ->
     features, targets, sizes = zip(
         *(_blocks(columns[0][:, part], columns[1][:, part]) for part in parts), strict=True
     )
+    blocks = np.concatenate(features)
     return args.Evaluation(
-        np.concatenate(features),
+        blocks.astype(np.float32),
+        blocks,
         np.concatenate(targets),
         np.concatenate(sizes),
         np.zeros((0, 0, 0)),
         np.zeros((0, 0)),
         len(sizes[0]),
         len(sizes[0]) + len(sizes[1]),
+        _size(points.accelerations),
     )
 
 
@@ -194,6 +197,7 @@ def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation
     )
     regressors = np.stack([unit - offset for unit in units], axis=-1)
     return args.Evaluation(
+        np.zeros((0, 0, 0), dtype=np.float32),
         np.zeros((0, 0, 0)),
         np.zeros((0, 0, 0)),
         np.zeros(0, dtype=np.int64),
@@ -201,7 +205,13 @@ def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation
         np.ascontiguousarray(points.accelerations - offset),
         points.n_grid,
         len(points.states),
+        _size(points.accelerations),
     )
+
+
+def _size(targets: args.Floats) -> float:
+    """Return the root mean square norm of targets, (N, r)."""
+    return float(np.sqrt(np.mean(np.sum(targets**2, axis=1))))
 
 
 def _initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:
@@ -211,7 +221,7 @@ def _initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State
     informed = isinstance(policy, DOptimal)
     covariance = args.Covariance(
         np.eye(q) / policy.regularization if isinstance(policy, DOptimal) else np.zeros((0, 0)),
-        np.zeros((PENDING_ROWS, q if informed else 0)),
+        np.zeros((PENDING_ROWS if q > SMALL else 4, q if informed else 0)),
         np.zeros(1, dtype=np.int64),
     )
     return args.State(

@@ -20,7 +20,7 @@ from dopt.kernel.arguments import (
     World,
 )
 from dopt.kernel.compiler import compiled, monotonic_microseconds
-from dopt.kernel.evaluation import BLOCK, model_error
+from dopt.kernel.evaluation import evaluation_buffers, model_error
 from dopt.kernel.information import absorb
 from dopt.kernel.learning import adam_step, remember
 from dopt.kernel.model import jacobian_rows
@@ -123,7 +123,7 @@ def advance(
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     room = max(width, r) * rules.window
     learning = (np.empty((depth, room)), np.empty((3, room)))
-    evaluating = (np.empty((depth, width * BLOCK)), np.empty((r, BLOCK)))
+    evaluating = evaluation_buffers(network, q, r)
     gradient, rows, scratch = np.empty(q), np.empty((r, q)), np.empty((r, q))
     target, residuals = np.empty(r), np.empty(r)
     for t in range(first, last):
