@@ -1,0 +1,97 @@
+"""The compiled kernel against the torch reference that defines a trial."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt.exploration import run_trial
+from dopt.kernel.run import KernelTrial
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+from tests.dopt.kernel.twin import relative_gap, transplant
+from tests.dopt.trials import PAIRS, trial
+
+WINDOW = {"name": "adam_window", "window": 7}
+"""Shorter than the trials, so that the kernel's ring of samples goes round."""
+NEWEST = {"name": "adam"}
+LOSS = 1e-5
+"""The kernel judges a model in single precision, down to a floor; what it decides by is double."""
+CASES = [
+    pytest.param(env, policy, learner, id=f"{env}-{policy}-{learner.get('name', 'rls')}")
+    for env, policy in PAIRS
+    for learner in ([{}] if policy == "oracle" else [NEWEST, WINDOW])
+]
+
+
+def check_agreement(spec: TrialSpec) -> tuple[TrialResult, TrialResult]:
+    """Run on both paths; states and inputs have to agree to 1e-8."""
+    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
+    assert np.isfinite(plain.loss).all()
+    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
+    assert relative_gap(fast.states, plain.states) < 1e-8
+    assert fast.loss == pytest.approx(plain.loss, rel=LOSS)
+    assert fast.reachable_loss == pytest.approx(plain.reachable_loss, rel=LOSS)
+    assert fast.diverged_at is None
+    assert plain.diverged_at is None
+    return fast, plain
+
+
+@pytest.mark.parametrize(("env", "policy", "learner"), CASES)
+def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str, Any]) -> None:
+    spec = trial(env, policy, 3, env={"horizon": 20}, learner=learner)
+    fast, plain = check_agreement(spec)
+    if policy != "oracle":
+        assert relative_gap(fast.parameters, plain.parameters) < 1e-8
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
+@pytest.mark.parametrize("model", [{"width": 5, "depth": 1}, {"width": 7, "depth": 3}])
+def test_networks_of_any_shape_agree(policy: str, model: dict[str, int]) -> None:
+    check_agreement(trial("arm", policy, 4, env={"horizon": 12}, model=model))
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_d_optimal_inputs_of_the_oracle_model_at_another_ridge(env: str) -> None:
+    policy = {"name": "d_optimal", "regularization": 0.1}
+    mapping: dict[str, Any] = trial(env, "oracle", 5, env={"horizon": 12}).to_mapping()
+    check_agreement(TrialSpec.from_mapping(mapping | {"policy": policy}))
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_late_in_a_trial_equal_states_give_equal_steps(env: str, policy: str) -> None:
+    late = 150
+    # M is inverted on the way from one path to the other: a larger λ keeps that exact.
+    fields = {"regularization": 0.1} if policy == "d_optimal" else {}
+    fast = KernelTrial(trial(env, policy, 6, env={"horizon": late + 1}, policy=fields))
+    fast.advance(late)
+    plain = transplant(fast)
+    fast.advance(late + 1)
+    plain.step(late)
+    gamma = fast.spec.system.gamma
+    assert plain.inputs[0, late].numpy() == pytest.approx(
+        fast.record.inputs[late], abs=1e-8 * gamma
+    )
+    assert relative_gap(fast.record.states[late + 1], plain.states[0, late + 1].numpy()) < 1e-8
+    assert relative_gap(fast.state.theta, plain.theta[0].numpy()) < 1e-8
+    assert fast.record.loss[late] == pytest.approx(plain.columns["loss"][0, late], rel=LOSS)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_without_noise_the_path_is_that_of_the_simulator(env: str) -> None:
+    from dopt.evaluation import simulate
+
+    spec = trial(env, "random", env={"noise": 0.0})
+    result = run_trial(spec)
+    path = simulate(spec.system, result.inputs[:, None])[:, 0]
+    assert result.states == pytest.approx(path, rel=1e-11, abs=1e-12)
+
+
+def test_times_are_measured_and_add_up_to_less_than_the_whole() -> None:
+    result = run_trial(trial("arm", "d_optimal"))
+    for column in (result.plan_us, result.learn_us, result.evaluate_us):
+        assert np.all(column[1:] > 0.0)
+        assert column.sum() < 1e6 * result.wall_seconds

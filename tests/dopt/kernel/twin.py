@@ -1,0 +1,44 @@
+"""A trial of the reference that goes on from where a trial of the kernel stands."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from dopt.kernel.information import dense
+from dopt.kernel.run import KernelTrial
+from dopt.reference.dynamics import known_flow
+from dopt.reference.learning import AdamLearner
+from dopt.reference.lockstep import Lockstep
+
+
+def transplant(trial: KernelTrial) -> Lockstep:
+    """Return a batch of one trial with the kernel's parameters, moments, M and history."""
+    t, state, record = trial.done, trial.state, trial.record
+    twin = Lockstep([trial.spec])
+    twin.theta.copy_(torch.tensor(state.theta)[None])
+    twin.states[0, : t + 1] = torch.tensor(record.states[: t + 1])
+    twin.inputs[0, :t] = torch.tensor(record.inputs[:t])
+    twin.targets[:, :t] = observed(twin, t)
+    if twin.information is not None:
+        twin.information = torch.linalg.inv(torch.tensor(dense(state.covariance)))[None]
+    if isinstance(twin.learner, AdamLearner):
+        twin.learner.optimizer.state[twin.theta] = {
+            "step": torch.tensor(float(t)),
+            "exp_avg": torch.tensor(state.moment_1)[None],
+            "exp_avg_sq": torch.tensor(state.moment_2)[None],
+        }
+    return twin
+
+
+def observed(twin: Lockstep, t: int) -> torch.Tensor:
+    """Return the accelerations observed in the first t steps, (1, t, r)."""
+    states, system = twin.states[:, : t + 1], twin.system
+    flow = (states[:, 1:] - states[:, :-1]) / system.dt
+    known = known_flow(system, states[:, :-1], twin.inputs[:, :t])
+    return (flow - known)[..., list(system.learned_rows)]
+
+
+def relative_gap(values: np.ndarray, expected: np.ndarray) -> float:
+    """Return the largest difference between two arrays beside the largest entry."""
+    return float(np.abs(values - expected).max() / np.abs(expected).max())

@@ -1,0 +1,96 @@
+"""Every registered policy on every system that it makes sense for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt.exploration import run_trial
+from dopt.policies import POLICIES
+from dopt.policies.base import OpenLoop
+from dopt.randomness import draw
+from dopt.systems.equilibrium import eigenmode
+from tests.dopt.trials import PAIRS, trial
+
+BOUNDED = [(env, policy) for env, policy in PAIRS if policy != "random"]
+
+
+def open_loop(env: str, policy: str, horizon: int, **fields: Any) -> np.ndarray:
+    """Return the inputs of a policy that observes nothing, (T, m), at γ = 3."""
+    spec = trial(env, policy, env={"horizon": horizon, "gamma": 3.0}, policy=fields)
+    assert isinstance(spec.policy, OpenLoop)
+    return draw(spec).inputs
+
+
+@pytest.mark.parametrize(("env", "policy"), BOUNDED)
+def test_inputs_obey_the_bound(env: str, policy: str) -> None:
+    spec = trial(env, policy, 1)
+    norms = np.linalg.norm(run_trial(spec).inputs, axis=1)
+    assert norms.max() <= spec.system.gamma * (1 + 1e-12)
+    if policy != "periodic":
+        assert norms == pytest.approx(spec.system.gamma, rel=1e-12)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+def test_gaussian_inputs_have_the_energy_of_the_bound_on_average(env: str) -> None:
+    u = open_loop(env, "random", 40_000)
+    m = u.shape[1]
+    assert (u**2).sum(axis=1).mean() == pytest.approx(9.0, rel=0.03)
+    assert np.atleast_2d(np.cov(u.T)) == pytest.approx(9.0 / m * np.eye(m), abs=0.03 * 9.0)
+    kurtosis = (u**4).mean(axis=0) / (u**2).mean(axis=0) ** 2
+    assert kurtosis == pytest.approx(3.0, rel=0.1)
+
+
+@pytest.mark.parametrize("policy", ["random", "random_sphere"])
+def test_white_inputs_are_independent_from_step_to_step(policy: str) -> None:
+    u = open_loop("arm", policy, 10_000)
+    assert abs((u[1:] * u[:-1]).sum(axis=1).mean()) < 0.05 * 9.0
+
+
+def test_inputs_on_the_sphere_have_no_direction() -> None:
+    u = open_loop("arm", "random_sphere", 10_000)
+    assert np.linalg.norm(u, axis=1) == pytest.approx(3.0)
+    assert u.mean(axis=0) == pytest.approx(0.0, abs=0.1)
+    assert np.cov(u.T) == pytest.approx(4.5 * np.eye(2), abs=0.2)
+
+
+@pytest.mark.parametrize("hold", [1, 3, 10, 64, 500])
+@pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
+def test_held_inputs_change_at_each_span_and_only_there(env: str, hold: int) -> None:
+    u = open_loop(env, "random_held", 64, hold=hold)
+    assert u.shape[0] == 64
+    changes = np.flatnonzero(np.any(np.diff(u, axis=0) != 0.0, axis=1)) + 1
+    assert np.all(changes % hold == 0)
+    if env == "quadrotor":
+        assert changes.tolist() == list(range(hold, 64, hold))
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm"])
+def test_a_periodic_input_is_one_line_at_the_eigenfrequency(env: str) -> None:
+    spec = trial(env, "periodic", env={"horizon": 4_000, "gamma": 3.0})
+    u = draw(spec).inputs
+    mode = eigenmode(spec.system)
+    assert mode is not None
+    along = u @ mode.direction
+    assert np.linalg.norm(u, axis=1) == pytest.approx(np.abs(along), abs=1e-12)
+    assert np.abs(along).max() == pytest.approx(3.0, rel=1e-3)
+    power = np.abs(np.fft.rfft(along)) ** 2
+    frequencies = 2 * np.pi * np.fft.rfftfreq(len(along), spec.system.dt)
+    near = np.abs(frequencies - mode.frequency) <= 2 * frequencies[1]
+    assert power[near].sum() > 0.9 * power.sum()
+
+
+def test_a_periodic_input_takes_another_frequency() -> None:
+    u = open_loop("pendulum", "periodic", 1_000, frequency=5.0)
+    times = 0.02 * np.arange(1_000)
+    assert np.abs(u[:, 0]) == pytest.approx(np.abs(3.0 * np.sin(5.0 * times)), abs=1e-12)
+
+
+def test_every_policy_is_either_open_loop_or_starts_at_random_on_the_sphere() -> None:
+    for env, policy in PAIRS:
+        if not issubclass(POLICIES[policy], OpenLoop):
+            spec = trial(env, policy, 4, env={"horizon": 2})
+            first = run_trial(spec).inputs[0]
+            assert np.array_equal(first, draw(spec).inputs[0])

@@ -1,0 +1,58 @@
+"""Random parameters, states and information for a model of the reference."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import jacrev
+
+from dopt.randomness import draw
+from dopt.reference.models import Accelerations, model_function
+from dopt.spec import TrialSpec
+
+
+class Situation(NamedTuple):
+    """What a plan is made from, for one trial."""
+
+    model: Accelerations
+    theta: Tensor  # (q,)
+    state: Tensor  # (d,)
+    information: Tensor  # (q, q)
+
+
+def situation(
+    spec: TrialSpec, seed: int, seen: int = 20, regularization: float = 1e-2
+) -> Situation:
+    """Return a situation after some states have been seen, for the model of a trial."""
+    rng = torch.Generator().manual_seed(seed)
+    system = spec.system
+    model = model_function(system, spec.model)
+    theta = torch.tensor(draw(spec.with_seed(seed)).weights)
+    theta = theta + 0.1 * torch.rand(theta.shape, generator=rng, dtype=torch.float64)
+    widths = torch.ones(system.n_states, dtype=torch.float64)
+    widths[list(system.grid_indices)] = torch.tensor(system.grid_half_widths, dtype=torch.float64)
+    states = widths * (2 * torch.rand(seen + 1, system.n_states, generator=rng).double() - 1)
+    M = regularization * torch.eye(len(theta), dtype=torch.float64)
+    for x in states[1:]:
+        J = jacrev(model)(theta, x)
+        M = M + J.mT @ J
+    return Situation(model, theta, states[0], M)
+
+
+def step_from(spec: TrialSpec, now: Situation, u: Tensor) -> Tensor:
+    """Return x(u) = x + dt f_θ(x, u), by the system's own equations, (d,)."""
+    system = spec.system
+    known = system.known(tuple(now.state), tuple(u), system.parameters)
+    flow = torch.stack([torch.as_tensor(value, dtype=torch.float64) for value in known])
+    rows = torch.zeros(system.n_states, system.n_learned, dtype=torch.float64)
+    for k, row in enumerate(system.learned_rows):
+        rows[row, k] = 1.0
+    return now.state + system.dt * (flow + rows @ now.model(now.theta, now.state))
+
+
+def circle(radius: float, points: int) -> Tensor:
+    """Return points on a circle, (points, 2)."""
+    angles = torch.arange(points, dtype=torch.float64) * (2 * torch.pi / points)
+    return radius * torch.stack([angles.cos(), angles.sin()], dim=-1)
