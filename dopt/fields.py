@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, Literal
 
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, unknown_name
 
 Bound = Literal["any", "positive", "nonnegative", "fraction"]
 
@@ -21,7 +21,12 @@ _BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
 
 
 def quantity(
-    default: Any, unit: str = "1", bound: Bound = "any", *, size: int | None = None
+    default: Any,
+    unit: str = "1",
+    bound: Bound = "any",
+    *,
+    size: int | None = None,
+    choices: tuple[str, ...] = (),
 ) -> Any:
     """Declare a field with a unit and a bound.
 
@@ -35,8 +40,12 @@ def quantity(
         What every number of the field has to satisfy.
     size : int, optional
         Number of entries that a tuple has to have.
+    choices : tuple of str
+        Valid texts, all if empty.
     """
-    return dataclasses.field(default=default, metadata={"unit": unit, "bound": bound, "size": size})
+    return dataclasses.field(
+        default=default, metadata={"unit": unit, "bound": bound, "size": size, "choices": choices}
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,9 +76,12 @@ def _converted(path: str, field: dataclasses.Field[Any], value: object) -> objec
     if kind.startswith("tuple"):
         return _converted_tuple(path, field, kind, value)
     if kind.startswith("str"):
-        if isinstance(value, str):
-            return value
-        raise _wrong_type(path, value, "a text")
+        if not isinstance(value, str):
+            raise _wrong_type(path, value, "a text")
+        choices = field.metadata.get("choices", ())
+        if choices and value not in choices:
+            raise unknown_name(path, value, choices)
+        return value
     return _converted_number(path, field, kind.startswith("int"), value)
 
 

@@ -41,6 +41,9 @@ class Cell:
             raise _mismatch("policy 'oracle'", "model 'linear'", f"model '{self.model.name}'")
         if linear and not isinstance(self.policy, DOptimal):
             raise _mismatch("model 'linear'", "policy 'oracle'", f"policy '{self.policy.name}'")
+        if linear and getattr(self.policy, "form", "auto") not in ("auto", "primal"):
+            form = f"policy.form '{getattr(self.policy, 'form', '')}'"
+            raise _mismatch("model 'linear'", "policy.form 'primal' or 'auto'", form)
         if linear and not self.system.linear_parameters:
             raise _mismatch("model 'linear'", "linear parameters", f"env '{self.system.name}'")
         if isinstance(self.learner, RecursiveLeastSquares) != linear:

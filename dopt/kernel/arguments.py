@@ -17,6 +17,7 @@ Integers = npt.NDArray[np.int64]
 MLP_MODEL, LINEAR_MODEL = 0, 1
 OPEN_LOOP, UNIFORM, D_OPTIMAL = 0, 1, 2
 ADAM, LEAST_SQUARES = 0, 1
+PRIMAL, DUAL, SKETCH = 0, 1, 2
 
 
 class World(NamedTuple):
@@ -53,6 +54,8 @@ class Rules(NamedTuple):
     beta_2: float
     epsilon: float
     window: int
+    form: int  # of the information matrix: PRIMAL, DUAL or SKETCH
+    regularization: float  # λ of M₀ = λI
 
 
 class Randomness(NamedTuple):
@@ -90,6 +93,35 @@ class Covariance(NamedTuple):
     n_pending: Integers  # (1,)
 
 
+class Dual(NamedTuple):
+    """Rows of the Gram matrix and its factor (:mod:`dopt.kernel.dual`); empty in other forms."""
+
+    features: Floats  # (T, p) at the states seen
+    hidden: Floats  # (L, T, w)
+    deltas: Floats  # (r, L, T, w)
+    factor: Floats  # (r T, r T), C in the lower triangle
+    n_states: Integers  # (1,)
+
+
+class Sketch(NamedTuple):
+    """Random projection of the parameters (:mod:`dopt.kernel.sketch`); empty in other forms."""
+
+    buckets: Integers  # (q,)
+    signs: Floats  # (q,)
+    size: int
+
+
+class Point(NamedTuple):
+    """Passes of the network at one state for one component, and along m directions."""
+
+    phi: Floats  # (p,)
+    hidden: Floats  # (L, w)
+    deltas: Floats  # (L, w)
+    phi_dots: Floats  # (m, p)
+    hidden_dots: Floats  # (m, L, w)
+    deltas_dots: Floats  # (m, L, w)
+
+
 class State(NamedTuple):
     """Everything that changes from step to step; written in place."""
 
@@ -97,6 +129,8 @@ class State(NamedTuple):
     moment_1: Floats  # (q,) of Adam
     moment_2: Floats  # (q,)
     covariance: Covariance
+    dual: Dual
+    sketch: Sketch
     window_features: Floats  # (p, window) newest samples, a ring
     window_targets: Floats  # (r, window)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from dopt.kernel import network as nn
-from dopt.kernel.arguments import LINEAR_MODEL, Network, World
+from dopt.kernel.arguments import LINEAR_MODEL, Network, Point, World
 from dopt.kernel.compiler import compiled
 
 STEP = 1e-30
@@ -68,66 +68,110 @@ def model_accelerations(
         regressors(accelerations, world, x, rows, out)
         add_linear(rows, theta, out)
         return
-    phi, hidden, _ = _point_buffers(network)
+    phi = np.empty(network.sizes[0])
+    hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1]))
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
 
 
 @compiled
-def jacobian_rows(
-    accelerations: Any, world: World, network: Network, theta: Any, x: Any, rows: Any, out: Any
-) -> None:
-    """Write the learned rows of J(x), (r, q), and a_θ(x), (r,)."""
-    if network.kind == LINEAR_MODEL:
-        regressors(accelerations, world, x, rows, out)
-        add_linear(rows, theta, out)
-        return
-    phi, hidden, deltas = _point_buffers(network)
+def point_at(
+    network: Network, theta: Any, x: Any, directions: Any, component: int, out: Any
+) -> Point:
+    """Run the network forward and back at a state and along directions, (m, d).
+
+    ``out`` (r,) receives a_θ(x).
+    """
+    m, p = directions.shape[0], network.sizes[0]
+    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
+    point = Point(
+        np.empty(p),
+        np.empty((depth, width)),
+        np.empty((depth, width)),
+        np.empty((m, p)),
+        np.empty((m, depth, width)),
+        np.empty((m, depth, width)),
+    )
+    nn.features_at(network, x, point.phi)
+    nn.activations_at(network, theta, point.phi, point.hidden, out)
+    nn.back_signals(network, theta, point.hidden, component, point.deltas)
+    for j in range(m):
+        nn.features_along(network, x, directions[j], point.phi_dots[j])
+        nn.tangents_at(
+            network,
+            theta,
+            point.phi_dots[j],
+            point.hidden,
+            component,
+            point.deltas,
+            point.hidden_dots[j],
+            point.deltas_dots[j],
+        )
+    return point
+
+
+@compiled
+def all_components(network: Network, theta: Any, x: Any, out: Any) -> Any:
+    """Return features, activations and δ of every component, (r, L, w), at a state.
+
+    ``out`` (r,) receives a_θ(x).
+    """
+    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
+    phi, hidden = np.empty(network.sizes[0]), np.empty((depth, width))
+    deltas = np.empty((out.shape[0], depth, width))
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
     for k in range(out.shape[0]):
-        nn.back_signals(network, theta, hidden, k, deltas)
-        nn.parameter_gradient(network, phi, hidden, deltas, k, rows[k])
+        nn.back_signals(network, theta, hidden, k, deltas[k])
+    return phi, hidden, deltas
 
 
 @compiled
-def gradient_and_changes(
+def network_gradients(network: Network, point: Point, component: int, q: int) -> Any:
+    """Return g and the columns of D B as rows, (1 + m, q)."""
+    m = point.phi_dots.shape[0]
+    out = np.empty((1 + m, q))
+    nn.parameter_gradient(network, point.phi, point.hidden, point.deltas, component, out[0])
+    for j in range(m):
+        nn.gradient_along(
+            network,
+            point.phi,
+            point.phi_dots[j],
+            point.hidden,
+            point.hidden_dots[j],
+            point.deltas,
+            point.deltas_dots[j],
+            component,
+            out[1 + j],
+        )
+    return out
+
+
+@compiled
+def network_rows(network: Network, phi: Any, hidden: Any, deltas: Any, q: int) -> Any:
+    """Return the learned rows of J, (r, q)."""
+    rows = np.empty((deltas.shape[0], q))
+    for k in range(deltas.shape[0]):
+        nn.parameter_gradient(network, phi, hidden, deltas[k], k, rows[k])
+    return rows
+
+
+@compiled
+def linear_gradients(
     accelerations: Any,
     complex_accelerations: Any,
     world: World,
-    network: Network,
-    theta: Any,
+    q: int,
     x: Any,
     directions: Any,
     component: int,
-    out: Any,
-) -> None:
-    """Write g and D B for one component: ``out`` (1 + m, q), ``directions`` (m, d)."""
-    output = np.empty(world.learned_rows.shape[0])
-    if network.kind == LINEAR_MODEL:
-        rows = np.empty((output.shape[0], theta.shape[0]))
-        regressors(accelerations, world, x, rows, output)
-        for i in range(theta.shape[0]):
-            out[0, i] = rows[component, i]
-        for j in range(directions.shape[0]):
-            regressors_along(complex_accelerations, world, x, directions[j], component, out[1 + j])
-        return
-    phi, hidden, deltas = _point_buffers(network)
-    phi_dot, hidden_dot, deltas_dot = _point_buffers(network)
-    nn.features_at(network, x, phi)
-    nn.activations_at(network, theta, phi, hidden, output)
-    nn.back_signals(network, theta, hidden, component, deltas)
-    nn.parameter_gradient(network, phi, hidden, deltas, component, out[0])
-    for j in range(directions.shape[0]):
-        nn.features_along(network, x, directions[j], phi_dot)
-        nn.tangents_at(network, theta, phi_dot, hidden, component, deltas, hidden_dot, deltas_dot)
-        nn.gradient_along(
-            network, phi, phi_dot, hidden, hidden_dot, deltas, deltas_dot, component, out[1 + j]
-        )
-
-
-@compiled
-def _point_buffers(network: Network) -> Any:
-    """Return room for the features, (p,), the activations and the δ, (L, w), of one point."""
-    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    return np.empty(network.sizes[0]), np.empty((depth, width)), np.empty((depth, width))
+) -> Any:
+    """Return g and the columns of D B of the linear model as rows, (1 + m, q)."""
+    m, r = directions.shape[0], world.learned_rows.shape[0]
+    out, rows = np.empty((1 + m, q)), np.empty((r, q))
+    regressors(accelerations, world, x, rows, np.empty(r))
+    for i in range(q):
+        out[0, i] = rows[component, i]
+    for j in range(m):
+        regressors_along(complex_accelerations, world, x, directions[j], component, out[1 + j])
+    return out

@@ -6,10 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from dopt.kernel.arguments import Network, State, World
+from dopt.kernel.arguments import DUAL, LINEAR_MODEL, SKETCH, Network, Rules, State, World
 from dopt.kernel.compiler import compilable, compiled
+from dopt.kernel.dual import dual_forms
 from dopt.kernel.information import quadratic_forms
-from dopt.kernel.model import gradient_and_changes, model_accelerations
+from dopt.kernel.model import (
+    linear_gradients,
+    model_accelerations,
+    network_gradients,
+    point_at,
+)
+from dopt.kernel.sketch import sketched
 from dopt.planning.sphere import sphere_maximizer
 
 compilable(sphere_maximizer)
@@ -50,12 +57,46 @@ def input_columns(known: Any, world: World, x: Any) -> Any:
 
 
 @compiled
+def planning_forms(
+    accelerations: Any,
+    complex_accelerations: Any,
+    world: World,
+    network: Network,
+    rules: Rules,
+    state: State,
+    bar: Any,
+    columns: Any,
+    component: int,
+) -> Any:
+    """Return xᵀM⁻¹y for x and y among g and the columns of D B, (1 or 1 + m, 1 + m).
+
+    With one input the quadratic term of equation 7 is constant on the sphere: the row of g is
+    enough and costs one product with M⁻¹.
+    """
+    q, m = state.theta.shape[0], columns.shape[0]
+    if network.kind == LINEAR_MODEL:
+        G = linear_gradients(
+            accelerations, complex_accelerations, world, q, bar, columns, component
+        )
+    else:
+        a = np.empty(world.learned_rows.shape[0])
+        point = point_at(network, state.theta, bar, columns, component, a)
+        if rules.form == DUAL:
+            return dual_forms(state.dual, rules.regularization, point, component)
+        G = network_gradients(network, point, component, q)
+        if rules.form == SKETCH:
+            G = sketched(state.sketch, G)
+    return quadratic_forms(state.covariance, G[: 1 if m == 1 else 1 + m], G)
+
+
+@compiled
 def d_optimal_input(
     known: Any,
     accelerations: Any,
     complex_accelerations: Any,
     world: World,
     network: Network,
+    rules: Rules,
     state: State,
     x: Any,
     component: int,
@@ -65,22 +106,18 @@ def d_optimal_input(
     """Write the maximiser of (g + D B u)ᵀ M⁻¹ (g + D B u) on the sphere, (m,)."""
     bar = predicted_state(known, accelerations, world, network, state.theta, x)
     columns = input_columns(known, world, bar)
-    m = columns.shape[0]
-    G = np.empty((1 + m, state.theta.shape[0]))
-    gradient_and_changes(
+    S = planning_forms(
         accelerations,
         complex_accelerations,
         world,
         network,
-        state.theta,
+        rules,
+        state,
         bar,
         columns,
         component,
-        G,
     )
-    # With one input the quadratic term is constant on the sphere: one product with M⁻¹ is enough.
-    multiplied = G[: 1 if m == 1 else 1 + m]
-    S = quadratic_forms(state.covariance, multiplied, G)
+    m = columns.shape[0]
     if m == 1:
         up = S[0, 1] > 0.0 or (S[0, 1] == 0.0 and tie[0] > 0.0)
         u[0] = world.gamma if up else -world.gamma

@@ -20,6 +20,7 @@ from dopt.learning import Adam
 from dopt.models import MLP
 from dopt.policies import DOptimal, Uniform
 from dopt.policies.base import OpenLoop
+from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.spec import Cell, TrialSpec
@@ -139,18 +140,18 @@ def _rules(cell: Cell) -> args.Rules:
     policies = {OpenLoop: args.OPEN_LOOP, Uniform: args.UNIFORM, DOptimal: args.D_OPTIMAL}
     policy = next(code for kind, code in policies.items() if isinstance(cell.policy, kind))
     steps = cell.policy.iterations if isinstance(cell.policy, Uniform) else 0
-    if not isinstance(cell.learner, Adam):
-        return args.Rules(policy, steps, args.LEAST_SQUARES, 0.0, 0.0, 0.0, 0.0, 1)
-    adam = cell.learner
+    adam = cell.learner if isinstance(cell.learner, Adam) else Adam()
     return args.Rules(
         policy,
         steps,
-        args.ADAM,
+        args.ADAM if isinstance(cell.learner, Adam) else args.LEAST_SQUARES,
         adam.learning_rate,
         adam.beta_1,
         adam.beta_2,
         adam.epsilon,
         adam.window,
+        _form(cell),
+        cell.policy.regularization if isinstance(cell.policy, DOptimal) else 1.0,
     )
 
 
@@ -215,23 +216,59 @@ def _size(targets: args.Floats) -> float:
 
 
 def _initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:
-    system, policy, learner = spec.system, spec.policy, spec.learner
-    q = len(weights)
+    system, learner = spec.system, spec.learner
     window = learner.window if isinstance(learner, Adam) else 0
-    informed = isinstance(policy, DOptimal)
-    covariance = args.Covariance(
-        np.eye(q) / policy.regularization if isinstance(policy, DOptimal) else np.zeros((0, 0)),
-        np.zeros((PENDING_ROWS if q > SMALL else 4, q if informed else 0)),
-        np.zeros(1, dtype=np.int64),
-    )
     return args.State(
         weights.copy(),
-        np.zeros(q),
-        np.zeros(q),
-        covariance,
+        np.zeros(len(weights)),
+        np.zeros(len(weights)),
+        *_information(spec, len(weights)),
         np.zeros((len(system.features), window)),
         np.zeros((system.n_learned, window)),
     )
+
+
+def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, args.Sketch]:
+    """Return the initial information in the chosen form; the other forms are empty."""
+    policy = spec.policy
+    form = _form(spec.cell)
+    size, dual, sketch = 0, _empty_dual(spec, 0), count_sketch(0, 1)
+    if form == args.PRIMAL and isinstance(policy, DOptimal):
+        size = q
+    elif form == args.DUAL:
+        dual = _empty_dual(spec, spec.system.horizon)
+    elif form == args.SKETCH and isinstance(policy, DOptimal):
+        size = policy.sketch_size
+        sketch = count_sketch(q, size)
+    regularization = policy.regularization if isinstance(policy, DOptimal) else 1.0
+    covariance = args.Covariance(
+        np.eye(size) / regularization,
+        np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
+        np.zeros(1, dtype=np.int64),
+    )
+    return covariance, dual, args.Sketch(*sketch, size)
+
+
+def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
+    depth, width, r = 1, 1, spec.system.n_learned
+    if isinstance(spec.model, MLP):
+        depth, width = spec.model.depth, spec.model.width
+    return args.Dual(
+        np.empty((states, len(spec.system.features))),
+        np.empty((depth, states, width)),
+        np.empty((r, depth, states, width)),
+        np.empty((r * states, r * states)),
+        np.zeros(1, dtype=np.int64),
+    )
+
+
+def _form(cell: Cell) -> int:
+    """Return the form of the information matrix, PRIMAL where there is none."""
+    if not isinstance(cell.policy, DOptimal):
+        return args.PRIMAL
+    n_rows = cell.system.n_learned * cell.system.horizon
+    names = {"primal": args.PRIMAL, "dual": args.DUAL, "sketch": args.SKETCH}
+    return names[cell.policy.chosen_form(cell.model.n_parameters(cell.system), n_rows)]
 
 
 def _empty_record(system: System) -> args.Record:

@@ -9,8 +9,11 @@ import numpy as np
 from dopt.kernel.arguments import (
     ADAM,
     D_OPTIMAL,
+    DUAL,
     LEAST_SQUARES,
+    LINEAR_MODEL,
     OPEN_LOOP,
+    SKETCH,
     Evaluation,
     Network,
     Randomness,
@@ -20,11 +23,13 @@ from dopt.kernel.arguments import (
     World,
 )
 from dopt.kernel.compiler import compiled, monotonic_microseconds
+from dopt.kernel.dual import dual_absorb
 from dopt.kernel.evaluation import evaluation_buffers, model_error
 from dopt.kernel.information import absorb
 from dopt.kernel.learning import adam_step, remember
-from dopt.kernel.model import jacobian_rows
+from dopt.kernel.model import add_linear, all_components, network_rows, regressors
 from dopt.kernel.policies import d_optimal_input, uniform_input
+from dopt.kernel.sketch import sketched
 
 
 @compiled
@@ -53,6 +58,7 @@ def plan(
             complex_accelerations,
             world,
             network,
+            rules,
             state,
             states[t],
             component,
@@ -91,6 +97,40 @@ def observe(
 
 
 @compiled
+def inform(
+    accelerations: Any,
+    world: World,
+    network: Network,
+    rules: Rules,
+    state: State,
+    x: Any,
+    target: Any,
+) -> None:
+    """Add JᵀJ at a state to M, and take the least-squares step that goes with it."""
+    q, r = state.theta.shape[0], target.shape[0]
+    residuals = np.empty(r)
+    if network.kind == LINEAR_MODEL:
+        rows = np.empty((r, q))
+        regressors(accelerations, world, x, rows, residuals)
+        add_linear(rows, state.theta, residuals)
+    else:
+        phi, hidden, deltas = all_components(network, state.theta, x, residuals)
+        if rules.form == DUAL:
+            dual_absorb(state.dual, rules.regularization, phi, hidden, deltas)
+            return
+        rows = network_rows(network, phi, hidden, deltas, q)
+        if rules.form == SKETCH:
+            rows = sketched(state.sketch, rows)
+    for k in range(r):
+        residuals[k] = target[k] - residuals[k]
+    scratch = np.empty(rows.shape)
+    absorb(state.covariance, rows, residuals, scratch)
+    for k in range(r if rules.learner == LEAST_SQUARES else 0):
+        for i in range(q):
+            state.theta[i] += residuals[k] * scratch[k, i]
+
+
+@compiled
 def within(x: Any, limit: float) -> bool:
     """Tell whether every entry is finite and within the limit."""
     inside = True
@@ -124,8 +164,7 @@ def advance(
     room = max(width, r) * rules.window
     learning = (np.empty((depth, room)), np.empty((3, room)))
     evaluating = evaluation_buffers(network, q, r)
-    gradient, rows, scratch = np.empty(q), np.empty((r, q)), np.empty((r, q))
-    target, residuals = np.empty(r), np.empty(r)
+    gradient, target = np.empty(q), np.empty(r)
     for t in range(first, last):
         clock_0 = monotonic_microseconds()
         x, following, u = record.states[t], record.states[t + 1], record.inputs[t]
@@ -153,14 +192,8 @@ def advance(
         clock_3 = monotonic_microseconds()
         if not within(state.theta, np.inf):
             return t
-        if rules.policy == D_OPTIMAL or rules.learner == LEAST_SQUARES:
-            jacobian_rows(accelerations, world, network, state.theta, x, rows, residuals)
-            for k in range(r):
-                residuals[k] = target[k] - residuals[k]
-            absorb(state.covariance, rows, residuals, scratch)
-            for k in range(r if rules.learner == LEAST_SQUARES else 0):
-                for i in range(q):
-                    state.theta[i] += residuals[k] * scratch[k, i]
+        if rules.policy == D_OPTIMAL:
+            inform(accelerations, world, network, rules, state, x, target)
         clock_4 = monotonic_microseconds()
         loss = model_error(network, state.theta, points, 0, points.n_grid, evaluating)
         record.loss[t] = loss

@@ -5,8 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+import numpy.typing as npt
+
 from dopt.fields import quantity
 from dopt.policies.base import ClosedLoop
+
+SMALL_PRIMAL = 600
+LARGE_DUAL = 4000
+_SKETCH_SEED = 1_406_2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,12 +24,44 @@ class DOptimal(ClosedLoop):
     uniform on the sphere. M₀ = λI, and M_{t+1} = M_t + JᵀJ with J at (x_t, u_t) and the parameters
     after the learning step of time t.
 
+    M is held in one of three forms. ``primal`` keeps M⁻¹, q × q. ``dual`` keeps the Gram matrix of
+    the N rows seen and never builds a q × q matrix; it chooses the same inputs. ``sketch`` projects
+    the gradients to ``sketch_size`` random dimensions: bounded memory for wide networks over long
+    horizons, an approximation. ``auto`` takes the cheapest exact form, and the sketch when neither
+    fits.
+
     Parameters
     ----------
     regularization : float
         λ.
+    form : {"auto", "primal", "dual", "sketch"}
+        How the information matrix is held.
+    sketch_size : int
+        Dimensions of the sketch.
     """
 
     name: ClassVar[str] = "d_optimal"
 
     regularization: float = quantity(1e-3, bound="positive")
+    form: str = quantity("auto", choices=("auto", "primal", "dual", "sketch"))
+    sketch_size: int = quantity(256, "dimensions", "positive")
+
+    def chosen_form(self, n_parameters: int, n_rows: int) -> str:
+        """Return the form for q parameters and N rows in the whole trial.
+
+        Primal costs about q² a step, dual about N²/3 on average over the trial.
+        """
+        if self.form != "auto":
+            return self.form
+        if n_parameters <= max(SMALL_PRIMAL, n_rows / 3**0.5):
+            return "primal"
+        return "dual" if n_rows <= LARGE_DUAL else "sketch"
+
+
+def count_sketch(
+    n_parameters: int, size: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Return the bucket, (q,), and the sign, (q,), of every parameter; the same for all trials."""
+    rng = np.random.default_rng(_SKETCH_SEED)
+    buckets = rng.integers(size, size=n_parameters)
+    return buckets, rng.choice([-1.0, 1.0], size=n_parameters)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.policies import DOptimal, Uniform
 from dopt.policies.base import OpenLoop
+from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.learning import learner_for
@@ -88,15 +89,30 @@ class Lockstep:
         self.states[:, 0] = self._tensor(np.array(self.system.initial_state))
         self.inputs = self._unset(n, T, self.system.n_inputs)
         self.targets = self._unset(n, T, self.system.n_learned)
+        self.project: Callable[[Tensor], Tensor] = lambda rows: rows
         self.columns = {name: np.full((n, T), np.nan) for name in COLUMNS}
         self.information: Tensor | None = None
         if isinstance(self.cell.policy, DOptimal):
-            prior = self._regularization() * torch.eye(self.theta.shape[1]).to(self.theta)
+            self._choose_form(self.cell.policy)
+            size = self.project(self.theta).shape[1]
+            prior = self._regularization() * torch.eye(size).to(self.theta)
             self.information = prior.repeat(n, 1, 1)
         points = evaluation_set(self.system)
         self.points = self._tensor(points.states)
         self.truth = self._tensor(points.accelerations)
         self.n_grid = points.n_grid
+
+    def _choose_form(self, policy: DOptimal) -> None:
+        """Plan in the space of a sketch where the specification says so.
+
+        The dual form is an algorithm of the kernel for the same M; the reference builds M.
+        """
+        q, n_rows = self.theta.shape[1], self.system.n_learned * self.system.horizon
+        if policy.chosen_form(q, n_rows) == "sketch":
+            buckets, signs = count_sketch(q, policy.sketch_size)
+            matrix = torch.zeros(q, policy.sketch_size).to(self.theta)
+            matrix[torch.arange(q), torch.tensor(buckets)] = torch.tensor(signs).to(self.theta)
+            self.project = lambda rows: rows @ matrix
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
@@ -108,7 +124,13 @@ class Lockstep:
             return uniform_inputs(self.system, self.model, self.theta, seen, policy.iterations)
         assert self.information is not None
         problem = quadratic_problem(
-            self.system, self.model, self.theta, self.information, x, self.components[:, t]
+            self.system,
+            self.model,
+            self.theta,
+            self.information,
+            x,
+            self.components[:, t],
+            self.project,
         )
         return d_optimal_inputs(problem, self.system.gamma, self.ties[:, t])
 
@@ -129,7 +151,7 @@ class Lockstep:
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
         if self.information is not None:
-            J = self._rows(self.theta, self.states[:, t])
+            J = self.project(self._rows(self.theta, self.states[:, t]))
             self.information = self.information + J.mT @ J
 
     def evaluate(self) -> tuple[Tensor, Tensor]:

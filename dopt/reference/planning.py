@@ -13,6 +13,7 @@ M       information matrix                                  q × q
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -47,16 +48,20 @@ def quadratic_problem(
     information: Tensor,
     x: Tensor,
     components: Tensor,
+    project: Callable[[Tensor], Tensor],
 ) -> QuadraticProblem:
-    """Return Q and v for parameters (n, q), M (n, q, q), states (n, d), components k (n,)."""
+    """Return Q and v for parameters (n, q), M (n, s, s), states (n, d), components k (n,).
+
+    ``project`` maps gradients, (..., q), to the space of M, (..., s): the identity, or a sketch.
+    """
     bar = predicted_states(system, model, theta, x)
     g, DB = vmap(lambda p, z, k: _gradient_and_changes(system, model, p, z, k))(
         theta, bar, components
     )
-    factor = torch.linalg.cholesky(information)
-    solved = torch.cholesky_solve(torch.cat([g.unsqueeze(-1), DB], dim=-1), factor)
-    Q = DB.mT @ solved[..., 1:]
-    v = -(DB.mT @ solved[..., :1]).squeeze(-1)
+    columns = project(torch.cat([g.unsqueeze(-1), DB], dim=-1).mT).mT
+    solved = torch.cholesky_solve(columns, torch.linalg.cholesky(information))
+    Q = columns[..., 1:].mT @ solved[..., 1:]
+    v = -(columns[..., 1:].mT @ solved[..., :1]).squeeze(-1)
     return QuadraticProblem(Q, v)
 
 

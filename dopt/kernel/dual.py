@@ -1,0 +1,175 @@
+"""D-optimal planning without a q × q matrix, in compiled code.
+
+With G the N × q matrix of all rows seen, M = λI + GᵀG and K = λI + GGᵀ = CCᵀ (Cholesky),
+
+    aᵀM⁻¹b = (aᵀb - (C⁻¹Ga)ᵀ(C⁻¹Gb)) / λ    (Woodbury).
+
+For a network the inner products of parameter gradients need no parameter gradients: each is a sum
+over layers of (δ · δ')(h · h' + 1), with h the activations below the layer and δ the derivative of
+the output with respect to its pre-activations. A step costs O(n w) for the products and O(N²) for
+the triangular solves, N = n r rows from n states; memory is O(n w + N²).
+
+The derivative of g along a direction of the state replaces h by ḣ and δ by its derivative, one at a
+time (product rule).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dopt.kernel.arguments import Dual, Point
+from dopt.kernel.compiler import compiled, vectorized
+from dopt.kernel.information import inner
+
+
+@compiled
+def below(point: Point, index: int) -> Any:
+    """Return the activations below a layer."""
+    return point.phi if index == 0 else point.hidden[index - 1]
+
+
+@compiled
+def below_along(point: Point, j: int, index: int) -> Any:
+    """Return the derivative of the activations below a layer along direction j."""
+    return point.phi_dots[j] if index == 0 else point.hidden_dots[j, index - 1]
+
+
+@compiled
+def stored_below(dual: Dual, n: int, index: int) -> Any:
+    """Return the activations below a layer at the n states seen."""
+    return dual.features[:n] if index == 0 else dual.hidden[index - 1, :n]
+
+
+@compiled
+def dual_forms(dual: Dual, regularization: float, point: Point, component: int) -> Any:
+    """Return xᵀM⁻¹y, (1 + m, 1 + m), for x and y among g and the columns of D B."""
+    n, r = dual.n_states[0], dual.deltas.shape[0]
+    products = _products(dual, n, point, component)
+    _solve_lower(dual.factor, n * r, products)
+    out = _own_products(point)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = (out[i, j] - inner(products[i], products[j])) / regularization
+    return out
+
+
+@compiled
+def dual_absorb(dual: Dual, regularization: float, phi: Any, hidden: Any, deltas: Any) -> None:
+    """Add the r rows of J at one state, given the passes there; ``deltas`` is (r, L, w)."""
+    n, r = dual.n_states[0], deltas.shape[0]
+    _store(dual, n, phi, hidden, deltas)
+    N = n * r
+    rows = np.empty((r, N + r))
+    no_phi, no_hidden = np.empty((0, 0)), np.empty((0, 0, 0))
+    for k in range(r):
+        point = Point(phi, hidden, deltas[k], no_phi, no_hidden, no_hidden)
+        products = _products(dual, n + 1, point, k)
+        for i in range(N + r):
+            rows[k, i] = products[0, i]
+    _solve_lower(dual.factor, N, rows)
+    for k in range(r):
+        R = N + k
+        for i in range(N, R):
+            row = dual.factor[i]
+            rows[k, i] = (rows[k, i] - inner(row[:i], rows[k, :i])) / row[i]
+        for i in range(R):
+            dual.factor[R, i] = rows[k, i]
+        pivot = regularization + rows[k, R] - inner(rows[k, :R], rows[k, :R])
+        dual.factor[R, R] = np.sqrt(pivot)
+    dual.n_states[0] = n + 1
+
+
+@compiled
+def _store(dual: Dual, n: int, phi: Any, hidden: Any, deltas: Any) -> None:
+    """Keep the activations and δ of a state in place n."""
+    for i in range(phi.shape[0]):
+        dual.features[n, i] = phi[i]
+    for index in range(hidden.shape[0]):
+        for i in range(hidden.shape[1]):
+            dual.hidden[index, n, i] = hidden[index, i]
+            for k in range(deltas.shape[0]):
+                dual.deltas[k, index, n, i] = deltas[k, index, i]
+
+
+@compiled
+def _products(dual: Dual, n: int, point: Point, component: int) -> Any:
+    """Return the products of g and of each column of D B with all rows seen, (1 + m, n r)."""
+    r, depth, m = dual.deltas.shape[0], dual.deltas.shape[1], point.phi_dots.shape[0]
+    out = np.zeros((1 + m, n * r))
+    slopes = np.empty((m, n))
+    for index in range(depth + 1):
+        stored = stored_below(dual, n, index)
+        values = np.dot(stored, below(point, index))
+        for j in range(m):
+            slopes[j] = np.dot(stored, below_along(point, j, index))
+        if index == depth:
+            _add_output_layer(out, values, slopes, component, r)
+            continue
+        for k in range(r):
+            signals = dual.deltas[k, index, :n]
+            back = np.dot(signals, point.deltas[index])
+            _add_products(out[0], back, values, 1.0, k, r)
+            for j in range(m):
+                _add_products(out[1 + j], back, slopes[j], 0.0, k, r)
+                back_dot = np.dot(signals, point.deltas_dots[j, index])
+                _add_products(out[1 + j], back_dot, values, 1.0, k, r)
+    return out
+
+
+@vectorized
+def _add_products(out: Any, a: Any, b: Any, one: float, component: int, stride: int) -> None:
+    for s in range(a.shape[0]):
+        out[s * stride + component] += a[s] * (b[s] + one)
+
+
+@vectorized
+def _add_output_layer(out: Any, values: Any, slopes: Any, component: int, stride: int) -> None:
+    for s in range(values.shape[0]):
+        out[0, s * stride + component] += values[s] + 1.0
+        for j in range(slopes.shape[0]):
+            out[1 + j, s * stride + component] += slopes[j, s]
+
+
+@compiled
+def _solve_lower(factor: Any, n_rows: int, right: Any) -> None:
+    """Replace the first entries of each right-hand side, (k, ·), by those of C⁻¹ times it."""
+    for i in range(n_rows):
+        row = factor[i]
+        for k in range(right.shape[0]):
+            right[k, i] = (right[k, i] - inner(row[:i], right[k, :i])) / row[i]
+
+
+@compiled
+def _own_products(point: Point) -> Any:
+    """Return the inner products among g and the columns of D B, (1 + m, 1 + m)."""
+    depth, m = point.hidden.shape[0], point.phi_dots.shape[0]
+    out = np.zeros((1 + m, 1 + m))
+    for index in range(depth + 1):
+        h = below(point, index)
+        last = index == depth
+        # In the output layer δ is the unit vector of the component and does not change.
+        delta = point.deltas[0 if last else index]
+        size = 1.0 if last else inner(delta, delta)
+        base = inner(h, h) + 1.0
+        out[0, 0] += size * base
+        for i in range(m):
+            h_i = below_along(point, i, index)
+            cross_i = 0.0 if last else inner(delta, point.deltas_dots[i, index])
+            out[0, 1 + i] += cross_i * base + size * inner(h, h_i)
+            for j in range(i + 1):
+                h_j = below_along(point, j, index)
+                cross_j, both = 0.0, 0.0
+                if not last:
+                    cross_j = inner(delta, point.deltas_dots[j, index])
+                    both = inner(point.deltas_dots[i, index], point.deltas_dots[j, index])
+                out[1 + i, 1 + j] += both * base + size * inner(h_i, h_j)
+                out[1 + i, 1 + j] += cross_i * inner(h, h_j) + cross_j * inner(h, h_i)
+    for i in range(1 + m):
+        for j in range(i):
+            if j == 0:
+                out[i, 0] = out[0, i]
+            else:
+                out[j, i] = out[i, j]
+    return out
