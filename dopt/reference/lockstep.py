@@ -87,6 +87,7 @@ class Lockstep:
         n, T = len(self.specs), self.system.horizon
         self.states = self._unset(n, T + 1, self.system.n_states)
         self.states[:, 0] = self._tensor(np.array(self.system.initial_state))
+        self.diverged = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
         self.inputs = self._unset(n, T, self.system.n_inputs)
         self.targets = self._unset(n, T, self.system.n_learned)
         self.project: Callable[[Tensor], Tensor] = lambda rows: rows
@@ -145,8 +146,10 @@ class Lockstep:
         self.targets[:, t] = observed[:, list(self.system.learned_rows)]
 
     def learn(self, t: int) -> None:
-        """Update the parameters with the samples up to time t."""
+        """Update the parameters with the samples up to time t; diverged trials keep theirs."""
+        before = self.theta.clone()
         self.learner.learn(self.states[:, : t + 1], self.targets[:, : t + 1])
+        self.theta.copy_(torch.where(self.diverged, before, self.theta))
 
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
@@ -168,12 +171,15 @@ class Lockstep:
         u = self.plan(t)
         clocks.append(self._clock())
         self.act(t, u)
+        inside = self.states[:, t + 1].abs() <= self.system.state_limit
+        self.diverged |= ~inside.all(dim=1, keepdim=True)
         clocks.append(self._clock())
         self.learn(t)
         clocks.append(self._clock())
         self.inform(t)
         clocks.append(self._clock())
         loss, reachable = self.evaluate()
+        self.diverged |= ~loss.isfinite().unsqueeze(1)
         clocks.append(self._clock())
         planned, _, learned, informed, evaluated = np.diff(clocks) * 1e6 / len(self.specs)
         self.columns["loss"][:, t] = loss.cpu().numpy()

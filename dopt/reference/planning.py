@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp, vmap
 
-from dopt.planning.sphere import maximize_on_sphere
 from dopt.reference.dynamics import flow, input_matrix
 from dopt.reference.models import Accelerations
+from dopt.reference.sphere import maximize_on_spheres
 from dopt.systems.base import System
 
 TIE_MARGIN = 1e-9
@@ -59,10 +59,16 @@ def quadratic_problem(
         theta, bar, components
     )
     columns = project(torch.cat([g.unsqueeze(-1), DB], dim=-1).mT).mT
-    solved = torch.cholesky_solve(columns, torch.linalg.cholesky(information))
+    solved = torch.cholesky_solve(columns, _factor(information))
     Q = columns[..., 1:].mT @ solved[..., 1:]
     v = -(columns[..., 1:].mT @ solved[..., :1]).squeeze(-1)
     return QuadraticProblem(Q, v)
+
+
+def _factor(information: Tensor) -> Tensor:
+    """Return the Cholesky factors of M; NaN where M is not positive definite, or NaN itself."""
+    factor, failed = torch.linalg.cholesky_ex(information)
+    return torch.where((failed == 0)[:, None, None], factor, torch.nan)
 
 
 def _gradient_and_changes(
@@ -84,11 +90,9 @@ def _gradient_and_changes(
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:
     """Return the maximisers, (n, m); ``ties`` (n, m) decide between equal ones."""
-    solutions = [
-        torch.from_numpy(maximize_on_sphere(Q.numpy(), v.numpy(), gamma, tie.numpy()))
-        for Q, v, tie in zip(problem.Q.cpu(), problem.v.cpu(), ties.cpu(), strict=True)
-    ]
-    return torch.stack(solutions).to(problem.v)
+    if problem.v.shape[1] == 1:
+        return gamma * torch.where(problem.v == 0, ties, -problem.v).sign()
+    return maximize_on_spheres(problem.Q, problem.v, gamma, ties)
 
 
 def uniform_inputs(
