@@ -1,0 +1,63 @@
+"""The quadratic problem on a sphere for a batch, in torch: see :mod:`dopt.planning.sphere`.
+
+The same mathematics in another form: bisection of the secular equation for all problems at once.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+BISECTIONS = 200
+ROUNDING = 4e-16
+
+
+def maximize_on_spheres(Q: Tensor, v: Tensor, radius: float, ties: Tensor) -> Tensor:
+    """Return maximisers, (n, m), of uᵀQu - 2vᵀu on ‖u‖ = radius.
+
+    Parameters
+    ----------
+    Q : (n, m, m)
+        Quadratic terms; the symmetric parts count.
+    v : (n, m)
+        Linear terms.
+    radius : float
+        γ > 0.
+    ties : (n, m)
+        Directions that decide between maximisers of equal value.
+    """
+    scale = torch.maximum(radius * Q.abs().amax((1, 2)), v.abs().amax(1)).clamp_min(1e-300)
+    A = (Q + Q.mT) * (0.5 * radius / scale)[:, None, None]
+    values, axes = torch.linalg.eigh(A)
+    w = (axes.mT @ (v / scale[:, None]).unsqueeze(-1)).squeeze(-1)
+    preferred = (axes.mT @ ties.unsqueeze(-1)).squeeze(-1)
+    gaps = values[:, -1:] - values
+    top = gaps <= ROUNDING * values.shape[1] * values.abs().amax(1, keepdim=True)
+    gaps = torch.where(top, torch.zeros_like(gaps), gaps)
+
+    s = _secular_root(w, gaps, top)
+    unit = -w / (gaps + s).clamp_min(1e-300)
+    below = torch.where(top, torch.zeros_like(w), -w / torch.where(top, torch.ones_like(w), gaps))
+    missing = 1 - below.square().sum(1, keepdim=True)
+    along = torch.where(top, preferred, torch.zeros_like(preferred))
+    along = along / torch.linalg.vector_norm(along, dim=1, keepdim=True).clamp_min(1e-300)
+    hard = (torch.where(top, w, torch.zeros_like(w)).abs().amax(1, keepdim=True) < 1e-150) & (
+        missing >= 0
+    )
+    unit = torch.where(hard, below + along * missing.clamp_min(0).sqrt(), unit)
+    u = (axes @ unit.unsqueeze(-1)).squeeze(-1)
+    scaled: Tensor = u * (radius / torch.linalg.vector_norm(u, dim=1, keepdim=True))
+    return scaled
+
+
+def _secular_root(w: Tensor, gaps: Tensor, top: Tensor) -> Tensor:
+    """Return s ≥ 0 with ‖w / (gaps + s)‖ = 1, (n, 1), by bisection of its logarithm."""
+    low = torch.where(top, w, torch.zeros_like(w)).square().sum(1, keepdim=True).sqrt()
+    low = low.clamp_min(1e-150).log()
+    high = torch.linalg.vector_norm(w, dim=1, keepdim=True).clamp_min(1e-150).log()
+    high = torch.maximum(low, high)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        outside = (w / (gaps + middle.exp())).square().sum(1, keepdim=True) >= 1
+        low, high = torch.where(outside, middle, low), torch.where(outside, high, middle)
+    return (0.5 * (low + high)).exp()
