@@ -72,6 +72,7 @@ def launch_grid(
         try:
             code = _run(store, launch, grid, settings, work, say, stream)
         except KeyboardInterrupt:
+            say("stopped: what was committed is kept, the same command goes on from here")
             code = ExitCode.INTERRUPTED
         finally:
             store.end_launch(launch, _STATES.get(code, "failed"))

@@ -41,6 +41,7 @@ class RayExecutor(Executor):
         self._address = address
         self._chunks: dict[Any, Sequence[Task]] = {}
         self._remote: Any = None
+        self._lost = False
 
     def start(self) -> None:
         try:
@@ -75,6 +76,7 @@ class RayExecutor(Executor):
         references = list(self._chunks)
         if not references:
             return []
+        self._check_alive()
         ready, others = ray.wait(references, num_returns=1, timeout=timeout)
         if ready and others:
             ready += ray.wait(others, num_returns=len(others), timeout=0)[0]
@@ -85,10 +87,24 @@ class RayExecutor(Executor):
         return len(self._chunks)
 
     def stop(self) -> None:
-        for reference in self._chunks:
-            ray.cancel(reference, force=True)
+        if not self._lost:
+            for reference in self._chunks:
+                ray.cancel(reference, force=True)
         self._chunks.clear()
         ray.shutdown()
+
+    def _check_alive(self) -> None:
+        """See that the processes of our own Ray run; by itself it takes a minute to notice."""
+        node: Any = ray._private.worker._global_node
+        if self._address != "local" or node is None:
+            return
+        dead = {kind for kind, _ in node.dead_processes()} & {"gcs_server", "raylet"}
+        if dead:
+            self._lost = True
+            raise InfrastructureError(
+                f"Ray's {' and '.join(sorted(dead))} has ended: run the same command again "
+                "to go on."
+            )
 
     def _collect(self, reference: Any) -> list[Event]:
         chunk = self._chunks.pop(reference)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,3 +145,16 @@ def _unknown_elsewhere() -> Run:
     run.__module__, run.__qualname__ = "os", "getpid_of_nobody"
     vars(os)["getpid_of_nobody"] = run
     return run
+
+
+def test_the_end_of_ray_itself_is_no_fault_of_a_trial(ray_executor: Executor) -> None:
+    """The last test of this file, because it takes the Ray of the others."""
+    import ray
+
+    node: Any = ray._private.worker._global_node
+    ray_executor._run = slow  # type: ignore[attr-defined]
+    ray_executor.submit(tasks(range(20)))
+    os.kill(node.all_processes["raylet"][0].process.pid, signal.SIGKILL)
+    with pytest.raises(InfrastructureError, match="Ray's raylet has ended"):
+        drain(ray_executor)
+    ray_executor.stop()
