@@ -1,0 +1,61 @@
+"""Helpers for axes: readable logarithmic ticks, multiples of π, panels in rows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axis import Axis
+from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFormatter
+
+TAU_TICKS = {0: "0", 1: "π/2", 2: "π", 3: "3π/2", 4: "2π"}
+
+
+def log_ticks(axis: Axis, low: float, high: float) -> None:
+    """Set ticks of a logarithmic axis over [low, high], with at least a few labels."""
+    decades = math.log10(high / low)
+    steps = (1.0, 2.0, 5.0) if decades < 1.5 else (1.0, 3.0) if decades < 2.5 else (1.0,)
+    axis.set_major_locator(LogLocator(subs=steps, numticks=12))
+    axis.set_minor_locator(LogLocator(subs=tuple(range(2, 10)), numticks=40))
+    axis.set_minor_formatter(NullFormatter())
+    if decades < 4:
+        axis.set_major_formatter(FuncFormatter(lambda value, _: log_text(value)))
+
+
+def log_text(value: float) -> str:
+    """Return a tick's value, below 0.01 as a power of ten such as 3 × 10⁻⁴."""
+    if value >= 0.009:
+        return f"{value:g}"
+    exponent = math.floor(math.log10(value) + 1e-9)
+    factor = round(value / 10.0**exponent)
+    return f"$10^{{{exponent}}}$" if factor == 1 else f"${factor}\\times10^{{{exponent}}}$"
+
+
+def angle_ticks(axis: Axis) -> None:
+    """Label an angle in multiples of π/2."""
+    axis.set_major_locator(MultipleLocator(math.pi / 2))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: angle_text(value)))
+
+
+def angle_text(angle: float) -> str:
+    """Return a multiple of π/2 as text, such as ``-π/2``."""
+    count = round(angle / (math.pi / 2))
+    text = TAU_TICKS.get(abs(count)) or f"{abs(count) / 2:g}π"
+    return f"\N{MINUS SIGN}{text}" if count < 0 else text
+
+
+def log_limits(values: npt.NDArray[np.float64], margin: float = 1.15) -> tuple[float, float]:
+    """Return limits around the positive, finite ones of some values; (0.1, 1) for none."""
+    usable = values[np.isfinite(values) & (values > 0)]
+    if not len(usable):
+        return 0.1, 1.0
+    return float(usable.min()) / margin, float(usable.max()) * margin
+
+
+def rows_and_columns(panels: int, widest: int) -> tuple[int, int]:
+    """Return a grid for some panels, at most ``widest`` in a row, as square as that allows."""
+    columns = min(panels, widest)
+    if panels == 4:
+        columns = min(widest, 2) if widest < 4 else 4
+    return math.ceil(panels / columns), columns

@@ -1,0 +1,142 @@
+"""Figure 2, left and middle: phase portraits, one panel per policy, same seed and axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from analysis.coverage import CELLS
+from analysis.figures.axes import angle_ticks, rows_and_columns
+from analysis.figures.plot import Plot
+from analysis.figures.style import (
+    BLACK,
+    TEXT_WIDTH,
+    environment_title,
+    mathematical,
+    policy_style,
+)
+from analysis.portraits import (
+    SEED_RULE,
+    Plane,
+    Portrait,
+    Portraits,
+    measure_portraits,
+    tabulate_portraits,
+)
+
+PANEL_HEIGHT = 1.95
+BOX: dict[str, Any] = {
+    "facecolor": "#f3f3f3",
+    "edgecolor": "#707070",
+    "linestyle": (0, (3, 2)),
+    "linewidth": 0.8,
+}
+
+
+def phase_plot(env: str) -> Plot[Portraits]:
+    """Return the phase portraits of one environment."""
+    return Plot(
+        name=f"figure2_phase_{env}",
+        title=f"Phase portraits, {environment_title(env)}",
+        statistic=f"one trajectory per policy: {SEED_RULE}; coverage: mean over trials",
+        band="standard error of the mean coverage (printed)",
+        part=lambda selection: selection.only([env]).compared(),
+        measure=lambda reader, selection, _: measure_portraits(reader, selection, env),
+        tabulate=tabulate_portraits,
+        draw=draw,
+        caption=caption,
+    )
+
+
+def draw(portraits: Portraits) -> Figure:
+    """Draw one panel for each policy, all with the same axes."""
+    rows, columns = rows_and_columns(len(portraits.panels), 3)
+    width = TEXT_WIDTH * max(columns, 2) / 3
+    figure = Figure(figsize=(width, PANEL_HEIGHT * rows + 0.6), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for axes, portrait in zip(panels, portraits.panels, strict=False):
+        _panel(axes, portrait, portraits.plane)
+    last = len(portraits.panels)
+    for axes in panels[last:]:
+        axes.set_axis_off()
+    _set_axes(panels[0], portraits)
+    x_label, y_label = (mathematical(label) for label in portraits.plane.labels)
+    for index, axes in enumerate(panels[:last]):
+        lowest = index + columns >= last
+        axes.tick_params(labelbottom=lowest)
+        axes.set_xlabel(x_label if lowest else "")
+        axes.set_ylabel(y_label if index % columns == 0 else "")
+    handles = _handles(portraits.seed)
+    if last < len(panels):
+        panels[-1].legend(handles=handles, loc="center")
+    else:
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(3, columns + 1))
+    return figure
+
+
+def _panel(axes: Axes, portrait: Portrait, plane: Plane) -> None:
+    (left, right), (bottom, top) = plane.box
+    axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, zorder=0.5, **BOX))
+    style = policy_style(portrait.policy)
+    axes.plot(portrait.line[:, 0], portrait.line[:, 1], color=style.colour, lw=0.7, zorder=2)
+    axes.plot(*portrait.start, marker="o", ms=4, mfc="white", mec=BLACK, mew=1, zorder=3)
+    axes.set_title(
+        f"{style.label} ({count_text(portrait)})\n{coverage_text(portrait)}", fontsize=7.5
+    )
+    if not len(portrait.line):
+        axes.text(0.5, 0.5, "no finished trial", transform=axes.transAxes, ha="center")
+    elif portrait.diverged:
+        axes.text(0.02, 0.02, "this trial diverged", transform=axes.transAxes, fontsize=6.5)
+
+
+def count_text(portrait: Portrait) -> str:
+    """Return the number of trials behind the coverage."""
+    left_out = f", {portrait.n_diverged} diverged" if portrait.n_diverged else ""
+    return f"n = {portrait.n}{left_out}"
+
+
+def coverage_text(portrait: Portrait) -> str:
+    """Return the coverage in per cent, with its standard error where there is one."""
+    if not portrait.n:
+        return "coverage unknown"
+    share = f"coverage {100 * portrait.coverage:.1f}"
+    return f"{share} ± {100 * portrait.coverage_error:.1f} %" if portrait.n > 1 else f"{share} %"
+
+
+def _set_axes(axes: Axes, portraits: Portraits) -> None:
+    for dimension, axis in enumerate((axes.xaxis, axes.yaxis)):
+        low, high = _extent(portraits, dimension)
+        margin = 0.04 * (high - low)
+        axis.set_view_interval(low - margin, high + margin, ignore=True)
+        if portraits.plane.angles[dimension]:
+            angle_ticks(axis)
+
+
+def _extent(portraits: Portraits, dimension: int) -> tuple[float, float]:
+    values = np.concatenate([panel.line[:, dimension] for panel in portraits.panels])
+    values = np.concatenate([values[np.isfinite(values)], portraits.plane.box[dimension]])
+    return float(values.min()), float(values.max())
+
+
+def _handles(seed: int) -> list[Line2D | Patch]:
+    return [
+        Line2D([], [], color="#404040", lw=0.9, label=f"trajectory of seed {seed}"),
+        Line2D([], [], ls="", marker="o", ms=4, mfc="white", mec=BLACK, mew=1, label="start"),
+        Patch(**BOX, label="evaluation box"),
+    ]
+
+
+def caption(portraits: Portraits) -> str:
+    """Return the caption, with the rule for the seed and what coverage is."""
+    return (
+        f"Phase portraits of the {environment_title(portraits.env)}, one panel per policy, "
+        f"all of seed {portraits.seed} ({SEED_RULE}). Angles are wrapped around the stable "
+        f"equilibrium and the line is broken where it wraps. Circle: start. Dashed: evaluation "
+        f"box. Coverage: share of the {CELLS} × {CELLS} cells of that box which a trial visits, "
+        f"mean ± standard error over trials."
+    )

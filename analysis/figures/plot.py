@@ -1,0 +1,60 @@
+"""A figure as data: what it needs, how it is measured, tabulated, drawn and described."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Generic, TypeVar
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from analysis.divergence import DivergenceRule
+from analysis.loss_curves import Axis
+from analysis.selection import Selection
+from orchestrate.store import Reader
+
+N = TypeVar("N")
+
+
+@dataclass(frozen=True)
+class Request:
+    """Choices that change what is drawn, beside the selection of trials."""
+
+    rule: DivergenceRule = DivergenceRule.EXCLUDE
+    axis: Axis = Axis.STEPS
+
+    def as_dict(self) -> dict[str, str]:
+        return {key: str(value) for key, value in asdict(self).items()}
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A figure before it is written: its ink, the table of what is drawn, and its caption."""
+
+    figure: Figure
+    table: pd.DataFrame
+    caption: str
+
+
+@dataclass(frozen=True)
+class Plot(Generic[N]):
+    """A kind of figure over numbers of type N.
+
+    ``part`` cuts the selection down to what this figure shows; without entries it is not drawn.
+    """
+
+    name: str
+    title: str
+    statistic: str
+    band: str
+    part: Callable[[Selection], Selection]
+    measure: Callable[[Reader, Selection, Request], N]
+    tabulate: Callable[[N], pd.DataFrame]
+    draw: Callable[[N], Figure]
+    caption: Callable[[N], str]
+
+    def make(self, reader: Reader, selection: Selection, request: Request) -> Drawing:
+        """Read, measure, then draw."""
+        numbers = self.measure(reader, selection, request)
+        return Drawing(self.draw(numbers), self.tabulate(numbers), self.caption(numbers))

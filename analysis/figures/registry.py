@@ -1,0 +1,128 @@
+"""All outputs of ``analysis figures``, by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+
+from analysis import provenance
+from analysis.figures import publish
+from analysis.figures.input_spectrum import spectrum_plot
+from analysis.figures.loss_curves import loss_plot
+from analysis.figures.phase_portraits import phase_plot
+from analysis.figures.plot import Plot, Request
+from analysis.figures.style import styled
+from analysis.markdown import comparison_markdown, summary_markdown
+from analysis.selection import Selection
+from analysis.tables import compare_policies, summarise
+from orchestrate.store import Reader
+
+PLOTS: dict[str, Plot[Any]] = {
+    plot.name: plot
+    for plot in (
+        loss_plot("figure1", "loss"),
+        loss_plot("figure1_reachable", "reachable_loss"),
+        phase_plot("pendulum"),
+        phase_plot("cartpole"),
+        spectrum_plot("cartpole", "figure2_spectrum"),
+    )
+}
+TABLES = ("summary", "comparison")
+NAMES = (*PLOTS, *TABLES)
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What happened to one output: drawn, unchanged, or nothing stored for it."""
+
+    name: str
+    state: str
+
+
+def build(
+    reader: Reader,
+    selection: Selection,
+    request: Request,
+    folder: Path,
+    names: tuple[str, ...] = NAMES,
+    *,
+    force: bool = False,
+) -> Iterator[Outcome]:
+    """Write the named outputs into a folder, and say of each what happened."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        part = _part(name, selection)
+        if not part.entries:
+            yield Outcome(name, "not drawn, nothing is stored for it")
+            continue
+        facts = provenance.describe(reader, part) | {"request": request.as_dict(), "name": name}
+        mark = _mark(facts)
+        endings = (*publish.PICTURES, "csv", "txt") if name in PLOTS else ("md", "csv")
+        if not force and publish.is_current(folder, name, endings, mark):
+            yield Outcome(name, "unchanged")
+            continue
+        if name in PLOTS:
+            facts |= _draw(PLOTS[name], reader, part, request, folder, mark)
+        else:
+            _tabulate(name, reader, part, request, folder)
+        publish.write_provenance(facts | {"fingerprint": mark}, folder, name)
+        yield Outcome(name, "written")
+
+
+def _part(name: str, selection: Selection) -> Selection:
+    if name in PLOTS:
+        return PLOTS[name].part(selection)
+    if name == "comparison":
+        compared = selection.compared()
+        return compared if len(compared.policies) > 1 else Selection(())
+    return selection
+
+
+def _mark(facts: dict[str, Any]) -> str:
+    """Return the fingerprint; where the data lie and which commit was checked out is no part."""
+    parts = ("selection", "request", "versions", "name", "notes")
+    content = {key: facts[key] for key in parts} | {"code": provenance.code_hash()}
+    return publish.fingerprint(content)
+
+
+def _draw(
+    plot: Plot[Any],
+    reader: Reader,
+    selection: Selection,
+    request: Request,
+    folder: Path,
+    mark: str,
+) -> dict[str, str]:
+    with styled():
+        drawing = plot.make(reader, selection, request)
+        caption = drawing.caption
+        if selection.gaps:
+            warning = partial_warning(selection)
+            caption = f"{warning} {caption}"
+            drawing.figure.suptitle(warning, fontsize=8, color="#b00020", weight="bold")
+        publish.write_pictures(drawing.figure, folder, plot.name, plot.title, mark)
+    publish.write_table(drawing.table, folder, plot.name)
+    publish.write_text(caption + "\n", folder / f"{plot.name}.txt")
+    return {"title": plot.title, "statistic": plot.statistic, "band": plot.band, "caption": caption}
+
+
+def _tabulate(
+    name: str, reader: Reader, selection: Selection, request: Request, folder: Path
+) -> None:
+    if name == "summary":
+        table = summarise(reader, selection, request.rule)
+        text = summary_markdown(table)
+    else:
+        table = compare_policies(reader, selection, "loss", request.rule)
+        text = comparison_markdown(table, request.rule)
+    warning = f"{partial_warning(selection)}\n\n" if selection.gaps else ""
+    publish.write_table(table, folder, name)
+    publish.write_text(warning + text, folder / f"{name}.md")
+
+
+def partial_warning(selection: Selection) -> str:
+    """Return the mark of an output that lacks trials."""
+    return f"PARTIAL: {sum(len(gap.seeds) for gap in selection.gaps)} trials missing."

@@ -1,0 +1,109 @@
+"""One look for all figures: one colour and line style per policy, fixed sizes, embedded fonts."""
+
+from __future__ import annotations
+
+import unicodedata
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+
+LineStyle = str | tuple[float, tuple[float, ...]]
+
+_OKABE_ITO: tuple[str, ...] = tuple(
+    matplotlib.colors.to_hex(colour) for colour in matplotlib.color_sequences["okabe_ito"]
+)
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = _OKABE_ITO
+GREY = "#8c8c8c"
+
+TEXT_WIDTH = 6.75
+"""Width of a figure over the page [inches]."""
+
+COLUMN_WIDTH = 4.2
+"""Width of a figure of one panel [inches]."""
+
+_RC: dict[Any, Any] = {
+    "font.size": 8,
+    "font.family": "DejaVu Sans",
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.use_mathtext": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.5,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.minor.width": 0.4,
+    "ytick.minor.width": 0.4,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "legend.handlelength": 2.6,
+    "lines.linewidth": 1.2,
+    "figure.dpi": 200,
+    "savefig.dpi": 200,
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "dopt",
+    "path.simplify": False,
+}
+
+
+def styled() -> AbstractContextManager[None]:
+    """Return the context in which figures are made and written."""
+    return matplotlib.rc_context(_RC)
+
+
+@dataclass(frozen=True)
+class PolicyStyle:
+    """How a policy is named and drawn in every figure."""
+
+    label: str
+    colour: str
+    line: LineStyle
+    width: float = 1.2
+
+
+_STYLES = {
+    "d_optimal": PolicyStyle("D-optimal", VERMILLION, "-", 1.6),
+    "oracle": PolicyStyle("oracle", BLACK, (0, (4, 1.5))),
+    "uniform": PolicyStyle("uniform", GREEN, (0, (6, 1.2, 1.2, 1.2))),
+    "periodic": PolicyStyle("periodic", BLUE, (0, (1.2, 1.2)), 1.4),
+    "random": PolicyStyle("random", PURPLE, (0, (2.5, 1.2))),
+    "random_held": PolicyStyle("random, held", SKY, (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2))),
+    "random_sphere": PolicyStyle("random on the sphere", ORANGE, (0, (8, 2))),
+}
+
+
+def policy_style(policy: str) -> PolicyStyle:
+    """Return a policy's style; policies of a user are grey, each with dashes from its name."""
+    if policy in _STYLES:
+        return _STYLES[policy]
+    dash = 2.0 + sum(policy.encode()) % 7
+    return PolicyStyle(policy.replace("_", " "), GREY, (0, (dash, 1.5)))
+
+
+def environment_title(env: str) -> str:
+    """Return the name of an environment as a title."""
+    return env.replace("_", " ")
+
+
+def mathematical(label: str) -> str:
+    """Return a label whose dotted letters are set as mathematics, where the dot sits well."""
+    pieces: list[str] = []
+    for letter in unicodedata.normalize("NFD", label):
+        if letter == "\N{COMBINING DOT ABOVE}":
+            pieces[-1] = f"$\\dot{{{_LETTERS.get(pieces[-1], pieces[-1])}}}$"
+        else:
+            pieces.append(letter)
+    return "".join(pieces)
+
+
+_LETTERS = {"φ": r"\varphi"}
