@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TextIO
 
@@ -22,6 +24,9 @@ from orchestrate.store import LaunchRecord, Registration, Store
 
 OTHERS_SECONDS = 1.0
 """Time between two looks at trials that another launch runs."""
+
+SILENT_SECONDS = 3.0
+"""What takes longer is announced."""
 
 SHOWN_CAUSES = 3
 """Causes of failure that are named at the end."""
@@ -98,7 +103,8 @@ def _run(
     _count(tally, state)
     say(_opening(grid, state, settings, store.safe_url))
     if tally.left:
-        work.prepare()
+        with _said_if_slow("compiling the kernel, which is kept for later launches", say):
+            work.prepare()
         start = time.monotonic()
         with make_executor(settings, work.run) as executor, Interrupt() as stop:
             chunks = Chunks(_waiting(grid, state), settings.chunk_seconds, executor.slots)
@@ -110,6 +116,16 @@ def _run(
         if stop.draining and tally.left:
             return ExitCode.INTERRUPTED
     return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
+
+
+@contextmanager
+def _said_if_slow(text: str, say: Say) -> Iterator[None]:
+    timer = threading.Timer(SILENT_SECONDS, say, [text])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _drive(driver: Driver, grid: Grid, progress: Progress) -> None:
@@ -168,6 +184,6 @@ def _closing(tally: Tally, driver: Driver, seconds: float) -> str:
     for cause, count in driver.failures.most_common(SHOWN_CAUSES):
         lines.append(f"{count:,} failed with {cause}")
     if tally.left:
-        why = "stopped at the first failure" if driver.failures else "interrupted"
+        why = "interrupted" if driver.stop.draining else "stopped at the first failure"
         lines.append(f"{why}, {tally.left:,} left: the same command goes on from here")
     return "\n".join(lines)

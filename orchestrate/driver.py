@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Protocol
 
@@ -98,7 +98,7 @@ class Driver:
         for event in events:
             claim, trial = self._running.pop(event.key)
             self.chunks.observe(trial.config_key, event.usage.wall_seconds)
-            run = RunRecord(**asdict(event.usage))
+            run = RunRecord(**vars(event.usage))
             if isinstance(event.outcome, Trouble):
                 trouble = event.outcome
                 self._fail(claim, Failure(trouble.type, trouble.message, trouble.traceback), run)
@@ -134,13 +134,12 @@ class Driver:
         if lost.blameless or len(lost.keys) == 1:
             counts.update(lost.keys)
         limit = NODE_LOSSES if lost.blameless else ATTEMPTS
-        for key in lost.keys:
-            claim, trial = self._running.pop(key)
-            if counts[key] >= limit:
-                self._fail(claim, _death(lost, limit), _no_usage())
-            else:
-                self.store.release(self.launch, [key])
-                self.chunks.add([trial], alone=not lost.blameless)
+        again = [key for key in lost.keys if counts[key] < limit]
+        held = {key: self._running.pop(key) for key in lost.keys}
+        self.store.release(self.launch, again)
+        self.chunks.add((held[key][1] for key in again), alone=not lost.blameless)
+        for key in held.keys() - again:
+            self._fail(held[key][0], _death(lost, limit), _no_usage())
 
 
 def _death(lost: Lost, times: int) -> Failure:

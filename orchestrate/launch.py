@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from orchestrate.surroundings import pin_threads  # noqa: E402
 pin_threads()
 
 import hydra  # noqa: E402
+from hydra.core.hydra_config import HydraConfig  # noqa: E402
 from omegaconf import DictConfig, OmegaConf  # noqa: E402
 
 from dopt.exploration import run_trial  # noqa: E402
@@ -35,6 +37,7 @@ from orchestrate.single import launch_trial  # noqa: E402
 from orchestrate.store import StoreError, StoreUnavailableError  # noqa: E402
 
 WORK = Work(run_trial, warm_up)
+LAUNCH_SECTIONS = ("launch", "store", "executor")
 
 
 @dataclass(frozen=True)
@@ -55,33 +58,42 @@ def read_command_line() -> Request | None:
     Exception
         Hydra's own errors, and those of the grid.
     """
-    tasks: list[DictConfig | tuple[DictConfig, list[Combination]]] = []
+    requests: list[Callable[[], Request]] = []
 
     @hydra.main(config_path=str(ROOT / "conf"), config_name="config", version_base="1.3")
     def capture(task: DictConfig | tuple[DictConfig, list[Combination]]) -> None:
-        tasks.append(task)  # Hydra would add a line of its own to an error in here
+        # Read it later: to an error in here Hydra would add a line of its own.
+        if isinstance(task, tuple):
+            requests.append(partial(_grid_request, *task))
+        else:
+            requests.append(partial(_single_request, task, _words(HydraConfig.get())))
 
     capture()
-    return _request(tasks[0]) if tasks else None
+    return requests[0]() if requests else None
 
 
-def _request(task: DictConfig | tuple[DictConfig, list[Combination]]) -> Request:
-    if isinstance(task, tuple):
-        config, combinations = task
-        overrides = tuple(str(word) for word in config.hydra.overrides.task)
-        return Request(combinations, _launch_sections(config), overrides, False)
-    sections = {key: task[key] for key in TRIAL_SECTIONS}
-    plain = {
-        key: OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
-        for key, part in sections.items()
-    }
-    return Request([Combination(plain)], _launch_sections(task), (), True)
+def _grid_request(config: DictConfig, combinations: list[Combination]) -> Request:
+    launch = _plain(config, LAUNCH_SECTIONS)
+    return Request(combinations, launch, _words(config.hydra), single=False)
 
 
-def _launch_sections(config: DictConfig) -> dict[str, Any]:
+def _single_request(config: DictConfig, words: tuple[str, ...]) -> Request:
+    combination = Combination(_plain(config, TRIAL_SECTIONS))
+    return Request([combination], _plain(config, LAUNCH_SECTIONS), words, single=True)
+
+
+def _words(hydra_config: DictConfig) -> tuple[str, ...]:
+    """Return the overrides as they were typed, references in them included."""
+    words = OmegaConf.to_container(hydra_config.overrides.task, resolve=False)
+    return tuple(map(str, words)) if isinstance(words, list) else ()
+
+
+def _plain(config: DictConfig, sections: Sequence[str]) -> dict[str, Any]:
+    """Return the sections, resolved and in plain types."""
+    parts = {key: config[key] for key in sections}
     return {
-        key: OmegaConf.to_container(config[key], resolve=True)
-        for key in ("launch", "store", "executor")
+        key: OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
+        for key, part in parts.items()
     }
 
 
@@ -104,11 +116,11 @@ def main() -> int:
 
 def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
     """Run a grid that has been read, and return the exit code."""
-    if settings.dry_run:
-        say(preview(grid, settings.store_url))
-        return ExitCode.DONE
-    record = launch_record(sys.argv, request.overrides, ROOT)
     try:
+        if settings.dry_run:
+            say(preview(grid, settings.store_url))
+            return ExitCode.DONE
+        record = launch_record(sys.argv, request.overrides, ROOT)
         if not request.single:
             return launch_grid(grid, settings, record, WORK, say=say)
         code, line = launch_trial(grid.trials[0], settings, record, WORK)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
@@ -26,9 +31,11 @@ def sentence_for(error: Exception) -> str:
     cause = error.__cause__ if isinstance(error, ConfigCompositionException) else error
     if isinstance(cause, ConfigAttributeError | ConfigKeyError) and cause.full_key:
         return _unknown_key(cause)
-    if isinstance(cause, OmegaConfBaseException):
+    if isinstance(cause, OmegaConfBaseException) and cause is not error:
         return _one_line(f"{error} {cause}")
-    return _one_line(str(error) or type(error).__name__)
+    if isinstance(error, HydraException | OmegaConfBaseException):
+        return _one_line(str(error))
+    return _one_line(f"{type(error).__name__}: {error} (HYDRA_FULL_ERROR=1 shows where it arose)")
 
 
 def _unknown_key(cause: OmegaConfBaseException) -> str:
