@@ -89,10 +89,18 @@ def _gradient_and_changes(
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:
-    """Return the maximisers, (n, m); ``ties`` (n, m) decide between equal ones."""
-    if problem.v.shape[1] == 1:
-        return gamma * torch.where(problem.v == 0, ties, -problem.v).sign()
-    return maximize_on_spheres(problem.Q, problem.v, gamma, ties)
+    """Return the maximisers, (n, m); ``ties`` (n, m) decide between equal ones.
+
+    A problem that is not finite has none: its input is NaN, and the trial diverges.
+    """
+    Q, v = problem
+    finite = torch.cat([Q, v.unsqueeze(-1)], dim=-1).isfinite().all(-1).all(-1, keepdim=True)
+    if v.shape[1] == 1:
+        chosen = gamma * torch.where(v == 0, ties, -v).sign()
+    else:
+        Q, v = torch.where(finite.unsqueeze(-1), Q, 0.0), torch.where(finite, v, 0.0)
+        chosen = maximize_on_spheres(Q, v, gamma, ties)
+    return torch.where(finite, chosen, torch.nan)
 
 
 def uniform_inputs(
