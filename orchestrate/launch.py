@@ -66,7 +66,9 @@ def read_command_line() -> Request | None:
         if isinstance(task, tuple):
             requests.append(partial(_grid_request, *task))
         else:
-            requests.append(partial(_single_request, task, _words(HydraConfig.get())))
+            requests.append(
+                partial(_single_request, task, _words(HydraConfig.get().overrides.task))
+            )
 
     capture()
     return requests[0]() if requests else None
@@ -74,7 +76,7 @@ def read_command_line() -> Request | None:
 
 def _grid_request(config: DictConfig, combinations: list[Combination]) -> Request:
     launch = _plain(config, LAUNCH_SECTIONS)
-    return Request(combinations, launch, _words(config.hydra), single=False)
+    return Request(combinations, launch, _words(config.hydra.overrides.task), single=False)
 
 
 def _single_request(config: DictConfig, words: tuple[str, ...]) -> Request:
@@ -82,9 +84,9 @@ def _single_request(config: DictConfig, words: tuple[str, ...]) -> Request:
     return Request([combination], _plain(config, LAUNCH_SECTIONS), words, single=True)
 
 
-def _words(hydra_config: DictConfig) -> tuple[str, ...]:
+def _words(overrides: object) -> tuple[str, ...]:
     """Return the overrides as they were typed, references in them included."""
-    words = OmegaConf.to_container(hydra_config.overrides.task, resolve=False)
+    words = OmegaConf.to_container(overrides, resolve=False)
     return tuple(map(str, words)) if isinstance(words, list) else ()
 
 

@@ -51,7 +51,8 @@ class LaunchSettings:
         LaunchError
             If a value has the wrong type or is out of bounds.
         """
-        launch, name = given["launch"], given["executor"]["name"]
+        launch = _section("launch", given["launch"])
+        name = _section("executor", given["executor"])["name"]
         if name not in EXECUTORS:
             raise unknown_name("executor.name", name, EXECUTORS)
         retry = launch["retry"]
@@ -59,14 +60,22 @@ class LaunchSettings:
             raise unknown_name("launch.retry", retry, RETRY)
         return cls(
             executor=name,
-            store_url=_text("store.url", given["store"]["url"]),
+            store_url=_text("store.url", _section("store", given["store"])["url"]),
             dry_run=_flag("launch.dry_run", launch["dry_run"]),
             fail_fast=_flag("launch.fail_fast", launch["fail_fast"]),
             retry=cast("Retry | None", retry),
             workers=_count("launch.workers", launch["workers"]),
             chunk_seconds=_seconds("launch.chunk_seconds", launch["chunk_seconds"]),
-            ray_address=_text("launch.ray.address", launch["ray"]["address"]),
+            ray_address=_text(
+                "launch.ray.address", _section("launch.ray", launch["ray"])["address"]
+            ),
         )
+
+
+def _section(key: str, value: object) -> Mapping[str, Any]:
+    if isinstance(value, Mapping):
+        return value
+    raise _wrong(key, value, "a section with settings of its own")
 
 
 def _flag(key: str, value: object) -> bool:

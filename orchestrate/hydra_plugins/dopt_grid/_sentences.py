@@ -16,6 +16,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from dopt.errors import DoptError, unknown_name
 
+_SEVERAL = re.compile(r"(?:Ambiguous value for argument|Sweep parameters) ('.*?')(?: requires|\n)")
 _NOISE = re.compile(r"\s*(\^|See https?:|full_key:|object_type=|reference_type=|To append |$)")
 
 
@@ -28,6 +29,8 @@ def sentence_for(error: Exception) -> str:
         return _unknown(group or "configuration", option, error.options)
     if isinstance(error, OverrideParseException):
         return _one_line(f"cannot read the override '{error.override}': {error.message}")
+    if match := _SEVERAL.search(str(error)):
+        return f"{match[1]} gives several values to one trial: add -m for a grid, or quote it."
     cause = error.__cause__ if isinstance(error, ConfigCompositionException) else error
     if isinstance(cause, ConfigAttributeError | ConfigKeyError) and cause.full_key:
         return _unknown_key(cause)
