@@ -76,8 +76,9 @@ def dual_absorb(dual: Dual, regularization: float, phi: Any, hidden: Any, deltas
             rows[k, i] = (rows[k, i] - inner(row[:i], rows[k, :i])) / row[i]
         for i in range(R):
             dual.factor[R, i] = rows[k, i]
-        pivot = regularization + rows[k, R] - inner(rows[k, :R], rows[k, :R])
-        dual.factor[R, R] = np.sqrt(pivot)
+        # A Schur complement of λI + GGᵀ: never below λ but for rounding.
+        rest = rows[k, R] - inner(rows[k, :R], rows[k, :R])
+        dual.factor[R, R] = np.sqrt(regularization + max(rest, 0.0))
     dual.n_states[0] = n + 1
 
 

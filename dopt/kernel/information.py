@@ -192,6 +192,11 @@ def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> N
     """
     r = rows.shape[0]
     multiply_rows(covariance, rows, scratch)
+    for k in range(r):
+        if inner(scratch[k], rows[k]) < 0.0:
+            restore(covariance)
+            multiply_rows(covariance, rows, scratch)
+            break
     L = np.zeros((r, r))
     for k in range(r):
         for i in range(k + 1):
@@ -206,6 +211,35 @@ def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> N
         for j in range(row.shape[0]):
             row[j] /= L[k, k]
         _append(covariance, row)
+
+
+@vectorized
+def restore(covariance: Covariance) -> None:
+    """Make M⁻¹ positive semidefinite again, by a fresh eigendecomposition.
+
+    A negative variance jᵀM⁻¹j is the cheap sign that rounding has destroyed it, which takes a
+    regularisation near the resolution of float64.
+    """
+    upper, pending = covariance.upper, covariance.pending
+    q = upper.shape[0]
+    full = np.empty((q, q))
+    for i in range(q):
+        for j in range(i, q):
+            value = upper[i, j]
+            for k in range(covariance.n_pending[0]):
+                value -= pending[k, i] * pending[k, j]
+            full[i, j] = value
+            full[j, i] = value
+    values, axes = np.linalg.eigh(full)
+    for i in range(q):
+        for j in range(i, q):
+            upper[i, j] = 0.0
+    for k in range(q):
+        if values[k] > 0.0:
+            for i in range(q):
+                for j in range(i, q):
+                    upper[i, j] += values[k] * axes[i, k] * axes[j, k]
+    covariance.n_pending[0] = 0
 
 
 @vectorized
