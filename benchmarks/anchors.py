@@ -1,0 +1,29 @@
+"""Speed of other people's code for the same task.
+
+All were measured on one core of a two-core machine in float64: cartpole, two hidden layers of 16
+units (386 parameters), D-optimal policy. The authors' figures are those of the code that they
+released with the paper. Absolute times move with the machine, ratios less so.
+"""
+
+from __future__ import annotations
+
+from benchmarks.rows import Anchor
+
+_AUTHORS = "authors' released code"
+_LOCKSTEP = "torch.func, 100 trials in lockstep"
+_SCAN = "JAX lax.scan, whole trial compiled"
+
+STEP = Anchor(12_600, _AUTHORS)
+"""Plan, step, learn from a window of 100, update M⁻¹ [µs]."""
+
+RANDOM_STEP = Anchor(550, _AUTHORS)
+"""A step of the random policy that learns from one sample [µs]."""
+
+EVALUATION = Anchor(870, _AUTHORS)
+"""Evaluation on 8,000 points [µs]."""
+
+LOCKSTEP = Anchor(342, _LOCKSTEP)
+"""The step of :data:`STEP`, for each trial of the batch [µs]."""
+
+SCAN, SCAN_ONE_SAMPLE = Anchor(160, _SCAN), Anchor(136, _SCAN)
+"""The step of :data:`STEP`, and the same learning from one sample [µs]."""

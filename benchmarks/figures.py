@@ -1,0 +1,73 @@
+"""How long do the figures take from two million rows? Real trials, each stored many times."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+
+import numpy as np
+
+from benchmarks.launches import RECORD, claims_for, run_record
+from benchmarks.processes import database, run
+from benchmarks.rows import Row, Target
+from dopt.errors import IncompatibleError
+from dopt.exploration import run_trial
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+from dopt.systems import SYSTEMS
+from orchestrate.store import Store
+
+PAPER = ("random", "uniform", "periodic", "d_optimal", "oracle")
+SEEDS = 212
+"""With 19 cells of 500 steps, two million rows."""
+
+
+def measure(quick: bool) -> list[Row]:
+    """Return seconds of the whole command, all figures and tables."""
+    seeds = 5 if quick else SEEDS
+    with tempfile.TemporaryDirectory() as folder:
+        url = database(folder)
+        rows = fill(url, seeds)
+        done = run("-m", "analysis", "figures", "--db", url, "--out", f"{folder}/figures")
+    what = "all figures and tables"
+    peak = f"{rows:,} rows; {done.peak_mebibytes:.0f} MiB"
+    return [Row(what, done.seconds, "s", Target(5, 30), note=peak)]
+
+
+def fill(url: str, seeds: int) -> int:
+    """Store one real trial of each cell under many seeds, its losses scaled; return the rows."""
+    rows = 0
+    with Store.open(url) as store:
+        launch = store.begin_launch(RECORD)
+        for cell in _cells():
+            result = run_trial(cell)
+            claims = claims_for(store, launch, [cell.with_seed(seed) for seed in range(seeds)])
+            items = [(claim, _varied(result, i), run_record()) for i, claim in enumerate(claims)]
+            rows += sum(store.commit_many(items)) * cell.system.horizon
+        store.end_launch(launch, "done")
+    return rows
+
+
+def _cells() -> Iterator[TrialSpec]:
+    for env in SYSTEMS:
+        for policy in PAPER:
+            linear = policy == "oracle"
+            learner = "recursive_least_squares" if linear else "adam_window"
+            try:
+                yield TrialSpec.from_mapping(
+                    {
+                        "env": {"name": env},
+                        "policy": {"name": policy},
+                        "model": {"name": "linear" if linear else "mlp"},
+                        "learner": {"name": learner},
+                    }
+                )
+            except IncompatibleError:
+                continue
+
+
+def _varied(result: TrialResult, seed: int) -> TrialResult:
+    factor = float(np.exp(0.3 * np.random.default_rng(seed).standard_normal()))
+    loss, reachable = factor * result.loss, factor * result.reachable_loss
+    return dataclasses.replace(result, loss=loss, reachable_loss=reachable)

@@ -1,0 +1,39 @@
+"""Where and with what something was measured."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from pathlib import Path
+
+LIBRARIES = ("numpy", "numba", "llvmlite", "torch", "jax", "ray", "sqlalchemy", "matplotlib")
+
+
+def describe() -> list[str]:
+    """Return lines about the processor, its load, and the versions of the libraries."""
+    cores = len(os.sched_getaffinity(0))
+    load = os.getloadavg()[0]
+    found = [f"{name} {version}" for name in LIBRARIES if (version := _version(name))]
+    return [
+        f"machine: {_processor()}, {cores} cores, {platform.system()} {platform.release()}, "
+        f"load {load:.1f} before the start",
+        f"versions: Python {platform.python_version()}, {', '.join(found)}",
+    ]
+
+
+def _processor() -> str:
+    """Return the name of the processor as the kernel knows it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None

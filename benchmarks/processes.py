@@ -1,0 +1,72 @@
+"""Commands as a user runs them: a whole process, its time and its memory."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+LAUNCH = str(ROOT / "orchestrate" / "launch.py")
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A process that ended well.
+
+    Attributes
+    ----------
+    started
+        Seconds since 1970 at which it was started.
+    seconds
+        Until its end.
+    peak_mebibytes
+        Largest resident memory of the process itself, without its children.
+    output
+        What it printed.
+    """
+
+    started: float
+    seconds: float
+    peak_mebibytes: float
+    output: str
+
+
+def run(*arguments: str) -> Finished:
+    """Run this interpreter with arguments and return what it took.
+
+    Raises
+    ------
+    RuntimeError
+        If the process fails; the message holds the end of its output.
+    """
+    with tempfile.TemporaryFile("w+") as output:
+        started, clock = time.time(), time.perf_counter()
+        process = subprocess.Popen(
+            [sys.executable, *arguments], stdout=output, stderr=subprocess.STDOUT, cwd=ROOT
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        seconds = time.perf_counter() - clock
+        output.seek(0)
+        text = output.read()
+    if process.returncode:
+        raise RuntimeError(
+            f"'{' '.join(arguments)}' ended with {process.returncode}, but 0 is expected; its last "
+            f"line is: {text.strip().splitlines()[-1:]}"
+        )
+    return Finished(started, seconds, usage.ru_maxrss / 1024, text)
+
+
+def launch(*arguments: str) -> Finished:
+    """Run ``orchestrate/launch.py``."""
+    return run(LAUNCH, *arguments)
+
+
+def database(folder: str | Path, name: str = "results") -> str:
+    """Return the URL of a database in a folder."""
+    return f"sqlite:///{Path(folder) / name}.db"

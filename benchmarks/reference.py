@@ -1,0 +1,48 @@
+"""How fast is the plain reference in torch, one trial at a time and a hundred in lockstep?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks import anchors
+from benchmarks.rows import Row
+from benchmarks.trials import cartpole
+from dopt.result import TrialResult
+
+BATCH = 100
+SKIPPED = 4
+"""First steps of a batch, in which torch allocates and traces."""
+
+
+def measure(quick: bool) -> list[Row]:
+    """Return the cost of a step for each trial of a batch, and trial-steps per second."""
+    import torch
+
+    rows = _rows(1, 120)
+    if not quick:
+        rows += _rows(BATCH, SKIPPED + 8)
+    if not quick and torch.cuda.is_available():
+        rows += _rows(BATCH, 120, "cuda")
+    return rows
+
+
+def _rows(size: int, steps: int, device: str = "cpu") -> list[Row]:
+    from dopt.reference.lockstep import run_trials
+
+    specs = [cartpole(seed=seed, horizon=steps) for seed in range(size)]
+    result = run_trials(specs, device)[0]
+    step, evaluation = _settled(result)
+    what = f"torch, {f'{size} trials in lockstep' if size > 1 else 'one trial'} on {device}"
+    known = anchors.LOCKSTEP if size == BATCH and device == "cpu" else None
+    note = f"{min(steps, 100)} samples in the window"
+    return [
+        Row(what, step, "µs a step", anchor=known, note=note),
+        Row(f"{what}, evaluated", 1e6 / (step + evaluation), "trial-steps/s"),
+    ]
+
+
+def _settled(result: TrialResult) -> tuple[float, float]:
+    """Return microseconds of a step and of its evaluation, for one trial of the batch."""
+    last = slice(max(SKIPPED, len(result.loss) - 20), None)
+    step = np.median((result.plan_us + result.learn_us)[last])
+    return float(step), float(np.median(result.evaluate_us[last]))

@@ -1,0 +1,83 @@
+"""The benchmark runs and prints a table that can be read; how fast anything is, is not tested."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.cli import HEADERS, QUESTIONS, main, parser
+from benchmarks.rows import Anchor, Row, Target
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def table(text: str) -> list[dict[str, str]]:
+    """Return the rows of the table by their headers."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    headers, _, *rows = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines)
+    return [dict(zip(headers, row, strict=True)) for row in rows]
+
+
+def test_the_step_is_measured_beside_its_targets() -> None:
+    command = [sys.executable, "-m", "benchmarks", "--quick", "--only", "step"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    rows = table(done.stdout)
+    assert tuple(rows[0]) == HEADERS
+    assert {row["question"] for row in rows} == {"step"}
+    for row in rows[:3]:
+        value, unit = row["measured"].split()
+        assert unit == "µs"
+        assert float(value) > 0
+        assert row["target"].startswith("1: ≤ ")
+        assert float(row["of target"]) > 0
+    assert "machine: " in done.stdout
+    assert "numba " in done.stdout
+
+
+def test_a_question_that_fails_is_said_and_the_others_are_asked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ask(question: str, quick: bool) -> list[Row]:
+        if question == "store":
+            raise OSError("the disk is full\nand more")
+        return [Row("quick" if quick else "whole", 1.0, "s")]
+
+    monkeypatch.setattr("benchmarks.cli.ask", ask)
+    assert main(["--only", "store,step"]) == 1
+    first, second = table(capsys.readouterr().out)
+    assert first["note"] == "OSError: the disk is full"
+    assert (second["what"], second["measured"]) == ("whole", "1 s")
+    assert main(["--only", "step", "--quick"]) == 0
+
+
+def test_a_question_that_does_not_exist_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parser().parse_args(["--only", "step,speed"])
+    assert "'speed' is no question, choose of step" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_every_question_has_a_file_of_its_own(question: str) -> None:
+    text = (ROOT / "benchmarks" / f"{question}.py").read_text(encoding="utf-8")
+    assert "?" in text.splitlines()[0]
+
+
+def test_ratios_are_above_one_where_the_target_is_met() -> None:
+    at_most, at_least = Target(1, 125.0), Target(4, 300_000.0, at_least=True)
+    assert at_most.ratio(100.0) == 1.25
+    assert at_least.ratio(150_000.0) == 0.5
+    assert at_most.ratio(0.0) == math.inf
+
+
+def test_a_row_shows_how_many_times_faster_it_is_than_others() -> None:
+    row = Row("step", 100.0, "µs", Target(1, 125.0), Anchor(12_600.0, "others"), "note")
+    assert row.cells() == ["100 µs", "1: ≤ 125", "1.25", "12,600", "126", "note"]
+
+
+def test_what_was_left_out_says_why() -> None:
+    assert Row("scan", None, note="jax is not installed").cells()[0] == "left out"
+    assert Row("scan", None, note="jax is not installed").cells()[-1] == "jax is not installed"
