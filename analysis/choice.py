@@ -1,24 +1,32 @@
 """Which stored configuration stands for a policy in an environment.
 
 A database may hold the paper's grid beside other widths, bounds and learners. A picture compares
-policies under one setting, the triple (env, model, learner) of an environment: the one with most
-trials of the reference policy. A policy that exists only with a model of its own (the oracle) is
-taken with that model, in the same env section. What was left out is said; a tie is an error.
+policies under one setting, the triple (env, model, learner) of an environment. A setting with the
+reference policy and a baseline goes before one with the reference alone, such as another width;
+then the one with most trials wins, then the one nearest to the defaults, which are the paper's
+setting. A policy that exists only with a model of its own (the oracle) is taken with that model, in
+the same env section. What was left out is said; a tie is an error.
 """
 
 from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from analysis.errors import AnalysisError
+from dopt.errors import SpecificationError
+from dopt.spec import TrialSpec
 from orchestrate.store import Cell
 
 REFERENCE = "d_optimal"
 """The policy that all others are compared with."""
+
+Setting = tuple[str, str, str]
+"""JSON of the sections env, model and learner."""
 
 
 @dataclass(frozen=True)
@@ -89,27 +97,50 @@ def _choose_policies(group: Sequence[Candidate]) -> list[Cell]:
 
 
 def _reference(group: Sequence[Candidate]) -> Candidate:
-    """Return the candidate that fixes the setting: most trials of the reference policy."""
-    totals: dict[tuple[str, str, str], int] = {}
+    """Return the candidate that fixes the setting; see the top of this file for the order."""
+    pool = [candidate for candidate in group if candidate.cell.policy == REFERENCE] or group
+    totals: Counter[Setting] = Counter()
+    policies: dict[Setting, set[str]] = {}
     for candidate in group:
         setting = _setting(candidate.cell)
-        totals[setting] = totals.get(setting, 0) + candidate.n_trials
-    pool = [candidate for candidate in group if candidate.cell.policy == REFERENCE] or group
-    most = max(candidate.n_trials for candidate in pool)
-    pool = [candidate for candidate in pool if candidate.n_trials == most]
-    widest = max(totals[_setting(candidate.cell)] for candidate in pool)
-    pool = [candidate for candidate in pool if totals[_setting(candidate.cell)] == widest]
-    if len({_setting(candidate.cell) for candidate in pool}) > 1:
-        raise _tie(pool)
-    return pool[0]
+        totals[setting] += candidate.n_trials
+        policies.setdefault(setting, set()).add(candidate.cell.policy)
+
+    def rank(candidate: Candidate) -> tuple[int, ...]:
+        setting = _setting(candidate.cell)
+        alone = len(policies[setting]) < 2
+        return -alone, totals[setting], candidate.n_trials, -departures(candidate.cell)
+
+    best = _first(pool, rank)
+    if len({_setting(candidate.cell) for candidate in best}) > 1:
+        raise _tie(best)
+    return best[0]
 
 
 def _most(candidates: Sequence[Candidate]) -> Candidate:
-    most = max(candidate.n_trials for candidate in candidates)
-    pool = [candidate for candidate in candidates if candidate.n_trials == most]
-    if len(pool) > 1:
-        raise _tie(pool)
-    return pool[0]
+    best = _first(candidates, lambda one: (one.n_trials, -departures(one.cell)))
+    if len(best) > 1:
+        raise _tie(best)
+    return best[0]
+
+
+def _first(
+    candidates: Sequence[Candidate], rank: Callable[[Candidate], tuple[int, ...]]
+) -> list[Candidate]:
+    """Return the candidates of the highest rank."""
+    top = max(map(rank, candidates))
+    return [candidate for candidate in candidates if rank(candidate) == top]
+
+
+def departures(cell: Cell) -> int:
+    """Return how many values of a configuration are not their defaults."""
+    sections = {key: value for key, value in cell.config.items() if isinstance(value, Mapping)}
+    names = {key: {"name": section.get("name")} for key, section in sections.items()}
+    try:
+        usual = flatten(TrialSpec.from_mapping(names).to_mapping())
+    except SpecificationError:
+        return 0  # a system or policy of a user's own, which is not registered here
+    return sum(usual.get(path) != value for path, value in flatten(sections).items())
 
 
 def _tie(pool: Sequence[Candidate]) -> AnalysisError:
@@ -123,7 +154,7 @@ def _tie(pool: Sequence[Candidate]) -> AnalysisError:
     )
 
 
-def _setting(cell: Cell) -> tuple[str, str, str]:
+def _setting(cell: Cell) -> Setting:
     env, model, learner = (
         json.dumps(cell.config.get(section), sort_keys=True)
         for section in ("env", "model", "learner")

@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
             selection = select(reader, _filter(options))
             _check_complete(selection, options.allow_partial)
             for note in selection.notes:
-                say(f"note: {note}")
+                sys.stderr.write(f"note: {note}\n")  # the output may be a CSV
             return int(options.run(reader, selection, options))
     except IncompleteError as error:
         sys.stderr.write(f"{error}\n")

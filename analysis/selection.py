@@ -44,11 +44,15 @@ class Entry:
 
 @dataclass(frozen=True)
 class Selection:
-    """Entries in the order in which they are drawn, gaps, and sentences on what was left out."""
+    """Entries in the order in which they are drawn, gaps, and sentences on what was left out.
+
+    ``stored`` are all entries that the request allows, other widths and variants included.
+    """
 
     entries: tuple[Entry, ...]
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
+    stored: tuple[Entry, ...] = ()
 
     @property
     def environments(self) -> tuple[str, ...]:
@@ -73,6 +77,7 @@ class Selection:
             tuple(entry for entry in self.entries if kept(entry.cell.env, entry.cell.policy)),
             tuple(gap for gap in self.gaps if kept(gap.env, gap.policy)),
             self.notes,
+            tuple(entry for entry in self.stored if kept(entry.cell.env, entry.cell.policy)),
         )
 
     def compared(self) -> Selection:
@@ -126,7 +131,12 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     chosen = choose(Candidate(cell, len(trials[cell.config_key])) for cell in accepted)
     chosen.sort(key=lambda cell: (environment_rank(cell.env), policy_rank(cell.policy)))
     entries = tuple(Entry(cell, trials[cell.config_key]) for cell in chosen)
-    return Selection(entries, tuple(_gaps(entries, compatible)), tuple(_notes(accepted, chosen)))
+    return Selection(
+        entries,
+        tuple(_gaps(entries, compatible)),
+        tuple(_notes(accepted, chosen)),
+        tuple(Entry(cell, trials[cell.config_key]) for cell in accepted),
+    )
 
 
 def newest(cells: list[Cell]) -> list[Cell]:

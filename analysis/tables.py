@@ -31,6 +31,13 @@ class Finals:
     n_finished: int
     n_diverged: int
 
+    def describe(self) -> str:
+        """Return the count to print, such as ``98/100, 2 diverged``."""
+        used = len(self.losses)
+        if not self.n_diverged:
+            return str(used)
+        return f"{used}/{self.n_finished}, {self.n_diverged} diverged"
+
 
 def final_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Finals:
     """Return the loss after the last step of each trial; from the summary column where it is."""

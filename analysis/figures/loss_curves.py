@@ -141,7 +141,7 @@ def caption(numbers: Numbers) -> str:
     return (
         f"L² norm of the model's error over the {where} against time t, one panel per environment. "
         f"Lines: mean over trials; bands: {BAND}; no smoothing. "
-        f"An axis with two slanted strokes is broken where no other curve runs. {rules[request.rule]} "
-        f"Policies of one environment share initial weights and noise for the same seed. Trials: "
-        f"{'. '.join(counts)}."
+        f"An axis with two slanted strokes is broken where no other curve runs. "
+        f"{rules[request.rule]} Policies of one environment share initial weights and noise for "
+        f"the same seed. Trials: {'. '.join(counts)}."
     )

@@ -12,7 +12,6 @@ from typing import Any
 import pandas as pd
 from matplotlib.figure import Figure
 
-
 PICTURES = ("pdf", "svg", "png")
 
 

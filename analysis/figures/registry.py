@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-
 from analysis import provenance
 from analysis.figures import publish
 from analysis.figures.input_spectrum import spectrum_plot
@@ -15,6 +14,7 @@ from analysis.figures.loss_curves import loss_plot
 from analysis.figures.phase_portraits import phase_plot
 from analysis.figures.plot import Plot, Request
 from analysis.figures.style import styled
+from analysis.figures.width import cost_plot, loss_against_width_plot
 from analysis.markdown import comparison_markdown, summary_markdown
 from analysis.selection import Selection
 from analysis.tables import compare_policies, summarise
@@ -28,6 +28,8 @@ PLOTS: dict[str, Plot[Any]] = {
         phase_plot("pendulum"),
         phase_plot("cartpole"),
         spectrum_plot("cartpole", "figure2_spectrum"),
+        cost_plot("figure4_width"),
+        loss_against_width_plot("figure4_width_loss"),
     )
 }
 TABLES = ("summary", "comparison")

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import pytest
 
+from dopt.spec import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fill, make_grid
 
 SHORT = {"env": {"horizon": 60}}
+WIDTHS = (4, 8, 32, 64)
+
+
+def wide(width: int, seeds: Iterable[int], **sections: Mapping[str, object]) -> list[TrialSpec]:
+    """Return D-optimal trials of a width in the cartpole."""
+    model = {"model": {"width": width}}
+    return make_grid(("cartpole",), ("d_optimal",), seeds, **{**SHORT, **model, **sections})
 
 
 @pytest.fixture(scope="session")
 def url(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return a complete grid of three systems and five policies, one trial of which diverged."""
+    """Return a complete grid of three systems and five policies, one trial of which diverged.
+
+    Beside it there are other widths of the D-optimal policy in the cartpole.
+    """
     address = f"sqlite:///{tmp_path_factory.mktemp('complete')}/results.db"
     specs = make_grid(("pendulum", "cartpole", "quadrotor"), seeds=range(5), **SHORT)
+    specs += [spec for width in WIDTHS for spec in wide(width, range(5))]
     lost = [s for s in specs if (s.system.name, s.policy.name, s.seed) == ("cartpole", "random", 2)]
     fill(address, specs, diverged={lost[0].trial_key: 20})
     return address

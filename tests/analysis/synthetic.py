@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import IncompatibleError
+from dopt.models import MLP
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
 from dopt.systems import System
@@ -64,7 +65,7 @@ def fake_result(spec: TrialSpec, diverged_at: int | None = None) -> TrialResult:
     columns = {
         "loss": loss,
         "reachable_loss": 0.5 * loss,
-        "plan_us": rng.gamma(5, 4, system.horizon),
+        "plan_us": rng.gamma(5, 4, system.horizon) * _size(spec),
         "learn_us": rng.gamma(5, 8, system.horizon),
         "evaluate_us": rng.gamma(5, 2, system.horizon),
     }
@@ -80,6 +81,11 @@ def fake_result(spec: TrialSpec, diverged_at: int | None = None) -> TrialResult:
         wall_seconds=0.1,
         cpu_seconds=0.1,
     )
+
+
+def _size(spec: TrialSpec) -> float:
+    """Return what planning costs more for a wider network: the square of the width."""
+    return (spec.model.width / 16) ** 2 if isinstance(spec.model, MLP) else 1.0
 
 
 def _inputs(system: System, policy: str, rng: np.random.Generator) -> Array:

@@ -1,0 +1,162 @@
+"""Figure 4: cost of a step against the width of the network, and its final loss."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from analysis.counts import count_text
+from analysis.figures.axes import log_limits, log_ticks
+from analysis.figures.loss_curves import NORM
+from analysis.figures.plot import Plot
+from analysis.figures.style import (
+    BLUE,
+    COLUMN_WIDTH,
+    GREEN,
+    GREY,
+    VERMILLION,
+    environment_title,
+    policy_style,
+)
+from analysis.width import (
+    Cost,
+    WidthCosts,
+    WidthLosses,
+    measure_costs,
+    measure_losses,
+    tabulate_costs,
+    tabulate_losses,
+    width_part,
+)
+
+HEIGHT = 3.2
+LOSS_HEIGHT = 2.6
+COLOURS = {"plan": VERMILLION, "learn": BLUE, "evaluate": GREEN}
+MARKERS = {"plan": "o", "learn": "s", "evaluate": "^"}
+FORM_LINES = {"primal": (0, (5, 2)), "dual": (0, (1.5, 1.5)), "sketch": (0, (5, 1.5, 1, 1.5))}
+
+
+def cost_plot(name: str) -> Plot[WidthCosts]:
+    """Return the cost of a step against width."""
+    return Plot(
+        name=name,
+        title="Planning cost against width",
+        statistic="median over steps and trials of the microseconds of each part of a step",
+        band="10 % to 90 % quantiles over steps and trials",
+        part=width_part,
+        measure=lambda reader, selection, _: measure_costs(reader, selection),
+        tabulate=tabulate_costs,
+        draw=draw_costs,
+        caption=caption_costs,
+    )
+
+
+def loss_against_width_plot(name: str) -> Plot[WidthLosses]:
+    """Return the final loss against width."""
+    return Plot(
+        name=name,
+        title="Final loss against width",
+        statistic="mean over trials of the loss after the last step",
+        band="± 2 standard errors of the mean",
+        part=width_part,
+        measure=lambda reader, selection, request: measure_losses(reader, selection, request.rule),
+        tabulate=tabulate_losses,
+        draw=draw_losses,
+        caption=caption_losses,
+    )
+
+
+def draw_costs(numbers: WidthCosts) -> Figure:
+    """Draw every part of a step on logarithmic axes, with the time that a step may take."""
+    figure, axes = _axes(HEIGHT, numbers.costs[0].widths)
+    axes.axhline(numbers.limit_us, color="black", lw=0.8, ls=(0, (5, 2)))
+    limit = f"real time: dt = {numbers.limit_us / 1e3:g} ms"
+    axes.annotate(
+        limit, (1, numbers.limit_us), xycoords=("axes fraction", "data"), xytext=(-2, -3),
+        textcoords="offset points", ha="right", va="top", fontsize=6.5,
+    )  # fmt: skip
+    for cost in numbers.costs:
+        _line(axes, cost, other=cost.form != numbers.costs[0].form)
+    drawn = np.concatenate([np.r_[cost.low, cost.high] for cost in numbers.costs])
+    low, high = log_limits(np.r_[drawn, numbers.limit_us], margin=1.5)
+    axes.set_ylim(low, high)
+    log_ticks(axes.yaxis, low, high)
+    axes.set_ylabel("time per step [µs]")
+    axes.set_title(f"{policy_style(numbers.policy).label}, {environment_title(numbers.env)}")
+    figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def _axes(height: float, widths: np.ndarray[tuple[int], np.dtype[np.int64]]) -> tuple[Figure, Axes]:
+    """Return axes whose ticks are the widths."""
+    figure = Figure(figsize=(COLUMN_WIDTH, height), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("width w [units in each hidden layer]")
+    axes.xaxis.set_major_locator(FixedLocator(widths.tolist()))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    return figure, axes
+
+
+def _line(axes: Axes, cost: Cost, *, other: bool) -> None:
+    colour = GREY if other else COLOURS[cost.part]
+    style = FORM_LINES.get(cost.form, "-") if other else "-"
+    name = f"{cost.part}, {cost.form} form" if other else cost.part
+    axes.fill_between(cost.widths, cost.low, cost.high, color=colour, alpha=0.15, lw=0)
+    label = f"{name}: $\\propto w^{{{cost.exponent:.1f}}}$"
+    marker = MARKERS[cost.part]
+    axes.plot(cost.widths, cost.median, color=colour, ls=style, marker=marker, ms=3, label=label)
+
+
+def caption_costs(numbers: WidthCosts) -> str:
+    """Return the caption, with what the parts are and how the slopes are fitted."""
+    first = numbers.costs[0]
+    counts = {str(w): str(n) for w, n in zip(first.widths, first.n, strict=True)}
+    others = [cost.form for cost in numbers.costs[1:] if cost.form != first.form]
+    beside = f" In grey: planning with the {' and the '.join(others)} form." if others else ""
+    return (
+        f"Time per step against the width of both hidden layers, "
+        f"{policy_style(numbers.policy).label} in the {environment_title(numbers.env)}, on "
+        f"one core: planning with the update of the information matrix (form: {first.form}), one "
+        f"step of learning, one evaluation of the loss. Points: median over steps and trials; "
+        f"bands: 10 % to 90 % quantiles. Exponents: least squares on logarithms over the upper "
+        f"half of the widths. Dashed: the time between two steps.{beside} "
+        f"Trials by width: {count_text(counts)}."
+    )
+
+
+def draw_losses(numbers: WidthLosses) -> Figure:
+    """Draw the mean final loss with two standard errors, and n at each point."""
+    figure, axes = _axes(LOSS_HEIGHT, numbers.widths)
+    style, half = policy_style(numbers.policy), 2 * numbers.error
+    axes.errorbar(
+        numbers.widths, numbers.mean, np.nan_to_num(half), color=style.colour, marker="o", ms=3,
+        capsize=2,
+    )  # fmt: skip
+    for width, value, count in zip(numbers.widths, numbers.mean, numbers.counts, strict=True):
+        axes.annotate(
+            f"n = {count}", (width, value), xytext=(0, 9), textcoords="offset points",
+            ha="center", fontsize=6, bbox={"fc": "white", "ec": "none", "pad": 0.5},
+        )  # fmt: skip
+    edges = np.r_[numbers.mean - half, numbers.mean + half, numbers.mean]
+    low, high = log_limits(edges, margin=1.35)
+    axes.set_ylim(low, high)
+    log_ticks(axes.yaxis, low, high)
+    axes.set_ylabel(f"final {NORM['loss']}")
+    axes.set_title(f"{style.label}, {environment_title(numbers.env)}")
+    return figure
+
+
+def caption_losses(numbers: WidthLosses) -> str:
+    """Return the caption, with the statistic and n by width."""
+    counts = dict(zip(map(str, numbers.widths), numbers.counts, strict=True))
+    return (
+        f"L² norm of the model's error over the evaluation grid after the last step, against the "
+        f"width of both hidden layers, {policy_style(numbers.policy).label} in the "
+        f"{environment_title(numbers.env)}: mean over trials ± 2 standard errors. "
+        f"Trials by width: {count_text(counts)}."
+    )
