@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
+import llvmlite.binding
 import numba
 from llvmlite import ir
 from numba import types
@@ -27,9 +30,11 @@ def _source_digest() -> str:
     """Return a digest of every source that ends up in compiled code.
 
     Numba checks only the file of the outermost function of what it finds in its cache, so a change
-    in a file further in would go unnoticed: each state of the sources gets a folder of its own.
+    in a file further in would go unnoticed: each state of the sources, and each kind of processor,
+    gets a folder of its own.
     """
     digest = hashlib.sha256(numba.__version__.encode())
+    digest.update(llvmlite.binding.get_host_cpu_name().encode())
     for folder in _COMPILED_SOURCES:
         for path in sorted((_PACKAGE / folder).rglob("*.py")):
             digest.update(path.read_bytes())
@@ -50,7 +55,25 @@ def _cache_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="dopt-kernel-"))
 
 
-numba.config.CACHE_DIR = str(_cache_folder())
+CACHE_FOLDER = _cache_folder()
+numba.config.CACHE_DIR = str(CACHE_FOLDER)
+
+
+@contextlib.contextmanager
+def one_compiler_at_a_time(what: str) -> Iterator[None]:
+    """Let one process at a time put ``what`` into the cache; once it is there, all read freely.
+
+    Numba numbers the files of its cache without a lock: of two processes that compile at once, one
+    can overwrite the other's function, and later processes then run the wrong one.
+    """
+    complete = CACHE_FOLDER / f"{what}.complete"
+    if complete.exists():
+        yield
+        return
+    with (CACHE_FOLDER / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+        complete.touch()
 
 
 def compiled(function: F) -> F:

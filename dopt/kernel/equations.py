@@ -18,7 +18,7 @@ from numba import complex128, float64, types
 from numba.extending import overload
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from dopt.kernel.compiler import compilable
+from dopt.kernel.compiler import compilable, one_compiler_at_a_time
 from dopt.systems import elementary
 from dopt.systems.base import System
 
@@ -80,12 +80,19 @@ def _compiled_functions(
     n_inputs: int,
     n_parameters: int,
 ) -> Equations:
+    name = f"{known.__module__}.{known.__qualname__}"
     known, accelerations = compilable(known), compilable(accelerations)
-    return Equations(
-        _known_into(known, n_states, n_inputs, n_parameters),
-        _accelerations_into(accelerations, n_states, n_parameters, ACCELERATIONS),
-        _accelerations_into(accelerations, n_states, n_parameters, COMPLEX_ACCELERATIONS),
-    )
+    with one_compiler_at_a_time(name):
+        return Equations(
+            _known_into(known, n_states, n_inputs, n_parameters),
+            _accelerations_into(accelerations, n_states, n_parameters, ACCELERATIONS),
+            _accelerations_into(accelerations, n_states, n_parameters, COMPLEX_ACCELERATIONS),
+        )
+
+
+def _is_own(function: Callable[..., Any]) -> bool:
+    """Tell whether a change of the function's source changes the folder of the cache."""
+    return function.__module__.startswith("dopt.systems.")
 
 
 def _known_into(
@@ -100,7 +107,7 @@ def _known_into(
         for i in range(len(values)):
             out[i] = values[i]
 
-    return numba.njit(KNOWN, cache=True, error_model="numpy")(into)
+    return numba.njit(KNOWN, cache=_is_own(function), error_model="numpy")(into)
 
 
 def _accelerations_into(
@@ -111,4 +118,4 @@ def _accelerations_into(
         for i in range(len(values)):
             out[i] = values[i]
 
-    return numba.njit(signature, cache=True, error_model="numpy")(into)
+    return numba.njit(signature, cache=_is_own(function), error_model="numpy")(into)

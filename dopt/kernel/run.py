@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import itertools
 import time
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import arguments as args
+from dopt.kernel.compiler import one_compiler_at_a_time
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
 from dopt.kernel.evaluation import BLOCK
 from dopt.kernel.information import PENDING_ROWS, SMALL
@@ -87,7 +89,9 @@ def _loop_for(*call: Any) -> Any:
     if kinds not in _compiled_for:
         signatures = (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)
         pointers = [numba.types.FunctionType(signature) for signature in signatures]
-        loop.compile((*pointers, *kinds, numba.int64, numba.int64))
+        name = f"loop-{hashlib.sha256(str(kinds).encode()).hexdigest()[:16]}"
+        with one_compiler_at_a_time(name):
+            loop.compile((*pointers, *kinds, numba.int64, numba.int64))
         loop.disable_compile()
         _compiled_for.add(kinds)
     return loop

@@ -1,0 +1,90 @@
+"""The cache of compiled code: one process writes, and no function takes another's place."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from dopt.kernel import compiler
+from dopt.kernel.compiler import one_compiler_at_a_time
+from dopt.kernel.equations import compiled_equations
+from dopt.systems import SYSTEMS, Pendulum
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(compiler, "CACHE_FOLDER", tmp_path)
+    return tmp_path
+
+
+def test_a_second_compiler_waits_for_the_first(folder: Path) -> None:  # noqa: ARG001
+    first_ended, second_entered = threading.Event(), threading.Event()
+    after_first = []
+
+    def second() -> None:
+        with one_compiler_at_a_time("loop"):
+            after_first.append(first_ended.is_set())
+            second_entered.set()
+
+    with one_compiler_at_a_time("equations"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        assert not second_entered.wait(0.2)
+        first_ended.set()
+    thread.join(10.0)
+    assert after_first == [True]
+
+
+def test_what_is_in_the_cache_is_read_by_all_at_once(folder: Path) -> None:
+    with one_compiler_at_a_time("loop"):
+        pass
+    with one_compiler_at_a_time("other"), one_compiler_at_a_time("loop"):
+        assert (folder / "loop.complete").exists()
+
+
+def test_a_failed_compilation_is_not_taken_for_a_complete_one(folder: Path) -> None:
+    with pytest.raises(KeyError), one_compiler_at_a_time("loop"):
+        raise KeyError
+    assert not (folder / "loop.complete").exists()
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_compiled_equations_are_those_of_the_system(name: str) -> None:
+    system, rng = SYSTEMS[name](), np.random.default_rng(0)
+    equations, p = compiled_equations(system), np.array(SYSTEMS[name]().parameters)
+    x, u = rng.standard_normal(system.n_states), rng.standard_normal(system.n_inputs)
+    known, learned = np.empty(system.n_states), np.empty(system.n_learned)
+    equations.known(x, u, p, known)
+    equations.accelerations(x, p, learned)
+    assert known == pytest.approx(np.array(system.known(tuple(x), tuple(u), system.parameters)))
+    assert learned == pytest.approx(system.learned(x[None])[0], rel=1e-12)
+    z, slopes = x + 1e-30j * rng.standard_normal(system.n_states), np.empty(len(learned), complex)
+    equations.complex_accelerations(z, p + 0j, slopes)
+    exact = np.array(system.accelerations(tuple(z), system.parameters))
+    assert slopes.imag == pytest.approx(exact.imag, rel=1e-10, abs=1e-42)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Springy(Pendulum):
+    """A system that no one has registered."""
+
+    name: ClassVar[str] = "springy"
+
+    @staticmethod
+    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+        return (-parameters[2] * state[0] ** 3,)
+
+
+def test_equations_from_elsewhere_are_compiled_but_not_cached() -> None:
+    """Only the sources of the package are part of the name of the cache's folder."""
+    equations, out = compiled_equations(Springy()), np.empty(1)
+    equations.accelerations(np.array([2.0, 0.0]), np.array(Springy().parameters), out)
+    assert out[0] == -80.0
+    assert equations.accelerations.stats.cache_path is None
+    own = compiled_equations(Pendulum()).accelerations
+    assert str(compiler.CACHE_FOLDER) in own.stats.cache_path
