@@ -107,7 +107,8 @@ def _run(
             work.prepare()
         start = time.monotonic()
         with make_executor(settings, work.run) as executor, Interrupt() as stop:
-            chunks = Chunks(_waiting(grid, state), settings.chunk_seconds, executor.slots)
+            waiting = _waiting(grid, state)
+            chunks = Chunks(waiting, settings.chunk_seconds, executor.slots, executor.batch)
             driver = Driver(store, launch, executor, chunks, tally, stop, settings.fail_fast)
             driver.elsewhere = state.running_elsewhere
             with Progress(tally, stream) as progress:

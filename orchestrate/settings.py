@@ -10,7 +10,7 @@ from dopt.errors import unknown_name
 from orchestrate.errors import LaunchError
 
 RETRY = ("failed", "diverged", "all")
-EXECUTORS = ("inprocess", "local", "ray")
+EXECUTORS = ("inprocess", "local", "lockstep", "ray")
 
 Retry = Literal["failed", "diverged", "all"]
 
@@ -31,6 +31,8 @@ class LaunchSettings:
         Work that a worker gets at once.
     retry
         Trials of the grid that are run again although they have an outcome.
+    device, batch
+        Torch device of the lockstep executor and trials in one of its batches.
     """
 
     executor: str
@@ -41,6 +43,8 @@ class LaunchSettings:
     workers: int | None = None
     chunk_seconds: float = 1.0
     ray_address: str = "local"
+    device: str = "cpu"
+    batch: int = 100
 
     @classmethod
     def from_mapping(cls, given: Mapping[str, Any]) -> LaunchSettings:
@@ -52,7 +56,8 @@ class LaunchSettings:
             If a value has the wrong type or is out of bounds.
         """
         launch = _section("launch", given["launch"])
-        name = _section("executor", given["executor"])["name"]
+        executor = _section("executor", given["executor"])
+        name = executor["name"]
         if name not in EXECUTORS:
             raise unknown_name("executor.name", name, EXECUTORS)
         retry = launch["retry"]
@@ -69,6 +74,8 @@ class LaunchSettings:
             ray_address=_text(
                 "launch.ray.address", _section("launch.ray", launch["ray"])["address"]
             ),
+            device=_text("executor.device", executor.get("device", cls.device)),
+            batch=_count("executor.batch", executor.get("batch", cls.batch)) or cls.batch,
         )
 
 

@@ -1,10 +1,11 @@
-"""Where trials run: in this process, in a pool of processes, or on Ray."""
+"""Where trials run: in this process, in a pool of processes, on Ray, or in lockstep."""
 
 from __future__ import annotations
 
 from orchestrate.executors.base import Executor, Run
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.executors.local import LocalExecutor
+from orchestrate.executors.lockstep import LockstepExecutor
 from orchestrate.settings import LaunchSettings
 
 
@@ -14,6 +15,8 @@ def make_executor(settings: LaunchSettings, run: Run) -> Executor:
         return InProcessExecutor(run)
     if settings.executor == "local":
         return LocalExecutor(run, settings.workers)
+    if settings.executor == "lockstep":
+        return LockstepExecutor(settings.device, settings.batch)
     from orchestrate.executors.ray import RayExecutor  # importing Ray takes a second
 
     return RayExecutor(run, settings.workers, settings.ray_address)

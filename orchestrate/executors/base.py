@@ -87,9 +87,12 @@ class Executor(ABC):
     ----------
     slots : int
         Number of tasks that run at the same time; known once started.
+    batch : int or None
+        Trials of one configuration that make a chunk, where they run together.
     """
 
     slots: int = 1
+    batch: int | None = None
 
     def __enter__(self) -> Self:
         self.start()

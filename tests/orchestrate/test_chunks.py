@@ -61,3 +61,15 @@ def test_a_lost_trial_comes_first_and_alone() -> None:
     known.add(TRIALS[50:52], alone=True)
     assert len(known) == 52
     assert [[task.spec.seed for task in known.next()] for _ in range(2)] == [[50], [51]]
+
+
+def test_a_batch_holds_trials_of_one_configuration() -> None:
+    kinds = [specification(0), specification(0, horizon=7)]
+    mixed = [kind.with_seed(seed) for seed in range(5) for kind in kinds]
+    batches = Chunks(mixed, seconds=1.0, slots=1, batch=3)
+    taken = []
+    while len(batches):
+        taken.append([task.spec for task in batches.next()])
+    assert [len(batch) for batch in taken] == [3, 2, 3, 2]
+    assert all(len({trial.config_key for trial in batch}) == 1 for batch in taken)
+    assert {t.trial_key for batch in taken for t in batch} == {t.trial_key for t in mixed}

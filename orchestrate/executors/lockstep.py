@@ -1,0 +1,89 @@
+"""The trials of one configuration together, in torch: on a graphics processor or on this one.
+
+The reference (:mod:`dopt.reference`) takes each step for the whole batch at once. The numbers are
+those of the trials run one by one, to rounding.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import socket
+import time
+import traceback
+from collections import deque
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+from dopt.result import TrialResult
+from orchestrate.errors import LaunchError
+from orchestrate.executors.base import Event, Executor, Finished, Task, Trouble, Usage
+from orchestrate.executors.task import KIBIBYTE
+
+
+class LockstepExecutor(Executor):
+    """Runs a chunk, which holds trials of one configuration, as one batch in this process.
+
+    Parameters
+    ----------
+    device : str
+        Torch device, such as ``"cpu"`` or ``"cuda"``.
+    batch : int
+        Trials in a batch at most.
+    """
+
+    def __init__(self, device: str, batch: int) -> None:
+        self._device = device
+        self.batch = batch
+        self._chunks: deque[list[Task]] = deque()
+
+    def start(self) -> None:
+        self.slots = 1
+        import torch
+
+        if self._device.startswith("cuda") and not torch.cuda.is_available():
+            raise LaunchError(
+                f"executor.device is '{self._device}', but torch sees no CUDA device here: "
+                f"set executor.device=cpu."
+            )
+
+    def submit(self, chunk: Sequence[Task]) -> None:
+        if chunk:
+            self._chunks.append(list(chunk))
+
+    def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a batch cannot be left
+        return list(run_batch(self._chunks.popleft(), self._device)) if self._chunks else []
+
+    @property
+    def pending(self) -> int:
+        return len(self._chunks)
+
+    def stop(self) -> None:
+        self._chunks.clear()
+
+
+def run_batch(tasks: Sequence[Task], device: str) -> list[Finished]:
+    """Run tasks of one configuration in lockstep; an exception is every task's."""
+    from dopt.reference.lockstep import run_trials
+
+    started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
+    outcomes: Sequence[TrialResult | Trouble]
+    try:
+        outcomes = run_trials([task.spec for task in tasks], device)
+    except Exception as error:
+        text = "".join(traceback.format_exception(error))
+        outcomes = [Trouble(type(error).__name__, str(error), text)] * len(tasks)
+    share = Usage(
+        node=socket.gethostname(),
+        pid=os.getpid(),
+        wall_seconds=(time.perf_counter() - wall) / len(tasks),
+        cpu_seconds=(time.process_time() - cpu) / len(tasks),
+        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIBIBYTE,
+        started=started,
+        ended=datetime.now(UTC),
+    )
+    return [
+        Finished(task.key, dataclasses.replace(share), outcome)
+        for task, outcome in zip(tasks, outcomes, strict=True)
+    ]

@@ -1,0 +1,62 @@
+"""Batches in lockstep give the numbers of the trials run one by one, and come out as events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from dopt.exploration import run_trial
+from dopt.result import TrialResult
+from orchestrate.errors import LaunchError
+from orchestrate.executors.base import Finished, Task, Trouble
+from orchestrate.executors.lockstep import LockstepExecutor
+from orchestrate.store import Reader
+from tests.dopt.trials import trial
+
+TRIALS = [trial("pendulum", "d_optimal", seed, env={"horizon": 8}) for seed in range(3)]
+
+
+def test_a_chunk_is_run_as_one_batch() -> None:
+    with LockstepExecutor("cpu", batch=3) as executor:
+        executor.submit([Task(spec.trial_key, spec) for spec in TRIALS])
+        events = executor.wait(0.1)
+        assert executor.pending == 0
+    assert [event.key for event in events if isinstance(event, Finished)] == [
+        spec.trial_key for spec in TRIALS
+    ]
+    for event, spec in zip(events, TRIALS, strict=True):
+        assert isinstance(event, Finished)
+        assert isinstance(event.outcome, TrialResult)
+        alone = run_trial(spec, "reference")
+        assert event.outcome.loss == pytest.approx(alone.loss, rel=1e-9)
+        assert event.outcome.inputs == pytest.approx(alone.inputs, rel=1e-9)
+
+
+def test_what_cannot_run_together_is_every_trials_trouble() -> None:
+    mixed = [TRIALS[0], trial("pendulum", "random", 1, env={"horizon": 8})]
+    with LockstepExecutor("cpu", batch=2) as executor:
+        executor.submit([Task(spec.trial_key, spec) for spec in mixed])
+        outcomes = [event.outcome for event in executor.wait(0.1) if isinstance(event, Finished)]
+    assert [isinstance(outcome, Trouble) for outcome in outcomes] == [True, True]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
+def test_a_device_that_is_not_there_is_a_sentence() -> None:
+    with pytest.raises(LaunchError, match=r"executor\.device is 'cuda'.*executor\.device=cpu"):
+        LockstepExecutor("cuda", batch=2).start()
+
+
+def test_a_grid_runs_in_lockstep(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    grid = ("-m", "env=pendulum", "policy=random,oracle", "seed=range(4)", "env.horizon=6")
+    code, _, errors = command_line(
+        *grid, "executor=lockstep", "executor.batch=3", f"store.url={url}"
+    )
+    assert code == 0, errors
+    with Reader.open(url) as reader:
+        assert [cell.n_done for cell in reader.cells()] == [4, 4]
