@@ -28,6 +28,8 @@ def every_field(spec: TrialSpec) -> list[tuple[str, str, Any]]:
 def other(value: Any) -> Any:
     if value is None:
         return 1.5
+    if isinstance(value, str):
+        return "primal"
     if isinstance(value, tuple):
         return [other(value[0]), *value[1:]]
     return 0.5 * value if 0 < value < 1 else value + 1

@@ -41,7 +41,7 @@ def check_agreement(spec: TrialSpec) -> tuple[TrialResult, TrialResult]:
 
 @pytest.mark.parametrize(("env", "policy", "learner"), CASES)
 def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str, Any]) -> None:
-    spec = trial(env, policy, 3, env={"horizon": 20}, learner=learner)
+    spec = trial(env, policy, 3, env={"horizon": 15}, learner=learner)
     fast, plain = check_agreement(spec)
     if policy != "oracle":
         assert relative_gap(fast.parameters, plain.parameters) < 1e-8
@@ -51,6 +51,16 @@ def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str,
 @pytest.mark.parametrize("model", [{"width": 5, "depth": 1}, {"width": 7, "depth": 3}])
 def test_networks_of_any_shape_agree(policy: str, model: dict[str, int]) -> None:
     check_agreement(trial("arm", policy, 4, env={"horizon": 12}, model=model))
+
+
+@pytest.mark.parametrize("model", [{"width": 9, "depth": 3}, {"width": 20, "depth": 1}])
+@pytest.mark.parametrize("form", ["primal", "dual", "sketch"])
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+def test_every_form_of_the_information_matrix_agrees(
+    env: str, form: str, model: dict[str, int]
+) -> None:
+    policy = {"form": form, "sketch_size": 48}
+    check_agreement(trial(env, "d_optimal", 2, env={"horizon": 14}, policy=policy, model=model))
 
 
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])

@@ -47,9 +47,11 @@ def check_optimal(Q: np.ndarray, v: np.ndarray, radius: float, tie: np.ndarray) 
 
 
 @st.composite
-def problems(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+def problems(
+    draw: st.DrawFn, dimension: int | None = None
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Draw Q of any definiteness and rank, v along few or all axes, scales of all sizes."""
-    m = draw(st.integers(1, 6))
+    m = dimension or draw(st.integers(1, 6))
     levels = st.sampled_from([-3.0, -1.0, 0.0, 1e-9, 1.0, 1.0 + 1e-12, 2.0]) | st.floats(-5.0, 5.0)
     values = 10.0 ** draw(st.integers(-8, 8)) * draw(arrays(float, m, elements=levels))
     Q, axes = from_eigenvalues(values, draw(st.integers(0, 99)))

@@ -48,6 +48,11 @@ def _axes(like: Tensor) -> Tensor:
     return torch.eye(len(like), dtype=torch.float64)
 
 
+def whole(rows: Tensor) -> Tensor:
+    """Return gradients as they are: no sketch."""
+    return rows
+
+
 def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return Q, v and the chosen input of the reference."""
     problem = quadratic_problem(
@@ -57,6 +62,7 @@ def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tens
         now.information[None],
         now.state[None],
         torch.tensor([component]),
+        whole,
     )
     ties = torch.ones(1, spec.system.n_inputs, dtype=torch.float64)
     u = d_optimal_inputs(problem, spec.system.gamma, ties)
@@ -139,6 +145,7 @@ def test_each_trial_of_a_batch_has_its_own_problem() -> None:
         torch.stack([now.information for now in several]),
         torch.stack([now.state for now in several]),
         torch.tensor([0, 1, 1]),
+        whole,
     )
     ties = torch.ones(3, 2, dtype=torch.float64)
     inputs = d_optimal_inputs(problem, spec.system.gamma, ties)

@@ -1,0 +1,129 @@
+"""The torch reference: batches, modules of any kind, devices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from dopt.errors import SpecificationError
+from dopt.kernel.run import KernelTrial
+from dopt.randomness import draw
+from dopt.reference.lockstep import Lockstep, run_trials
+from dopt.reference.models import network_function, tanh_network
+from tests.dopt.trials import PAIRS, trial
+
+CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
+
+
+class Residual(nn.Module):
+    """A network of another kind: GELU units with a skip connection and a layer norm."""
+
+    def __init__(self, n_in: int, n_out: int) -> None:
+        super().__init__()
+        self.lift = nn.Linear(n_in, 8, dtype=torch.float64)
+        self.block = nn.Sequential(
+            nn.LayerNorm(8, dtype=torch.float64), nn.Linear(8, 8, dtype=torch.float64), nn.GELU()
+        )
+        self.out = nn.Linear(8, n_out, dtype=torch.float64)
+
+    def forward(self, phi: torch.Tensor) -> torch.Tensor:
+        h = torch.relu(self.lift(phi))
+        result: torch.Tensor = self.out(h + self.block(h))
+        return result
+
+
+@pytest.mark.parametrize(
+    ("env", "policy"), [p for p in PAIRS if p[1] in ("random", "uniform", "d_optimal", "oracle")]
+)
+def test_a_batch_is_its_trials_one_by_one(env: str, policy: str) -> None:
+    specs = [trial(env, policy, seed, env={"horizon": 12}) for seed in range(3)]
+    together = run_trials(specs)
+    for spec, many in zip(specs[1:], together[1:], strict=True):
+        one = run_trials([spec])[0]
+        gamma = spec.system.gamma
+        assert many.inputs == pytest.approx(one.inputs, rel=0.0, abs=1e-9 * gamma)
+        assert many.states == pytest.approx(one.states, rel=1e-9, abs=1e-9)
+        assert many.loss == pytest.approx(one.loss, rel=1e-9)
+        assert many.parameters == pytest.approx(one.parameters, rel=1e-6, abs=1e-9)
+
+
+def test_trials_of_two_cells_are_no_batch() -> None:
+    with pytest.raises(SpecificationError, match="may differ in the seed alone"):
+        run_trials([trial("arm", "random"), trial("arm", "uniform")])
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
+def test_any_module_is_explored(policy: str) -> None:
+    torch.manual_seed(0)
+    spec = trial("arm", policy, env={"horizon": 25}, learner={"learning_rate": 2e-2})
+    module = Residual(len(spec.system.features), spec.system.n_learned)
+    initial = nn.utils.parameters_to_vector(module.parameters()).detach().numpy()
+    result = run_trials([spec], module=module)[0]
+    assert not result.diverged
+    assert result.parameters.shape == initial.shape
+    assert np.mean(result.parameters != initial) > 0.5  # units of a ReLU may be dead
+    assert np.array_equal(nn.utils.parameters_to_vector(module.parameters()).detach(), initial)
+    norms = np.linalg.norm(result.inputs, axis=1)
+    if policy != "random":
+        assert norms == pytest.approx(spec.system.gamma)
+
+
+def test_the_registered_network_is_the_module_of_the_same_weights() -> None:
+    spec = trial("arm", "d_optimal", 3, env={"horizon": 10})
+    module = tanh_network(spec.model.layer_sizes(spec.system))  # type: ignore[attr-defined]
+    nn.utils.vector_to_parameters(torch.tensor(draw(spec).weights), module.parameters())
+    own, registered = run_trials([spec], module=module)[0], run_trials([spec])[0]
+    assert np.array_equal(own.inputs, registered.inputs)
+    assert np.array_equal(own.loss, registered.loss)
+
+
+def test_the_flat_vector_holds_the_parameters_in_the_order_of_torch() -> None:
+    spec = trial("cartpole", "random", 1)
+    module = tanh_network(spec.model.layer_sizes(spec.system))  # type: ignore[attr-defined]
+    theta = nn.utils.parameters_to_vector(module.parameters()).detach()
+    x = torch.tensor([0.3, -1.0, 2.0, 0.7], dtype=torch.float64)
+    phi = torch.tensor(spec.system.featurize(x.numpy()[None])[0])
+    function = network_function(spec.system, module)
+    assert torch.equal(function(theta, x), module(phi))
+
+
+def test_information_is_the_prior_and_all_rows_after_each_learning_step() -> None:
+    spec = trial("cartpole", "d_optimal", 2, env={"horizon": 6})
+    batch = Lockstep([spec])
+    expected = spec.policy.regularization * np.eye(batch.theta.shape[1])  # type: ignore[attr-defined]
+    with torch.no_grad():
+        for t in range(6):
+            batch.step(t)
+            rows = _differences(batch, batch.states[0, t])
+            expected += rows.T @ rows
+    assert batch.information is not None
+    found = batch.information[0].numpy()
+    assert found == pytest.approx(expected, rel=0.0, abs=1e-6 * np.abs(expected).max())
+
+
+def _differences(batch: Lockstep, x: torch.Tensor) -> np.ndarray:
+    """Return J, (r, q), by central differences of the model in each parameter."""
+    theta, step = batch.theta[0], 1e-5
+    columns = [
+        (batch.model(theta + e, x) - batch.model(theta - e, x)) / (2 * step)
+        for e in step * torch.eye(len(theta), dtype=torch.float64)
+    ]
+    return torch.stack(columns, dim=1).numpy()
+
+
+def test_the_kernel_and_the_reference_start_alike() -> None:
+    spec = trial("arm", "d_optimal", 9)
+    batch, fast = Lockstep([spec]), KernelTrial(spec)
+    assert np.array_equal(batch.theta[0].numpy(), fast.state.theta)
+    assert np.array_equal(batch.states[0, 0].numpy(), fast.record.states[0])
+
+
+@CUDA
+@pytest.mark.parametrize("policy", ["random", "uniform", "d_optimal"])
+def test_a_gpu_runs_the_same_trials(policy: str) -> None:
+    specs = [trial("arm", policy, seed, env={"horizon": 10}) for seed in range(3)]
+    for gpu, cpu in zip(run_trials(specs, device="cuda"), run_trials(specs), strict=True):
+        assert gpu.inputs == pytest.approx(cpu.inputs, rel=0.0, abs=1e-7 * specs[0].system.gamma)
+        assert gpu.loss == pytest.approx(cpu.loss, rel=1e-7)
