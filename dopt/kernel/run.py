@@ -11,6 +11,7 @@ from typing import Any
 import numba
 import numpy as np
 
+from dopt.errors import SpecificationError
 from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import arguments as args
 from dopt.kernel.compiler import one_compiler_at_a_time
@@ -46,14 +47,26 @@ class KernelTrial:
     def __init__(self, spec: TrialSpec) -> None:
         self.spec = spec
         self.constants = _constants(spec.cell)
-        self.randomness = args.Randomness(*_fields(draw(spec), args.Randomness))
-        self.state = _initial_state(spec, draw(spec).weights)
+        draws = draw(spec)
+        self.randomness = args.Randomness(*_fields(draws, args.Randomness))
+        self.state = _initial_state(spec, draws.weights)
         self.record = _empty_record(spec.system)
         self.done = 0
         self.diverged_at: int | None = None
 
     def advance(self, last: int) -> None:
-        """Run the steps up to ``last``, unless the trial has diverged."""
+        """Run the steps up to ``last``, unless the trial has diverged.
+
+        Raises
+        ------
+        SpecificationError
+            If ``last`` lies beyond the horizon.
+        """
+        if last > self.spec.system.horizon:
+            raise SpecificationError(
+                f"step {last} was asked for, but the horizon is {self.spec.system.horizon}: raise "
+                f"env.horizon."
+            )
         if self.diverged_at is not None:
             return
         world, network, rules, points = self.constants

@@ -11,6 +11,7 @@ from dopt.exploration import run_trial
 from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
+from tests.dopt.kernel.test_information import run
 from tests.dopt.kernel.twin import relative_gap, transplant
 from tests.dopt.trials import PAIRS, trial
 
@@ -74,11 +75,8 @@ def test_d_optimal_inputs_of_the_oracle_model_at_another_ridge(env: str) -> None
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
 def test_late_in_a_trial_equal_states_give_equal_steps(env: str, policy: str) -> None:
     late = 150
-    # M is inverted on the way from one path to the other: a larger λ keeps that exact.
-    fields = {"regularization": 0.1} if policy == "d_optimal" else {}
-    fast = KernelTrial(trial(env, policy, 6, env={"horizon": late + 1}, policy=fields))
-    fast.advance(late)
-    plain = transplant(fast)
+    fast = KernelTrial(trial(env, policy, 6, env={"horizon": late + 1}))
+    plain = transplant(fast, run(fast, late))
     fast.advance(late + 1)
     plain.step(late)
     gamma = fast.spec.system.gamma

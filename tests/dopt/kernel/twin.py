@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch.func import jacrev, vmap
 
-from dopt.kernel.information import dense
 from dopt.kernel.run import KernelTrial
 from dopt.reference.dynamics import known_flow
 from dopt.reference.learning import AdamLearner
 from dopt.reference.lockstep import Lockstep
 
 
-def transplant(trial: KernelTrial) -> Lockstep:
-    """Return a batch of one trial with the kernel's parameters, moments, M and history."""
+def transplant(trial: KernelTrial, parameters: np.ndarray) -> Lockstep:
+    """Return a batch of one trial with the kernel's parameters, moments and history.
+
+    M is summed afresh from the rows at the ``parameters``, (t, q), after each of the steps done.
+    """
     t, state, record = trial.done, trial.state, trial.record
     twin = Lockstep([trial.spec])
     twin.theta.copy_(torch.tensor(state.theta)[None])
@@ -21,7 +24,8 @@ def transplant(trial: KernelTrial) -> Lockstep:
     twin.inputs[0, :t] = torch.tensor(record.inputs[:t])
     twin.targets[:, :t] = observed(twin, t)
     if twin.information is not None:
-        twin.information = torch.linalg.inv(torch.tensor(dense(state.covariance)))[None]
+        J = vmap(jacrev(twin.model))(torch.tensor(parameters), twin.states[0, :t]).flatten(0, 1)
+        twin.information = twin.information + J.mT @ J
     if isinstance(twin.learner, AdamLearner):
         twin.learner.optimizer.state[twin.theta] = {
             "step": torch.tensor(float(t)),
