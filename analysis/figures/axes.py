@@ -11,11 +11,19 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFo
 
 TAU_TICKS = {0: "0", 1: "π/2", 2: "π", 3: "3π/2", 4: "2π"}
 
+TICKS: dict[float, tuple[float, ...]] = {
+    0.8: (1, 1.5, 2, 3, 4, 5, 7),
+    1.5: (1, 2, 5),
+    2.5: (1, 3),
+    math.inf: (1,),
+}
+"""Labelled multiples of a power of ten, by the decades of an axis below which they hold."""
+
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Set ticks of a logarithmic axis over [low, high], with at least a few labels."""
     decades = math.log10(high / low)
-    steps = (1.0, 2.0, 5.0) if decades < 1.5 else (1.0, 3.0) if decades < 2.5 else (1.0,)
+    steps = next(steps for limit, steps in TICKS.items() if decades < limit)
     axis.set_major_locator(LogLocator(subs=steps, numticks=12))
     axis.set_minor_locator(LogLocator(subs=tuple(range(2, 10)), numticks=40))
     axis.set_minor_formatter(NullFormatter())
