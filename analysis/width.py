@@ -24,6 +24,7 @@ from analysis.tables import final_losses
 from orchestrate.store import Reader
 
 PARTS = ("plan", "learn", "evaluate")
+FORMS = ("primal", "dual", "sketch")
 LEAST_WIDTHS = 3
 QUANTILES = (0.1, 0.5, 0.9)
 
@@ -130,6 +131,11 @@ def form_of(entry: Entry) -> str:
     return str(policy.get("form", "primal"))
 
 
+def form_rank(form: str) -> tuple[int, str]:
+    """Return the sorting key of a form."""
+    return (FORMS.index(form) if form in FORMS else len(FORMS), form)
+
+
 def measure_costs(reader: Reader, selection: Selection) -> WidthCosts:
     """Return all parts of the first line, and planning of the others."""
     cell = selection.entries[0].cell
@@ -141,7 +147,8 @@ def measure_costs(reader: Reader, selection: Selection) -> WidthCosts:
 
 
 def _by_form(selection: Selection) -> list[Line]:
-    forms = dict.fromkeys(form_of(entry) for entry in selection.entries)
+    first, *others = dict.fromkeys(form_of(entry) for entry in selection.entries)
+    forms = [first, *sorted(others, key=form_rank)]
     return [tuple(e for e in selection.entries if form_of(e) == form) for form in forms]
 
 

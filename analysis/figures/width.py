@@ -106,7 +106,8 @@ def _line(axes: Axes, cost: Cost, *, other: bool) -> None:
     colour = GREY if other else COLOURS[cost.part]
     style = FORM_LINES.get(cost.form, "-") if other else "-"
     name = f"{cost.part}, {cost.form} form" if other else cost.part
-    axes.fill_between(cost.widths, cost.low, cost.high, color=colour, alpha=0.15, lw=0)
+    if not other:
+        axes.fill_between(cost.widths, cost.low, cost.high, color=colour, alpha=0.15, lw=0)
     label = f"{name}: $\\propto w^{{{cost.exponent:.1f}}}$"
     marker = MARKERS[cost.part]
     axes.plot(cost.widths, cost.median, color=colour, ls=style, marker=marker, ms=3, label=label)
@@ -120,34 +121,30 @@ def caption_costs(numbers: WidthCosts) -> str:
     beside = f" In grey: planning with the {' and the '.join(others)} form." if others else ""
     return (
         f"Time per step against the width of both hidden layers, "
-        f"{policy_style(numbers.policy).label} in the {environment_title(numbers.env)}, on "
-        f"one core: planning with the update of the information matrix (form: {first.form}), one "
-        f"step of learning, one evaluation of the loss. Points: median over steps and trials; "
-        f"bands: 10 % to 90 % quantiles. Exponents: least squares on logarithms over the upper "
-        f"half of the widths. Dashed: the time between two steps.{beside} "
+        f"{policy_style(numbers.policy).label} in the {environment_title(numbers.env)}, one "
+        f"trial on a core: planning with the update of the information matrix (form: "
+        f"{first.form}), one step of learning, one evaluation of the loss. Points: median over "
+        f"steps and trials; bands: 10 % to 90 % quantiles. Exponents: least squares on logarithms "
+        f"over the upper half of the widths. Dashed: the time between two steps.{beside} "
         f"Trials by width: {count_text(counts)}."
     )
 
 
 def draw_losses(numbers: WidthLosses) -> Figure:
-    """Draw the mean final loss with two standard errors, and n at each point."""
+    """Draw the mean final loss with two standard errors, and n in the title."""
     figure, axes = _axes(LOSS_HEIGHT, numbers.widths)
     style, half = policy_style(numbers.policy), 2 * numbers.error
     axes.errorbar(
         numbers.widths, numbers.mean, np.nan_to_num(half), color=style.colour, marker="o", ms=3,
         capsize=2,
     )  # fmt: skip
-    for width, value, count in zip(numbers.widths, numbers.mean, numbers.counts, strict=True):
-        axes.annotate(
-            f"n = {count}", (width, value), xytext=(0, 9), textcoords="offset points",
-            ha="center", fontsize=6, bbox={"fc": "white", "ec": "none", "pad": 0.5},
-        )  # fmt: skip
     edges = np.r_[numbers.mean - half, numbers.mean + half, numbers.mean]
     low, high = log_limits(edges, margin=1.35)
     axes.set_ylim(low, high)
     log_ticks(axes.yaxis, low, high)
     axes.set_ylabel(f"final {NORM['loss']}")
-    axes.set_title(f"{style.label}, {environment_title(numbers.env)}")
+    counts = count_text(dict(zip(map(str, numbers.widths), numbers.counts, strict=True)))
+    axes.set_title(f"{style.label}, {environment_title(numbers.env)} ({counts})")
     return figure
 
 
