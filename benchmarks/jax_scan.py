@@ -1,7 +1,7 @@
 """How fast is the same step as a JAX scan, the whole trial compiled? Only where JAX is installed.
 
-It chooses the kernel's inputs: the same equations, random numbers and rules. The table says how many
-of its first inputs are the kernel's; where rounding once decides otherwise, the two part.
+It chooses the kernel's inputs: the same equations, random numbers and rules. The table says how
+many of its first inputs are the kernel's; where rounding once decides otherwise, the two part.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ def measure(quick: bool) -> list[Row]:
     if importlib.util.find_spec("jax") is None:
         return [Row("JAX lax.scan of the same step", None, note="jax is not installed")]
     rounds, known = 1 if quick else 5, anchors.SCAN_ONE_SAMPLE
+    one_sample = cartpole(learner="adam", grid=TINY_GRID)
     with on_one_core():
         return [
             _compare("JAX scan, window of 100", cartpole(grid=TINY_GRID), anchors.SCAN, rounds),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -11,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+POLL_SECONDS = 0.02
 LAUNCH = str(ROOT / "orchestrate" / "launch.py")
 
 
@@ -25,7 +25,7 @@ class Finished:
     seconds
         Until its end.
     peak_mebibytes
-        Largest resident memory of the process itself, without its children.
+        Largest resident memory of the process itself, without its children (Linux; else NaN).
     output
         What it printed.
     """
@@ -49,8 +49,10 @@ def run(*arguments: str) -> Finished:
         process = subprocess.Popen(
             [sys.executable, *arguments], stdout=output, stderr=subprocess.STDOUT, cwd=ROOT
         )
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
+        peak = float("nan")
+        while process.poll() is None:
+            peak = _peak_mebibytes(process.pid, peak)
+            time.sleep(POLL_SECONDS)
         seconds = time.perf_counter() - clock
         output.seek(0)
         text = output.read()
@@ -59,7 +61,20 @@ def run(*arguments: str) -> Finished:
             f"'{' '.join(arguments)}' ended with {process.returncode}, but 0 is expected; its last "
             f"line is: {text.strip().splitlines()[-1:]}"
         )
-    return Finished(started, seconds, usage.ru_maxrss / 1024, text)
+    return Finished(started, seconds, peak, text)
+
+
+def _peak_mebibytes(pid: int, before: float) -> float:
+    """Return the largest resident memory so far, or ``before`` once the process has ended.
+
+    The kernel's account at the end (``ru_maxrss``) holds the memory of the process that started it.
+    """
+    try:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    except OSError:
+        return before
+    lines = [line for line in status.splitlines() if line.startswith("VmHWM")]
+    return int(lines[0].split()[1]) / 1024 if lines else before
 
 
 def launch(*arguments: str) -> Finished:
