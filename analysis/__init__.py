@@ -1,5 +1,5 @@
 """From the results database to numbers, from numbers to tables and pictures.
 
-Reading (``selection``, ``finals``), numbers (``statistics``, ``paired``, ``spectrum``, ``phase``,
+Reading (``selection``, ``reading``), numbers (``statistics``, ``paired``, ``spectrum``, ``phase``,
 ``coverage``) and ink (``figures``) are strictly apart: what is drawn is saved as CSV beside it.
 """

@@ -21,6 +21,10 @@ class IncompatibleError(SpecificationError):
 def unknown_name(kind: str, given: object, valid: Iterable[str]) -> SpecificationError:
     """Return the error for an unknown name, with the nearest valid one."""
     names = sorted(valid)
+    if not names:
+        return SpecificationError(
+            f"{kind} '{given}' is unknown, there is none to set: leave it out."
+        )
     near = difflib.get_close_matches(str(given), names, n=1, cutoff=0.5)
     hint = f"did you mean '{near[0]}'?" if near else "choose one of these."
     return SpecificationError(

@@ -10,7 +10,12 @@ from typing import Any, Literal
 
 from dopt.errors import SpecificationError, unknown_name
 
+LARGEST_WHOLE = 2**31 - 1
+"""Whole numbers of a specification fit into the columns of every database."""
+
 Bound = Literal["any", "positive", "nonnegative", "fraction"]
+
+_LARGEST_REAL = sys.float_info.max
 
 _BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
     "any": (lambda _: True, ""),
@@ -106,11 +111,12 @@ def _converted_number(
         raise _wrong_type(path, value, expected)
     number = value if whole else _real(value)
     holds, words = _BOUNDS[field.metadata.get("bound", "any")]
-    if not abs(number) <= sys.float_info.max or not holds(number):
+    largest, limit = (LARGEST_WHOLE, "at most 2^31 - 1") if whole else (_LARGEST_REAL, "finite")
+    if not abs(number) <= largest or not holds(number):
         unit = field.metadata.get("unit", "1")
         suffix = "" if unit == "1" else f" {unit}"
         raise SpecificationError(
-            f"{path} is {number}{suffix}, but it has to be finite{words}: set it so."
+            f"{path} is {number}{suffix}, but it has to be {limit}{words}: set it so."
         )
     return number
 

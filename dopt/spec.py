@@ -22,6 +22,9 @@ from dopt.systems import SYSTEMS, System
 CODE_VERSION = 1
 """Raised whenever a change of the code changes the numbers of a trial."""
 
+LARGEST_SEED = 2**63 - 1
+"""Fits into a column of every database."""
+
 _SECTIONS = ("env", "policy", "model", "learner")
 
 
@@ -80,9 +83,11 @@ class TrialSpec(Checked):
     seed: int = quantity(0, bound="nonnegative")
 
     def __post_init__(self) -> None:
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+        whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
+        if not whole or not 0 <= self.seed <= LARGEST_SEED:
             raise SpecificationError(
-                f"seed is {self.seed!r}, but a whole number of 0 or above is expected: set it so."
+                f"seed is {self.seed!r}, but a whole number of 0 or above and below 2^63 is "
+                f"expected: set it so."
             )
 
     @classmethod
