@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf  # noqa: E402
 from dopt.exploration import run_trial  # noqa: E402
 from dopt.kernel import warm_up  # noqa: E402
 from orchestrate.campaign import Work, launch_grid  # noqa: E402
-from orchestrate.errors import ExitCode, InfrastructureError  # noqa: E402
+from orchestrate.errors import ExitCode, InfrastructureError, LaunchError  # noqa: E402
 from orchestrate.grid import TRIAL_SECTIONS, Combination, Grid, build_grid  # noqa: E402
 from orchestrate.hydra_plugins.dopt_grid._sentences import sentence_for  # noqa: E402
 from orchestrate.preview import preview  # noqa: E402
@@ -104,6 +104,8 @@ def main() -> int:
     debug = os.environ.get("HYDRA_FULL_ERROR") == "1"
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then lets its errors through to us
     try:
+        # Hydra wants the overrides in one run of words, so -m goes before all of them.
+        sys.argv[1:] = sorted(sys.argv[1:], key=lambda word: word not in ("-m", "--multirun"))
         request = read_command_line()
         if request is None:
             return ExitCode.DONE
@@ -130,7 +132,7 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
         return code
     except (StoreUnavailableError, InfrastructureError) as error:
         return _refuse(str(error), ExitCode.INFRASTRUCTURE)
-    except StoreError as error:
+    except (StoreError, LaunchError) as error:
         return _refuse(str(error), ExitCode.BAD_REQUEST)
 
 

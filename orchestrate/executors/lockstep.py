@@ -42,10 +42,14 @@ class LockstepExecutor(Executor):
         self.slots = 1
         import torch
 
-        if self._device.startswith("cuda") and not torch.cuda.is_available():
+        kind, _, number = self._device.partition(":")
+        there = torch.cuda.device_count() if kind == "cuda" else 0
+        if self._device != "cpu" and not (
+            kind == "cuda" and (number or "0") in map(str, range(there))
+        ):
             raise LaunchError(
-                f"executor.device is '{self._device}', but torch sees no CUDA device here: "
-                f"set executor.device=cpu."
+                f"executor.device is '{self._device}', but torch can run here on cpu and on "
+                f"{there} CUDA devices: set executor.device=cpu."
             )
 
     def submit(self, chunk: Sequence[Task]) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-import torch
 
 from dopt.exploration import run_trial
 from dopt.result import TrialResult
@@ -43,10 +42,20 @@ def test_what_cannot_run_together_is_every_trials_trouble() -> None:
     assert [isinstance(outcome, Trouble) for outcome in outcomes] == [True, True]
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
-def test_a_device_that_is_not_there_is_a_sentence() -> None:
-    with pytest.raises(LaunchError, match=r"executor\.device is 'cuda'.*executor\.device=cpu"):
-        LockstepExecutor("cuda", batch=2).start()
+@pytest.mark.parametrize("device", ["cuda:99", "banana", "meta"])
+def test_a_device_that_is_not_there_is_a_sentence(device: str) -> None:
+    with pytest.raises(LaunchError, match=f"executor.device is '{device}'.*executor.device=cpu"):
+        LockstepExecutor(device, batch=2).start()
+
+
+def test_a_launch_on_a_device_that_is_not_there_is_refused(
+    command_line: Callable[..., tuple[int, str, str]],
+) -> None:
+    code, _, errors = command_line(
+        "env.horizon=5", "-m", "seed=0", "executor=lockstep", "executor.device=cuda:99"
+    )
+    assert (code, errors.count("\n")) == (2, 1)
+    assert errors.startswith("error: executor.device is 'cuda:99'")
 
 
 def test_a_grid_runs_in_lockstep(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Literal
 
@@ -16,6 +17,9 @@ from dopt.errors import unknown_name
 
 NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
 """Groups and sections that hold for a whole launch."""
+
+MOST_VALUES = 1_000_000
+"""Values of one sweep at most: a mistyped range would fill the memory first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +98,13 @@ def _check_sweep(loader: ConfigLoader, override: Override) -> None:
         raise ConfigCompositionException(
             f"'{line}' has no finite list of values: use a choice a,b or range(start,stop,step)."
         )
-    if not any(True for _ in override.sweep_iterator()):
+    count = sum(1 for _ in itertools.islice(override.sweep_iterator(), MOST_VALUES + 1))
+    if count == 0:
         raise _empty(loader, override)
+    if count > MOST_VALUES:
+        raise ConfigCompositionException(
+            f"'{line}' has more than {MOST_VALUES:,} values: check its bounds, or sweep in parts."
+        )
 
 
 def _empty(loader: ConfigLoader, override: Override) -> Exception:
