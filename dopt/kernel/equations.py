@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import cmath
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -90,11 +91,6 @@ def _compiled_functions(
         )
 
 
-def _is_own(function: Callable[..., Any]) -> bool:
-    """Tell whether a change of the function's source changes the folder of the cache."""
-    return function.__module__.startswith("dopt.systems.")
-
-
 def _known_into(
     function: Callable[..., Any], n_states: int, n_inputs: int, n_parameters: int
 ) -> Any:
@@ -107,7 +103,7 @@ def _known_into(
         for i in range(len(values)):
             out[i] = values[i]
 
-    return numba.njit(KNOWN, cache=_is_own(function), error_model="numpy")(into)
+    return _compiled_for(function, into, KNOWN)
 
 
 def _accelerations_into(
@@ -118,4 +114,22 @@ def _accelerations_into(
         for i in range(len(values)):
             out[i] = values[i]
 
-    return numba.njit(signature, cache=_is_own(function), error_model="numpy")(into)
+    return _compiled_for(function, into, signature)
+
+
+def _compiled_for(function: Callable[..., Any], into: Callable[..., None], signature: Any) -> Any:
+    """Compile ``into`` under a name of its own.
+
+    Numba tells functions of one name apart by a number that starts anew in each process. Two of
+    them that were cached by different processes, or one cached and one compiled here, would share a
+    symbol, and a call of one could run the other.
+    """
+    own = function.__module__.startswith("dopt.systems.")
+    name = f"{function.__module__}.{function.__qualname__}"
+    into.__qualname__ = name if own else f"{name}.{next(_foreign)}"
+    into.__name__ = into.__qualname__.replace(".", "_").replace("<", "_").replace(">", "_")
+    # The cache's folder is named after the package's sources: only they may be found in it.
+    return numba.njit(signature, cache=own, error_model="numpy")(into)
+
+
+_foreign = itertools.count()

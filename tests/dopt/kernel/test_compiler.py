@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +17,7 @@ import pytest
 from dopt.kernel import compiler
 from dopt.kernel.compiler import one_compiler_at_a_time
 from dopt.kernel.equations import compiled_equations
-from dopt.systems import SYSTEMS, Pendulum
+from dopt.systems import SYSTEMS, Pendulum, System
 
 
 @pytest.fixture
@@ -88,3 +92,40 @@ def test_equations_from_elsewhere_are_compiled_but_not_cached() -> None:
     assert equations.accelerations.stats.cache_path is None
     own = compiled_equations(Pendulum()).accelerations
     assert str(compiler.CACHE_FOLDER) in own.stats.cache_path
+
+
+def symbols(system: System) -> list[str]:
+    """Return the symbols of the compiled equations without Numba's number, which starts anew."""
+    names = [
+        code.fndesc.mangled_name
+        for function in compiled_equations(system)
+        for code in function.overloads.values()
+    ]
+    return [re.sub(r"B\d+v\d+B", "", name) for name in names]
+
+
+def test_no_two_systems_share_a_symbol() -> None:
+    """Two that do and come from different processes can be taken for each other: wrong physics."""
+    shipped = [symbol for system in SYSTEMS.values() for symbol in symbols(system())]
+    assert len(shipped) == 3 * len(SYSTEMS)
+    assert len(set(shipped)) == len(shipped)
+    assert not set(symbols(Springy())[1:]) & set(shipped)
+
+
+def test_systems_cached_by_different_processes_are_not_confused(tmp_path: Path) -> None:
+    program = (
+        "import sys, numpy as np\n"
+        "from dopt.kernel.equations import compiled_equations\n"
+        "from dopt.systems import SYSTEMS\n"
+        "systems = [SYSTEMS[name]() for name in sys.argv[1:]]\n"
+        "functions = [compiled_equations(system).known for system in systems]\n"
+        "for system, known in zip(systems, functions):\n"
+        "    x, u = np.arange(1.0, 1 + system.n_states), np.ones(system.n_inputs)\n"
+        "    out, p = np.empty(system.n_states), system.parameters\n"
+        "    known(x, u, np.array(p), out)\n"
+        "    assert np.allclose(out, system.known(tuple(x), tuple(u), p)), system.name\n"
+    )
+    environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
+    for names in (["pendulum"], ["cartpole"], ["cartpole", "pendulum"], ["pendulum", "cartpole"]):
+        command = [sys.executable, "-c", program, *names]
+        subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[3])

@@ -12,10 +12,11 @@ from dopt.reference.learning import AdamLearner
 from dopt.reference.lockstep import Lockstep
 
 
-def transplant(trial: KernelTrial, parameters: np.ndarray) -> Lockstep:
+def transplant(trial: KernelTrial, parameters: np.ndarray | None = None) -> Lockstep:
     """Return a batch of one trial with the kernel's parameters, moments and history.
 
-    M is summed afresh from the rows at the ``parameters``, (t, q), after each of the steps done.
+    M is summed afresh from the rows at the ``parameters``, (t, q), after each of the steps done;
+    without them it is M₀.
     """
     t, state, record = trial.done, trial.state, trial.record
     twin = Lockstep([trial.spec])
@@ -23,7 +24,7 @@ def transplant(trial: KernelTrial, parameters: np.ndarray) -> Lockstep:
     twin.states[0, : t + 1] = torch.tensor(record.states[: t + 1])
     twin.inputs[0, :t] = torch.tensor(record.inputs[:t])
     twin.targets[:, :t] = observed(twin, t)
-    if twin.information is not None:
+    if twin.information is not None and parameters is not None:
         J = vmap(jacrev(twin.model))(torch.tensor(parameters), twin.states[0, :t]).flatten(0, 1)
         twin.information = twin.information + J.mT @ J
     if isinstance(twin.learner, AdamLearner):
