@@ -35,9 +35,11 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return the address of a small grid's database, made by the launch itself."""
     url = f"sqlite:///{tmp_path_factory.mktemp('readme') / 'results.db'}"
     grid = ("env=pendulum,cartpole", "policy=random,periodic,d_optimal", "seed=range(3)")
+    widths = ("env=cartpole", "policy=d_optimal", "width=4,8", "seed=range(3)")
     settings = ("env.horizon=12", "executor=inprocess", f"store.url={url}")
-    done = run("orchestrate/launch.py", "-m", *grid, *settings)
-    assert done.returncode == 0, done.stderr
+    for trials in (grid, widths):
+        done = run("orchestrate/launch.py", "-m", *trials, *settings)
+        assert done.returncode == 0, done.stderr
     return url
 
 
