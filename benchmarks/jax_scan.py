@@ -38,9 +38,7 @@ def measure(quick: bool) -> list[Row]:
     with on_one_core():
         return [
             _compare("JAX scan, window of 100", cartpole(grid=TINY_GRID), anchors.SCAN, rounds),
-            _compare(
-                "JAX scan, one sample", cartpole("d_optimal", "adam", grid=TINY_GRID), known, rounds
-            ),
+            _compare("JAX scan, one sample", one_sample, known, rounds),
         ]
 
 
