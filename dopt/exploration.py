@@ -7,21 +7,20 @@ from typing import Literal
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
 
-Path = Literal["auto", "kernel", "reference"]
+Path = Literal["kernel", "reference"]
 
 
-def run_trial(spec: TrialSpec, path: Path = "auto") -> TrialResult:
+def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     """Run a trial; its numbers depend on nothing but its specification.
 
     Parameters
     ----------
     spec : TrialSpec
         What to run.
-    path : {"auto", "kernel", "reference"}
-        Compiled kernel or torch reference; "auto" takes the kernel, which covers every registered
-        choice.
+    path : {"kernel", "reference"}, optional
+        Compiled kernel or torch reference, in place of what the specification says.
     """
-    if path == "reference":
+    if (path or spec.cell.path) == "reference":
         from dopt.reference.lockstep import run_trials
 
         return run_trials([spec])[0]

@@ -25,19 +25,28 @@ CODE_VERSION = 1
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
 
+PATHS = ("kernel", "reference")
+
 _SECTIONS = ("env", "policy", "model", "learner")
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A trial without its seed: one cell of a grid."""
+    """A trial without its seed: one cell of a grid.
+
+    ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
+    agree to rounding only, which grows over a trial: so it is part of the trial's identity.
+    """
 
     system: System
     policy: Policy
     model: Model
     learner: Learner
+    path: str = "kernel"
 
     def __post_init__(self) -> None:
+        if self.path not in PATHS:
+            raise unknown_name("path", self.path, PATHS)
         self.policy.check(self.system)
         linear = isinstance(self.model, Linear)
         if isinstance(self.policy, Oracle) and not linear:
@@ -60,7 +69,7 @@ class Cell:
     def canonical_json(self) -> str:
         """Sorted, compact JSON of the content and the code version, without the seed."""
         parts = (self.system, self.policy, self.model, self.learner)
-        content: dict[str, object] = {"code_version": CODE_VERSION}
+        content: dict[str, object] = {"code_version": CODE_VERSION, "path": self.path}
         content |= {key: section_of(part) for key, part in zip(_SECTIONS, parts, strict=True)}
         return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
@@ -98,7 +107,8 @@ class TrialSpec(Checked):
         ----------
         given : mapping
             Sections ``env``, ``policy``, ``model`` and ``learner``, each with a ``name`` and the
-            fields that differ from their defaults, and the ``seed``.
+            fields that differ from their defaults, the ``seed`` and, if it is not the kernel, the
+            execution ``path``.
 
         Raises
         ------
@@ -108,14 +118,15 @@ class TrialSpec(Checked):
             If the choices are valid one by one but make no sense together.
         """
         for key in given:
-            if key not in (*_SECTIONS, "seed"):
-                raise unknown_name("configuration key", key, (*_SECTIONS, "seed"))
+            if key not in (*_SECTIONS, "path", "seed"):
+                raise unknown_name("configuration key", key, (*_SECTIONS, "path", "seed"))
         sections = {key: _section(given, key) for key in _SECTIONS}
         cell = Cell(
             build("env", SYSTEMS, sections["env"]),
             build("policy", POLICIES, sections["policy"]),
             build("model", MODELS, sections["model"]),
             build("learner", LEARNERS, sections["learner"]),
+            str(given.get("path", "kernel")),
         )
         return cls(cell, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
 

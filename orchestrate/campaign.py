@@ -103,8 +103,9 @@ def _run(
     _count(tally, state)
     say(_opening(grid, state, settings, store.safe_url))
     if tally.left:
-        with _said_if_slow("compiling the kernel, which is kept for later launches", say):
-            work.prepare()
+        if settings.path == "kernel":
+            with _said_if_slow("compiling the kernel, which is kept for later launches", say):
+                work.prepare()
         start = time.monotonic()
         with make_executor(settings, work.run) as executor, Interrupt() as stop:
             waiting = _waiting(grid, state)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.spec import TrialSpec
+from dopt.spec import Cell, TrialSpec
 
 TRIAL_SECTIONS = ("env", "policy", "model", "learner", "seed")
 """The parts of a configuration that make a trial."""
@@ -54,6 +54,17 @@ class Grid:
     def repeats(self) -> int:
         """Number of trials that the command line names more than once."""
         return self.asked - sum(self.left_out.values()) - len(self.trials)
+
+    def on_path(self, path: str) -> Grid:
+        """Return the grid with its trials on an execution path."""
+        cells: dict[str, Cell] = {}
+        trials = []
+        for trial in self.trials:
+            key = trial.config_key
+            if key not in cells:
+                cells[key] = dataclasses.replace(trial.cell, path=path)
+            trials.append(TrialSpec(cells[key], trial.seed))
+        return dataclasses.replace(self, trials=trials)
 
 
 def build_grid(combinations: Iterable[Combination], *, alone: bool = False) -> Grid:

@@ -111,6 +111,8 @@ def main() -> int:
             return ExitCode.DONE
         grid = build_grid(request.combinations, alone=request.single)
         settings = LaunchSettings.from_mapping(request.launch)
+        if settings.path != "kernel":
+            grid = grid.on_path(settings.path)
     except Exception as error:
         if debug:
             raise

@@ -46,6 +46,11 @@ class LaunchSettings:
     device: str = "cpu"
     batch: int = 100
 
+    @property
+    def path(self) -> str:
+        """Execution path of the trials: a batch in lockstep is the reference's."""
+        return "reference" if self.executor == "lockstep" else "kernel"
+
     @classmethod
     def from_mapping(cls, given: Mapping[str, Any]) -> LaunchSettings:
         """Check the sections ``launch``, ``store`` and ``executor`` of a configuration.

@@ -20,7 +20,8 @@ def launch_trial(
 
     A traceback goes to the standard error.
     """
-    here = dataclasses.replace(settings, executor="inprocess")
+    together = settings.executor == "lockstep"
+    here = settings if together else dataclasses.replace(settings, executor="inprocess")
     grid = Grid([trial], asked=1, left_out={})
     code = launch_grid(grid, here, record, work, say=_nothing, stream=None)
     with Reader.open(settings.store_url) as reader:

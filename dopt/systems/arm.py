@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -81,9 +80,7 @@ class Arm(System):
     friction: float = quantity(2.0, "N m s", "nonnegative")
     gamma: float = quantity(5.0, "N m", "positive")
     initial_state: tuple[float, ...] = quantity((0.0, 0.0, 0.0, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity(
-        (math.pi / 5, 3.0, math.pi / 5, 3.0), bound="positive"
-    )
+    grid_half_widths: tuple[float, ...] = quantity((0.65, 1.6, 1.0, 2.3), bound="positive")
     grid_points: tuple[int, ...] = quantity((6, 6, 6, 6), bound="positive")
 
     @staticmethod

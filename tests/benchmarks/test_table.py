@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.cli import HEADERS, QUESTIONS, main, parser
+from benchmarks.launches import _accounts
 from benchmarks.rows import Anchor, Row, Target
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -81,3 +82,13 @@ def test_a_row_shows_how_many_times_faster_it_is_than_others() -> None:
 def test_what_was_left_out_says_why() -> None:
     assert Row("scan", None, note="jax is not installed").cells()[0] == "left out"
     assert Row("scan", None, note="jax is not installed").cells()[-1] == "jax is not installed"
+
+
+def test_the_rate_of_a_launch_leaves_out_the_first_trial_of_each_worker() -> None:
+    first, second = 7, 8
+    rows = [(first, 0.0, 5.0, 5.0), (second, 1.0, 7.0, 6.0), (first, 5.0, 6.0, 1.0)]
+    rows += [(first, 6.0 + i, 7.0 + i, 1.0) for i in range(4)]
+    rows += [(second, 7.0 + i, 8.0 + i, 1.0) for i in range(3)]
+    found = _accounts(rows)
+    assert (found.span, found.work) == (10.0, 19.0)
+    assert found.rate == pytest.approx(2.0)

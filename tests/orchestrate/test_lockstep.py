@@ -69,3 +69,18 @@ def test_a_grid_runs_in_lockstep(
     assert code == 0, errors
     with Reader.open(url) as reader:
         assert [cell.n_done for cell in reader.cells()] == [4, 4]
+
+
+def test_lockstep_and_the_kernel_keep_their_trials_apart(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    """Their numbers agree to rounding only: one must not be taken for the other."""
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    one = ("env=pendulum", "policy=oracle", "seed=1", "env.horizon=6", f"store.url={url}")
+    assert command_line(*one, "executor=lockstep")[0] == 0
+    assert command_line(*one, "executor=inprocess")[0] == 0
+    with Reader.open(url) as reader:
+        assert sorted(str(cell.config["path"]) for cell in reader.cells()) == [
+            "kernel",
+            "reference",
+        ]
