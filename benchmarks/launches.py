@@ -28,10 +28,13 @@ class Accounts:
         Seconds from the start of the first trial to the end of the last one.
     work
         Sum of the seconds that the trials took themselves.
+    rate
+        Trials per second once every worker has ended its first one, which loads compiled code.
     """
 
     span: float
     work: float
+    rate: float
 
 
 def launch_trials(url: str, specs: Sequence[TrialSpec], workers: int) -> Accounts:
@@ -43,11 +46,25 @@ def launch_trials(url: str, specs: Sequence[TrialSpec], workers: int) -> Account
     if code is not ExitCode.DONE:
         raise RuntimeError(f"the launch ended with {code!r}, but {ExitCode.DONE!r} is expected.")
     with Reader.open(url) as reader:
-        first, last, total = reader.query(
-            "SELECT min(started), max(ended), sum(wall_seconds) FROM attempt"
-        )[0]
-    span = datetime.fromisoformat(last) - datetime.fromisoformat(first)
-    return Accounts(span.total_seconds(), float(total))
+        rows = reader.query("SELECT pid, started, ended, wall_seconds FROM attempt")
+    return _accounts(
+        [(pid, _seconds(start), _seconds(end), work) for pid, start, end, work in rows]
+    )
+
+
+def _accounts(rows: Sequence[tuple[int, float, float, float]]) -> Accounts:
+    """Return the accounts of trials, each with its process, start, end and own seconds."""
+    first_ends: dict[int, float] = {}
+    for pid, _, end, _ in rows:
+        first_ends[pid] = min(end, first_ends.get(pid, end))
+    steady, last = max(first_ends.values()), max(end for _, _, end, _ in rows)
+    later = sum(end > steady for _, _, end, _ in rows)
+    span = last - min(start for _, start, _, _ in rows)
+    return Accounts(span, sum(work for *_, work in rows), later / (last - steady))
+
+
+def _seconds(stamp: str) -> float:
+    return datetime.fromisoformat(stamp).timestamp()
 
 
 def _nothing(_: str) -> None:
