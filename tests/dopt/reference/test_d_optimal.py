@@ -122,7 +122,7 @@ def _gap_and_effect(env: str, dt: float) -> tuple[float, float]:
     spec = trial(env, "d_optimal")
     system = dataclasses.replace(spec.system, dt=dt)
     spec = TrialSpec(Cell(system, spec.policy, spec.model, spec.learner))
-    now, component = situation(spec, 5), system.n_learned - 1
+    now, component = situation(spec, 6), system.n_learned - 1
     g, DB = pieces(spec, now, component)
     u = torch.full((system.n_inputs,), system.gamma / system.n_inputs**0.5, dtype=torch.float64)
 
