@@ -6,12 +6,19 @@ registries and every system whose equations compile.
 
 from __future__ import annotations
 
+EVERYTHING = "everything"
+"""Mark of a cache that holds all that :func:`warm_up` compiles."""
+
 
 def warm_up() -> None:
-    """Compile the kernel for all registered systems, or load it from the disk cache.
+    """See to it that the disk cache holds the kernel for all registered systems.
 
     Called once before worker processes start, so that they find compiled code.
     """
+    from dopt.kernel.cache import is_complete, mark_complete
+
+    if is_complete(EVERYTHING):
+        return
     from dopt.kernel.equations import compiled_equations
     from dopt.kernel.run import run_trial_in_kernel
     from dopt.spec import TrialSpec
@@ -23,3 +30,4 @@ def warm_up() -> None:
     names = {"policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
     sections = {key: {"name": name} for key, name in names.items()}
     run_trial_in_kernel(TrialSpec.from_mapping({"env": section, **sections, "seed": 0}))
+    mark_complete(EVERYTHING)

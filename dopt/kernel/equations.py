@@ -19,7 +19,8 @@ from numba import complex128, float64, types
 from numba.extending import overload
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from dopt.kernel.compiler import compilable, one_compiler_at_a_time
+from dopt.kernel.cache import one_compiler_at_a_time
+from dopt.kernel.compiler import compilable
 from dopt.systems import elementary
 from dopt.systems.base import System
 

@@ -14,7 +14,7 @@ import numpy as np
 from dopt.errors import SpecificationError
 from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import arguments as args
-from dopt.kernel.compiler import one_compiler_at_a_time
+from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
 from dopt.kernel.evaluation import BLOCK
 from dopt.kernel.information import PENDING_ROWS, SMALL

@@ -14,15 +14,15 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from dopt.kernel import compiler
-from dopt.kernel.compiler import one_compiler_at_a_time
+from dopt.kernel import cache, warm_up
+from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import compiled_equations
 from dopt.systems import SYSTEMS, Pendulum, System
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(compiler, "CACHE_FOLDER", tmp_path)
+    monkeypatch.setattr(cache, "CACHE_FOLDER", tmp_path)
     return tmp_path
 
 
@@ -91,7 +91,7 @@ def test_equations_from_elsewhere_are_compiled_but_not_cached() -> None:
     assert out[0] == -80.0
     assert equations.accelerations.stats.cache_path is None
     own = compiled_equations(Pendulum()).accelerations
-    assert str(compiler.CACHE_FOLDER) in own.stats.cache_path
+    assert str(cache.CACHE_FOLDER) in own.stats.cache_path
 
 
 def symbols(system: System) -> list[str]:
@@ -129,3 +129,11 @@ def test_systems_cached_by_different_processes_are_not_confused(tmp_path: Path) 
     for names in (["pendulum"], ["cartpole"], ["cartpole", "pendulum"], ["pendulum", "cartpole"]):
         command = [sys.executable, "-c", program, *names]
         subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[3])
+
+
+def test_a_warm_cache_is_seen_without_the_compiler() -> None:
+    warm_up()
+    program = (
+        "import sys; from dopt.kernel import warm_up; warm_up(); assert 'numba' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[3])
