@@ -47,8 +47,11 @@ smoke: setup  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'
 	$(BIN)/python -m analysis figures --db '$(SMOKE_DB)' --out figures/smoke
 
-bench: setup  ## print measured speed beside its targets
+bench: setup  ## print measured speed beside its targets, and draw cost against width
 	$(BIN)/python -m benchmarks
+	$(BIN)/python orchestrate/launch.py -m experiment=width executor=local store.url='$(DB)'
+	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width
+	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width_loss
 
 clean:  ## remove what the targets made, except results
 	rm -rf $(VENV) figures .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
