@@ -99,20 +99,15 @@ def symmetric_products(upper: Any, x: Any, z: Any, y: Any, w: Any) -> None:
     w[:] = 0.0
     blocked = q - q % 2
     for i in range(0, blocked, 2):
-        _two_rows(
-            upper[i, i + 2 :],
-            upper[i + 1, i + 2 :],
-            x[i : i + 2],
-            z[i : i + 2],
-            x[i + 2 :],
-            z[i + 2 :],
-            y[i : i + 2],
-            w[i : i + 2],
-            y[i + 2 :],
-            w[i + 2 :],
-        )
-        _triangle(upper, x, y, i, i + 2)
-        _triangle(upper, z, w, i, i + 2)
+        x_0, x_1, z_0, z_1 = x[i], x[i + 1], z[i], z[i + 1]
+        first, second = upper[i, i + 2 :], upper[i + 1, i + 2 :]
+        below = (x[i + 2 :], z[i + 2 :], y[i + 2 :], w[i + 2 :])
+        sum_x0, sum_x1, sum_z0, sum_z1 = _two_rows(first, second, x_0, x_1, z_0, z_1, *below)
+        a, b, c = upper[i, i], upper[i, i + 1], upper[i + 1, i + 1]
+        y[i] += sum_x0 + a * x_0 + b * x_1
+        y[i + 1] += sum_x1 + b * x_0 + c * x_1
+        w[i] += sum_z0 + a * z_0 + b * z_1
+        w[i + 1] += sum_z1 + b * z_0 + c * z_1
     _triangle(upper, x, y, blocked, q)
     _triangle(upper, z, w, blocked, q)
 
@@ -121,17 +116,16 @@ def symmetric_products(upper: Any, x: Any, z: Any, y: Any, w: Any) -> None:
 def _two_rows(
     row_0: Any,
     row_1: Any,
-    x_head: Any,
-    z_head: Any,
+    x_0: float,
+    x_1: float,
+    z_0: float,
+    z_1: float,
     x: Any,
     z: Any,
-    y_head: Any,
-    w_head: Any,
     y: Any,
     w: Any,
-) -> None:
-    """Do for two rows and two vectors what :func:`_four_rows` does for four and one."""
-    x_0, x_1, z_0, z_1 = x_head[0], x_head[1], z_head[0], z_head[1]
+) -> tuple[float, float, float, float]:
+    """Do for two rows and two vectors what :func:`_four_rows` does; return the four sums."""
     sum_x0, sum_x1, sum_z0, sum_z1 = 0.0, 0.0, 0.0, 0.0
     for j in range(x.shape[0]):
         entry_0, entry_1 = row_0[j], row_1[j]
@@ -141,10 +135,7 @@ def _two_rows(
         sum_z1 += entry_1 * z[j]
         y[j] += entry_0 * x_0 + entry_1 * x_1
         w[j] += entry_0 * z_0 + entry_1 * z_1
-    y_head[0] += sum_x0
-    y_head[1] += sum_x1
-    w_head[0] += sum_z0
-    w_head[1] += sum_z1
+    return sum_x0, sum_x1, sum_z0, sum_z1
 
 
 @vectorized
