@@ -50,11 +50,11 @@ def compilable(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @intrinsic
-def power_of_two(typing_context: Any, shifted: Any) -> Any:  # noqa: ARG001
+def power_of_two(typing_context: Any, shifted: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
     """Return 2^k for a float that holds the integer k in the lowest bits of its significand."""
     bits, exponent_at, bias = (32, 23, 127) if shifted == types.float32 else (64, 52, 1023)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
         word = ir.IntType(bits)
         exponent = builder.shl(builder.bitcast(arguments[0], word), ir.Constant(word, exponent_at))
         biased = builder.add(exponent, ir.Constant(word, bias << exponent_at))
@@ -64,11 +64,11 @@ def power_of_two(typing_context: Any, shifted: Any) -> Any:  # noqa: ARG001
 
 
 @intrinsic
-def monotonic_microseconds(typing_context: Any) -> Any:  # noqa: ARG001
+def monotonic_microseconds(typing_context: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
     """Read the system's monotonic clock [µs] (POSIX clock_gettime)."""
     monotonic = 6 if os.uname().sysname == "Darwin" else 1
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
         word = ir.IntType(64)
         timespec = ir.LiteralStructType([word, word])
         kind = ir.FunctionType(ir.IntType(32), [ir.IntType(32), timespec.as_pointer()])

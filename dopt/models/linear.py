@@ -24,5 +24,5 @@ class Linear(Model):
     def n_parameters(self, system: System) -> int:
         return len(system.linear_parameters)
 
-    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002
+    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
         return np.zeros(self.n_parameters(system))

@@ -36,7 +36,7 @@ class Periodic(OpenLoop):
                 f"parameters has no oscillation about a stable equilibrium: choose another policy."
             )
 
-    def inputs(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002
+    def inputs(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
         mode = eigenmode(system)
         assert mode is not None, "check() is called before"
         frequency = mode.frequency if self.frequency is None else self.frequency
