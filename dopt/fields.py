@@ -130,6 +130,5 @@ def _real(value: float) -> float:
 
 
 def _wrong_type(path: str, value: object, expected: str) -> SpecificationError:
-    return SpecificationError(
-        f"{path} is {value!r} ({type(value).__name__}), but {expected} is expected: set it so."
-    )
+    given = "null" if value is None else f"{value!r} ({type(value).__name__})"
+    return SpecificationError(f"{path} is {given}, but {expected} is expected: set it so.")

@@ -1,25 +1,60 @@
-"""From configuration sections to specification dataclasses and back."""
+"""From configuration sections to specification dataclasses and back.
+
+A section names a class of this package by ``name``, or one of the user's own by ``_target_``, the
+dotted path of a class that can be imported. Such a section also holds the digest of the file that
+defines the class: when the file changes, its trials are other trials.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import importlib
+import inspect
 from collections.abc import Mapping
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Checked
 
 T = TypeVar("T", bound=Checked)
 
+TARGET = "_target_"
+SOURCE = "source"
+
+_ABOUT = ("name", TARGET, SOURCE)
+
 
 def build(section: str, registry: Mapping[str, type[T]], given: Mapping[str, object]) -> T:
-    """Return the registered dataclass that ``given`` names, filled with its other entries.
+    """Return the dataclass that ``given`` names, filled with its other entries.
 
     Raises
     ------
     SpecificationError
-        If the name or a field is unknown, or a value does not fit.
+        If the class or a field is unknown, or a value does not fit.
     """
+    cls = _own(section, registry, given) if TARGET in given else _shipped(section, registry, given)
+    fields = [field.name for field in dataclasses.fields(cls)]
+    for key in given:
+        if key not in _ABOUT and key not in fields:
+            raise unknown_name(f"{section}.{cls.name} field", key, fields)  # type: ignore[attr-defined]
+    return cls(**{key: value for key, value in given.items() if key not in _ABOUT})
+
+
+def section_of(item: Checked) -> dict[str, object]:
+    """Return the configuration section that :func:`build` turns into ``item``."""
+    fields = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
+    listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
+    return {"name": getattr(item, "name", None), **_origin(type(item)), **listed}
+
+
+def name_of(given: Mapping[str, object]) -> str:
+    """Return how a section is called in a message: its name, or its class where it gives none."""
+    return str(given.get("name") or given.get(TARGET))
+
+
+def _shipped(section: str, registry: Mapping[str, type[T]], given: Mapping[str, object]) -> type[T]:
     if "name" not in given:
         raise SpecificationError(
             f"{section}.name is missing, one of {', '.join(sorted(registry))} is expected: set it."
@@ -27,16 +62,76 @@ def build(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obj
     name = given["name"]
     if not isinstance(name, str) or name not in registry:
         raise unknown_name(section, name, registry)
-    cls = registry[name]
-    fields = [field.name for field in dataclasses.fields(cls)]
-    for key in given:
-        if key != "name" and key not in fields:
-            raise unknown_name(f"{section}.{name} field", key, fields)
-    return cls(**{key: value for key, value in given.items() if key != "name"})
+    return registry[name]
 
 
-def section_of(item: Checked) -> dict[str, object]:
-    """Return the configuration section that :func:`build` turns into ``item``."""
-    fields = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
-    listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
-    return {"name": getattr(item, "name", None), **listed}
+def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, object]) -> type[T]:
+    """Import a class of the user's own and see that it fits."""
+    path = str(given[TARGET])
+    cls: Any = _imported(section, path)
+    wanted = _base(next(iter(registry.values())))
+    if not (isinstance(cls, type) and issubclass(cls, wanted) and dataclasses.is_dataclass(cls)):
+        raise _unfit(section, path, f"a dataclass derived from dopt's {wanted.__name__}")
+    own = cast("type[T]", cls)
+    missing = [key for key in dir(own) if getattr(getattr(own, key), "__isabstractmethod__", False)]
+    if missing:
+        raise _unfit(section, path, f"a class that defines {', '.join(missing)}")
+    name = own.__dict__.get("name")
+    if not isinstance(name, str) or name in registry:
+        raise _unfit(section, path, "a class with a 'name' of its own, which no other has")
+    if given.get("name", name) != name:
+        raise SpecificationError(
+            f"{section}.name is '{given['name']}', but {path} is called '{name}': "
+            f"leave {section}.name out, or correct it."
+        )
+    _check_source(section, path, own, given)
+    return own
+
+
+def _check_source(section: str, path: str, cls: type[Checked], given: Mapping[str, object]) -> None:
+    if given.get(SOURCE, source_digest(cls)) != source_digest(cls):
+        raise SpecificationError(
+            f"{section} asks for {path} as it was in another state of its file: "
+            f"leave {section}.{SOURCE} out to take it as it is now, or restore the file."
+        )
+
+
+def _base(cls: type[Checked]) -> type[Checked]:
+    """Return the class that declares the section of a specification."""
+    return next(base for base in cls.__mro__ if "section" in base.__dict__)
+
+
+def _imported(section: str, path: str) -> object:
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SpecificationError(
+            f"{section}.{TARGET} is '{path}', which cannot be imported ({error}): give the path of "
+            f"a class as module.Class, in a folder that PYTHONPATH names."
+        ) from error
+
+
+def _unfit(section: str, path: str, expected: str) -> SpecificationError:
+    return SpecificationError(
+        f"{section}.{TARGET} is '{path}', but {expected} is expected: correct the class or "
+        f"the path."
+    )
+
+
+def _origin(cls: type[Checked]) -> dict[str, object]:
+    """Return what identifies a class of the user's own; nothing for one of this package."""
+    if cls.__module__.partition(".")[0] == __name__.partition(".")[0]:
+        return {}
+    return {TARGET: f"{cls.__module__}.{cls.__qualname__}", SOURCE: source_digest(cls)}
+
+
+def source_digest(cls: type) -> str:
+    """Return the digest of the file that defines a class, as it was when first asked for."""
+    if cls not in _digests:
+        content = Path(inspect.getfile(cls)).read_bytes()
+        _digests[cls] = hashlib.sha256(content).hexdigest()[:16]
+    return _digests[cls]
+
+
+_digests: dict[type, str] = {}

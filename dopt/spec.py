@@ -6,16 +6,18 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import ClassVar
 
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.fields import Checked, quantity
 from dopt.learning import LEARNERS, Learner
 from dopt.learning.recursive_least_squares import RecursiveLeastSquares
+from dopt.memory import memory_by_setting
 from dopt.models import MODELS, Linear, Model
 from dopt.models.mlp import MLP
 from dopt.policies import POLICIES, DOptimal, Oracle, Policy
+from dopt.policies.base import OpenLoop
 from dopt.registry import build, section_of
 from dopt.systems import SYSTEMS, System
 
@@ -24,6 +26,12 @@ CODE_VERSION = 1
 
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
+
+LARGEST_HORIZON = 10_000_000
+"""A trial is committed whole, one row for each step."""
+
+LARGEST_MEMORY = 2**40
+"""Bytes that a trial may need on any machine; a launch also asks its own."""
 
 PATHS = ("kernel", "reference")
 
@@ -47,7 +55,9 @@ class Cell:
     def __post_init__(self) -> None:
         if self.path not in PATHS:
             raise unknown_name("path", self.path, PATHS)
+        self._check_runnable()
         self.policy.check(self.system)
+        self._check_size()
         linear = isinstance(self.model, Linear)
         if isinstance(self.policy, Oracle) and not linear:
             raise _mismatch("policy 'oracle'", "model 'linear'", f"model '{self.model.name}'")
@@ -64,6 +74,46 @@ class Cell:
                 "model 'linear' and the other way round",
                 f"learner '{self.learner.name}' with model '{self.model.name}'",
             )
+
+    def _check_runnable(self) -> None:
+        """Refuse parts of a user's own that no path can run: all but systems and open loops."""
+        parts = ((self.policy, POLICIES), (self.model, MODELS), (self.learner, LEARNERS))
+        for part, registry in parts:
+            shipped: Collection[type] = registry.values()
+            if type(part) not in shipped and not isinstance(part, OpenLoop):
+                raise SpecificationError(
+                    f"{part.section} is a {type(part).__name__} of your own, but only systems and "
+                    f"policies derived from OpenLoop can be so: take one of "
+                    f"{', '.join(sorted(registry))}."
+                )
+
+    def _check_size(self) -> None:
+        """Refuse what no machine can run, such as a mistyped number of zeros."""
+        if self.system.horizon > LARGEST_HORIZON:
+            raise SpecificationError(
+                f"env.horizon is {self.system.horizon:,} steps, but it has to be at most "
+                f"{LARGEST_HORIZON:,}: set it so."
+            )
+        if self.memory > LARGEST_MEMORY:
+            raise SpecificationError(
+                f"a trial would need {self.memory / 2**30:,.0f} GiB of memory, most of it because "
+                f"of {self.largest_setting}, but at most {LARGEST_MEMORY / 2**30:,.0f} GiB are "
+                f"allowed: make {self.largest_setting} smaller."
+            )
+
+    @property
+    def memory(self) -> int:
+        """Bytes that one trial holds at once, beside the interpreter."""
+        return sum(self._memory_by_setting.values())
+
+    @property
+    def largest_setting(self) -> str:
+        """The setting that decides about most of the memory."""
+        return max(self._memory_by_setting, key=lambda key: self._memory_by_setting[key])
+
+    @functools.cached_property
+    def _memory_by_setting(self) -> dict[str, int]:
+        return memory_by_setting(self.system, self.policy, self.model, self.learner)
 
     @functools.cached_property
     def canonical_json(self) -> str:
@@ -95,7 +145,7 @@ class TrialSpec(Checked):
         whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
         if not whole or not 0 <= self.seed <= LARGEST_SEED:
             raise SpecificationError(
-                f"seed is {self.seed!r}, but a whole number of 0 or above and below 2^63 is "
+                f"seed is {_shown(self.seed)}, but a whole number of 0 or above and below 2^63 is "
                 f"expected: set it so."
             )
 
@@ -189,6 +239,10 @@ class TrialSpec(Checked):
             "dt": self.system.dt,
             "gamma": self.system.gamma,
         }
+
+
+def _shown(value: object) -> str:
+    return "null" if value is None else repr(value)
 
 
 def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:

@@ -31,6 +31,10 @@ def _source_digest() -> str:
     """
     digest = hashlib.sha256(version("numba").encode())
     digest.update(llvmlite.binding.get_host_cpu_name().encode())
+    # Two virtual machines may name one processor and offer different parts of it.
+    digest.update(llvmlite.binding.get_host_cpu_features().flatten().encode())
+    # Numba files what it keeps under the path of its source: another checkout would not find it.
+    digest.update(str(_PACKAGE).encode())
     for folder in _COMPILED_SOURCES:
         for path in sorted((_PACKAGE / folder).rglob("*.py")):
             digest.update(path.read_bytes())

@@ -25,6 +25,11 @@ def compiled(function: F) -> F:
     return _njit(function)
 
 
+def called_from_python(function: F) -> F:
+    """Compile a function during which other threads of the interpreter run."""
+    return _njit(function, nogil=True)
+
+
 def contracted(function: F) -> F:
     """Compile a function whose products and sums may be fused: a·b + c rounds once."""
     return _njit(function, fastmath={"contract"})

@@ -22,7 +22,7 @@ from dopt.kernel.arguments import (
     State,
     World,
 )
-from dopt.kernel.compiler import compiled, monotonic_microseconds
+from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
 from dopt.kernel.dual import dual_absorb
 from dopt.kernel.evaluation import evaluation_buffers, model_error
 from dopt.kernel.information import absorb
@@ -139,7 +139,7 @@ def within(x: Any, limit: float) -> bool:
     return inside
 
 
-@compiled
+@called_from_python
 def advance(
     known: Any,
     accelerations: Any,

@@ -29,3 +29,7 @@ class Model(Checked):
     @abstractmethod
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
         """Draw the initial parameters, (q,)."""
+
+    @abstractmethod
+    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+        """Return the modelled accelerations, (N, r), of states, (N, d), with parameters (q,)."""

@@ -26,3 +26,12 @@ class Linear(Model):
 
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
         return np.zeros(self.n_parameters(system))
+
+    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+        offset, *units = (
+            np.stack(np.broadcast_arrays(*system.accelerations(tuple(states.T), form)), axis=-1)
+            for form in system.linear_form
+        )
+        regressors = np.stack([unit - offset for unit in units], axis=-1)
+        predicted: Array = offset + regressors @ parameters
+        return predicted

@@ -38,8 +38,8 @@ class MLP(Model):
         return (len(system.features), *[self.width] * self.depth, system.n_learned)
 
     def n_parameters(self, system: System) -> int:
-        sizes = self.layer_sizes(system)
-        return sum((n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes))
+        n_in, n_out, width = len(system.features), system.n_learned, self.width
+        return (n_in + 1) * width + (self.depth - 1) * (width + 1) * width + (width + 1) * n_out
 
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
         """Draw every weight and bias of a layer uniformly in ±1/√(number of its inputs)."""
@@ -50,3 +50,15 @@ class MLP(Model):
                 for n_in, n_out in itertools.pairwise(sizes)
             ]
         )
+
+    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+        values = system.featurize(states)
+        sizes, first = self.layer_sizes(system), 0
+        for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
+            weights = parameters[first : first + n_in * n_out].reshape(n_out, n_in)
+            first += n_in * n_out
+            values = values @ weights.T + parameters[first : first + n_out]
+            first += n_out
+            if layer < self.depth:
+                values = np.tanh(values)
+        return values

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import llvmlite.binding
 import numpy as np
 import pytest
 
@@ -137,3 +138,22 @@ def test_a_warm_cache_is_seen_without_the_compiler() -> None:
         "import sys; from dopt.kernel import warm_up; warm_up(); assert 'numba' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[3])
+
+
+def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the processor has the same name and offers less, as in a virtual machine."""
+
+    class Less(dict[str, bool]):
+        def flatten(self) -> str:
+            return "-avx2"
+
+    here = cache._source_digest()
+    monkeypatch.setattr(llvmlite.binding, "get_host_cpu_features", Less)
+    assert cache._source_digest() != here
+
+
+def test_another_checkout_has_a_cache_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba would not find there what was compiled here, although it is said to be complete."""
+    here = cache._source_digest()
+    monkeypatch.setattr(cache, "_PACKAGE", Path("/elsewhere/dopt"))
+    assert cache._source_digest() != here

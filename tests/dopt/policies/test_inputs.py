@@ -29,7 +29,7 @@ def test_inputs_obey_the_bound(env: str, policy: str) -> None:
     spec = trial(env, policy, 1)
     norms = np.linalg.norm(run_trial(spec).inputs, axis=1)
     assert norms.max() <= spec.system.gamma * (1 + 1e-12)
-    if policy != "periodic":
+    if policy not in ("periodic", "multisine", "chirp"):
         assert norms == pytest.approx(spec.system.gamma, rel=1e-12)
 
 
@@ -86,6 +86,54 @@ def test_a_periodic_input_takes_another_frequency() -> None:
     u = open_loop("pendulum", "periodic", 1_000, frequency=5.0)
     times = 0.02 * np.arange(1_000)
     assert np.abs(u[:, 0]) == pytest.approx(np.abs(3.0 * np.sin(5.0 * times)), abs=1e-12)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+def test_a_binary_sequence_is_balanced_and_white_over_its_clock(env: str) -> None:
+    u = open_loop(env, "prbs", 10 * 1023, hold=10)
+    m = u.shape[1]
+    assert np.abs(u) == pytest.approx(3.0 / np.sqrt(m))
+    clock = u[::10] * np.sqrt(m) / 3.0
+    assert np.abs(clock.sum(axis=0)) == pytest.approx(1.0)  # one sign is met once more
+    for shift in (1, 2, 17):
+        correlation = (np.roll(clock, shift, axis=0) * clock).sum(axis=0)
+        assert correlation == pytest.approx(-1.0)  # of all but zero, for a maximal sequence
+    if m == 2:
+        assert abs(clock[:, 0] @ clock[:, 1]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+@pytest.mark.parametrize("band", [0.05, 0.2])
+def test_a_multisine_is_flat_inside_its_band_and_nothing_outside(env: str, band: float) -> None:
+    u = open_loop(env, "multisine", 1_000, band=band)
+    m, highest = u.shape[1], int(band * 500)
+    power = np.abs(np.fft.rfft(u, axis=0)) ** 2
+    for j in range(m):
+        inside = np.arange(1 + j, highest + 1, m)
+        assert power[inside, j] == pytest.approx(power[inside[0], j], rel=1e-6)
+        assert np.delete(power[:, j], inside).max() < 1e-12 * power[inside[0], j]
+    crest = np.linalg.norm(u, axis=1).max() / np.sqrt((u**2).sum(axis=1).mean())
+    assert crest < 2.2  # of random phases it would be about 3
+
+
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+def test_a_chirp_rises_to_its_band(env: str) -> None:
+    u = open_loop(env, "chirp", 4_000, band=0.2)
+    if u.shape[1] == 2:
+        assert np.linalg.norm(u, axis=1) == pytest.approx(3.0)
+    crossings = np.flatnonzero(np.diff(np.sign(u[:, 0])) != 0)
+    early, late = (np.sum(crossings < 400), np.sum(crossings >= 3_600))
+    assert late == pytest.approx(0.2 * 0.95 * 400, rel=0.05)  # two zeros a period
+    assert early == pytest.approx(0.2 * 0.05 * 400, abs=2)
+
+
+@pytest.mark.parametrize("policy", ["prbs", "multisine", "chirp"])
+def test_the_seed_gives_the_phase(policy: str) -> None:
+    one, same, other = (
+        draw(trial("pendulum", policy, seed, env={"horizon": 200})).inputs for seed in (1, 1, 2)
+    )
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
 
 
 def test_every_policy_is_either_open_loop_or_starts_at_random_on_the_sphere() -> None:

@@ -1,0 +1,81 @@
+"""What a system looks like from the side: its body as lines, for pictures.
+
+A system of one's own gets a body by registering one::
+
+    @body.register
+    def _(system: MySystem, states: Array) -> Body: ...
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import singledispatch
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.systems import Arm, Cartpole, Pendulum, Quadrotor, System
+
+Array = npt.NDArray[np.float64]
+
+CART = (0.3, 0.12)
+"""Half the length and half the height of the cart that is drawn, by the rod's length."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A system in a vertical plane [m], x to the right and y up.
+
+    Attributes
+    ----------
+    lines : tuple of (n, k, 2)
+        Polylines of k points, for each of n states.
+    masses : (n, p, 2)
+        Points at which masses sit.
+    """
+
+    lines: tuple[Array, ...]
+    masses: Array
+
+
+@singledispatch
+def body(system: System, states: Array) -> Body | None:  # noqa: ARG001  # what others take
+    """Return the body of a system at states (n, d); None for a system that has none."""
+    return None
+
+
+@body.register
+def _(system: Pendulum, states: Array) -> Body:
+    tip = _hanging(states[:, 0], system.length)
+    return Body((_polyline(np.zeros_like(tip), tip),), tip[:, None])
+
+
+@body.register
+def _(system: Cartpole, states: Array) -> Body:
+    cart = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
+    tip = cart - _hanging(-states[:, 2], system.length)  # the angle is from upright
+    corners = system.length * np.array(CART) * [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]
+    return Body((cart[:, None] + corners, _polyline(cart, tip)), tip[:, None])
+
+
+@body.register
+def _(system: Arm, states: Array) -> Body:
+    elbow = _hanging(states[:, 0], system.length_1)
+    hand = elbow + _hanging(states[:, 2], system.length_2)
+    return Body((_polyline(np.zeros_like(elbow), elbow, hand),), np.stack([elbow, hand], axis=1))
+
+
+@body.register
+def _(system: Quadrotor, states: Array) -> Body:
+    centre, tilt = states[:, [0, 2]], states[:, 4]
+    arm = system.half_span * np.stack([np.cos(tilt), np.sin(tilt)], axis=1)
+    return Body((_polyline(centre - arm, centre + arm),), centre[:, None])
+
+
+def _hanging(angle: Array, length: float) -> Array:
+    """Return the end (n, 2) of a rod from the origin, at an angle from hanging."""
+    return length * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+
+
+def _polyline(*points: Array) -> Array:
+    return np.stack(points, axis=1)

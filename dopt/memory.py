@@ -1,0 +1,62 @@
+"""How much memory a trial needs, from its sizes alone.
+
+Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
+w units in each of L hidden layers, N points of the evaluation grid.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dopt.learning import Learner
+from dopt.learning.adam import Adam
+from dopt.models import MLP, Model
+from dopt.policies import DOptimal, Policy
+from dopt.systems import System
+
+NUMBER = 8
+"""Bytes of a double."""
+
+STRONG_INPUTS = 8
+"""Simulated sequences from which the reachable set is drawn (:mod:`dopt.evaluation`)."""
+
+
+def memory_by_setting(
+    system: System, policy: Policy, model: Model, learner: Learner
+) -> dict[str, int]:
+    """Return the bytes that a trial holds at once, by the setting that decides about them.
+
+    The interpreter and its libraries, some 0.2 GiB, come on top.
+    """
+    T, d, m, r = system.horizon, system.n_states, system.n_inputs, system.n_learned
+    p, q = len(system.features), model.n_parameters(system)
+    N = math.prod(system.grid_points)
+    w, L = (model.width, model.depth) if isinstance(model, MLP) else (1, 1)
+    window = learner.window if isinstance(learner, Adam) else 0
+    numbers = {
+        # states, noise, inputs as drawn and applied, ties, five columns, components
+        "env.horizon": T * (2 * d + 3 * m + 6 + STRONG_INPUTS * (d + m)),
+        # states and their mesh, targets, and features in both precisions
+        "env.grid_points": N * (2 * d + 2 * r + 2 * p),
+        # parameters, two moments, gradient, and the copies for the evaluation
+        "model.width": 6 * q,
+        "learner.window": window * (p + r + (L + 3) * max(w, r)),
+    }
+    for setting, count in _information(policy, q, r * T, T * (p + L * w * (1 + r))).items():
+        numbers[setting] = numbers.get(setting, 0) + count
+    return {setting: NUMBER * count for setting, count in numbers.items()}
+
+
+def _information(policy: Policy, q: int, n_rows: int, n_factors: int) -> dict[str, int]:
+    """Return the numbers of the information matrix, in the form in which it is held.
+
+    The inverse is made from an identity matrix, which makes two of them for a moment.
+    """
+    if not isinstance(policy, DOptimal):
+        return {}
+    form = policy.chosen_form(q, n_rows)
+    if form == "primal":
+        return {"model.width": 2 * q**2 + 16 * q}
+    if form == "dual":
+        return {"env.horizon": n_rows**2 + n_factors}
+    return {"policy.sketch_size": 2 * policy.sketch_size**2, "model.width": 2 * q}

@@ -1,0 +1,75 @@
+"""The memory of a trial, reckoned from its sizes, is that of the arrays which it makes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt.errors import SpecificationError
+from dopt.kernel import run
+from dopt.randomness import draw
+from dopt.spec import LARGEST_HORIZON, TrialSpec
+from tests.dopt.trials import PAIRS, trial
+
+
+def size(item: Any) -> int:
+    """Return the bytes of all arrays in nested tuples."""
+    if isinstance(item, np.ndarray):
+        return item.nbytes
+    return sum(map(size, item)) if isinstance(item, tuple) else 0
+
+
+def held(spec: TrialSpec) -> int:
+    """Return the bytes of what a trial is made of in the kernel, its evaluation aside."""
+    draws = draw(spec)
+    arrays = (draws.noise, draws.inputs, draws.components, draws.ties)
+    state = run._initial_state(spec, draws.weights)
+    return size(arrays) + size(run._empty_record(spec.system)) + size(state)
+
+
+@pytest.mark.parametrize(("env", "policy"), PAIRS)
+def test_a_usual_trial_needs_little(env: str, policy: str) -> None:
+    spec = trial(env, policy, env={"horizon": 500})
+    assert held(spec) <= spec.cell.memory < 2**26
+
+
+@pytest.mark.parametrize(
+    ("changes", "setting"),
+    [
+        ({"policy": {"form": "primal"}, "model": {"width": 40}}, "model.width"),
+        ({"policy": {"form": "dual"}, "env": {"horizon": 1500}}, "env.horizon"),
+        ({"policy": {"form": "sketch", "sketch_size": 1500}}, "policy.sketch_size"),
+        ({"learner": {"window": 100_000}}, "learner.window"),
+        ({"env": {"grid_points": (500, 400, 2)}}, "env.grid_points"),
+    ],
+)
+def test_what_is_large_is_reckoned_and_named(changes: dict[str, Any], setting: str) -> None:
+    spec = trial("cartpole", "d_optimal", **changes)
+    assert spec.cell.largest_setting == setting
+    if setting not in ("env.grid_points", "learner.window"):  # whose arrays the kernel makes
+        assert held(spec) <= spec.cell.memory <= 4 * held(spec)
+
+
+@pytest.mark.parametrize(
+    ("changes", "setting"),
+    [
+        ({"model": {"width": 1_000_000}}, "model.width"),
+        ({"model": {"depth": 2**31 - 1}}, "model.width"),
+        ({"env": {"grid_points": (100_000, 100_000, 100)}}, "env.grid_points"),
+        ({"env": {"grid_points": (2**31 - 1,) * 3}}, "env.grid_points"),
+        ({"learner": {"window": 2**31 - 1}}, "learner.window"),
+        ({"policy": {"form": "sketch", "sketch_size": 10**6}}, "policy.sketch_size"),
+        ({"policy": {"form": "dual"}, "env": {"horizon": 10**6}}, "env.horizon"),
+    ],
+)
+def test_what_no_machine_can_hold_is_refused_by_name(changes: dict[str, Any], setting: str) -> None:
+    with pytest.raises(SpecificationError, match=rf"GiB .* because of {setting}, .* smaller\.$"):
+        trial("cartpole", "d_optimal", **changes)
+
+
+def test_a_horizon_has_a_bound() -> None:
+    assert trial("pendulum", "random", env={"horizon": LARGEST_HORIZON}).system.horizon
+    with pytest.raises(SpecificationError, match=r"env\.horizon is 10,000,001 steps, .* at most"):
+        trial("pendulum", "random", env={"horizon": LARGEST_HORIZON + 1})
