@@ -6,30 +6,31 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TextIO
 
+from dopt.errors import DoptError
 from dopt.spec import TrialSpec
 from orchestrate.chunks import Chunks
 from orchestrate.driver import Driver
-from orchestrate.errors import ExitCode
+from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors import make_executor
 from orchestrate.executors.base import Run
 from orchestrate.grid import Grid
+from orchestrate.heartbeat import Heartbeat
 from orchestrate.interrupt import Interrupt
-from orchestrate.progress import Progress, Tally, duration
+from orchestrate.patience import PatientStore
+from orchestrate.progress import Progress, Tally
 from orchestrate.settings import LaunchSettings
-from orchestrate.store import LaunchRecord, Registration, Store
+from orchestrate.store import LaunchRecord, Registration, Store, StoreUnavailableError
+from orchestrate.summary import closing, opening
 
 OTHERS_SECONDS = 1.0
 """Time between two looks at trials that another launch runs."""
 
 SILENT_SECONDS = 3.0
 """What takes longer is announced."""
-
-SHOWN_CAUSES = 3
-"""Causes of failure that are named at the end."""
 
 Say = Callable[[str], None]
 
@@ -49,6 +50,7 @@ def launch_grid(
     work: Work,
     say: Say,
     stream: TextIO | None = sys.stderr,
+    warn: Say | None = None,
 ) -> ExitCode:
     """Bring every trial of the grid to an outcome.
 
@@ -64,57 +66,85 @@ def launch_grid(
         Takes what there is to tell at the beginning and at the end.
     stream
         Where the progress goes, or None for none.
+    warn
+        Takes why the launch waits; by default ``say``.
 
     Raises
     ------
     StoreError, InfrastructureError
         If the database or the workers fail; nothing that was committed is lost.
     """
-    with Store.open(settings.store_url) as store:
-        store.recover()
+    with Store.open(settings.store_url, lease_seconds=settings.lease) as store:
         launch = store.begin_launch(record)
-        code = ExitCode.INFRASTRUCTURE
         try:
-            code = _run(store, launch, grid, settings, work, say, stream)
-        except KeyboardInterrupt:
-            say("stopped: what was committed is kept, the same command goes on from here")
-            code = ExitCode.INTERRUPTED
-        finally:
-            store.end_launch(launch, _STATES.get(code, "failed"))
+            with Heartbeat(store, launch, settings.lease):
+                patient = PatientStore(store, launch, settings.patience, warn or say)
+                code = _interruptible(patient, grid, settings, work, say, stream)
+                patient.end(_STATES.get(code, "failed"), code)
+        except BaseException as error:
+            # One more try to free the claims; what is wrong is said by the error that is raised.
+            with suppress(StoreUnavailableError):
+                store.end_launch(launch, "failed", _code_of(error))
+            raise
     return code
 
 
 _STATES = {ExitCode.DONE: "done", ExitCode.INTERRUPTED: "interrupted"}
 
 
-def _run(
-    store: Store,
-    launch: int,
+def _code_of(error: BaseException) -> ExitCode | None:
+    """Return what the shell will be told, None where the process is told to end."""
+    if isinstance(error, StoreUnavailableError | InfrastructureError):
+        return ExitCode.INFRASTRUCTURE
+    if isinstance(error, DoptError):
+        return ExitCode.BAD_REQUEST
+    return ExitCode.DEFECT if isinstance(error, Exception) else None
+
+
+def _interruptible(
+    store: PatientStore,
     grid: Grid,
     settings: LaunchSettings,
     work: Work,
     say: Say,
     stream: TextIO | None,
 ) -> ExitCode:
+    try:
+        return _run(store, grid, settings, work, say, stream)
+    except KeyboardInterrupt:
+        say("stopped: what was committed is kept, the same command goes on from here")
+        return ExitCode.INTERRUPTED
+
+
+def _run(
+    store: PatientStore,
+    grid: Grid,
+    settings: LaunchSettings,
+    work: Work,
+    say: Say,
+    stream: TextIO | None,
+) -> ExitCode:
+    store.recover()
     if settings.retry:
         store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
-    state = store.register(launch, grid.trials)
+    state = store.register(grid.trials)
     tally = Tally(state.total)
     _count(tally, state)
-    say(_opening(grid, state, settings, store.safe_url))
+    say(opening(grid, state, settings, store.safe_url))
     if tally.left:
-        if settings.path == "kernel":
+        prepare = work.prepare if settings.path == "kernel" else None
+        if prepare:
             with _said_if_slow("compiling the kernel, which is kept for later launches", say):
-                work.prepare()
+                prepare()
         start = time.monotonic()
-        with make_executor(settings, work.run) as executor, Interrupt() as stop:
+        with make_executor(settings, work.run, prepare) as executor, Interrupt() as stop:
             waiting = _waiting(grid, state)
             chunks = Chunks(waiting, settings.chunk_seconds, executor.slots, executor.batch)
-            driver = Driver(store, launch, executor, chunks, tally, stop, settings.fail_fast)
+            driver = Driver(store, executor, chunks, tally, stop, settings.fail_fast)
             driver.elsewhere = state.running_elsewhere
             with Progress(tally, stream) as progress:
                 _drive(driver, grid, progress)
-        say(_closing(tally, driver, time.monotonic() - start))
+        say(closing(tally, driver.failures, stop.draining, time.monotonic() - start))
         if stop.draining and tally.left:
             return ExitCode.INTERRUPTED
     return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
@@ -132,25 +162,33 @@ def _said_if_slow(text: str, say: Say) -> Iterator[None]:
 
 def _drive(driver: Driver, grid: Grid, progress: Progress) -> None:
     """Run until every trial has an outcome, also those that another launch had taken."""
+    pause = 0.0
     while True:
+        worked = False
         while driver.step():
+            worked = True
             progress.update()
         if driver.ending or not driver.elsewhere:
             return
-        _look_at_others(driver, grid)
+        if not worked:
+            time.sleep(pause)
+        pause = _look_at_others(driver, grid)
         progress.update()
 
 
-def _look_at_others(driver: Driver, grid: Grid) -> None:
-    """Count what other launches have finished, and take the trials that they have given up."""
+def _look_at_others(driver: Driver, grid: Grid) -> float:
+    """Count what other launches have finished, and take the trials that they have given up.
+
+    Returns the seconds before another look, where this one has found nothing to run.
+    """
     start = time.monotonic()
     driver.store.recover()
-    state = driver.store.register(driver.launch, grid.trials)
+    driver.store.release_forgotten()
+    state = driver.store.register(grid.trials)
     _count(driver.tally, state)
     driver.elsewhere = state.running_elsewhere
     driver.chunks.add(_waiting(grid, state))
-    if not state.todo and driver.elsewhere:
-        time.sleep(max(OTHERS_SECONDS, 5 * (time.monotonic() - start)))
+    return max(OTHERS_SECONDS, 5 * (time.monotonic() - start))
 
 
 def _waiting(grid: Grid, state: Registration) -> list[TrialSpec]:
@@ -162,30 +200,3 @@ def _count(tally: Tally, state: Registration) -> None:
     """Let the tally hold what the database says of the trials that are not of this launch."""
     tally.before = state.done + state.diverged + state.failed + state.cancelled - tally.over
     tally.failed_before = state.failed + state.cancelled - tally.failed
-
-
-def _opening(grid: Grid, state: Registration, settings: LaunchSettings, url: str) -> str:
-    lines = [f"left out {count:,} trials: {reason}" for reason, count in grid.left_out.items()]
-    if grid.repeats:
-        lines.append(f"{grid.repeats:,} of {grid.asked:,} jobs name a trial of the grid again")
-    counted = f"{state.done + state.diverged:,} of {state.total:,} already done"
-    if state.failed:
-        counted += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
-    if state.running_elsewhere:
-        counted += f", {state.running_elsewhere:,} running in another launch"
-    todo = f"{len(state.todo):,} to run with executor={settings.executor}"
-    lines.append(f"{counted}, {todo if state.todo else 'nothing to run'} · {url}")
-    return "\n".join(lines)
-
-
-def _closing(tally: Tally, driver: Driver, seconds: float) -> str:
-    lines = [
-        f"{tally.total - tally.left - tally.all_failed:,} of {tally.total:,} done, "
-        f"{tally.all_failed:,} failed, {tally.diverged:,} diverged now, in {duration(seconds)}"
-    ]
-    for cause, count in driver.failures.most_common(SHOWN_CAUSES):
-        lines.append(f"{count:,} failed with {cause}")
-    if tally.left:
-        why = "interrupted" if driver.stop.draining else "stopped at the first failure"
-        lines.append(f"{why}, {tally.left:,} left: the same command goes on from here")
-    return "\n".join(lines)

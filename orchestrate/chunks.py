@@ -23,7 +23,8 @@ class Chunks:
     seconds
         Work in a chunk.
     slots
-        Workers; towards the end the chunks get smaller, so that all workers end together.
+        Workers, which may change; towards the end the chunks get smaller, so that all workers end
+        together.
     batch
         Trials of one configuration that make a chunk, whatever they cost; None cuts by cost.
     """
@@ -36,7 +37,7 @@ class Chunks:
         self._alone: deque[TrialSpec] = deque()
         self.add(trials)
         self._seconds = seconds
-        self._slots = slots
+        self.slots = slots
         self._costs: dict[str, float] = {}
 
     def __len__(self) -> int:
@@ -63,7 +64,7 @@ class Chunks:
             return [Task(trial.trial_key, trial)]
         if self._batch:
             return self._next_batch(self._batch)
-        limit = min(LARGEST, max(1, len(self._waiting) // (2 * self._slots)))
+        limit = min(LARGEST, max(1, len(self._waiting) // (2 * self.slots)))
         chunk: list[Task] = []
         cost = 0.0
         while self._waiting and len(chunk) < limit:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,11 +12,11 @@ from dopt.result import TrialResult
 from dopt.spec import TrialSpec
 from orchestrate.chunks import Chunks
 from orchestrate.executors.base import Executor, Finished, Lost, Trouble
+from orchestrate.patience import PatientStore
 from orchestrate.progress import Tally
-from orchestrate.store import Claim, Failure, InvalidResultError, RunRecord, Store
+from orchestrate.store import Claim, Failure, InvalidResultError, RunRecord
 
 POLL_SECONDS = 0.2
-HEARTBEAT_SECONDS = 5.0
 
 ATTEMPTS = 2
 """Times that a trial may end its worker while it runs alone."""
@@ -45,8 +44,7 @@ class Driver:
         How often each cause of failure was met.
     """
 
-    store: Store
-    launch: int
+    store: PatientStore
     executor: Executor
     chunks: Chunks
     tally: Tally
@@ -57,7 +55,6 @@ class Driver:
     _running: dict[str, tuple[Claim, TrialSpec]] = field(default_factory=dict)
     _strikes: Counter[str] = field(default_factory=Counter)
     _node_losses: Counter[str] = field(default_factory=Counter)
-    _beat: float = field(default_factory=time.monotonic)
 
     def step(self) -> bool:
         """Hand out what there is room for and commit what has ended; False when nothing is left."""
@@ -69,9 +66,6 @@ class Driver:
         for event in events:
             if isinstance(event, Lost):
                 self._recover(event)
-        if time.monotonic() - self._beat > HEARTBEAT_SECONDS:
-            self._beat = time.monotonic()
-            self.store.heartbeat(self.launch)
         return True
 
     @property
@@ -80,9 +74,10 @@ class Driver:
         return self.stop.draining or (self.fail_fast and bool(self.failures))
 
     def _fill(self) -> None:
+        self.chunks.slots = self.executor.slots
         while not self.ending and len(self.chunks) and self.executor.pending < self._window:
             tasks = self.chunks.next()
-            claims = self.store.claim(self.launch, [task.key for task in tasks])
+            claims = self.store.claim([task.key for task in tasks])
             held = {claim.trial_key: claim for claim in claims}
             self.elsewhere += len(tasks) - len(held)
             mine = [task for task in tasks if task.key in held]
@@ -100,8 +95,7 @@ class Driver:
             self.chunks.observe(trial.config_key, event.usage.wall_seconds)
             run = RunRecord(**vars(event.usage))
             if isinstance(event.outcome, Trouble):
-                trouble = event.outcome
-                self._fail(claim, Failure(trouble.type, trouble.message, trouble.traceback), run)
+                self._fail(claim, Failure(**vars(event.outcome)), run)
             else:
                 results.append((claim, event.outcome, run))
         if results:
@@ -109,7 +103,7 @@ class Driver:
 
     def _write(self, results: Sequence[tuple[Claim, TrialResult, RunRecord]]) -> None:
         try:
-            written = self.store.commit_many(results)
+            written = self.store.commit(results)
         except InvalidResultError as error:
             if len(results) > 1:
                 for one in results:
@@ -126,28 +120,51 @@ class Driver:
     def _fail(self, claim: Claim, failure: Failure, run: RunRecord) -> None:
         if self.store.fail(claim, failure, run):
             self.tally.failed += 1
-            self.failures[f"{failure.type}: {failure.message}"] += 1
+            self.failures[_words(failure)] += 1
+        else:
+            self.elsewhere += 1
 
     def _recover(self, lost: Lost) -> None:
-        """Let lost trials wait again, each alone, but for one that ends its worker every time."""
+        """Let lost trials wait again, each alone, but for one that was lost too often."""
         counts = self._node_losses if lost.blameless else self._strikes
         if lost.blameless or len(lost.keys) == 1:
             counts.update(lost.keys)
-        limit = NODE_LOSSES if lost.blameless else ATTEMPTS
+        limit = _limit(lost)
         again = [key for key in lost.keys if counts[key] < limit]
         held = {key: self._running.pop(key) for key in lost.keys}
-        self.store.release(self.launch, again)
-        self.chunks.add((held[key][1] for key in again), alone=not lost.blameless)
+        if again:
+            self.store.release(again, _cause(lost))
+            self.chunks.add((held[key][1] for key in again), alone=not lost.blameless)
         for key in held.keys() - again:
-            self._fail(held[key][0], _death(lost, limit), _no_usage())
+            self._fail(held[key][0], _death(lost, limit), _last_run(lost))
+
+
+def _limit(lost: Lost) -> int:
+    """Return how often a trial may be lost in this way."""
+    if lost.blameless:
+        return NODE_LOSSES
+    return 1 if lost.cause == "timeout" else ATTEMPTS
+
+
+def _cause(lost: Lost) -> str:
+    return "node lost" if lost.blameless else lost.cause
 
 
 def _death(lost: Lost, times: int) -> Failure:
+    if lost.cause == "timeout":
+        return Failure("TrialTimeoutError", lost.reason, lost.traceback, lost.cause)
     place = "with its node" if lost.blameless else "alone on its worker"
     message = f"lost {times} times {place}, which has {lost.reason} the last time"
-    return Failure("WorkerLost", message, "", "node lost" if lost.blameless else "killed")
+    return Failure("WorkerLost", message, lost.traceback, _cause(lost))
 
 
-def _no_usage() -> RunRecord:
+def _words(failure: Failure) -> str:
+    """Return the kind of a failure in one line."""
+    first = next(iter(failure.message.splitlines()), "")
+    return first if failure.cause == "timeout" else f"{failure.type}: {first}"
+
+
+def _last_run(lost: Lost) -> RunRecord:
+    """Return what is known of a run that could not be measured."""
     now = datetime.now(UTC)
-    return RunRecord("unknown", 0, 0.0, 0.0, 0, now, now)
+    return RunRecord(lost.node, lost.pid, 0.0, 0.0, 0, now, now)

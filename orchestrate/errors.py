@@ -13,6 +13,7 @@ class ExitCode(enum.IntEnum):
     DONE = 0
     SOME_FAILED = 1
     BAD_REQUEST = 2
+    DEFECT = 70  # of the program itself, with a traceback
     INFRASTRUCTURE = 75
     INTERRUPTED = 130
 

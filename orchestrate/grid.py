@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.registry import name_of
 from dopt.spec import Cell, TrialSpec
 
 TRIAL_SECTIONS = ("env", "policy", "model", "learner", "seed")
@@ -25,11 +26,14 @@ class Combination:
         Seeds of the cell, or None for the one in ``settings``.
     words
         The swept overrides that made it, as they would be typed.
+    unused
+        Keys that the command line sets and these choices lack.
     """
 
     settings: Mapping[str, Any]
     inner: Sequence[Any] | None = None
     words: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,11 +48,14 @@ class Grid:
         Number of trials that the command line spans, repeats and left-out ones included.
     left_out
         Sentence for each reason to leave trials out, with their number.
+    notes
+        Sentence for each setting that does not hold for the whole grid.
     """
 
     trials: list[TrialSpec]
     asked: int
     left_out: dict[str, int]
+    notes: tuple[str, ...] = ()
 
     @property
     def repeats(self) -> int:
@@ -77,6 +84,7 @@ def build_grid(combinations: Iterable[Combination], *, alone: bool = False) -> G
     SpecificationError
         If a value is unknown, of the wrong type or out of bounds, or if nothing is left.
     """
+    combinations = list(combinations)
     cells: list[list[TrialSpec]] = []
     left_out: dict[str, int] = {}
     asked = 0
@@ -93,7 +101,16 @@ def build_grid(combinations: Iterable[Combination], *, alone: bool = False) -> G
     trials = list({trial.trial_key: trial for trial in _seed_by_seed(cells)}.values())
     if not trials:
         raise SpecificationError(f"the grid is empty: {' '.join(left_out) or 'nothing was asked'}")
-    return Grid(trials, asked, left_out)
+    return Grid(trials, asked, left_out, tuple(_notes(combinations)))
+
+
+def _notes(combinations: Sequence[Combination]) -> Iterator[str]:
+    """Yield for each key that some choices lack, which of them have it."""
+    for key in dict.fromkeys(key for one in combinations for key in one.unused):
+        group = key.split(".")[0]
+        having = (one.settings.get(group) for one in combinations if key not in one.unused)
+        names = dict.fromkeys(name_of(part) for part in having if isinstance(part, Mapping))
+        yield f"{key} applies to {group}={','.join(names)} only"
 
 
 def _trials(combination: Combination) -> list[TrialSpec]:
@@ -106,7 +123,7 @@ def _trials(combination: Combination) -> list[TrialSpec]:
 def _choices(combination: Combination) -> str:
     """Return the options of the groups, such as ``env=quadrotor policy=periodic``."""
     sections = combination.settings.items()
-    return " ".join(f"{key}={part['name']}" for key, part in sections if key in ("env", "policy"))
+    return " ".join(f"{key}={name_of(part)}" for key, part in sections if key in ("env", "policy"))
 
 
 def _seed_by_seed(cells: Sequence[Sequence[TrialSpec]]) -> Iterator[TrialSpec]:

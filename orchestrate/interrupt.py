@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import Any, Self
 
@@ -37,4 +38,5 @@ class Interrupt:
         if self.draining:
             raise KeyboardInterrupt
         self.draining = True
-        sys.stderr.write("\nending the trials that run; once more stops at once\n")
+        with suppress(RuntimeError):  # the signal came while this very stream was written to
+            sys.stderr.write("\nending the trials that run; once more stops at once\n")

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 from dopt.spec import TrialSpec
 from orchestrate.grid import Grid
 from orchestrate.store import NoDatabaseError, Reader
 
-COLUMNS = ("env", "policy", "model", "learner", "width", "depth", "horizon", "gamma")
+SECTIONS = ("env", "policy", "model", "learner")
+ALWAYS = ("env", "policy")
+COUNTS = ("trials", "done", "failed", "to run")
+
+Values = dict[str, object]
+"""What a cell is made of: the name of each section, and each field by its dotted path."""
 
 
 def preview(grid: Grid, url: str) -> str:
@@ -18,21 +24,22 @@ def preview(grid: Grid, url: str) -> str:
     """
     status = _statuses(url)
     rows: dict[str, Counter[str]] = {}
-    first: dict[str, TrialSpec] = {}
+    cells: dict[str, Values] = {}
     for trial in grid.trials:
-        first.setdefault(trial.config_key, trial)
+        if trial.config_key not in cells:
+            cells[trial.config_key] = _values(trial)
         row = rows.setdefault(trial.config_key, Counter())
         row["trials"] += 1
         row[_heading(status.get(trial.trial_key))] += 1
-    shown = [column for column in COLUMNS if _varies(column, first)]
-    lines = [[*shown, "trials", "done", "failed", "to run"]]
+    shown = _columns(list(cells.values()))
+    lines = [[*(_heading_of(column) for column in shown), *COUNTS]]
     for key, row in rows.items():
-        values = first[key].columns()
-        lines.append([_text(values[column]) for column in shown])
-        lines[-1] += [f"{row[name]:,}" for name in ("trials", "done", "failed", "to run")]
+        lines.append([_text(cells[key].get(column)) for column in shown])
+        lines[-1] += [f"{row[name]:,}" for name in COUNTS]
     left_out = [f"left out {count:,} trials: {why}" for why, count in grid.left_out.items()]
     total = sum(rows.values(), Counter[str]())
-    end = f"{total['trials']:,} trials, {total['done']:,} done, {total['to run']:,} to run"
+    plural = "" if total["trials"] == 1 else "s"
+    end = f"{total['trials']:,} trial{plural}, {total['done']:,} done, {total['to run']:,} to run"
     return "\n".join([*_aligned(lines), *left_out, end])
 
 
@@ -57,8 +64,37 @@ def _heading(status: str | None) -> str:
     return "failed" if status in ("failed", "cancelled") else "to run"
 
 
-def _varies(column: str, first: dict[str, TrialSpec]) -> bool:
-    return column in ("env", "policy") or len({t.columns()[column] for t in first.values()}) > 1
+def _values(trial: TrialSpec) -> Values:
+    content = trial.to_mapping()
+    values: Values = {}
+    for section in SECTIONS:
+        fields = content[section]
+        assert isinstance(fields, dict)
+        values |= {f"{section}.{key}": value for key, value in fields.items()}
+        values[section] = values.pop(f"{section}.name")
+    return values
+
+
+def _columns(cells: Sequence[Values]) -> list[str]:
+    """Return the columns that tell the cells apart.
+
+    A field counts where it differs between cells with the same option of its section: that two
+    systems have different masses is no news.
+    """
+    names = [one for one in SECTIONS if one in ALWAYS or len({cell[one] for cell in cells}) > 1]
+    seen: dict[tuple[str, object], str] = {}
+    fields: dict[str, None] = {}
+    for cell in cells:
+        for path in cell.keys() - set(SECTIONS):
+            text = _text(cell[path])
+            if seen.setdefault((path, cell[path.split(".")[0]]), text) != text:
+                fields[path] = None
+    return [*names, *sorted(fields)]
+
+
+def _heading_of(column: str) -> str:
+    """Return the key that sets the column."""
+    return "width" if column == "model.width" else column
 
 
 def _text(value: object) -> str:

@@ -1,31 +1,38 @@
-"""Where a launch comes from: command, host, code and libraries."""
+"""Where a launch comes from: command, host, processor, code and libraries."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import platform
-import re
 import socket
 import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
+from orchestrate.passwords import without_password_in_word
 from orchestrate.store import LaunchRecord
 
 LIBRARIES = (
     "dopt",
     "hydra-core",
+    "llvmlite",
     "numba",
     "numpy",
     "omegaconf",
+    "psycopg",
     "ray",
     "scipy",
     "sqlalchemy",
     "torch",
 )
-_PASSWORD = re.compile(r"(://[^:/@\s]*):[^@\s]*@")
+
+COMMIT_VARIABLE = "DOPT_COMMIT"
+"""Says the commit where the code is without its repository, as in a container."""
+
+LARGEST_FILE = 16 * 2**20
+"""Bytes of a file outside the commit that is read; a larger one is no source, its size counts."""
 
 
 def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> LaunchRecord:
@@ -36,30 +43,54 @@ def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> 
     argv, overrides
         The command line, and what Hydra took as overrides.
     root
-        Folder of the code, whose commit is noted if it is a git repository.
+        Folder of the code, whose commit is noted if it is a git repository of its own, otherwise
+        the one that ``DOPT_COMMIT`` gives.
     """
-    commit = _git(root, "rev-parse", "HEAD")
-    diff = _git(root, "diff", "HEAD") if commit else None
-    changed = _git(root, "status", "--porcelain") if commit else None
+    commit = _commit(root)
+    difference = _difference(root) if commit else None
     return LaunchRecord(
-        argv=[without_password(word) for word in argv],
-        overrides=[without_password(word) for word in overrides],
+        argv=[without_password_in_word(word) for word in argv],
+        overrides=[without_password_in_word(word) for word in overrides],
         host=socket.gethostname(),
         pid=os.getpid(),
-        git_commit=commit.strip() if commit else None,
-        git_dirty=None if changed is None else bool(changed.strip()),
-        git_diff_hash=hashlib.sha256(diff.encode()).hexdigest() if diff else None,
-        versions={"python": platform.python_version(), **_versions()},
+        git_commit=commit or os.environ.get(COMMIT_VARIABLE) or None,
+        git_dirty=bool(difference) if commit else None,
+        git_diff_hash=hashlib.sha256(difference).hexdigest() if difference else None,
+        versions={**_versions(), **_processor()},
     )
 
 
-def without_password(text: str) -> str:
-    """Return ``text`` with the password of any URL in it replaced."""
-    return _PASSWORD.sub(r"\1:***@", text)
+def _commit(root: Path) -> str | None:
+    """Return the commit of the code; a repository that merely holds an installed copy has none."""
+    top = _git(root, "rev-parse", "--show-toplevel")
+    if top is None or Path(os.fsdecode(top.strip())).resolve() != root.resolve():
+        return None
+    commit = _git(root, "rev-parse", "HEAD")
+    return commit.decode().strip() if commit else None
+
+
+def _difference(root: Path) -> bytes:
+    """Return all by which the working tree differs from its commit, new files included."""
+    changed = _git(root, "diff", "--binary", "--no-ext-diff", "--no-textconv", "HEAD") or b""
+    added = _git(root, "ls-files", "--others", "--exclude-standard", "-z") or b""
+    new = [name + b"\0" + _content(root, name) for name in sorted(added.split(b"\0")) if name]
+    return b"\0".join([changed, *new]) if changed or new else b""
+
+
+def _content(root: Path, name: bytes) -> bytes:
+    """Return what tells the content of a file: its hash, or its size."""
+    path = root / os.fsdecode(name)
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            return str(size).encode()
+        return hashlib.sha256(path.read_bytes()).digest()
+    except OSError:
+        return b"unreadable"
 
 
 def _versions() -> dict[str, str]:
-    versions = {}
+    versions = {"python": platform.python_version()}
     for name in LIBRARIES:
         try:
             versions[name] = metadata.version(name)
@@ -68,7 +99,29 @@ def _versions() -> dict[str, str]:
     return versions
 
 
-def _git(root: Path, *arguments: str) -> str | None:
+def _processor() -> dict[str, str]:
+    """Return what the compiler makes its code for: instructions change the last digits."""
+    from llvmlite import binding
+
+    features = binding.get_host_cpu_features().flatten()
+    return {
+        "platform": platform.platform(),
+        "cpu": binding.get_host_cpu_name(),
+        "cpu_model": _cpu_model(),
+        "cpu_features": hashlib.sha256(features.encode()).hexdigest()[:16],
+    }
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def _git(root: Path, *arguments: str) -> bytes | None:
     """Return what git prints, or None outside a repository and without git."""
     try:
         done = subprocess.run(
@@ -76,4 +129,4 @@ def _git(root: Path, *arguments: str) -> str | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return done.stdout.decode(errors="replace")
+    return done.stdout

@@ -12,6 +12,9 @@ from orchestrate.errors import LaunchError
 RETRY = ("failed", "diverged", "all")
 EXECUTORS = ("inprocess", "local", "lockstep", "ray")
 
+LARGEST = 1_000_000_000
+"""Bound of seconds and GiB, beyond which the system's clocks and limits count no further."""
+
 Retry = Literal["failed", "diverged", "all"]
 
 
@@ -29,6 +32,14 @@ class LaunchSettings:
         Processes, or None for one on each core.
     chunk_seconds
         Work that a worker gets at once.
+    timeout
+        Seconds of wall time that one trial may take, or None for no limit.
+    memory_gib
+        Memory that one worker process may take, or None for no limit.
+    lease
+        Seconds after its last sign of life for which a launch on PostgreSQL keeps its trials.
+    patience
+        Seconds that a launch waits for a database that went away.
     retry
         Trials of the grid that are run again although they have an outcome.
     device, batch
@@ -42,6 +53,10 @@ class LaunchSettings:
     retry: Retry | None = None
     workers: int | None = None
     chunk_seconds: float = 1.0
+    timeout: float | None = 3600.0
+    memory_gib: float | None = None
+    lease: float = 60.0
+    patience: float = 30.0
     ray_address: str = "local"
     device: str = "cpu"
     batch: int = 100
@@ -75,7 +90,10 @@ class LaunchSettings:
             fail_fast=_flag("launch.fail_fast", launch["fail_fast"]),
             retry=cast("Retry | None", retry),
             workers=_count("launch.workers", launch["workers"]),
-            chunk_seconds=_seconds("launch.chunk_seconds", launch["chunk_seconds"]),
+            chunk_seconds=_amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
+            timeout=_limit("launch.timeout", launch["timeout"], "seconds"),
+            memory_gib=_limit("launch.memory_gib", launch["memory_gib"], "GiB"),
+            **_waiting(launch["lease"], launch["patience"]),
             ray_address=_text(
                 "launch.ray.address", _section("launch.ray", launch["ray"])["address"]
             ),
@@ -108,10 +126,25 @@ def _count(key: str, value: object) -> int | None:
     raise _wrong(key, value, "null or a whole number above 0")
 
 
-def _seconds(key: str, value: object) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool) and value > 0:
+def _limit(key: str, value: object, unit: str) -> float | None:
+    return None if value is None else _amount(key, value, unit, "null or a number")
+
+
+def _amount(key: str, value: object, unit: str, kind: str = "a number") -> float:
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < LARGEST:
         return float(value)
-    raise _wrong(key, value, "a number of seconds above 0")
+    raise _wrong(key, value, f"{kind} of {unit} above 0 and below {LARGEST:,}")
+
+
+def _waiting(lease: object, patience: object) -> dict[str, float]:
+    """Check that the trials of a launch that waits for its database remain its own."""
+    seconds = {
+        "lease": _amount("launch.lease", lease, "seconds"),
+        "patience": _amount("launch.patience", patience, "seconds"),
+    }
+    if seconds["patience"] >= seconds["lease"]:
+        raise _wrong("launch.patience", patience, f"less than launch.lease={lease}")
+    return seconds
 
 
 def _wrong(key: str, value: object, expected: str) -> LaunchError:

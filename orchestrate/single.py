@@ -23,7 +23,7 @@ def launch_trial(
     together = settings.executor == "lockstep"
     here = settings if together else dataclasses.replace(settings, executor="inprocess")
     grid = Grid([trial], asked=1, left_out={})
-    code = launch_grid(grid, here, record, work, say=_nothing, stream=None)
+    code = launch_grid(grid, here, record, work, say=_nothing, stream=None, warn=_warn)
     with Reader.open(settings.store_url) as reader:
         row = next(row for row in reader.trials(trial.config_key) if row.seed == trial.seed)
         if row.status == "failed":
@@ -33,6 +33,10 @@ def launch_trial(
 
 def _nothing(_: str) -> None:
     """Say nothing: the one line at the end is enough."""
+
+
+def _warn(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
 
 
 def _name(trial: TrialSpec) -> str:

@@ -41,5 +41,6 @@ def module_path() -> dict[str, str]:
     """
     package = Path(__file__).resolve().parent
     root = str(package.parent)
-    others = [path for path in sys.path if path and Path(path).resolve() != package]
-    return {"PYTHONPATH": os.pathsep.join([root, *(path for path in others if path != root)])}
+    paths = [path for path in sys.path if path and Path(path).resolve() != package]
+    first = [] if root in paths else [root]  # an installed copy stays behind the standard library
+    return {"PYTHONPATH": os.pathsep.join([*first, *paths])}

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from orchestrate.executors.base import Executor, Run
 from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.executors.limits import Limits
 from orchestrate.executors.local import LocalExecutor
 from orchestrate.executors.lockstep import LockstepExecutor
 from orchestrate.settings import LaunchSettings
 
 
-def make_executor(settings: LaunchSettings, run: Run) -> Executor:
-    """Return the executor that the settings name, not yet started."""
+def make_executor(
+    settings: LaunchSettings, run: Run, prepare: Callable[[], None] | None = None
+) -> Executor:
+    """Return the executor that the settings name, not yet started.
+
+    ``prepare`` has been called here, and is for machines elsewhere to call too.
+    """
+    limits = Limits(settings.timeout, settings.memory_gib)
     if settings.executor == "inprocess":
-        return InProcessExecutor(run)
+        return InProcessExecutor(run, limits)
     if settings.executor == "local":
-        return LocalExecutor(run, settings.workers)
+        return LocalExecutor(run, settings.workers, limits)
     if settings.executor == "lockstep":
         return LockstepExecutor(settings.device, settings.batch)
     from orchestrate.executors.ray import RayExecutor  # importing Ray takes a second
 
-    return RayExecutor(run, settings.workers, settings.ray_address)
+    return RayExecutor(run, settings.workers, settings.ray_address, limits, prepare)

@@ -42,11 +42,15 @@ class Usage:
 
 @dataclass(frozen=True)
 class Trouble:
-    """An exception that a task raised."""
+    """An exception that a task raised.
+
+    ``cause`` is its kind: "exception", "timeout", "out of memory" or "malformed".
+    """
 
     type: str
     message: str
     traceback: str
+    cause: str = "exception"
 
 
 @dataclass(frozen=True)
@@ -67,14 +71,25 @@ class Lost:
     keys
         The tasks of the chunk without an outcome; one of them may be to blame.
     reason
-        What is known of the end, such as "killed by signal 9".
+        What is known of the end, such as "been killed by signal 9".
+    cause
+        Its kind: "killed", "out of memory", or "timeout" where the one task of ``keys`` did not
+        heed its limit of time.
+    traceback
+        Where the worker was, as far as it could still say so.
     blameless
         Whether the whole node was lost, for which no task is to blame.
+    node, pid
+        Where the worker ran, as far as it is known.
     """
 
     keys: tuple[str, ...]
     reason: str
     blameless: bool = False
+    cause: str = "killed"
+    traceback: str = ""
+    node: str = "unknown"
+    pid: int = 0
 
 
 Event = Finished | Lost

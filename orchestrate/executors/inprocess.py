@@ -6,14 +6,20 @@ from collections import deque
 from collections.abc import Sequence
 
 from orchestrate.executors.base import Event, Executor, Run, Task
+from orchestrate.executors.limits import NO_LIMITS, Limits
 from orchestrate.executors.task import run_task
 
 
 class InProcessExecutor(Executor):
-    """Runs a task each time it is asked for an outcome."""
+    """Runs a task each time it is asked for an outcome.
 
-    def __init__(self, run: Run) -> None:
+    A limit of time cannot stop native code that does not come back to the interpreter, and one of
+    memory would be a limit of the whole launch: it is not set.
+    """
+
+    def __init__(self, run: Run, limits: Limits = NO_LIMITS) -> None:
         self._run = run
+        self._limits = limits
         self._chunks: deque[deque[Task]] = deque()
 
     def start(self) -> None:
@@ -26,7 +32,7 @@ class InProcessExecutor(Executor):
     def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a trial cannot be left
         if not self._chunks:
             return []
-        event = run_task(self._run, self._chunks[0].popleft())
+        event = run_task(self._run, self._chunks[0].popleft(), self._limits)
         if not self._chunks[0]:
             self._chunks.popleft()
         return [event]

@@ -16,6 +16,8 @@ from multiprocessing.connection import Connection, wait
 
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Event, Executor, Finished, Lost, Run, Task
+from orchestrate.executors.ending import Ending, LastWords
+from orchestrate.executors.limits import NO_LIMITS, Limits
 from orchestrate.surroundings import ONE_THREAD, module_path
 
 AHEAD = 2
@@ -28,21 +30,20 @@ MAX_STILLBORN = 3
 class Worker:
     """The driver's end of one process."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run, limits: Limits) -> None:
         ours, theirs = socket.socketpair()
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "orchestrate.executors.worker", str(theirs.fileno())],
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            stdout=sys.stderr.fileno() if _has_descriptor() else subprocess.DEVNULL,
-            env={**os.environ, **ONE_THREAD, **module_path()},
-            process_group=0,  # a Ctrl-C of the terminal reaches the driver only
-        )
-        theirs.close()
+        self._last_words = LastWords()
+        try:
+            with theirs:
+                self.process = _start(theirs.fileno(), self._last_words.descriptor)
+        except BaseException:
+            ours.close()
+            self._last_words.close()
+            raise
         self.connection = Connection(ours.detach())
         self.chunks: deque[deque[Task]] = deque()
         self.ready = False
-        self.send(run)
+        self.send((run, limits))
 
     def send(self, message: object) -> None:
         """Send, and leave the discovery of a dead worker to the next receive."""
@@ -82,26 +83,31 @@ class Worker:
         else:
             self.ready = True
 
-    def end(self) -> str:
+    def end(self) -> Ending:
         """Kill the process if it still runs, and say how it ended."""
         self.connection.close()
         self.process.kill()
-        code = self.process.wait()
-        return f"been killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        return self._last_words.explain(self.process.wait())
 
 
 class LocalExecutor(Executor):
     """Runs chunks on ``workers`` processes, by default one on each core that we may use."""
 
-    def __init__(self, run: Run, workers: int | None = None) -> None:
+    def __init__(self, run: Run, workers: int | None = None, limits: Limits = NO_LIMITS) -> None:
         self._run = run
+        self._limits = limits
         self.slots = workers or len(os.sched_getaffinity(0))
         self._workers: list[Worker] = []
         self._queue: deque[Sequence[Task]] = deque()
         self._stillborn = 0
 
     def start(self) -> None:
-        self._workers = [Worker(self._run) for _ in range(self.slots)]
+        try:
+            for _ in range(self.slots):
+                self._workers.append(self._worker())
+        except BaseException:
+            self.stop()
+            raise
 
     def submit(self, chunk: Sequence[Task]) -> None:
         if chunk:
@@ -139,18 +145,45 @@ class LocalExecutor(Executor):
 
     def _replace(self, worker: Worker) -> list[Event]:
         """Start a new process for a dead one; only the chunk that it was running is lost."""
-        reason = worker.end()
+        self._workers.remove(worker)
+        end = worker.end()
         self._stillborn = 0 if worker.ready else self._stillborn + 1
         if self._stillborn >= MAX_STILLBORN:
             raise InfrastructureError(
-                f"{self._stillborn} workers in a row have {reason} before they were ready: see "
+                f"{self._stillborn} workers in a row have {end.reason} before they were ready: see "
                 "what they wrote above, then run the same command again."
             )
         chunks = [tuple(chunk) for chunk in worker.chunks]
         running = chunks.pop(0) if worker.ready and chunks else ()
-        self._queue.extendleft(reversed(chunks))
-        self._workers[self._workers.index(worker)] = Worker(self._run)
-        return [Lost(tuple(task.key for task in running), reason)] if running else []
+        reason = end.reason
+        if end.cause == "timeout":  # the first is to blame, and the others have not begun
+            running, chunks, reason = running[:1], [running[1:], *chunks], self._limits.sentence
+        self._queue.extendleft(chunk for chunk in reversed(chunks) if chunk)
+        self._workers.append(self._worker())
+        if not running:
+            return []
+        keys, pid = tuple(task.key for task in running), worker.process.pid
+        return [Lost(keys, reason, False, end.cause, end.traceback, socket.gethostname(), pid)]
+
+    def _worker(self) -> Worker:
+        try:
+            return Worker(self._run, self._limits)
+        except OSError as error:
+            raise InfrastructureError(
+                f"A worker process cannot be started ({error.strerror or error}): set "
+                "launch.workers lower or raise the system's limits, and run the same command again."
+            ) from error
+
+
+def _start(*descriptors: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "orchestrate.executors.worker", *map(str, descriptors)],
+        pass_fds=descriptors,
+        stdin=subprocess.DEVNULL,
+        stdout=sys.stderr.fileno() if _has_descriptor() else subprocess.DEVNULL,
+        env={**os.environ, **ONE_THREAD, **module_path()},
+        process_group=0,  # a Ctrl-C of the terminal reaches the driver only
+    )
 
 
 def _has_descriptor() -> bool:

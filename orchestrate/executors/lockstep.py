@@ -11,7 +11,6 @@ import os
 import resource
 import socket
 import time
-import traceback
 from collections import deque
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -19,11 +18,14 @@ from datetime import UTC, datetime
 from dopt.result import TrialResult
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import Event, Executor, Finished, Task, Trouble, Usage
-from orchestrate.executors.task import KIBIBYTE
+from orchestrate.executors.task import KIBIBYTE, trouble
 
 
 class LockstepExecutor(Executor):
     """Runs a chunk, which holds trials of one configuration, as one batch in this process.
+
+    A batch has no limit of time: its trials take their steps together, and none of them could be
+    stopped without the others.
 
     Parameters
     ----------
@@ -76,8 +78,7 @@ def run_batch(tasks: Sequence[Task], device: str) -> list[Finished]:
     try:
         outcomes = run_trials([task.spec for task in tasks], device)
     except Exception as error:
-        text = "".join(traceback.format_exception(error))
-        outcomes = [Trouble(type(error).__name__, str(error), text)] * len(tasks)
+        outcomes = [trouble(error)] * len(tasks)
     share = Usage(
         node=socket.gethostname(),
         pid=os.getpid(),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-import os
+import re
+import time
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import ray
@@ -12,14 +14,25 @@ from ray import exceptions
 
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Event, Executor, Finished, Lost, Run, Task
-from orchestrate.executors.task import run_task
-from orchestrate.surroundings import ONE_THREAD, module_path, pin_threads
-
-OBJECT_STORE_BYTES = 256 * 2**20
-"""Room for the outcomes in flight; Ray would take a third of the memory."""
+from orchestrate.executors.limits import NO_LIMITS, Limits
+from orchestrate.executors.ray_chunk import Prepare
+from orchestrate.executors.ray_cluster import Cluster
+from orchestrate.executors.ray_connection import Connection, first_line
+from orchestrate.executors.ray_own import OwnRay
 
 _WORKER_LOST = (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError)
 _NODE_LOST = (exceptions.NodeDiedError, exceptions.ObjectLostError)
+
+FETCH_SECONDS = 60.0
+"""Time in which an outcome that is ready crosses the network."""
+
+
+@dataclass
+class Chunk:
+    """What is left of a chunk, and when its worker was last heard, [s], None before its start."""
+
+    tasks: deque[Task]
+    heard: float | None = None
 
 
 class RayExecutor(Executor):
@@ -33,105 +46,123 @@ class RayExecutor(Executor):
         Tasks at the same time; by default one on each core of the machine or cluster.
     address
         ``"local"`` starts a Ray that nobody else uses; anything else joins a cluster.
+    limits
+        What a trial and a worker may take.
+    prepare
+        What each machine of a cluster does before its first trial.
     """
 
-    def __init__(self, run: Run, workers: int | None = None, address: str = "local") -> None:
+    def __init__(
+        self,
+        run: Run,
+        workers: int | None = None,
+        address: str = "local",
+        limits: Limits = NO_LIMITS,
+        prepare: Prepare | None = None,
+    ) -> None:
         self._run = run
-        self._workers = workers
-        self._address = address
-        self._chunks: dict[Any, Sequence[Task]] = {}
-        self._remote: Any = None
+        self._limits = limits
+        self._ray: Connection
+        if address == "local":
+            self._ray = OwnRay(workers)
+        else:
+            self._ray = Cluster(address, workers, prepare)
+        self._queue: deque[Sequence[Task]] = deque()
+        self._chunks: dict[Any, Chunk] = {}
         self._lost = False
 
     def start(self) -> None:
-        try:
-            ray.init(address=self._address, log_to_driver=False, **self._options())
-        except Exception as error:
-            raise InfrastructureError(
-                f"Ray cannot be reached at '{self._address}' ({error}): check launch.ray.address, "
-                "or use executor=local."
-            ) from error
-        self.slots = self._workers or int(_cpus())
-        self._remote = ray.remote(num_cpus=1, max_retries=0)(_run_chunk)
-
-    def _options(self) -> dict[str, Any]:
-        surroundings = {**ONE_THREAD, **module_path()}
-        if self._address != "local":
-            return {"runtime_env": {"env_vars": surroundings}}
-        # The workers of our own Ray inherit our environment, which is seconds faster.
-        os.environ.update(surroundings)
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        return {
-            "num_cpus": self._workers,
-            "object_store_memory": OBJECT_STORE_BYTES,
-            "include_dashboard": False,
-            "logging_level": logging.ERROR,
-        }
+        self._ray.connect()
+        self.slots = self._ray.slots
 
     def submit(self, chunk: Sequence[Task]) -> None:
         if chunk:
-            self._chunks[self._remote.remote(self._run, list(chunk))] = chunk
+            self._queue.append(chunk)
+            self._feed()
+
+    def _feed(self) -> None:
+        limit = self._ray.limit
+        while self._queue and (limit is None or len(self._chunks) < limit):
+            chunk = list(self._queue.popleft())
+            self._chunks[self._ray.run(self._run, chunk, self._limits)] = Chunk(deque(chunk))
 
     def wait(self, timeout: float) -> list[Event]:
-        references = list(self._chunks)
-        if not references:
+        if not self._chunks:
             return []
-        self._check_alive()
-        ready, others = ray.wait(references, num_returns=1, timeout=timeout)
-        if ready and others:
-            ready += ray.wait(others, num_returns=len(others), timeout=0)[0]
-        return [event for reference in ready for event in self._collect(reference)]
+        events: list[Event] = []
+        try:
+            self._ray.check()
+            ready, _ = ray.wait(list(self._chunks), num_returns=1, timeout=timeout)
+            while ready:
+                for stream in ready:
+                    events += self._take(stream)
+                streams = list(self._chunks)
+                count = len(streams)
+                ready = ray.wait(streams, num_returns=count, timeout=0)[0] if count else []
+        except InfrastructureError:
+            self._lost = True
+            raise
+        self.slots = self._ray.slots
+        self._feed()
+        return events
 
     @property
     def pending(self) -> int:
-        return len(self._chunks)
+        return len(self._chunks) + len(self._queue)
 
     def stop(self) -> None:
         if not self._lost:
-            for reference in self._chunks:
-                ray.cancel(reference, force=True)
+            for stream in self._chunks:
+                ray.cancel(stream, force=True)
         self._chunks.clear()
-        ray.shutdown()
+        self._queue.clear()
+        self._ray.disconnect(lost=self._lost)
 
-    def _check_alive(self) -> None:
-        """See that the processes of our own Ray run; by itself it takes a minute to notice."""
-        node: Any = ray._private.worker._global_node
-        if self._address != "local" or node is None:
-            return
-        dead = {kind for kind, _ in node.dead_processes()} & {"gcs_server", "raylet"}
-        if dead:
-            self._lost = True
-            raise InfrastructureError(
-                f"Ray's {' and '.join(sorted(dead))} has ended: run the same command again "
-                "to go on."
-            )
-
-    def _collect(self, reference: Any) -> list[Event]:
-        chunk = self._chunks.pop(reference)
-        keys = tuple(task.key for task in chunk)
+    def _take(self, stream: Any) -> list[Event]:
+        """Return the next outcome of a chunk, if it is not only a sign that it has begun."""
+        chunk = self._chunks[stream]
         try:
-            finished: list[Finished] = ray.get(reference)
+            said: Finished | str | None = ray.get(next(stream), timeout=FETCH_SECONDS)
+        except StopIteration:
+            del self._chunks[stream]
+            return []
         except _WORKER_LOST as error:
-            return [Lost(keys, _first_line(error))]
+            self._ray.check()  # workers end with their raylet, for which no trial is to blame
+            return self._lose(stream, error)
         except _NODE_LOST as error:
-            return [Lost(keys, _first_line(error), blameless=True)]
+            keys = tuple(task.key for task in self._chunks.pop(stream).tasks)
+            return [Lost(keys, _loss(error), blameless=True)] if keys else []
         except exceptions.RayError as error:
             raise InfrastructureError(
-                f"Ray has failed ({_first_line(error)}): run the same command again to go on."
+                f"Ray has failed ({first_line(error)}): run the same command again to go on."
             ) from error
-        return list(finished)
+        chunk.heard = time.monotonic()
+        if isinstance(said, Finished):
+            chunk.tasks.popleft()
+            return [said]
+        if said is not None:
+            raise InfrastructureError(
+                f"A node of the Ray cluster would not compute the same: {said}; install one "
+                "version on all nodes, start each with orchestrate/executors/ray.env, and run "
+                "the same command again."
+            )
+        return []
+
+    def _lose(self, stream: Any, error: Exception) -> list[Event]:
+        """Give up a chunk whose worker ended, or only the task that took too long."""
+        chunk = self._chunks.pop(stream)
+        keys = tuple(task.key for task in chunk.tasks)
+        limit, heard = self._limits.seconds, chunk.heard
+        if keys and limit and heard and time.monotonic() - heard > limit:
+            self.submit([*chunk.tasks][1:])  # they have not begun
+            return [Lost(keys[:1], self._limits.sentence, cause="timeout")]
+        out_of_memory = isinstance(error, exceptions.OutOfMemoryError)
+        cause = "out of memory" if out_of_memory else "killed"
+        reason = f"ended unexpectedly ({first_line(error)})"
+        return [Lost(keys, reason, cause=cause)] if keys else []
 
 
-def _cpus() -> float:
-    resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-    return resources.get("CPU", 1.0)
-
-
-def _run_chunk(run: Run, tasks: list[Task]) -> list[Finished]:
-    pin_threads()
-    return [run_task(run, task) for task in tasks]
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+def _loss(error: Exception) -> str:
+    """Say of a node that it is gone, and which one, where Ray knows."""
+    address = re.search(r"Node IP: ([\w.:]+)", str(error))
+    return f"been lost with its machine {address[1]}" if address else "been lost"

@@ -8,12 +8,17 @@ from __future__ import annotations
 
 from orchestrate.store.errors import (
     InvalidResultError,
+    LaunchAliveError,
     NoDatabaseError,
     QueryError,
     SchemaVersionError,
     StoreError,
     StoreUnavailableError,
 )
+from orchestrate.store.examining import examine
+from orchestrate.store.findings import Finding
+from orchestrate.store.merging import Merged, Named, merge
+from orchestrate.store.opening import LEASE_SECONDS
 from orchestrate.store.reader import Reader
 from orchestrate.store.records import (
     Claim,
@@ -24,17 +29,25 @@ from orchestrate.store.records import (
     Result,
     RunRecord,
 )
-from orchestrate.store.rows import Cell, Curves, Table, Trajectory, TrialRow
-from orchestrate.store.store import LEASE_SECONDS, Store
+from orchestrate.store.rows import Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
+from orchestrate.store.schema import RETRIED
+from orchestrate.store.store import Store
+from orchestrate.store.upgrading import Upgrade, upgrade
 
 __all__ = [
     "LEASE_SECONDS",
+    "RETRIED",
     "Cell",
     "Claim",
     "Curves",
     "Failure",
+    "Finding",
     "InvalidResultError",
+    "LaunchAliveError",
     "LaunchRecord",
+    "LaunchRow",
+    "Merged",
+    "Named",
     "NoDatabaseError",
     "QueryError",
     "Reader",
@@ -49,4 +62,8 @@ __all__ = [
     "Table",
     "Trajectory",
     "TrialRow",
+    "Upgrade",
+    "examine",
+    "merge",
+    "upgrade",
 ]

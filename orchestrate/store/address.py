@@ -20,7 +20,7 @@ def parse(url: str) -> URL:
     """
     try:
         parsed = make_url(url)
-    except ArgumentError:
+    except (ArgumentError, ValueError):  # the latter for a port that is no number
         raise StoreError(
             f"The database URL cannot be read: expected something like {_EXAMPLES}."
         ) from None

@@ -9,28 +9,15 @@ from sqlalchemy import ColumnElement, Connection, Select, delete, insert, select
 
 from orchestrate.store.backend import Backend
 from orchestrate.store.records import Claim
-from orchestrate.store.schema import attempt, step, trajectory, trial
-from orchestrate.store.values import now
-
-_RETRIED = {
-    "failed": ("failed",),
-    "diverged": ("diverged",),
-    "cancelled": ("cancelled",),
-    "all": ("failed", "diverged", "cancelled"),
-}
-
-_OUTCOME = (
-    "n_steps",
-    "final_loss",
-    "best_loss",
-    "diverged_at",
-    "wall_seconds",
-    "cpu_seconds",
-    "peak_memory_bytes",
-    "node",
-    "launch_id",
-    "error_id",
+from orchestrate.store.schema import (
+    OUTCOME_COLUMNS,
+    RETRIED,
+    attempt,
+    step,
+    trajectory,
+    trial,
 )
+from orchestrate.store.values import now
 
 
 def claim(
@@ -74,8 +61,13 @@ def free_claims(
     launch_ids: Sequence[int],
     outcome: str,
     only: Select[Any] | None = None,
+    cause: str | None = None,
+    skip_locked: bool = False,
 ) -> int:
-    """Put running trials of the launches back to pending, those with a key in ``only`` if given."""
+    """Put running trials of the launches back to pending, those with a key in ``only`` if given.
+
+    ``skip_locked`` leaves alone those that a transaction is just writing, however long it takes.
+    """
     if not launch_ids:
         return 0
     held = trial.c.owner.in_(launch_ids) & (trial.c.status == "running")
@@ -84,9 +76,14 @@ def free_claims(
         chosen = select(trial.c.trial_id).where(trial.c.trial_key.in_(only))
         held = held & trial.c.trial_id.in_(chosen)
         open_attempt = open_attempt & attempt.c.trial_id.in_(chosen)
+    still_held = select(trial.c.trial_id).where(held)
+    if skip_locked:
+        held = held & trial.c.trial_id.in_(still_held.with_for_update(skip_locked=True))
     # Trials first, as a commit does, so that the two cannot wait for each other.
     freed = connection.execute(update(trial).where(held).values(status="pending", owner=None))
-    connection.execute(update(attempt).where(open_attempt).values(outcome=outcome, ended=now()))
+    over = open_attempt & attempt.c.trial_id.not_in(still_held)
+    end = {"outcome": outcome, "cause": cause, "ended": now()}
+    connection.execute(update(attempt).where(over).values(end))
     return freed.rowcount
 
 
@@ -94,16 +91,16 @@ def retry(
     connection: Connection, backend: Backend, status: str, trial_keys: Sequence[str] | None
 ) -> int:
     """Put finished but unsuccessful trials back to pending, without what they had written."""
-    if status not in _RETRIED:
+    if status not in RETRIED:
         raise ValueError(
-            f"Trials cannot be retried by the status '{status}': give {', '.join(_RETRIED)}."
+            f"Trials cannot be retried by the status '{status}': give {', '.join(RETRIED)}."
         )
     backend.exclusive(connection)
-    which: ColumnElement[bool] = trial.c.status.in_(_RETRIED[status])
+    which: ColumnElement[bool] = trial.c.status.in_(RETRIED[status])
     if trial_keys is not None:
         which = which & trial.c.trial_key.in_(backend.members(trial_keys))
     chosen = select(trial.c.trial_id).where(which)
     for table in (step, trajectory):
         connection.execute(delete(table).where(table.c.trial_id.in_(chosen)))
-    pending = {"status": "pending", **dict.fromkeys(_OUTCOME)}
+    pending = {"status": "pending", **dict.fromkeys((*OUTCOME_COLUMNS, "launch_id", "error_id"))}
     return connection.execute(update(trial).where(which).values(pending)).rowcount

@@ -10,7 +10,15 @@ class StoreError(DoptError):
 
 
 class StoreUnavailableError(StoreError):
-    """The database cannot be reached, is full, locked or damaged: infrastructure, not a trial."""
+    """The database cannot be reached, is full, locked or damaged: infrastructure, not a trial.
+
+    ``transient`` is True where waiting may help: a server or a connection that went away, or a lock
+    that was held for too long.
+    """
+
+    def __init__(self, message: str, *, transient: bool = False) -> None:
+        super().__init__(message)
+        self.transient = transient
 
 
 class NoDatabaseError(StoreError):
@@ -19,6 +27,10 @@ class NoDatabaseError(StoreError):
 
 class SchemaVersionError(StoreError):
     """The database was written by an older or a newer program."""
+
+
+class LaunchAliveError(StoreError):
+    """A launch is running in a database that should hold still."""
 
 
 class InvalidResultError(StoreError, ValueError):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import DBAPIError
 
-from orchestrate.store.errors import QueryError, StoreUnavailableError
+from orchestrate.store.errors import QueryError, StoreError, StoreUnavailableError
+from orchestrate.store.transience import is_transient
 
 _SQLITE = {
     "SQLITE_BUSY": "another process has kept it locked for too long; see what holds it open",
@@ -19,47 +21,125 @@ _SQLITE = {
     "SQLITE_NOTADB": "the file is not a SQLite database; give another path",
     "SQLITE_READONLY": "the file is read-only; make it writable or give another path",
 }
+_STATES = {
+    "28": "the server refuses this user; check the name and the password",
+    "2B": "a view of somebody else stands on one of the program's; drop it and make it again later",
+    "3F": "its schema does not exist; create it or correct the search path",
+    "42501": "the user may not do this; ask for the right to create and write tables",
+    "25006": "the server is read-only, as a standby is; give the address of its primary",
+    "53100": "the server's disk is full; make room and run the same command again",
+    "58": "reading or writing the server's disk failed; check it and run again",
+    "XX": "the server found damaged data; restore a backup",
+}
+_WRONG_PLACE = (
+    errno.EACCES,
+    errno.EEXIST,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EPERM,
+)
+_OUT_OF_TIME = ("SQLITE_INTERRUPT", "57014")
+_NOT_OF_THE_QUERY = (*(name for name in _SQLITE if name != "SQLITE_READONLY"), "08", "53", "57P")
+# What both drivers call what they raise, so that the one that is not installed is not imported.
+_DRIVERS = ("sqlite3", "psycopg")
+_KINDS = ("OperationalError", "InterfaceError", "InternalError")
+_NOT_YET_ALLOWED = ("42501", "3F000")
+_REFUSED = "its server answers but refuses; see the reason in brackets"
 _ELSEWHERE = "check that its server runs and answers, then run the same command again"
 
 
 @contextmanager
-def translated(safe_url: str) -> Iterator[None]:
-    """Raise ``StoreUnavailableError`` for what the database, not the program, did wrong."""
+def translated(safe_url: str, known_host: bool = False) -> Iterator[None]:
+    """Raise ``StoreUnavailableError`` for what the database, not the program, did wrong.
+
+    ``known_host`` says that the server has answered this process before. Errors come wrapped by
+    SQLAlchemy or, out of COPY and the backup, as the driver raised them.
+    """
     try:
         yield
-    except DBAPIError as error:
-        if not _is_infrastructure(error):
+    except Exception as error:
+        original = error.orig if isinstance(error, DBAPIError) else error
+        if original is None or not _is_infrastructure(original):
             raise
         raise StoreUnavailableError(
-            f"The results database {safe_url} cannot be used: {_advice(error.orig)} "
-            f"({_first_line(error)})."
+            f"The results database {safe_url} cannot be used: {_advice(original)} "
+            f"({_first_line(original)}).",
+            transient=is_transient(original, known_host),
         ) from error
 
 
 @contextmanager
-def translated_query(safe_url: str) -> Iterator[None]:
-    """Raise ``QueryError`` for SQL that the user wrote and the database refused."""
+def translated_file(safe_url: str) -> Iterator[None]:
+    """Raise ``StoreUnavailableError`` where a file beside the database cannot be used.
+
+    Where no such file can ever be made, it is a ``StoreError``: the address is wrong.
+    """
     try:
         yield
-    except DBAPIError as error:
-        raise QueryError(f"The query failed on {safe_url}: {_first_line(error)}.") from error
+    except OSError as error:
+        kind = StoreError if error.errno in _WRONG_PLACE else StoreUnavailableError
+        raise kind(
+            f"The results database {safe_url} needs {error.filename or 'files beside it'}, which "
+            f"cannot be made or opened ({error.strerror}): make its folder writable, make room, "
+            "or give another path."
+        ) from error
 
 
-def _is_infrastructure(error: DBAPIError) -> bool:
-    if isinstance(error, OperationalError | InterfaceError | InternalError):
+@contextmanager
+def translated_query(safe_url: str, seconds: float | None = None) -> Iterator[None]:
+    """Raise ``QueryError`` for SQL that the user wrote and the database refused.
+
+    ``seconds`` is the time that it was allowed.
+    """
+    with translated(safe_url):
+        try:
+            yield
+        except DBAPIError as error:
+            code = _code(error.orig)
+            if code in _OUT_OF_TIME:
+                raise QueryError(
+                    f"The query took longer than {seconds:g} s and was ended: ask for less, or "
+                    f"allow it more time."
+                ) from error
+            if code.startswith(_NOT_OF_THE_QUERY) or (not code and _is_infrastructure(error.orig)):
+                raise
+            refused = code == "SQLITE_AUTH"
+            reason = "only a SELECT may be asked" if refused else _first_line(error.orig)
+            raise QueryError(f"The query failed on {safe_url}: {reason}.") from error
+
+
+def _code(original: BaseException | None) -> str:
+    name = getattr(original, "sqlite_errorname", None)
+    return str(name or getattr(original, "sqlstate", None) or "")
+
+
+def _is_infrastructure(original: BaseException | None) -> bool:
+    if getattr(original, "sqlstate", None) in _NOT_YET_ALLOWED:
         return True
     # sqlite3 reports damage to the file with the base class and nothing else with it.
-    return type(error.orig) is sqlite3.DatabaseError
+    return type(original) is sqlite3.DatabaseError or any(
+        base.__name__ in _KINDS and base.__module__.partition(".")[0] in _DRIVERS
+        for base in type(original).__mro__
+    )
 
 
-def _advice(original: BaseException | None) -> str:
+def _advice(original: BaseException) -> str:
     name = getattr(original, "sqlite_errorname", None)
     if name is None:
-        return _ELSEWHERE
+        return _server_advice(original)
     primary = "_".join(name.split("_")[:2])  # SQLITE_IOERR_WRITE -> SQLITE_IOERR
     return _SQLITE.get(primary, "SQLite refused; see the reason in brackets")
 
 
-def _first_line(error: DBAPIError) -> str:
-    lines = str(error.orig).strip().splitlines()
-    return (lines[0] if lines else type(error.orig).__name__).rstrip(".")
+def _server_advice(original: BaseException) -> str:
+    state = getattr(original, "sqlstate", None)
+    if state is None:
+        return _REFUSED if "FATAL:" in str(original) else _ELSEWHERE
+    return next((text for code, text in _STATES.items() if state.startswith(code)), _ELSEWHERE)
+
+
+def _first_line(original: BaseException | None) -> str:
+    lines = str(original).strip().splitlines()
+    return (lines[0] if lines else type(original).__name__).rstrip(".")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import uuid
 
 from sqlalchemy import Connection, insert, or_, select, update
 
@@ -16,7 +15,7 @@ from orchestrate.store.values import now
 
 def begin(connection: Connection, backend: Backend, record: LaunchRecord) -> int:
     """Insert the launch, alive from the first moment that others can see it."""
-    token = uuid.uuid4().hex
+    token = backend.token()
     statement = insert(launch).values(
         token=token,
         state="running",
@@ -35,14 +34,19 @@ def begin(connection: Connection, backend: Backend, record: LaunchRecord) -> int
     return launch_id
 
 
-def end(connection: Connection, launch_id: int, state: str) -> str:
+def end(connection: Connection, launch_id: int, state: str, exit_code: int | None) -> str:
     """Write the last state, free the claims that are left and return the token of the launch."""
     if state not in LAUNCH_STATES[1:]:
         raise ValueError(f"A launch cannot end as '{state}': give {', '.join(LAUNCH_STATES[1:])}.")
     statement = (
         update(launch)
         .where(launch.c.launch_id == launch_id)
-        .values(state=state, ended=now(), lease_until=None)
+        .values(
+            state=state,
+            ended=now(),
+            lease_until=None,
+            exit_code=None if exit_code is None else int(exit_code),
+        )
         .returning(launch.c.token)
     )
     token = connection.execute(statement).scalar_one_or_none()
@@ -57,17 +61,21 @@ def renew(connection: Connection, backend: Backend, launch_id: int) -> None:
     connection.execute(
         update(launch)
         .where(launch.c.launch_id == launch_id, launch.c.state == "lost")
-        .values(state="running", ended=None)
+        .values(state="running", ended=None, exit_code=None)
     )
     backend.renew(connection, launch_id)
 
 
 def recover(connection: Connection, backend: Backend) -> tuple[int, list[str]]:
-    """Free the claims of dead launches; return how many, and the tokens of the dead."""
+    """Free the claims of dead launches; return how many, and the tokens of the dead.
+
+    What is locked just now is left for the next recovery: its transaction ends soon, or is evicted.
+    """
+    backend.evict(connection)
     backend.exclusive(connection)
-    dead = backend.dead(connection, _maybe_alive(connection))
+    dead = backend.dead(connection, maybe_alive(connection, skip_locked=True))
     ids = [one.launch_id for one in dead]
-    freed = free_claims(connection, ids, "lost")
+    freed = free_claims(connection, ids, "lost", skip_locked=True)
     connection.execute(
         update(launch)
         .where(launch.c.launch_id.in_(ids), launch.c.state == "running")
@@ -76,13 +84,17 @@ def recover(connection: Connection, backend: Backend) -> tuple[int, list[str]]:
     return freed, [one.token for one in dead]
 
 
-def _maybe_alive(connection: Connection) -> list[LaunchLife]:
+def maybe_alive(connection: Connection, skip_locked: bool = False) -> list[LaunchLife]:
+    """Return the launches that run or still own a trial; in every schema alike.
+
+    ``skip_locked`` leaves out those of which a transaction is just renewing the lease.
+    """
     owners = select(trial.c.owner).where(trial.c.owner.is_not(None))
     statement = (
         select(launch.c.launch_id, launch.c.token, launch.c.lease_until)
         .where(or_(launch.c.state == "running", launch.c.launch_id.in_(owners)))
         # A renewal of the lease waits for the verdict; a commit, which only needs the launch to
         # exist, does not, and so cannot lock up with this.
-        .with_for_update(key_share=True)
+        .with_for_update(key_share=True, skip_locked=skip_locked)
     )
     return [LaunchLife(*row) for row in connection.execute(statement)]

@@ -19,12 +19,13 @@ from sqlalchemy import (
     update,
 )
 
+from orchestrate.passwords import without_password
 from orchestrate.store.backend import Backend
 from orchestrate.store.checking import check_horizon, check_result
 from orchestrate.store.packing import DTYPE, pack
 from orchestrate.store.records import Array, Claim, Failure, Result, RunRecord
 from orchestrate.store.schema import STEP_VALUES, attempt, error, trajectory, trial
-from orchestrate.store.values import finite, plain, utc_text
+from orchestrate.store.values import finite, plain, storable, utc_text
 
 _RUN_COLUMNS = ("node", "wall_seconds", "cpu_seconds", "peak_memory_bytes")
 
@@ -160,6 +161,14 @@ def write_failure(connection: Connection, claim: Claim, failure: Failure, run: R
     return True
 
 
+def is_written(connection: Connection, claim: Claim) -> bool:
+    """Tell whether this very attempt has an outcome, whoever still knows of it."""
+    statement = select(attempt.c.outcome).where(
+        attempt.c.trial_id == claim.trial_id, attempt.c.attempt == claim.attempt
+    )
+    return connection.execute(statement).scalar_one_or_none() in ("done", "diverged", "failed")
+
+
 def _pass_fence(connection: Connection, claim: Claim, values: Mapping[str, Any]) -> int | None:
     """Return the horizon of the trial, or None where the claim is no longer held."""
     fence = {"fence_owner": claim.launch, **_attempt_key(claim)}
@@ -176,9 +185,9 @@ def _attempt_key(claim: Claim) -> dict[str, int]:
 
 def _error_id(connection: Connection, failure: Failure) -> int:
     row = {
-        "type": failure.type,
-        "message": failure.message,
-        "traceback": failure.traceback,
+        "type": storable(failure.type),
+        "message": storable(without_password(failure.message)),
+        "traceback": storable(without_password(failure.traceback)),
     }
     row["hash"] = hashlib.sha256("\0".join(row.values()).encode()).hexdigest()
     connection.execute(_INSERT_ERROR, row)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import time
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import repeat
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from sqlalchemy import (
@@ -25,6 +28,7 @@ from sqlalchemy import (
 
 from orchestrate.store import address
 from orchestrate.store.backend import Backend, LaunchLife
+from orchestrate.store.backup_schema import copy_schema
 from orchestrate.store.errors import StoreError
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, launch
@@ -33,26 +37,50 @@ from orchestrate.store.values import finite_list
 if TYPE_CHECKING:
     import psycopg
 
-# Bounds on a silent cut of the network, after which the driver raises instead of waiting.
-_TIMEOUTS = {
+# Seconds, and number, of questions to a silent peer before the connection counts as lost.
+_KEEPALIVES = {"keepalives_idle": "5", "keepalives_interval": "2", "keepalives_count": "3"}
+_CONNECTION = {
+    # A database of encoding SQL_ASCII, as a server without a locale makes it, would give bytes.
+    "client_encoding": "utf8",
+    # Bounds on a silent cut of the network, after which the driver raises instead of waiting.
     "connect_timeout": "5",
     "tcp_user_timeout": "10000",  # milliseconds
-    "keepalives_idle": "5",
-    "keepalives_interval": "2",
-    "keepalives_count": "3",
+    **_KEEPALIVES,
 }
 
 _NOW = text("SELECT extract(epoch FROM clock_timestamp())::double precision")
 _COPY_STEP = f"COPY step (trial_id, t, {', '.join(STEP_VALUES)}) FROM STDIN (FORMAT BINARY)"
 _COPY_TYPES = ["int8", "int4", *("float8" for _ in STEP_VALUES)]
-_LOCK = text("SELECT pg_advisory_xact_lock(hashtext('dopt.store.' || current_schema()))")
+_IMPATIENCE = text("SET LOCAL lock_timeout = '30s'")
+_LOCK = text("SELECT pg_try_advisory_xact_lock(hashtext('dopt.store.' || current_schema()))")
+_LOCK_PAUSE = 0.05  # seconds between two tries
+_SESSION = "dopt launch"
+
+# A launch that is stopped while it sends, rows of a COPY or the statements of a pipeline, keeps its
+# locks: no timeout of the server ends a session that is in the middle of hearing from its client.
+# So whoever meets it ends it, where its lease is over and its role is the same.
+_EVICT = text(
+    f"""
+    SELECT pg_terminate_backend(session.pid)
+    FROM pg_stat_activity AS session
+    WHERE session.datname = current_database() AND session.usename = current_user
+      AND session.xact_start IS NOT NULL AND session.pid <> pg_backend_pid()
+      AND session.application_name IN (
+        SELECT '{_SESSION} ' || split_part(token, '-', 1) FROM launch
+        WHERE lease_until < extract(epoch FROM clock_timestamp())
+      )
+    """
+)
+_LOOK_AGAIN = text("SELECT pg_stat_clear_snapshot()")
+_HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
 
 
 class PostgreSQLBackend(Backend):
     """A schema of a PostgreSQL database: the first one of the connection's search path."""
 
     def __init__(self, url: URL, lease_seconds: float) -> None:
-        super().__init__(_engine(url), address.safe(url))
+        self._session = uuid.uuid4().hex
+        super().__init__(_write_engine(url, lease_seconds, self._session), address.safe(url))
         self._lease_seconds = lease_seconds
 
     @contextmanager
@@ -61,8 +89,22 @@ class PostgreSQLBackend(Backend):
             self.exclusive(connection)
             yield connection
 
+    @contextmanager
+    def rebuilding(self) -> Iterator[Connection]:
+        with self.creation() as connection:
+            connection.execute(_IMPATIENCE)
+            yield connection
+
+    def back_up(self, connection: Connection, version: int) -> str:
+        return copy_schema(connection, version, self.safe_url)
+
+    def discard_backup(self, name: str) -> None:
+        """Do nothing: the copy was made in the transaction that was rolled back."""
+
     def exclusive(self, connection: Connection) -> None:
-        connection.execute(_LOCK)
+        while not connection.execute(_LOCK).scalar_one():
+            self.evict(connection)
+            time.sleep(_LOCK_PAUSE)
 
     def members(self, keys: Sequence[str]) -> Select[Any]:
         listed = bindparam("keys", list(keys), type_=ARRAY(Text), unique=True)
@@ -80,14 +122,21 @@ class PostgreSQLBackend(Backend):
         self.renew(connection, launch_id)
 
     def renew(self, connection: Connection, launch_id: int) -> None:
-        until = self._clock(connection) + self._lease_seconds
+        until = _clock(connection) + self._lease_seconds
         connection.execute(
             update(launch).where(launch.c.launch_id == launch_id).values(lease_until=until)
         )
 
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
-        now = self._clock(connection)
-        return [one for one in launches if one.lease_until is None or one.lease_until < now]
+        return _dead(connection, launches)
+
+    def token(self) -> str:
+        return f"{self._session}-{super().token()}"
+
+    def evict(self, connection: Connection) -> None:
+        if connection.execute(_HAS_LAUNCHES).scalar_one():
+            connection.execute(_LOOK_AGAIN)
+            connection.execute(_EVICT)
 
     def let_go(self, token: str) -> None:
         """Do nothing: a lease runs out by itself."""
@@ -95,9 +144,34 @@ class PostgreSQLBackend(Backend):
     def close(self) -> None:
         self.engine.dispose()
 
-    @staticmethod
-    def _clock(connection: Connection) -> float:
-        return float(connection.execute(_NOW).scalar_one())
+
+def dead(_: URL, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
+    """Return those of the launches whose process is gone, for a reader."""
+    return _dead(connection, launches)
+
+
+def _dead(connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
+    now = _clock(connection)
+    return [one for one in launches if one.lease_until is None or one.lease_until < now]
+
+
+def _clock(connection: Connection) -> float:
+    return float(connection.execute(_NOW).scalar_one())
+
+
+def _write_engine(url: URL, lease_seconds: float, session: str) -> Engine:
+    engine = _engine(url, {"application_name": f"{_SESSION} {session}"})
+
+    @event.listens_for(engine, "connect")
+    def _bound_silence(connection: psycopg.Connection, _: object) -> None:
+        # A launch that is stopped in a transaction would keep its rows from those that take over.
+        milliseconds = max(1, round(1000 * lease_seconds))
+        connection.execute(f"SET idle_in_transaction_session_timeout = {milliseconds}")
+        # So would one whose machine is gone while it sends steps: the server is to ask for it too.
+        connection.execute("; ".join(f"SET tcp_{key} = {n}" for key, n in _KEEPALIVES.items()))
+        connection.commit()
+
+    return engine
 
 
 def read_engine(url: URL) -> Engine:
@@ -113,10 +187,25 @@ def read_engine(url: URL) -> Engine:
     return engine.execution_options(isolation_level="REPEATABLE READ")
 
 
-def _engine(url: URL) -> Engine:
-    timeouts = {key: value for key, value in _TIMEOUTS.items() if key not in url.query}
+@contextmanager
+def reading(connection: Connection, seconds: float | None) -> Iterator[None]:
+    """End a statement of the block that takes longer.
+
+    What a SELECT may reach beside the tables, such as ``pg_read_file``, is a right of the user that
+    the URL names: no session can give it up.
+    """
+    # A query first: after that no statement can make the transaction one that writes.
+    connection.exec_driver_sql("SELECT 1")
+    milliseconds = 0 if seconds is None else max(1, round(1000 * seconds))
+    connection.exec_driver_sql(f"SET LOCAL statement_timeout = {milliseconds}")
+    yield
+
+
+def _engine(url: URL, more: Mapping[str, str] = MappingProxyType({})) -> Engine:
+    wanted = {**_CONNECTION, **more}
+    settings = {key: value for key, value in wanted.items() if key not in url.query}
     try:
-        return create_engine(url, connect_args=timeouts, pool_pre_ping=True)
+        return create_engine(url, connect_args=settings, pool_pre_ping=True)
     except ModuleNotFoundError as error:
         raise StoreError(
             f"A PostgreSQL database needs the library {error.name}: "

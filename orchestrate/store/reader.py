@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import chain
+from types import ModuleType
 from typing import Any, Self, cast
 
 import numpy as np
-from sqlalchemy import Connection, CursorResult, Engine, select, text
+from sqlalchemy import URL, Connection, CursorResult, Engine, select, text
 
-from orchestrate.store import address, postgresql, sqlite, versioning
-from orchestrate.store.errors import QueryError
+from orchestrate.store import address, living, postgresql, sqlite, versioning
+from orchestrate.store.errors import QueryError, StoreUnavailableError
 from orchestrate.store.faults import translated, translated_query
 from orchestrate.store.packing import unpack
+from orchestrate.store.questions import ask
 from orchestrate.store.records import Array
-from orchestrate.store.rows import Cell, Curves, Table, Trajectory, TrialRow
+from orchestrate.store.rows import Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
 from orchestrate.store.schema import STEP_VALUES, config, step, trajectory, trial
 
 _CELLS = text(
     "SELECT p.config_key, p.env, p.policy, p.model, p.learner, p.width, p.depth, p.horizon, p.dt, "
     "p.gamma, p.n_done, p.n_diverged, p.n_failed, p.n_cancelled, p.n_pending, p.n_running, "
     "c.config_json "
-    "FROM v_progress p JOIN config c ON c.config_key = p.config_key "
-    "ORDER BY p.env, p.policy, p.model, p.learner, p.width, p.depth, p.config_key"
+    "FROM v_progress p JOIN config c ON c.config_key = p.config_key"
 )
 _TRIALS = text(
     "SELECT seed, trial_key, status, attempt, n_steps, diverged_at, final_loss, best_loss, "
@@ -40,16 +42,18 @@ class Reader:
     Every method raises ``StoreUnavailableError`` where the database itself fails.
     """
 
-    def __init__(self, engine: Engine, safe_url: str) -> None:
+    def __init__(self, url: URL, engine: Engine, moment: Connection | None = None) -> None:
+        self._url = url
         self._engine = engine
-        self.safe_url = safe_url
+        self._moment = moment
+        self._kind = _kind(url)
+        self.safe_url = address.safe(url)
 
     @classmethod
     def open(cls, url: str) -> Self:
         """Open a database; raise ``NoDatabaseError`` or ``SchemaVersionError`` where it cannot."""
         parsed = address.parse(url)
-        kind = sqlite if parsed.get_backend_name() == "sqlite" else postgresql
-        reader = cls(kind.read_engine(parsed), address.safe(parsed))
+        reader = cls(parsed, _kind(parsed).read_engine(parsed))
         try:
             reader.schema_version()
         except BaseException:
@@ -67,6 +71,12 @@ class Reader:
         """Give back the connections."""
         self._engine.dispose()
 
+    @contextmanager
+    def moment(self) -> Iterator[Self]:
+        """Open a reader whose methods all see the same moment; for one thread, and not for long."""
+        with self._snapshot() as connection:
+            yield type(self)(self._url, self._engine, connection)
+
     def schema_version(self) -> str:
         """Return the version of the database's schema."""
         with self._snapshot() as connection:
@@ -75,7 +85,13 @@ class Reader:
     def cells(self) -> list[Cell]:
         """Return every configuration, sorted by its names, with the state of its trials."""
         with self._snapshot() as connection:
-            return [_cell(*row) for row in connection.execute(_CELLS)]
+            cells = [_cell(*row) for row in connection.execute(_CELLS)]
+        return sorted(cells, key=_names)
+
+    def launches(self) -> list[LaunchRow]:
+        """Return every command that wrote to the database, the first one first."""
+        with self._snapshot() as connection:
+            return living.launches(connection, partial(self._kind.dead, self._url))
 
     def trials(self, config_key: str) -> list[TrialRow]:
         """Return the trials of a configuration by seed; none where it is unknown."""
@@ -86,7 +102,8 @@ class Reader:
     def curves(self, config_key: str, column: str = "loss") -> Curves:
         """Return a column of the steps of all done and diverged trials of a configuration.
 
-        Raises ``QueryError`` where the column or the configuration is unknown.
+        Raises ``QueryError`` where the column or the configuration is unknown, and
+        ``StoreUnavailableError`` where a step is missing.
         """
         _check_column(column)
         with self._snapshot() as connection:
@@ -98,10 +115,16 @@ class Reader:
             rows = connection.execute(
                 select(step.c[column])
                 .join(trial, trial.c.trial_id == step.c.trial_id)
-                .where(finished)
+                .where(finished, step.c.t.between(0, horizon - 1))
                 .order_by(trial.c.seed, step.c.t)
             )
             numbers = _numbers(rows)
+        if numbers.size != len(trials) * horizon:
+            raise StoreUnavailableError(
+                f"The curves of configuration {config_key[:12]} in {self.safe_url} are not whole "
+                f"({numbers.size:,} steps instead of {len(trials) * horizon:,}): the database is "
+                "damaged; see what python -m orchestrate doctor says of it."
+            )
         return Curves(
             seeds=np.array([seed for seed, _ in trials], dtype=np.int64),
             t=np.arange(horizon, dtype=np.int64),
@@ -129,24 +152,55 @@ class Reader:
         dtype, *packed = row
         return Trajectory(*(unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)))
 
-    def query(self, sql: str) -> Table:
+    def query(self, sql: str, limit: int | None = None, timeout: float | None = None) -> Table:
         """Return the rows of one SELECT, each with its values by place and by name of column.
 
-        Raises ``QueryError`` where the database refuses the statement, as it does any that writes.
+        Only the first ``limit`` rows are read; ``cut`` of the table says whether there were more.
+        Raises ``QueryError`` where the database refuses the statement, as it does any that writes
+        or is not alone, and where it takes longer than ``timeout`` seconds.
         """
-        with translated_query(self.safe_url), self._engine.begin() as connection:
-            # Without parameters, so that a % in the statement needs no escape.
-            result = connection.exec_driver_sql(sql, execution_options={"no_parameters": True})
-            return Table(result.keys(), result) if result.returns_rows else Table((), ())
+        with translated_query(self.safe_url, timeout):
+            return ask(self._engine, self._kind.reading, sql, limit, timeout)
+
+    def rows(self, sql: str, /, **values: object) -> Table:
+        """Return the rows of a SELECT of the program's own, each ``:name`` in it bound to a value.
+
+        A value never becomes part of the statement, so it may come from anybody.
+        """
+        with self._snapshot() as connection:
+            result = connection.execute(text(sql), values)
+            return Table(result.keys(), result)
+
+    def batches(self, size: int, sql: str, /, **values: object) -> Iterator[list[Sequence[Any]]]:
+        """Yield the rows of such a SELECT, ``size`` at a time, without holding them all."""
+        with self._snapshot() as connection:
+            options = {"yield_per": size}
+            with connection.execute(text(sql), values, execution_options=options) as result:
+                for rows in result.partitions(size):
+                    yield list(rows)
 
     @contextmanager
     def _snapshot(self) -> Iterator[Connection]:
-        with translated(self.safe_url), self._engine.begin() as connection:
-            yield connection
+        with translated(self.safe_url):
+            if self._moment is not None:
+                yield self._moment
+                return
+            with self._engine.begin() as connection:
+                yield connection
+
+
+def _kind(url: URL) -> ModuleType:
+    return sqlite if url.get_backend_name() == "sqlite" else postgresql
 
 
 def _cell(*values: Any) -> Cell:
     return Cell(*values[:-1], json.loads(values[-1]))  # type: ignore[call-arg]
+
+
+def _names(cell: Cell) -> tuple[str | int, ...]:
+    """Return what to sort by; not in SQL, where databases order letters and NULL differently."""
+    sizes = (-1 if size is None else size for size in (cell.width, cell.depth))
+    return (cell.env, cell.policy, cell.model, cell.learner, *sizes, cell.config_key)
 
 
 def _numbers(result: CursorResult[Any]) -> Array:

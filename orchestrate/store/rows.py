@@ -95,15 +95,46 @@ class TrialRow:
     error_message: str | None
 
 
+@dataclass(frozen=True)
+class LaunchRow:
+    """One command that wrote to the database, and whether its process lives.
+
+    Attributes
+    ----------
+    state
+        As the launch wrote it; one that was killed says "running" until another one notices.
+    started, ended
+        UTC, as text.
+    """
+
+    launch_id: int
+    state: str
+    alive: bool
+    started: str
+    ended: str | None
+    host: str
+    pid: int
+    argv: Sequence[str]
+    overrides: Sequence[str]
+    git_commit: str | None
+    git_dirty: bool | None
+    git_diff_hash: str | None
+    versions: Mapping[str, str]
+
+
 class Table(list[Any]):
     """Rows of a query, each a tuple that knows its columns by name too.
 
     ``columns`` are the names as the database gave them, also where there is no row. In a row, a
     name that Python cannot use, such as ``count(*)``, is its place with an underscore: ``_0``.
+    ``cut`` says that there were more rows than the limit of the query.
     """
 
-    def __init__(self, columns: Iterable[str], rows: Iterable[Sequence[Any]]) -> None:
+    def __init__(
+        self, columns: Iterable[str], rows: Iterable[Sequence[Any]], cut: bool = False
+    ) -> None:
         self.columns = tuple(columns)
+        self.cut = cut
         row_type = namedtuple("Row", self.columns, rename=True)  # type: ignore[misc]
         super().__init__(map(row_type._make, rows))
 

@@ -26,7 +26,8 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""Number of the newest script in ``migrations/versions``, which leads from the one before it."""
 
 STATUSES = ("pending", "running", "done", "diverged", "failed", "cancelled")
 LAUNCH_STATES = ("running", "done", "failed", "interrupted", "lost")
@@ -41,6 +42,26 @@ CONFIG_COLUMNS = (
     "dt",
     "gamma",
 )
+OUTCOME_COLUMNS = (
+    "n_steps",
+    "final_loss",
+    "best_loss",
+    "diverged_at",
+    "wall_seconds",
+    "cpu_seconds",
+    "peak_memory_bytes",
+    "node",
+)
+"""Columns of a trial that its outcome fills, beside its status and what other rows it names."""
+
+RETRIED = {
+    "failed": ("failed",),
+    "diverged": ("diverged",),
+    "cancelled": ("cancelled",),
+    "all": ("failed", "diverged", "cancelled"),
+}
+"""What a user can ask to run again, and the statuses that it means."""
+
 STEP_VALUES = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 metadata = MetaData()
@@ -67,7 +88,8 @@ def _trial_key(**options: Any) -> Column[int]:
     return Column("trial_id", _Long, ForeignKey("trial.trial_id"), **options)
 
 
-schema_version = _table("schema_version", Column("version", Integer, nullable=False))
+# As Alembic would make it, but STRICT, which does not know VARCHAR.
+alembic_version = _table("alembic_version", Column("version_num", Text, primary_key=True))
 
 launch = _table(
     "launch",
@@ -85,7 +107,9 @@ launch = _table(
     Column("git_dirty", Integer),
     _text("git_diff_hash", nullable=True),
     _text("versions"),
+    Column("exit_code", Integer),
     _one_of("state", LAUNCH_STATES),
+    Index("launch_by_token", "token", unique=True),
 )
 
 config = _table(
@@ -135,6 +159,7 @@ trial = _table(
     _one_of("status", STATUSES),
     UniqueConstraint("config_id", "seed"),
     Index("trial_by_owner", "owner"),
+    Index("trial_by_config_status", "config_id", "status"),
 )
 
 step = _table(
@@ -173,5 +198,6 @@ attempt = _table(
     Column("cpu_seconds", _Real),
     Column("peak_memory_bytes", _Long),
     Column("error_id", _Long, ForeignKey("error.error_id")),
+    Index("attempt_by_end", "ended"),
     rowid=False,
 )

@@ -3,29 +3,40 @@
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, Engine, Select, create_engine, event, func, select
-from sqlalchemy.pool import QueuePool
+from sqlalchemy import URL, Connection, Select, func, select
 
 from orchestrate.store import address
 from orchestrate.store.backend import Backend, LaunchLife
-from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
+from orchestrate.store.backup_file import copy_file
+from orchestrate.store.errors import StoreError, StoreUnavailableError
+from orchestrate.store.faults import translated, translated_file
 from orchestrate.store.locks import LaunchLocks, file_lock
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES
+from orchestrate.store.sqlite_files import driver_of, existing_path, read_engine, write_engine
 
-BUSY_TIMEOUT_SECONDS = 30.0
+__all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "reading"]
 
 # Rows in one statement: its 502 parameters stay below the 999 that every SQLite takes.
 _BLOCK = 100
+
+_READING = (
+    sqlite3.SQLITE_SELECT,
+    sqlite3.SQLITE_READ,
+    sqlite3.SQLITE_FUNCTION,
+    sqlite3.SQLITE_RECURSIVE,
+)
+_SAFE_PRAGMAS = ("table_info", "table_xinfo", "table_list", "index_list", "index_xinfo")
+_LONGEST_VALUE = 2**26  # bytes; the parameters of a network of 2800 neurons in each layer fit
+_STEPS_BETWEEN_LOOKS = 10_000  # steps of SQLite's machine, well below a millisecond
 
 
 class SQLiteBackend(Backend):
@@ -33,22 +44,57 @@ class SQLiteBackend(Backend):
 
     def __init__(self, url: URL) -> None:
         self._path = address.sqlite_path(url)
-        self._folder = self._path.with_name(self._path.name + "-locks")
-        super().__init__(_write_engine(self._path), address.safe(url))
-        try:
+        self._folder = _locks_folder(self._path)
+        super().__init__(write_engine(self._path), address.safe(url))
+        with translated_file(self.safe_url):
+            if self._path.is_dir():
+                raise StoreError(
+                    f"The results database {self.safe_url} is a folder, but a file is expected: "
+                    f"give one in it, such as sqlite:///{self._path / 'results.db'}."
+                )
             self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StoreUnavailableError(
-                f"The results database {self.safe_url} needs the folder {self._folder}, which "
-                f"cannot be made ({error.strerror}): make it writable or give another path."
-            ) from error
         self._locks = LaunchLocks(self._folder)
 
     @contextmanager
     def creation(self) -> Iterator[Connection]:
         # The change to WAL happens outside transactions and fails when two processes try it.
-        with file_lock(self._folder / "create"), self.transaction() as connection:
+        with self._creation_lock(), self.transaction() as connection:
             yield connection
+
+    @contextmanager
+    def rebuilding(self) -> Iterator[Connection]:
+        with (
+            self._creation_lock(),
+            translated(self.safe_url),
+            self.engine.connect() as connection,
+        ):
+            # Dropping a table that is written anew would count as deleting what refers to it. The
+            # switch has no effect within a transaction.
+            driver_of(connection).execute("PRAGMA foreign_keys = OFF")
+            with connection.begin():
+                yield connection
+                self._check_references(connection)
+
+    def _check_references(self, connection: Connection) -> None:
+        broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
+        if broken:
+            raise StoreUnavailableError(
+                f"{len(broken)} rows of {self.safe_url} refer to rows that are not there, the "
+                f"first of them in the table {broken[0][0]}: nothing was changed; restore a copy."
+            )
+
+    def back_up(self, connection: Connection, version: int) -> str:  # noqa: ARG002
+        return str(copy_file(self._path, version))
+
+    def discard_backup(self, name: str) -> None:
+        Path(name).unlink(missing_ok=True)
+
+    @contextmanager
+    def _creation_lock(self) -> Iterator[None]:
+        with ExitStack() as stack:
+            with translated_file(self.safe_url):
+                stack.enter_context(file_lock(self._folder / "create"))
+            yield
 
     def exclusive(self, connection: Connection) -> None:
         """Do nothing: BEGIN IMMEDIATE lets one transaction in at a time."""
@@ -63,7 +109,8 @@ class SQLiteBackend(Backend):
                 _insert_blocks(connection, trial_id, start, part, size or len(part))
 
     def hold(self, connection: Connection, launch_id: int, token: str) -> None:  # noqa: ARG002
-        self._locks.acquire(token)
+        with translated_file(self.safe_url):
+            self._locks.acquire(token)
 
     def renew(self, connection: Connection, launch_id: int) -> None:
         """Do nothing: the kernel knows."""
@@ -71,12 +118,19 @@ class SQLiteBackend(Backend):
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:  # noqa: ARG002
         return [launch for launch in launches if not self._locks.is_held(launch.token)]
 
+    def evict(self, connection: Connection) -> None:
+        """Do nothing: the kernel has taken the locks of a dead process back."""
+
     def let_go(self, token: str) -> None:
         self._locks.release(token)
 
     def close(self) -> None:
         self._locks.close()
         self.engine.dispose()
+
+
+def _locks_folder(path: Path) -> Path:
+    return path.with_name(path.name + "-locks")
 
 
 def _insert_blocks(
@@ -105,57 +159,36 @@ def _insert_block(n: int) -> str:
     return f"INSERT INTO step (trial_id, t, {', '.join(STEP_VALUES)}) VALUES {', '.join(rows)}"
 
 
-def read_engine(url: URL) -> Engine:
-    """Return an engine that cannot write; raise ``NoDatabaseError`` where there is no file."""
-    path = address.sqlite_path(url)
-    if not path.is_file():
-        raise NoDatabaseError(
-            f"There is no results database at {address.safe(url)}: run a launch that writes it, "
-            "or give the URL of another one."
-        )
-    return _engine(lambda: _connect(path, _read_mode(path)), "BEGIN")
+def dead(url: URL, _: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
+    """Return those of the launches whose process is gone, for a reader."""
+    locks = LaunchLocks(_locks_folder(address.sqlite_path(url)))
+    return [launch for launch in launches if not locks.is_held(launch.token)]
 
 
-def _write_engine(path: Path) -> Engine:
-    # A transaction that reads first and then writes fails under load unless it locks at once.
-    return _engine(lambda: _writer(path), "BEGIN IMMEDIATE")
+@contextmanager
+def reading(connection: Connection, seconds: float | None) -> Iterator[None]:
+    """Refuse every statement of the block that does more than read the tables, and end slow ones.
+
+    The connection cannot write, attach or load anything; but a temporary table, a setting or the
+    end of the transaction would show in what is asked of it later.
+    """
+    driver = driver_of(connection)
+    driver.set_authorizer(_may_read)
+    longest = driver.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+    if seconds is not None:
+        end = time.monotonic() + seconds
+        driver.set_progress_handler(lambda: time.monotonic() > end, _STEPS_BETWEEN_LOOKS)
+    try:
+        yield
+    finally:
+        driver.set_authorizer(None)
+        driver.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
+        driver.set_progress_handler(None, 0)
 
 
-def _engine(connect: Any, begin: str) -> Engine:
-    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
-
-    @event.listens_for(engine, "begin")
-    def _begin(connection: Connection) -> None:
-        connection.exec_driver_sql(begin)
-
-    return engine
-
-
-def _connect(path: Path, mode: str) -> sqlite3.Connection:
-    connection = sqlite3.connect(
-        f"file:{quote(str(path))}?{mode}",
-        uri=True,
-        timeout=BUSY_TIMEOUT_SECONDS,
-        isolation_level=None,  # the engine says BEGIN
-        check_same_thread=False,  # the pool hands a connection to one thread at a time
-    )
-    connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
-    return connection
-
-
-def _writer(path: Path) -> sqlite3.Connection:
-    connection = _connect(path, "mode=rwc")
-    connection.execute("PRAGMA journal_mode = WAL")
-    # A power failure may cost the last trials, never the file, and they simply run again.
-    connection.execute("PRAGMA synchronous = NORMAL")
-    connection.execute("PRAGMA foreign_keys = ON")
-    return connection
-
-
-def _read_mode(path: Path) -> str:
-    # A database in WAL mode is read through two files beside it. On a medium where they cannot be
-    # made, nobody writes either, and the file may be taken as it is.
-    wal = path.with_name(path.name + "-wal")
-    if not wal.exists() and not os.access(path.parent, os.W_OK):
-        return "mode=ro&immutable=1"
-    return "mode=ro"
+def _may_read(action: int, name: str | None, *_: str | None) -> int:
+    looks = action == sqlite3.SQLITE_PRAGMA and name in _SAFE_PRAGMAS
+    # Functions that return tables, such as json_each, are declared as if the catalogue changed;
+    # SQLite itself refuses every statement that would change it.
+    declares = action == sqlite3.SQLITE_UPDATE and name == "sqlite_master"
+    return sqlite3.SQLITE_OK if action in _READING or looks or declares else sqlite3.SQLITE_DENY

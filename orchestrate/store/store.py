@@ -7,7 +7,7 @@ from typing import Self
 
 from orchestrate.store import address, claims, launches, outcomes, registering, versioning
 from orchestrate.store.backend import Backend
-from orchestrate.store.postgresql import PostgreSQLBackend
+from orchestrate.store.opening import LEASE_SECONDS, make_backend
 from orchestrate.store.records import (
     Claim,
     Failure,
@@ -17,9 +17,6 @@ from orchestrate.store.records import (
     Result,
     RunRecord,
 )
-from orchestrate.store.sqlite import SQLiteBackend
-
-LEASE_SECONDS = 60.0
 
 
 class Store:
@@ -38,12 +35,7 @@ class Store:
         ``lease_seconds`` is how long a launch on PostgreSQL counts as alive after a sign of life;
         on SQLite the kernel knows. Raises ``SchemaVersionError`` for a database of another version.
         """
-        parsed = address.parse(url)
-        backend: Backend
-        if parsed.get_backend_name() == "sqlite":
-            backend = SQLiteBackend(parsed)
-        else:
-            backend = PostgreSQLBackend(parsed, lease_seconds)
+        backend = make_backend(address.parse(url), lease_seconds)
         try:
             with backend.creation() as connection:
                 versioning.create_or_check(connection, backend.safe_url)
@@ -68,10 +60,10 @@ class Store:
         with self._backend.transaction() as connection:
             return launches.begin(connection, self._backend, record)
 
-    def end_launch(self, launch: int, state: str) -> None:
+    def end_launch(self, launch: int, state: str, exit_code: int | None = None) -> None:
         """End a launch as "done", "failed", "interrupted" or "lost" and free its last claims."""
         with self._backend.transaction() as connection:
-            token = launches.end(connection, launch, state)
+            token = launches.end(connection, launch, state, exit_code)
         self._backend.let_go(token)
 
     def heartbeat(self, launch: int) -> None:
@@ -125,11 +117,21 @@ class Store:
         with self._backend.transaction() as connection:
             return outcomes.write_failure(connection, claim, failure, run)
 
-    def release(self, launch: int, trial_keys: Sequence[str] | None = None) -> int:
-        """Put running trials of the launch, all or those given, back to pending; count them."""
+    def written(self, claims: Sequence[Claim]) -> list[bool]:
+        """Tell of each claim whether its attempt has its outcome, as after a lost answer."""
+        with self._backend.transaction() as connection:
+            return [outcomes.is_written(connection, claim) for claim in claims]
+
+    def release(
+        self, launch: int, trial_keys: Sequence[str] | None = None, cause: str | None = None
+    ) -> int:
+        """Put running trials of the launch, all or those given, back to pending; count them.
+
+        ``cause`` says what ended their attempts, where something did.
+        """
         only = None if trial_keys is None else self._backend.members(trial_keys)
         with self._backend.transaction() as connection:
-            return claims.free_claims(connection, [launch], "released", only)
+            return claims.free_claims(connection, [launch], "released", only, cause)
 
     def retry(self, status: str = "failed", trial_keys: Sequence[str] | None = None) -> int:
         """Put finished trials of a status back to pending and return how many.

@@ -1,4 +1,4 @@
-"""Plain Python values for the drivers: no NumPy scalars, no NaN, no local time."""
+"""Plain values for the drivers: no NumPy scalars, no NaN, no local time, no text they refuse."""
 
 from __future__ import annotations
 
@@ -27,6 +27,11 @@ def finite_list(array: Array) -> list[float | None]:
     if np.isfinite(array).all():
         return numbers
     return [finite(number) for number in numbers]
+
+
+def storable(text: str) -> str:
+    """Return the text with what no database takes made visible: zeros and halves of characters."""
+    return text.encode(errors="backslashreplace").decode().replace("\0", r"\x00")
 
 
 def utc_text(moment: datetime) -> str:

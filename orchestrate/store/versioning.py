@@ -2,44 +2,71 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, insert, inspect, select, text
+import shlex
 
+from sqlalchemy import Connection, inspect, text
+
+from orchestrate.store import migrations
 from orchestrate.store.errors import SchemaVersionError
-from orchestrate.store.schema import SCHEMA_VERSION, metadata, schema_version
-from orchestrate.store.views import VIEWS
+from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, metadata
+
+# Where the program kept the version before it used Alembic.
+_FIRST_TABLE = "schema_version"
 
 
 def create_or_check(connection: Connection, safe_url: str) -> None:
     """Create everything in an empty database; else raise ``SchemaVersionError`` if it differs."""
-    if inspect(connection).get_table_names():
-        check(connection, safe_url)
+    if is_empty(connection):
+        create(connection)
     else:
-        _create(connection)
+        check(connection, safe_url)
+
+
+def is_empty(connection: Connection) -> bool:
+    return not inspect(connection).get_table_names()
+
+
+def create(connection: Connection) -> None:
+    """Make the newest tables and views in an empty database."""
+    metadata.create_all(connection, checkfirst=False)
+    migrations.create_views(connection)
+    migrations.stamp(connection, SCHEMA_VERSION)
 
 
 def check(connection: Connection, safe_url: str) -> int:
     """Return the version of the schema; raise ``SchemaVersionError`` unless it is the program's."""
-    if not inspect(connection).has_table(schema_version.name):
+    version = version_of(connection, safe_url)
+    if version < SCHEMA_VERSION:
+        command = f"python -m orchestrate upgrade --db {shlex.quote(safe_url)}"
+        raise SchemaVersionError(
+            f"The results database {safe_url} was written by an older program (its schema is "
+            f"version {version}, this program reads version {SCHEMA_VERSION}): run '{command}', "
+            "which makes a backup first."
+        )
+    check_not_newer(version, safe_url)
+    return version
+
+
+def check_not_newer(version: int, safe_url: str) -> None:
+    if version > SCHEMA_VERSION:
+        raise SchemaVersionError(
+            f"The results database {safe_url} was written by a newer program (its schema is "
+            f"version {version}, this program reads version {SCHEMA_VERSION}): update the program."
+        )
+
+
+def version_of(connection: Connection, safe_url: str) -> int:
+    """Return the version of any released schema; raise ``SchemaVersionError`` for other tables."""
+    tables = inspect(connection).get_table_names()
+    found = None
+    if alembic_version.name in tables:
+        found = connection.execute(text("SELECT max(version_num) FROM alembic_version")).scalar()
+    elif _FIRST_TABLE in tables:
+        found = connection.execute(text("SELECT max(version) FROM schema_version")).scalar()
+    if "trial" not in tables or not str(found).isdecimal():
         raise SchemaVersionError(
             f"{safe_url} is not a results database of this program (it has no table "
-            f"'{schema_version.name}'): give the URL of another one, or of a new one."
+            f"'{alembic_version.name}' with the number of a schema): give the URL of another one, "
+            "or of a new one."
         )
-    version = int(connection.execute(select(schema_version.c.version)).scalar_one())
-    if version == SCHEMA_VERSION:
-        return version
-    age, advice = (
-        ("an older", "open it with the program that wrote it, or start a new one")
-        if version < SCHEMA_VERSION
-        else ("a newer", "update the program")
-    )
-    raise SchemaVersionError(
-        f"The results database {safe_url} was written by {age} program (its schema is version "
-        f"{version}, this program reads version {SCHEMA_VERSION}): {advice}."
-    )
-
-
-def _create(connection: Connection) -> None:
-    metadata.create_all(connection, checkfirst=False)
-    for name, query in VIEWS.items():
-        connection.execute(text(f"CREATE VIEW {name} AS {query}"))
-    connection.execute(insert(schema_version).values(version=SCHEMA_VERSION))
+    return int(str(found))

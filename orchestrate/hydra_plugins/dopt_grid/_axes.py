@@ -48,6 +48,11 @@ class Axis:
     def swept(self) -> bool:
         return len(self.texts) > 1
 
+    @property
+    def replaces(self) -> bool:
+        """Whether it sets a key that is there already: no group, and without ``+`` and ``~``."""
+        return self.kind != "choice" and self.key[0] not in "+~"
+
     def argument(self, index: int) -> str:
         """Return the override that sets value ``index``."""
         return f"{self.key}={self.texts[index]}"
@@ -79,9 +84,10 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         _check_sweep(loader, override)
         texts = tuple(override.sweep_string_iterator())
         values = tuple(_unquoted(value) for value in override.sweep_iterator())
-    if loader.get_group_options(override.key_or_group, results_filter=None) and not any(
-        isinstance(value, dict) for value in values
-    ):
+    options = loader.get_group_options(override.key_or_group, results_filter=None)
+    if options and not any(isinstance(value, dict) for value in values):
+        if None in values:
+            raise unknown_name(override.key_or_group, "null", options)
         return Axis(key, texts, values, "choice")
     scalar = override.type == OverrideType.CHANGE and override.package is None
     return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")

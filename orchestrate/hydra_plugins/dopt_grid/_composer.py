@@ -35,10 +35,14 @@ class Composer:
 
     def compose(self, words: Sequence[str]) -> DictConfig:
         """Return the configuration for overrides without sweeps."""
+        return self.attempt(words) or self.like_hydra(words)
+
+    def attempt(self, words: Sequence[str]) -> DictConfig | None:
+        """Return the configuration, or None where Hydra itself has to compose or to complain."""
         if self._files is not None:
             with contextlib.suppress(Exception):
                 return self._quick(self._files, words)
-        return self.like_hydra(words)
+        return None
 
     def like_hydra(self, words: Sequence[str]) -> DictConfig:
         """Return what Hydra composes for a job of a sweep."""

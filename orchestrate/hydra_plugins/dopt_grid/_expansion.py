@@ -2,13 +2,19 @@
 
 Hydra composes each distinct choice of groups once, with the first value of every other sweep; the
 remaining values of scalar sweeps are overlaid. An override that is neither a choice nor a scalar
-is composed by Hydra for each of its values. The result equals that of Hydra's own sweeper.
+is composed by Hydra for each of its values. The result equals that of Hydra's own sweeper wherever
+that has one.
+
+It has none where an override sets a key that some of the choices have and others lack, such as
+``policy.regularization=1e-2`` with every policy. Here it holds for the choices that have the key,
+and is an error only if none has.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from hydra.core.config_loader import ConfigLoader
 from omegaconf import DictConfig
@@ -16,7 +22,9 @@ from omegaconf import DictConfig
 from orchestrate.grid import TRIAL_SECTIONS, Combination
 from orchestrate.hydra_plugins.dopt_grid._axes import Axis, read_axes
 from orchestrate.hydra_plugins.dopt_grid._composer import Composer
-from orchestrate.hydra_plugins.dopt_grid._overlay import Overlay
+from orchestrate.hydra_plugins.dopt_grid._overlay import Overlay, has_key
+
+Check = Callable[[DictConfig], None]
 
 
 def expand(
@@ -26,6 +34,7 @@ def expand(
     *,
     sections: Sequence[str] = TRIAL_SECTIONS,
     inner: str = "seed",
+    check: Check = lambda _: None,
 ) -> list[Combination]:
     """Return the combinations of the grid that ``arguments`` span.
 
@@ -39,29 +48,87 @@ def expand(
         Top-level keys that the settings of a combination hold.
     inner
         Scalar whose values stay together in one combination, if nothing else depends on it.
+    check
+        Is given each configuration that is composed, and raises where it makes no sense.
     """
     axes = read_axes(loader, arguments)
-    scalars = [axis for axis in axes if axis.kind == "scalar" and axis.swept]
-    composed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
-    composer = Composer(loader, config)
+    expansion = _Expansion(Composer(loader, config), sections, inner, check)
+    fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
     result: list[Combination] = []
-    for picks in itertools.product(*(range(len(axis.texts)) for axis in composed)):
-        fixed = _arguments(composed, picks)
-        words = tuple(fixed[axis.key] for axis in composed if axis.swept)
-        first = composer.compose(_in_order(axes, fixed))
-        overlay = Overlay(first, [axis.key for axis in scalars], sections)
-        if overlay.applicable:
-            result.extend(_overlaid(overlay, scalars, words, inner))
-        else:
-            result.extend(_one_by_one(composer, axes, fixed, scalars, sections))
+    for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
+        result.extend(expansion.of(axes, _arguments(fixed, picks)))
+    expansion.check_every_key_was_used(axes)
     return result
+
+
+@dataclasses.dataclass
+class _Expansion:
+    """What the combinations of all choices share, and which keys some choice had."""
+
+    composer: Composer
+    sections: Sequence[str]
+    inner: str
+    check: Check
+    used: set[str] = dataclasses.field(default_factory=set)
+    refused: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+
+    def of(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> Iterator[Combination]:
+        """Yield the combinations of one choice of everything but the swept scalars."""
+        first, lacking = self._compose(axes, fixed)
+        self.check(first)
+        unused = tuple(axis.key for axis in lacking)
+        kept = [axis for axis in axes if axis not in lacking]
+        self.used |= {axis.key for axis in kept}
+        scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
+        words = tuple(fixed[axis.key] for axis in kept if axis.swept and axis.key in fixed)
+        overlay = Overlay(first, [axis.key for axis in scalars], self.sections)
+        if overlay.applicable:
+            found = _overlaid(overlay, scalars, words, self.inner)
+        else:
+            found = self._one_by_one(kept, fixed, scalars)
+        yield from (dataclasses.replace(one, unused=unused) for one in found)
+
+    def _compose(
+        self, axes: Sequence[Axis], fixed: Mapping[str, str]
+    ) -> tuple[DictConfig, list[Axis]]:
+        """Return the configuration, and the axes whose key this choice lacks."""
+        words = _in_order(axes, fixed)
+        composed = self.composer.attempt(words)
+        lacking = [] if composed is not None else self._lacking(axes, fixed)
+        if lacking:
+            kept = [axis for axis in axes if axis not in lacking]
+            self.refused |= {axis.key: words for axis in lacking}
+            composed = self.composer.compose(_in_order(kept, fixed))
+        return composed or self.composer.like_hydra(words), lacking
+
+    def _lacking(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> list[Axis]:
+        replacing = [axis for axis in axes if axis.replaces]
+        others = [axis for axis in axes if axis not in replacing]
+        bare = self.composer.attempt(_in_order(others, fixed))
+        return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
+
+    def check_every_key_was_used(self, axes: Sequence[Axis]) -> None:
+        """Let Hydra complain of a key that no choice had."""
+        for axis in axes:
+            if axis.key in self.refused and axis.key not in self.used:
+                self.composer.like_hydra(self.refused[axis.key])
+
+    def _one_by_one(
+        self, axes: Sequence[Axis], fixed: Mapping[str, str], scalars: Sequence[Axis]
+    ) -> Iterator[Combination]:
+        """Let Hydra compose each combination: a typed or structured value is where one varies."""
+        for picks in itertools.product(*(range(len(axis.texts)) for axis in scalars)):
+            every = {**fixed, **_arguments(scalars, picks)}
+            composed = self.composer.compose(_in_order(axes, every))
+            words = tuple(every[axis.key] for axis in axes if axis.swept)
+            yield Combination(Overlay(composed, [], self.sections).settings([]), None, words)
 
 
 def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[str, str]:
     return {axis.key: axis.argument(pick) for axis, pick in zip(axes, picks, strict=True)}
 
 
-def _in_order(axes: Sequence[Axis], fixed: dict[str, str]) -> list[str]:
+def _in_order(axes: Sequence[Axis], fixed: Mapping[str, str]) -> list[str]:
     """Return an override for each axis: the one in ``fixed``, or the first value."""
     return [fixed.get(axis.key) or axis.argument(0) for axis in axes]
 
@@ -80,18 +147,3 @@ def _overlaid(
             words=words
             + tuple(axis.argument(pick) for axis, pick in chosen if axis not in together),
         )
-
-
-def _one_by_one(
-    composer: Composer,
-    axes: Sequence[Axis],
-    fixed: dict[str, str],
-    scalars: Sequence[Axis],
-    sections: Sequence[str],
-) -> Iterator[Combination]:
-    """Let Hydra compose every combination: a typed or structured value stands where one varies."""
-    for picks in itertools.product(*(range(len(axis.texts)) for axis in scalars)):
-        every = fixed | _arguments(scalars, picks)
-        composed = composer.compose(_in_order(axes, every))
-        words = tuple(every[axis.key] for axis in axes if axis.swept)
-        yield Combination(Overlay(composed, [], sections).settings([]), None, words)

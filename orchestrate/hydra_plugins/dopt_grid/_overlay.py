@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from omegaconf import AnyNode, Container, DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 Settings = dict[str, Any]
 
@@ -35,7 +37,7 @@ class Overlay:
         self._keys = list(keys)
         present = [key for key in sections if key in config.keys()]  # noqa: SIM118
         self._base = {key: _resolved(config, key) for key in present}
-        references = list(_interpolations(config, present))
+        references = list(interpolations(config, present))
         self._paths = {key: [key] for key in keys}
         self._computed = [path for path, raw in references if not self._follow(path, raw)]
 
@@ -79,7 +81,7 @@ class Overlay:
         return not target._is_interpolation() or self._follow(path, str(target._value()))
 
 
-def _interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yield the dotted path and text of each leaf below ``node`` that refers to something else."""
     for key in keys:
         child, path = node._get_node(key), f"{prefix}{key}"
@@ -91,13 +93,20 @@ def _interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterato
             and not child._is_missing()
         ):
             inner = range(len(child)) if isinstance(child, ListConfig) else list(child)
-            yield from _interpolations(child, inner, f"{path}.")
+            yield from interpolations(child, inner, f"{path}.")
 
 
 def _node(config: DictConfig, key: str) -> Any:
     parent, _, last = key.rpartition(".")
     holder = OmegaConf.select(config, parent) if parent else config
     return holder._get_node(last) if isinstance(holder, DictConfig) else None
+
+
+def has_key(config: DictConfig, key: str) -> bool:
+    """Return whether a dotted key is there, whatever its value."""
+    with contextlib.suppress(OmegaConfBaseException):
+        return _node(config, key) is not None
+    return False
 
 
 def _resolved(config: DictConfig, path: str) -> Any:

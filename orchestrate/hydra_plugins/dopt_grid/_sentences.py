@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from pathlib import Path
 
 from hydra.errors import (
     ConfigCompositionException,
@@ -17,6 +18,9 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 from dopt.errors import DoptError, unknown_name
 
 _SEVERAL = re.compile(r"(?:Ambiguous value for argument|Sweep parameters) ('.*?')(?: requires|\n)")
+CONFIGURATION = Path(__file__).resolve().parents[2] / "conf"
+
+_BARE = re.compile(r"[^=]+")
 _NOISE = re.compile(r"\s*(\^|See https?:|full_key:|object_type=|reference_type=|To append |$)")
 
 
@@ -26,7 +30,9 @@ def sentence_for(error: Exception) -> str:
         return _one_line(str(error))
     if isinstance(error, MissingConfigException) and error.options:
         group, _, option = str(error.missing_cfg_file).rpartition("/")
-        return _unknown(group or "configuration", option, error.options)
+        return _unknown(group or "configuration", option, [*error.options, *_nested(group)])
+    if isinstance(error, OverrideParseException) and _BARE.fullmatch(error.override):
+        return f"'{error.override}' is no setting: write key=value, such as env=pendulum or seed=3."
     if isinstance(error, OverrideParseException):
         return _one_line(f"cannot read the override '{error.override}': {error.message}")
     if match := _SEVERAL.search(str(error)):
@@ -47,6 +53,13 @@ def _unknown_key(cause: OmegaConfBaseException) -> str:
     holder, _, last = str(cause.full_key).rpartition(".")
     names = [name for name in names if name not in ("hydra", "name")]
     return _unknown(f"setting of {holder}" if holder else "setting", last, names)
+
+
+def _nested(group: str) -> Iterable[str]:
+    """Yield the options in the folders of a group, such as ``baseline/random_held``."""
+    folder = CONFIGURATION / group
+    for path in folder.glob("*/*.yaml") if group else ():
+        yield path.relative_to(folder).with_suffix("").as_posix()
 
 
 def _unknown(kind: str, given: str, valid: Iterable[str]) -> str:

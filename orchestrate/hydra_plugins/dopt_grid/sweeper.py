@@ -14,6 +14,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from orchestrate.hydra_plugins.dopt_grid._expansion import expand
+from orchestrate.hydra_plugins.dopt_grid._unread import check_keys
 
 
 @dataclass
@@ -47,5 +48,6 @@ class GridSweeper(Sweeper):
 
     def sweep(self, arguments: list[str]) -> Any:
         defaults = [f"{key}={value}" for key, value in self.params.items()]
-        combinations = expand(self.loader, self.settings, defaults + arguments)
+        arguments = defaults + arguments
+        combinations = expand(self.loader, self.settings, arguments, check=check_keys)
         return self.task_function((self.settings, combinations))

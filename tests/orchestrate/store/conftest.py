@@ -2,60 +2,35 @@
 
 from __future__ import annotations
 
-import os
 import uuid
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine, create_engine, text
-from sqlalchemy.exc import OperationalError
+from sqlalchemy import Engine, text
 
 from orchestrate.store import Claim, Reader, Store
 from tests.orchestrate.store.fakes import LAUNCH, Spec
 
-SERVER = os.environ.get(
-    "DOPT_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres"
-)
-
 
 @pytest.fixture
-def sqlite_url(tmp_path: Path) -> str:
-    return f"sqlite:///{tmp_path}/results/results.db"
-
-
-@pytest.fixture(scope="session")
-def server() -> Iterator[Engine]:
-    engine = create_engine(SERVER, connect_args={"connect_timeout": 3})
-    try:
-        engine.connect().close()
-    except OperationalError as error:
-        _no_server(str(error.orig).splitlines()[0])
-    yield engine
-    engine.dispose()
-
-
-@pytest.fixture
-def postgresql_url(server: Engine) -> Iterator[str]:
-    """URL of a new schema on a running server, dropped afterwards."""
+def another_postgresql_url(postgresql_url: str, server: Engine, drop: Callable[[str], None]) -> str:
+    """Return the URL of one more new schema."""
     schema = f"test_{uuid.uuid4().hex}"
     with server.begin() as connection:
         connection.execute(text(f"CREATE SCHEMA {schema}"))
-    yield f"{SERVER}?options=-csearch_path%3D{schema}"
-    with server.begin() as connection:
-        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+    drop(schema)
+    return f"{postgresql_url.rpartition('%3D')[0]}%3D{schema}"
 
 
-def _no_server(reason: str) -> None:
-    message = f"no PostgreSQL server answers, set DOPT_TEST_POSTGRES to one: {reason}"
-    if os.environ.get("DOPT_REQUIRE_POSTGRES") == "1":
-        pytest.fail(message)
-    pytest.skip(message)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest) -> str:
-    return str(request.getfixturevalue(f"{request.param}_url"))
+@pytest.fixture
+def drop(request: pytest.FixtureRequest) -> Iterator[Callable[[str], None]]:
+    """Return a function that has a schema of the server dropped after the test."""
+    names: list[str] = []
+    yield names.append
+    for name in names:
+        if "/" not in name:
+            with request.getfixturevalue("server").begin() as connection:
+                connection.execute(text(f'DROP SCHEMA IF EXISTS "{name}" CASCADE'))
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -13,13 +14,14 @@ from typing import Any
 
 import sqlalchemy
 
-from orchestrate.store import Claim, Store
+from orchestrate.store import Claim, Store, merge, merge_source, merging, migrations, upgrade
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
 
 # Forked from a process that has imported everything and opened nothing: starts in milliseconds.
 CLEAN = multiprocessing.get_context("forkserver")
-CLEAN.set_forkserver_preload(["pytest", "psycopg", __name__])
+CLEAN.set_forkserver_preload(["pytest", "psycopg", "orchestrate.launch", __name__])
 PATIENCE_SECONDS = 60.0
+NOBODY = 65534
 
 
 @contextmanager
@@ -104,6 +106,59 @@ def run_grid(pipe: Pipe, url: str, n: int, lease_seconds: float = 60.0) -> None:
                 mine += store.commit(claim, result(claim.trial_id), RUN)
         store.end_launch(launch, "done")
         pipe.send(mine)
+
+
+def run_and_stop(pipe: Pipe, url: str, n: int) -> None:
+    """Commit n trials of a grid of twice as many, one at a time, and stop for ever."""
+    store = Store.open(url)
+    for claim in _claims(store, 2 * n)[:n]:
+        store.commit(claim, result(claim.trial_id), RUN)
+    pipe.send("committed")
+    time.sleep(PATIENCE_SECONDS)
+
+
+def without_rights(pipe: Pipe, side: Callable[[str], Any], url: str) -> None:
+    """Open a database as a user who owns nothing, and tell what came of it."""
+    if os.geteuid() == 0:
+        os.setgroups([])
+        os.setresgid(NOBODY, NOBODY, NOBODY)
+        os.setresuid(NOBODY, NOBODY, NOBODY)
+    try:
+        pipe.send(side(url))
+    except Exception as error:
+        pipe.send(error)
+
+
+def upgrade_and_tell(pipe: Pipe, url: str, barrier: Barrier | None, stops: bool = False) -> None:
+    """Upgrade at the same moment as others do, or stop for ever before the last change."""
+    if stops:
+
+        def stop(_: sqlalchemy.Connection) -> None:
+            pipe.send("half")
+            time.sleep(PATIENCE_SECONDS)
+
+        migrations.create_views = stop
+    if barrier is not None:
+        barrier.wait(PATIENCE_SECONDS)
+    pipe.send("upgraded" if upgrade(url).changed else "nothing to do")
+
+
+def merge_and_tell(pipe: Pipe, url: str, other: str, after: int) -> None:
+    """Merge with pages of three trials, and stop for ever before the given one."""
+    merge_source.PAGE = 3
+    add = merging.Target.add
+    count = 0
+
+    def stop(*arguments: Any) -> None:
+        nonlocal count
+        if count == after:
+            pipe.send("in the middle")
+            time.sleep(PATIENCE_SECONDS)
+        count += 1
+        add(*arguments)
+
+    merging.Target.add = stop  # type: ignore[method-assign]
+    merge(url, other)
 
 
 def _claims(store: Store, n: int) -> list[Claim]:

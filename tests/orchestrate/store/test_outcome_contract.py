@@ -188,3 +188,11 @@ class TestFailure:
         assert [tuple(row) for row in rows] == [(1, "failed"), (2, "done")]
         assert reader.query("SELECT status FROM v_failures")[0].status == "done"
         assert reader.trials(Spec().config_key)[0].error_type is None
+
+    def test_may_say_what_no_database_takes(self, store: Store, take: Take, reader: Reader) -> None:
+        (claim,) = take(Spec())
+        text = "a zero \0 and the name of a file, \udcff"
+        assert store.fail(claim, Failure("OSError", text, f"Traceback\n{text}"), RUN)
+        (row,) = reader.query("SELECT message, traceback FROM v_failures")
+        assert row.message == r"a zero \x00 and the name of a file, \udcff"
+        assert row.traceback == f"Traceback\n{row.message}"

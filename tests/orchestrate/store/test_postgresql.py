@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from sqlalchemy import create_engine, text
+from sqlalchemy import Engine, create_engine, text
 
 from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
+from orchestrate.store.records import Array
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 
 LEASE_SECONDS = 0.5
+DEADLINE = 30.0
 
 
 @pytest.fixture
@@ -79,3 +84,62 @@ def _end_backend(url: str, pid: int) -> None:
     with engine.begin() as connection:
         connection.execute(text("SELECT pg_terminate_backend(:pid)"), {"pid": pid})
     engine.dispose()
+
+
+@pytest.fixture
+def without_encoding(server: Engine) -> Iterator[str]:
+    """Return the URL of a new database as a server without a locale makes it."""
+    name = f"test_{uuid.uuid4().hex}"
+    engine = server.execution_options(isolation_level="AUTOCOMMIT")
+    locale = "ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C'"
+    with engine.connect() as connection:
+        connection.execute(text(f"CREATE DATABASE {name} TEMPLATE template0 {locale}"))
+    yield server.url.set(database=name).render_as_string(hide_password=False)
+    with engine.connect() as connection:
+        connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
+
+
+def test_a_database_without_an_encoding_is_read_and_written(without_encoding: str) -> None:
+    with Store.open(without_encoding) as store:
+        launch = store.begin_launch(LAUNCH)
+        (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+        assert store.commit(claim, result(), RUN)
+    with Reader.open(without_encoding) as reader:
+        assert [row.status for row in reader.trials(Spec().config_key)] == ["done"]
+
+
+def test_a_sleeper_that_sends_its_steps_holds_up_nobody(
+    store: Store, open_store: Callable[..., Store], reader: Reader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = open_store(LEASE_SECONDS)
+    launch = late.begin_launch(LAUNCH)
+    sent, other = late.claim(launch, late.register(launch, [Spec(0), Spec(1)]).todo)
+    sends, wakes = threading.Event(), threading.Event()
+
+    def asleep(column: Array) -> Iterator[float | None]:
+        if not sends.is_set():
+            sends.set()
+            wakes.wait(DEADLINE)
+        yield from column.tolist()
+
+    monkeypatch.setattr("orchestrate.store.postgresql.finite_list", asleep)
+    with ThreadPoolExecutor(1) as pool:
+        committed = pool.submit(late.commit, sent, result(), RUN)
+        assert sends.wait(DEADLINE)
+        time.sleep(LEASE_SECONDS * 1.2)
+        freed = store.recover()
+        slept = not committed.done()
+        wakes.set()
+        assert committed.result(DEADLINE)
+    assert slept, "others waited for the sleeper"
+    assert freed == 1
+    assert not late.commit(other, result(1), RUN)
+    rows = reader.query("SELECT trial_id, outcome FROM attempt ORDER BY trial_id")
+    assert [tuple(row) for row in rows] == [(sent.trial_id, "done"), (other.trial_id, "lost")]
+
+
+def test_the_server_asks_for_a_silent_launch(store: Store) -> None:
+    with store._backend.transaction() as connection:
+        for name in ("idle", "interval", "count"):
+            asked = connection.execute(text(f"SHOW tcp_keepalives_{name}")).scalar_one()
+            assert 0 < int(str(asked)) <= 5

@@ -18,6 +18,7 @@ from orchestrate.store import (
     SchemaVersionError,
     Store,
     StoreError,
+    StoreUnavailableError,
 )
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, diverged, result
 
@@ -56,6 +57,17 @@ class TestReader:
         np.testing.assert_array_equal(curves.diverged, [False, True, False], strict=False)
         expected = [result(0).loss, diverged(3, seed=1).loss, result(2).loss]
         np.testing.assert_array_equal(curves.values, expected)
+
+    @pytest.mark.parametrize(
+        "damage", ["DELETE FROM step WHERE t = 2", "UPDATE step SET t = 99 WHERE t = 2"]
+    )
+    def test_refuses_curves_that_are_not_whole(
+        self, store: Store, reader: Reader, damage: str
+    ) -> None:
+        with store._backend.transaction() as connection:
+            connection.exec_driver_sql(damage)
+        with pytest.raises(StoreUnavailableError, match=r"18 steps instead of 21.*doctor"):
+            reader.curves(KEY)
 
     def test_has_no_curves_of_trials_that_wait(self, reader: Reader) -> None:
         curves = reader.curves(Spec(policy="d_optimal", width=None).config_key)
@@ -182,19 +194,19 @@ class TestOpening:
         assert list(tmp_path.iterdir()) == []
 
     def test_an_empty_schema_is_no_database(self, postgresql_url: str) -> None:
-        with pytest.raises(SchemaVersionError, match="no table 'schema_version'"):
+        with pytest.raises(SchemaVersionError, match="no table 'alembic_version'"):
             Reader.open(postgresql_url)
 
     @pytest.mark.parametrize(("version", "word"), [(0, "an older"), (99, "a newer")])
     def test_refuses_other_versions(self, store: Store, url: str, version: int, word: str) -> None:
         with store._backend.transaction() as connection:
-            connection.exec_driver_sql(f"UPDATE schema_version SET version = {version}")
+            connection.exec_driver_sql(f"UPDATE alembic_version SET version_num = '{version}'")
         for side in (Store, Reader):
             with pytest.raises(SchemaVersionError, match=f"by {word} program"):
                 side.open(url)
 
     def test_shows_the_version(self, reader: Reader) -> None:
-        assert reader.schema_version() == "1"
+        assert reader.schema_version() == "2"
 
     @pytest.mark.parametrize("side", [Store, Reader])
     @pytest.mark.parametrize(

@@ -16,9 +16,10 @@ from orchestrate.store import (
     Reader,
     SchemaVersionError,
     Store,
+    StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.sqlite import _read_mode
+from orchestrate.store.sqlite_files import _read_mode
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import eight_open
 
@@ -157,10 +158,22 @@ def test_refuses_the_database_of_something_else(tmp_path: Path, side: type[Store
         side.open(f"sqlite:///{path}")
 
 
-def test_says_when_the_folder_cannot_be_made(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("file/results.db", "cannot be made or opened"),
+        ("folder", "is a folder, but a file is expected"),
+        ("n" * 300, "cannot be made or opened"),
+    ],
+)
+def test_a_place_where_no_file_can_be_is_a_wrong_request(
+    tmp_path: Path, place: str, words: str
+) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(StoreUnavailableError, match="cannot be made"):
-        Store.open(f"sqlite:///{tmp_path}/file/results.db")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(StoreError, match=words) as caught:
+        Store.open(f"sqlite:///{tmp_path}/{place}")
+    assert not isinstance(caught.value, StoreUnavailableError)
 
 
 def test_a_full_disk_loses_nothing_committed(
@@ -186,7 +199,7 @@ def test_an_integer_column_refuses_bytes(path: Path, store: Store) -> None:
     assert store.recover() == 0
     connection = sqlite3.connect(path)
     with pytest.raises(sqlite3.IntegrityError, match="cannot store BLOB"):
-        connection.execute("INSERT INTO schema_version VALUES (?)", (b"12345678",))
+        connection.execute("INSERT INTO step (trial_id, t) VALUES (1, ?)", (b"12345678",))
     connection.close()
 
 
@@ -199,3 +212,8 @@ def test_reads_a_medium_where_nothing_can_be_written(
     assert _read_mode(path) == "mode=ro&immutable=1"
     (tmp_path / "results.db-wal").touch()
     assert _read_mode(path) == "mode=ro"
+
+
+def test_a_committed_trial_survives_a_power_cut(store: Store) -> None:
+    with store._backend.transaction() as connection:
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar_one() == 2  # FULL

@@ -1,0 +1,83 @@
+"""A Ray cluster that others have started, of any number of machines that come and go."""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray import cloudpickle
+
+from orchestrate.errors import LaunchError
+from orchestrate.executors import ray_node
+from orchestrate.executors.base import Run, Task
+from orchestrate.executors.limits import Limits
+from orchestrate.executors.ray_chunk import Prepare
+from orchestrate.executors.ray_connection import TASK_OPTIONS, Connection, unreachable
+from orchestrate.executors.ray_watch import ClusterWatch
+from orchestrate.surroundings import ONE_THREAD
+
+CONNECT_SECONDS = 5.0
+
+SETTINGS_FILE = Path(__file__).with_name("ray.env")
+
+
+class Cluster(Connection):
+    """The cluster with its head at ``address``, of which ``workers`` cores are used, or all.
+
+    ``prepare`` is called on every worker before its first trial.
+    """
+
+    def __init__(self, address: str, workers: int | None, prepare: Prepare | None) -> None:
+        if not re.fullmatch(r"auto|[^/@]+:\d+", address):
+            raise LaunchError(
+                f"launch.ray.address is '{address}', but local or HOST:PORT of the head of a "
+                "cluster is expected: start the launch on a node of the cluster."
+            )
+        self._address = address
+        self._workers = self.limit = workers
+        self._prepare = prepare
+
+    def connect(self) -> None:
+        self._look_for_head()
+        self._init(self._address, runtime_env={"env_vars": ONE_THREAD})
+        cloudpickle.register_pickle_by_value(ray_node)  # type: ignore[no-untyped-call]
+        self._task = ray.remote(**TASK_OPTIONS)(ray_node.run_where_alike)
+        self._expected = ray_node.fingerprint(setting_names())
+        self._watch = ClusterWatch(ray.get_runtime_context().gcs_address)
+
+    @property
+    def slots(self) -> int:
+        return self._workers or max(1, self._watch.cores)
+
+    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
+        payload = cloudpickle.dumps(  # type: ignore[no-untyped-call]
+            (run, tasks, limits, self._prepare)
+        )
+        return self._task.remote(self._expected, payload)
+
+    def check(self) -> None:
+        self._watch.check()
+
+    def disconnect(self, *, lost: bool) -> None:
+        self._watch.stop()
+        if not lost:  # otherwise it takes seconds, in which the claims would not be free
+            ray.shutdown()
+
+    def _look_for_head(self) -> None:
+        """See that something listens there; Ray was seen to try for more than two minutes."""
+        host, _, port = self._address.rpartition(":")
+        if not host:
+            return
+        try:
+            socket.create_connection((host, int(port)), CONNECT_SECONDS).close()
+        except OSError as error:
+            raise unreachable(self._address, error) from None
+
+
+def setting_names() -> list[str]:
+    """Return the settings of Ray that are the same on all nodes."""
+    lines = SETTINGS_FILE.read_text().splitlines()
+    return [line.partition("=")[0] for line in lines if line and not line.startswith("#")]

@@ -1,0 +1,77 @@
+"""The two kinds of Ray that a launch can use, behind one interface."""
+
+from __future__ import annotations
+
+import logging
+import os
+from abc import ABC, abstractmethod
+from typing import Any
+
+import ray
+
+from orchestrate.errors import InfrastructureError
+from orchestrate.executors.base import Run, Task
+from orchestrate.executors.limits import Limits
+
+TASK_OPTIONS: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "num_returns": "streaming"}
+"""One core for a chunk, which Ray never repeats, and whose outcomes come as they end."""
+
+_TOKEN = "RAY_AUTH_TOKEN"
+
+
+class Connection(ABC):
+    """A Ray to run chunks on."""
+
+    limit: int | None = None
+    """Chunks that may be with Ray at once, where it would run more of them than wanted."""
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Connect, or raise ``InfrastructureError``."""
+
+    @property
+    @abstractmethod
+    def slots(self) -> int:
+        """Number of tasks that run at the same time, now."""
+
+    @abstractmethod
+    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
+        """Start a chunk and return the stream of its outcomes."""
+
+    @abstractmethod
+    def check(self) -> None:
+        """Raise ``InfrastructureError`` if Ray is lost."""
+
+    @abstractmethod
+    def disconnect(self, *, lost: bool) -> None:
+        """Leave Ray; nothing of it answers any more if it is ``lost``."""
+
+    @staticmethod
+    def _init(address: str, **options: Any) -> None:
+        if ray.is_initialized():
+            ray.shutdown()  # what is left of one that was lost
+        # Of a lost node Ray prints the memory map and a hundred lines more between ours.
+        ray._private.worker.print_to_stdstream = _print_nothing
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
+        except Exception as error:
+            raise unreachable(address, error) from None
+
+
+def unreachable(address: str, error: Exception) -> InfrastructureError:
+    """Return the error for a Ray to which there is no connection."""
+    return InfrastructureError(
+        f"Ray cannot be reached at '{address}' ({first_line(error)}): check launch.ray.address, "
+        "or use executor=local."
+    )
+
+
+def first_line(error: Exception) -> str:
+    """Return the beginning of what Ray says, without the token that opens the cluster."""
+    lines = str(error).strip().splitlines()
+    line = lines[0] if lines else type(error).__name__
+    token = os.environ.get(_TOKEN)
+    return line.replace(token, "***") if token else line
+
+
+def _print_nothing(*_: object, **__: object) -> None: ...

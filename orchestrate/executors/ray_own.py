@@ -1,0 +1,61 @@
+"""A Ray of our own on this machine, which nobody else uses and which ends with the launch."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import ray
+
+from orchestrate.errors import InfrastructureError
+from orchestrate.executors.base import Run, Task
+from orchestrate.executors.limits import Limits
+from orchestrate.executors.ray_chunk import run_chunk
+from orchestrate.executors.ray_connection import TASK_OPTIONS, Connection
+from orchestrate.surroundings import ONE_THREAD, module_path
+
+OBJECT_STORE_BYTES = 256 * 2**20
+"""Room for the outcomes in flight; Ray would take a third of the memory."""
+
+
+class OwnRay(Connection):
+    """Ray with ``workers`` processes, by default one on each core."""
+
+    def __init__(self, workers: int | None) -> None:
+        self._workers = workers
+
+    def connect(self) -> None:
+        # Workers inherit our environment, which is seconds faster than to be given one.
+        os.environ.update({**ONE_THREAD, **module_path()})
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        self._init(
+            "local",
+            num_cpus=self._workers,
+            object_store_memory=OBJECT_STORE_BYTES,
+            include_dashboard=False,
+        )
+        self._task = ray.remote(**TASK_OPTIONS)(run_chunk)
+        resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        self._cores = int(resources.get("CPU", 1.0))
+
+    @property
+    def slots(self) -> int:
+        return self._workers or self._cores
+
+    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
+        return self._task.remote(run, tasks, limits)
+
+    def check(self) -> None:
+        """See that the processes run; by itself Ray takes a minute to notice."""
+        node: Any = ray._private.worker._global_node
+        if node is None:
+            return
+        dead = {kind for kind, _ in node.dead_processes()} & {"gcs_server", "raylet"}
+        if dead:
+            raise InfrastructureError(
+                f"Ray's {' and '.join(sorted(dead))} has ended: run the same command again "
+                "to go on."
+            )
+
+    def disconnect(self, *, lost: bool) -> None:  # noqa: ARG002  # there is always something to end
+        ray.shutdown()

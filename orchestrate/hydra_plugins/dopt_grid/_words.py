@@ -1,0 +1,82 @@
+"""The words of a command line, read before Hydra sees them, so that a refusal is one sentence."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra._internal.utils import get_args_parser
+
+from dopt.errors import SpecificationError
+from orchestrate.usage import Parser, UsageError
+
+PROGRAM = "python orchestrate/launch.py"
+
+OWN_SWEEPER = (
+    "this program expands its grids itself, but another hydra/sweeper was given: leave it out."
+)
+
+_CHOICE = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>null|\[.*\]|)\s*")
+
+
+def ordered(words: Sequence[str], folder: Path) -> list[str]:
+    """Return the words with the flags before the overrides, which Hydra wants in one run.
+
+    Parameters
+    ----------
+    words
+        What was typed after the name of the program.
+    folder
+        The configuration files; its folders are the groups.
+
+    Raises
+    ------
+    UsageError
+        If a flag is unknown, flags contradict each other, or the sweeper is replaced.
+    SpecificationError
+        If the option of a group is no name.
+    """
+    parser = Parser(prog=PROGRAM, parents=[get_args_parser()], add_help=False)
+    flags = parser.read(words, mixed=True)
+    _check_flags(flags)
+    for word in flags.overrides:
+        if word.startswith("hydra/sweeper=") and word != "hydra/sweeper=grid":
+            raise UsageError(OWN_SWEEPER)
+        _check_choice(word, folder)
+    return [*(word for word in words if word not in flags.overrides), *flags.overrides]
+
+
+def _check_flags(flags: argparse.Namespace) -> None:
+    if flags.multirun and flags.cfg:
+        raise UsageError(
+            "-m and --cfg cannot be combined, a configuration is that of one trial: look at a grid "
+            "with launch.dry_run=true, or leave out -m."
+        )
+    given = {
+        "--run": flags.run,
+        "--multirun": flags.multirun,
+        "--cfg": flags.cfg,
+        "--shell-completion": flags.shell_completion,
+        "--info": flags.info,
+    }
+    several = [name for name, value in given.items() if value]
+    if len(several) > 1:
+        raise UsageError(f"{' and '.join(several)} cannot be combined: leave one out.")
+    if flags.resolve and not (flags.cfg or flags.help):
+        raise UsageError("--resolve goes with --cfg or --help: add one of them.")
+
+
+def _check_choice(word: str, folder: Path) -> None:
+    """Refuse null, a list and nothing as the option of a group; Hydra would stumble over them."""
+    match = _CHOICE.fullmatch(word)
+    if not match or match["group"] == "experiment" or not (folder / match["group"]).is_dir():
+        return
+    group, value = match["group"], match["value"]
+    options = ", ".join(sorted(path.stem for path in (folder / group).glob("*.yaml")))
+    what = f"the list {value}" if value.startswith("[") else value or "empty"
+    raise SpecificationError(
+        f"{group} is {what}, but one of {options} is expected: give one, or several to a grid as "
+        f"in -m {group}=a,b."
+    )

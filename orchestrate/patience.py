@@ -1,0 +1,128 @@
+"""What a launch asks of its database, asked again for a while when the database went away."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from orchestrate.store import (
+    Claim,
+    Failure,
+    Registrable,
+    Registration,
+    Result,
+    RunRecord,
+    Store,
+    StoreUnavailableError,
+)
+
+FIRST_PAUSE = 0.1
+LONGEST_PAUSE = 3.0
+"""Seconds between two tries; each pause is twice the one before."""
+
+T = TypeVar("T")
+Say = Callable[[str], None]
+
+
+class PatientStore:
+    """The operations of one launch, each tried for ``seconds`` after its first failure.
+
+    Of an operation that failed nobody knows whether it was done: its answer may be what was lost.
+    So each one is repeated in a form that does no harm when it was.
+
+    Raises
+    ------
+    StoreUnavailableError
+        From every method, if the database stays away, or at once if waiting cannot help.
+    """
+
+    def __init__(self, store: Store, launch: int, seconds: float, say: Say) -> None:
+        self._store = store
+        self._launch = launch
+        self._seconds = seconds
+        self._say = say
+
+    @property
+    def safe_url(self) -> str:
+        """The URL without a password."""
+        return self._store.safe_url
+
+    def recover(self) -> None:
+        """Put the trials of dead launches back to pending."""
+        self._persist(self._store.recover)
+
+    def retry(self, status: str, trial_keys: Sequence[str]) -> None:
+        """Put those of the trials that have the status back to pending."""
+        self._persist(lambda: self._store.retry(status, trial_keys))
+
+    def register(self, specs: Sequence[Registrable]) -> Registration:
+        """Write down a grid and return the state of each of its trials."""
+        return self._persist(lambda: self._store.register(self._launch, specs))
+
+    def claim(self, trial_keys: Sequence[str]) -> list[Claim]:
+        """Take those of the trials, none of which the launch holds, that are pending."""
+
+        def again() -> list[Claim]:
+            self._store.release(self._launch, trial_keys)
+            return self._store.claim(self._launch, trial_keys)
+
+        return self._persist(lambda: self._store.claim(self._launch, trial_keys), again)
+
+    def commit(self, items: Sequence[tuple[Claim, Result, RunRecord]]) -> list[bool]:
+        """Write finished trials; False for each whose claim is lost."""
+        claims = [claim for claim, _, _ in items]
+
+        def again() -> list[bool]:
+            written = self._store.commit_many(items)
+            return written if all(written) else self._store.written(claims)
+
+        return self._persist(lambda: self._store.commit_many(items), again)
+
+    def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
+        """Write a failed trial; False where the claim is lost."""
+
+        def again() -> bool:
+            return self._store.fail(claim, failure, run) or self._store.written([claim])[0]
+
+        return self._persist(lambda: self._store.fail(claim, failure, run), again)
+
+    def release(self, trial_keys: Sequence[str], cause: str) -> None:
+        """Put trials of the launch back to pending, whose attempts have ended for the cause."""
+        self._persist(lambda: self._store.release(self._launch, trial_keys, cause))
+
+    def release_forgotten(self) -> None:
+        """Put what the launch holds back to pending, while it runs nothing.
+
+        On a server a claim can outlive the connection that asked for it, and so be committed after
+        it was repeated in vain.
+        """
+        self._persist(lambda: self._store.release(self._launch))
+
+    def end(self, state: str, exit_code: int) -> None:
+        """End the launch in the given state and free its last claims."""
+        self._persist(lambda: self._store.end_launch(self._launch, state, exit_code))
+
+    def _persist(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
+        try:
+            return operation()
+        except StoreUnavailableError as error:
+            if not error.transient:
+                raise
+            self._say(f"waiting for up to {self._seconds:g} s: {error}")
+        return self._repeat(again or operation)
+
+    def _repeat(self, operation: Callable[[], T]) -> T:
+        start, pause = time.monotonic(), FIRST_PAUSE
+        while True:
+            left = start + self._seconds - time.monotonic()
+            time.sleep(max(0.0, min(pause, left)))
+            pause = min(2 * pause, LONGEST_PAUSE)
+            try:
+                result = operation()
+            except StoreUnavailableError as error:
+                if not error.transient or time.monotonic() - start >= self._seconds:
+                    raise
+            else:
+                self._say(f"the database is back after {time.monotonic() - start:.1f} s")
+                return result

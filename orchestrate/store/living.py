@@ -1,0 +1,49 @@
+"""Launches as a reader sees them: where they came from, and which of them live."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import Connection, select
+
+from orchestrate.store.backend import LaunchLife
+from orchestrate.store.rows import LaunchRow
+from orchestrate.store.schema import launch
+
+Dead = Callable[[Connection, Sequence[LaunchLife]], list[LaunchLife]]
+
+_ROWS = select(launch).order_by(launch.c.launch_id)
+
+
+def launches(connection: Connection, dead: Dead) -> list[LaunchRow]:
+    """Return every launch, the first one first; ``dead`` tells which of the running ones are."""
+    rows = [row._asdict() for row in connection.execute(_ROWS)]
+    running = [
+        LaunchLife(row["launch_id"], row["token"], row["lease_until"])
+        for row in rows
+        if row["state"] == "running"
+    ]
+    gone = {one.launch_id for one in dead(connection, running)}
+    alive = {one.launch_id for one in running} - gone
+    return [_row(row, row["launch_id"] in alive) for row in rows]
+
+
+def _row(row: Mapping[str, Any], alive: bool) -> LaunchRow:
+    dirty = row["git_dirty"]
+    return LaunchRow(
+        launch_id=row["launch_id"],
+        state=row["state"],
+        alive=alive,
+        started=row["started"],
+        ended=row["ended"],
+        host=row["host"],
+        pid=row["pid"],
+        argv=json.loads(row["argv"]),
+        overrides=json.loads(row["overrides"]),
+        git_commit=row["git_commit"],
+        git_dirty=None if dirty is None else bool(dirty),
+        git_diff_hash=row["git_diff_hash"],
+        versions=json.loads(row["versions"]),
+    )

@@ -1,0 +1,100 @@
+"""The other database of a merge: its whole trials, a page at a time, as one moment shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from orchestrate.store.reader import Reader
+from orchestrate.store.records import Array
+from orchestrate.store.schema import STEP_VALUES
+
+PAGE = 50
+"""Trials in one transaction: a launch that writes meanwhile waits for less than a second."""
+
+_TRIALS = (
+    "SELECT r.*, c.config_key, c.horizon, c.env, c.policy, e.hash AS error_hash FROM trial r "
+    "JOIN config c ON c.config_id = r.config_id LEFT JOIN error e ON e.error_id = r.error_id "
+    "WHERE r.trial_id > :last AND r.status IN ('done', 'diverged', 'failed', 'cancelled') "
+    "ORDER BY r.trial_id LIMIT :size"
+)
+_ATTEMPTS = (
+    "SELECT a.*, e.hash AS error_hash FROM attempt a "
+    "LEFT JOIN error e ON e.error_id = a.error_id "
+    "WHERE a.trial_id = :trial_id AND a.outcome IS NOT NULL ORDER BY a.attempt"
+)
+_STEPS = f"SELECT t, {', '.join(STEP_VALUES)} FROM step WHERE trial_id = :trial_id ORDER BY t"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What a trial that ran to its end left behind.
+
+    Attributes
+    ----------
+    steps : (T, number of STEP_VALUES)
+    trajectory
+        The row of the table, without the number of the trial.
+    """
+
+    steps: Array
+    trajectory: dict[str, Any]
+
+
+class Source:
+    """Questions to a moment of the other database."""
+
+    def __init__(self, moment: Reader) -> None:
+        self._moment = moment
+
+    def launches(self) -> list[dict[str, Any]]:
+        return self._dicts("SELECT * FROM launch ORDER BY launch_id")
+
+    def pages(self) -> Iterator[list[dict[str, Any]]]:
+        """Yield the trials that have an outcome."""
+        last = 0
+        while page := self._dicts(_TRIALS, last=last, size=PAGE):
+            last = page[-1]["trial_id"]
+            yield page
+
+    def config(self, config_id: int) -> dict[str, Any]:
+        (row,) = self._dicts("SELECT * FROM config WHERE config_id = :id", id=config_id)
+        return row
+
+    def error(self, digest: str) -> dict[str, Any]:
+        (row,) = self._dicts("SELECT * FROM error WHERE hash = :hash", hash=digest)
+        return row
+
+    def attempts(self, trial_id: int) -> list[dict[str, Any]]:
+        """Return the attempts that ended, the first one first."""
+        return self._dicts(_ATTEMPTS, trial_id=trial_id)
+
+    def curve(self, row: dict[str, Any]) -> Curve | None:
+        """Return the steps and arrays of a trial, or None where some of them are missing."""
+        return curve(self._moment, row["trial_id"], row["horizon"])
+
+    def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
+        table = self._moment.rows(sql, **values)
+        return [dict(zip(table.columns, row, strict=True)) for row in table]
+
+
+def curve(moment: Reader, trial_id: int, horizon: int) -> Curve | None:
+    """Return what a trial left behind, or None where it is not whole."""
+    steps = np.array(list(moment.rows(_STEPS, trial_id=trial_id)), dtype=np.float64)
+    arrays = moment.rows("SELECT * FROM trajectory WHERE trial_id = :id", id=trial_id)
+    if (
+        len(arrays) != 1
+        or len(steps) != horizon
+        or not np.array_equal(steps[:, 0], np.arange(horizon))
+    ):
+        return None
+    row = dict(zip(arrays.columns, arrays[0], strict=True))
+    del row["trial_id"]
+    return Curve(steps[:, 1:], {key: _bytes(value) for key, value in row.items()})
+
+
+def _bytes(value: Any) -> Any:
+    return bytes(value) if isinstance(value, memoryview) else value

@@ -1,0 +1,168 @@
+"""The database that a merge writes to: rows of another one find their place and new numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Row, insert, select, update
+
+from orchestrate.store.backend import Backend
+from orchestrate.store.merge_source import Curve, Source
+from orchestrate.store.schema import (
+    OUTCOME_COLUMNS,
+    STEP_VALUES,
+    attempt,
+    config,
+    error,
+    launch,
+    trial,
+)
+from orchestrate.store.schema import step as step_table
+from orchestrate.store.schema import trajectory as trajectory_table
+
+_COPIED = ("status", *OUTCOME_COLUMNS)
+_NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
+_STEPS = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
+
+
+class Target:
+    """One transaction of a merge."""
+
+    def __init__(
+        self, connection: Connection, backend: Backend, source: Source, launches: Mapping[int, int]
+    ) -> None:
+        self._connection = connection
+        self._backend = backend
+        self._source = source
+        self._launches = launches
+
+    def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
+        """Return the trials with these keys; nobody claims one before the transaction ends."""
+        statement = select(trial).where(trial.c.trial_key.in_(self._backend.members(keys)))
+        # In the order in which a commit locks them, so that the two cannot wait for each other.
+        statement = statement.order_by(trial.c.trial_id).with_for_update()
+        rows = self._connection.execute(statement)
+        return {row.trial_key: row for row in rows}
+
+    def new_attempts(self, row: Mapping[str, Any], here: Row[Any] | None) -> list[dict[str, Any]]:
+        """Return the attempts at a trial of the source that this database does not know."""
+        there = self._source.attempts(row["trial_id"])
+        if here is None:
+            return there
+        statement = select(attempt.c.launch_id, attempt.c.claimed)
+        known = {
+            tuple(one)
+            for one in self._connection.execute(
+                statement.where(attempt.c.trial_id == here.trial_id)
+            )
+        }
+        return [a for a in there if (self._launches[a["launch_id"]], a["claimed"]) not in known]
+
+    def add(
+        self,
+        row: Mapping[str, Any],
+        here: Row[Any] | None,
+        attempts: Sequence[Mapping[str, Any]],
+        curve: Curve | None,
+    ) -> None:
+        """Write a trial with its outcome, whole."""
+        trial_id = self._write_trial(row, here, attempts)
+        self._write_attempts(trial_id, 0 if here is None else here.attempt, attempts)
+        if curve is not None:
+            self._backend.insert_steps(self._connection, trial_id, curve.steps)
+            self._connection.execute(
+                insert(trajectory_table), {"trial_id": trial_id, **curve.trajectory}
+            )
+
+    def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
+        """Tell whether both databases hold the same numbers; times may differ."""
+        if any(getattr(here, name) != row[name] for name in ("status", "n_steps", "diverged_at")):
+            return False
+        where = here.trial_id
+        steps = self._connection.execute(_STEPS.where(step_table.c.trial_id == where)).all()
+        mine = np.array([tuple(one) for one in steps], dtype=np.float64)
+        arrays = self._connection.execute(
+            select(trajectory_table).where(trajectory_table.c.trial_id == where)
+        ).one_or_none()
+        return (
+            mine.shape == there.steps.shape
+            and np.array_equal(mine[:, _NUMBERS], there.steps[:, _NUMBERS], equal_nan=True)
+            and arrays is not None
+            and all(getattr(arrays, name) == value for name, value in there.trajectory.items())
+        )
+
+    def _write_trial(
+        self, row: Mapping[str, Any], here: Row[Any] | None, attempts: Sequence[Mapping[str, Any]]
+    ) -> int:
+        values = {name: row[name] for name in _COPIED}
+        values["attempt"] = (0 if here is None else here.attempt) + len(attempts)
+        values["launch_id"] = self._launches.get(row["launch_id"])
+        values["error_id"] = self._error(row["error_hash"])
+        if here is not None:
+            where = trial.c.trial_id == here.trial_id
+            self._connection.execute(update(trial).where(where).values(values))
+            return int(here.trial_id)
+        values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
+        values["config_id"] = self._config(row["config_key"], row["config_id"])
+        statement = insert(trial).values(values).returning(trial.c.trial_id)
+        return int(self._connection.execute(statement).scalar_one())
+
+    def _write_attempts(
+        self, trial_id: int, before: int, attempts: Sequence[Mapping[str, Any]]
+    ) -> None:
+        for number, row in enumerate(attempts, start=before + 1):
+            values = {name: row[name] for name in attempt.c.keys()}  # noqa: SIM118  not a dict
+            values |= {"trial_id": trial_id, "attempt": number}
+            values["launch_id"] = self._launches[row["launch_id"]]
+            values["error_id"] = self._error(row["error_hash"])
+            self._connection.execute(insert(attempt), values)
+
+    def _config(self, config_key: str, there: int) -> int:
+        statement = select(config.c.config_id).where(config.c.config_key == config_key)
+        here = self._connection.execute(statement).scalar()
+        if here is None:
+            values = self._source.config(there)
+            del values["config_id"]
+            adding = insert(config).values(values).returning(config.c.config_id)
+            here = self._connection.execute(adding).scalar_one()
+        return int(here)
+
+    def _error(self, digest: str | None) -> int | None:
+        if digest is None:
+            return None
+        statement = select(error.c.error_id).where(error.c.hash == digest)
+        here = self._connection.execute(statement).scalar()
+        if here is None:
+            values = self._source.error(digest)
+            del values["error_id"]
+            adding = insert(error).values(values).returning(error.c.error_id)
+            here = self._connection.execute(adding).scalar_one()
+        return int(here)
+
+
+def add_launches(
+    connection: Connection, rows: Sequence[Mapping[str, Any]]
+) -> tuple[dict[int, int], int]:
+    """Write down the launches of the source; return their numbers here, and how many are new.
+
+    One that runs there does not run here: it counts as lost until a later merge sees its end.
+    """
+    known = {row.token: row for row in connection.execute(select(launch))}
+    numbers, added = {}, 0
+    for row in rows:
+        values = {name: row[name] for name in launch.c.keys() if name != "launch_id"}  # noqa: SIM118
+        running = row["state"] == "running"
+        values |= {"lease_until": None, "state": "lost" if running else row["state"]}
+        here = known.get(row["token"])
+        if here is None:
+            adding = insert(launch).values(values).returning(launch.c.launch_id)
+            numbers[row["launch_id"]] = int(connection.execute(adding).scalar_one())
+            added += 1
+            continue
+        numbers[row["launch_id"]] = here.launch_id
+        if here.state == "lost" and here.ended is None and not running:
+            where = launch.c.launch_id == here.launch_id
+            connection.execute(update(launch).where(where).values(values))
+    return numbers, added

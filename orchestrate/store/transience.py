@@ -1,0 +1,60 @@
+"""Whether waiting may help against a fault of the database."""
+
+from __future__ import annotations
+
+# A lock held for too long, and a race between processes that open the file.
+_SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
+
+# Classes and codes of the SQL standard and of PostgreSQL's appendix A.
+_STATES = (
+    "08",  # connection lost or refused
+    "40",  # deadlock, serialization failure: the transaction was the victim, not the cause
+    "53200",  # out of memory
+    "53300",  # too many connections
+    "55P03",  # lock not available
+    "57014",  # cancelled, as by a statement timeout
+    "57P01",  # shutting down
+    "57P02",  # crashed
+    "57P03",  # starting up
+    "57P05",  # an idle session was ended
+    "25P03",  # an idle transaction was ended
+)
+
+# While a connection is made, the driver has no code, and only the server's text tells a login that
+# it refuses for ever from one that it refuses now.
+_REFUSED_NOW = (
+    "starting up",
+    "shutting down",
+    "recovery mode",
+    "not yet accepting connections",
+    "too many clients",
+    "too many connections",
+    "connection slots are reserved",
+    "terminating connection",
+)
+_UNKNOWN_HOST = ("failed to resolve host", "could not translate host name")
+
+
+def is_transient(error: BaseException | None, known_host: bool) -> bool:
+    """Tell whether the same request may succeed later, with nobody doing anything about it.
+
+    ``known_host`` says that the server has answered before: its name is right, then, and when it
+    cannot be resolved, as while a container restarts, it will be again.
+    """
+    name = getattr(error, "sqlite_errorname", None)
+    if name is not None:
+        return str(name).startswith(_SQLITE)
+    state = getattr(error, "sqlstate", None)
+    if state is not None:
+        return str(state).startswith(_STATES)
+    return _is_no_driver_of_sqlite(error) and _text_is_transient(str(error), known_host)
+
+
+def _is_no_driver_of_sqlite(error: BaseException | None) -> bool:
+    return type(error).__module__.partition(".")[0] == "psycopg"
+
+
+def _text_is_transient(text: str, known_host: bool) -> bool:
+    if any(words in text for words in _UNKNOWN_HOST):
+        return known_host
+    return "FATAL:" not in text or any(words in text for words in _REFUSED_NOW)

@@ -1,0 +1,70 @@
+"""Everything that the database knows of one trial."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from orchestrate.passwords import without_password
+from orchestrate.store import Reader
+
+_TRIAL = "SELECT * FROM v_trial WHERE trial_id = :trial_id"
+_CONFIG = "SELECT config_json FROM config WHERE config_key = :config_key"
+_ATTEMPTS = """
+SELECT a.attempt, a.launch_id, a.outcome, a.cause, a.node, a.pid, a.claimed, a.started, a.ended,
+       a.wall_seconds, a.cpu_seconds, a.peak_memory_bytes, e.type, e.message, e.traceback
+FROM attempt a
+LEFT JOIN error e ON e.error_id = a.error_id
+WHERE a.trial_id = :trial_id
+ORDER BY a.attempt
+"""
+_LOSS = "SELECT loss FROM step WHERE trial_id = :trial_id ORDER BY t"
+
+
+@dataclass(frozen=True)
+class TrialReport:
+    """One trial.
+
+    Attributes
+    ----------
+    trial
+        Row of ``v_trial``.
+    config
+        The whole configuration without the seed.
+    launches
+        The commands that tried it, without passwords.
+    attempts
+        One for each time that it was claimed, with its error if there was one.
+    loss
+        The curve; None where it is not finite, empty where there is none.
+    """
+
+    trial: Mapping[str, Any]
+    config: Mapping[str, Any]
+    launches: Sequence[Mapping[str, Any]]
+    attempts: Sequence[Mapping[str, Any]]
+    loss: Sequence[float | None]
+
+
+def report(reader: Reader, trial_id: int) -> TrialReport:
+    """Return what is known of a trial; ``reader`` sees one moment."""
+    trial = reader.rows(_TRIAL, trial_id=trial_id)[0]._asdict()
+    attempts = [row._asdict() for row in reader.rows(_ATTEMPTS, trial_id=trial_id)]
+    tried = {attempt["launch_id"] for attempt in attempts}
+    return TrialReport(
+        trial=trial,
+        config=json.loads(reader.rows(_CONFIG, config_key=trial["config_key"])[0][0]),
+        launches=[
+            {name: _public(value) for name, value in asdict(launch).items()}
+            for launch in reader.launches()
+            if launch.launch_id in tried
+        ],
+        attempts=attempts,
+        loss=[row[0] for row in reader.rows(_LOSS, trial_id=trial_id)],
+    )
+
+
+def _public(value: Any) -> Any:
+    return [without_password(word) for word in value] if isinstance(value, list) else value

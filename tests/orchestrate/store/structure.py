@@ -1,0 +1,92 @@
+"""Everything that a database knows about its tables, to compare two of them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sqlalchemy import Connection, create_engine, inspect, text
+
+_POSTGRESQL = {
+    "columns": "SELECT c.relname, a.attnum, a.attname, format_type(a.atttypid, a.atttypmod), "
+    "a.attnotnull, pg_get_expr(d.adbin, d.adrelid) FROM pg_attribute a "
+    "JOIN pg_class c ON c.oid = a.attrelid AND c.relkind IN ('r', 'v') "
+    "LEFT JOIN pg_attrdef d ON d.adrelid = c.oid AND d.adnum = a.attnum "
+    "WHERE a.attnum > 0 AND c.relnamespace = to_regnamespace(current_schema())",
+    "constraints": "SELECT conrelid::regclass::text, conname, contype::text, "
+    "pg_get_constraintdef(oid) FROM pg_constraint "
+    "WHERE connamespace = to_regnamespace(current_schema())",
+    "indexes": "SELECT indexname, replace(indexdef, current_schema() || '.', '') FROM pg_indexes "
+    "WHERE schemaname = current_schema()",
+    "views": "SELECT viewname, definition FROM pg_views WHERE schemaname = current_schema()",
+    "sequences": "SELECT sequencename, last_value, data_type::text FROM pg_sequences "
+    "WHERE schemaname = current_schema()",
+}
+
+
+def structure(url: str) -> dict[str, list[Any]]:
+    """Return tables with columns, types, constraints and options, indexes and views."""
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        found = _of_sqlite(connection) if engine.name == "sqlite" else _of_server(connection)
+    engine.dispose()
+    return found
+
+
+def _of_server(connection: Connection) -> dict[str, list[Any]]:
+    return {
+        part: sorted(map(repr, map(tuple, connection.execute(text(query)))))
+        for part, query in _POSTGRESQL.items()
+    }
+
+
+def _of_sqlite(connection: Connection) -> dict[str, list[Any]]:
+    statements = connection.exec_driver_sql("SELECT type, name, tbl_name, sql FROM sqlite_master")
+    tables = connection.exec_driver_sql(
+        "SELECT name, type, ncol, wr, strict FROM pragma_table_list"
+    )
+    found = {
+        # The text holds columns, types, constraints and options, and their order.
+        "statements": sorted((*row[:3], _words(row.sql)) for row in statements),
+        "tables": sorted(map(tuple, tables)),
+    }
+    names = [row[0] for row in found["tables"] if row[1] == "table"]
+    for pragma in ("table_xinfo", "foreign_key_list", "index_list"):
+        for name in names:
+            rows = connection.exec_driver_sql(f"PRAGMA {pragma}({name})").all()
+            # The first number counts in the order in which they were made.
+            found[f"{pragma} {name}"] = sorted(repr(tuple(row)[1:]) for row in rows)
+    return found
+
+
+def _words(sql: str | None) -> str:
+    text = re.sub(r"\s+", " ", (sql or "").replace('"', ""))
+    return re.sub(r" ?([(),]) ?", r"\1", text).strip()
+
+
+def contents(url: str, columns: dict[str, tuple[str, ...]]) -> dict[str, list[str]]:
+    """Return the rows of the tables, as text that tells any two values apart."""
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        found = {
+            table: sorted(
+                repr(tuple(row))
+                for row in connection.execute(text(f"SELECT {', '.join(names)} FROM {table}"))
+            )
+            for table, names in columns.items()
+        }
+    engine.dispose()
+    return found
+
+
+def columns(url: str) -> dict[str, tuple[str, ...]]:
+    """Return the names of the columns of each table, without that of the version."""
+    engine = create_engine(url)
+    inspector = inspect(engine)
+    found = {
+        table: tuple(column["name"] for column in inspector.get_columns(table))
+        for table in inspector.get_table_names()
+        if table not in ("schema_version", "alembic_version")
+    }
+    engine.dispose()
+    return found

@@ -1,0 +1,213 @@
+"""Each kind of damage is found, named, and left as it is, on every database."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine
+from sqlalchemy.engine import make_url
+
+from orchestrate.store import Claim, Finding, Reader, Store, StoreError, examine
+from orchestrate.store.schema import STEP_VALUES
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
+from tests.orchestrate.store.structure import columns, contents
+
+Take = Callable[..., list[Claim]]
+
+
+def key(config_json: str, seed: int) -> str:
+    return hashlib.sha256(f"{config_json} {seed}".encode()).hexdigest()
+
+
+@pytest.fixture
+def grid(store: Store, launch: int, take: Take, url: str) -> str:
+    """Three finished trials of two policies each, one of them diverged; return the URL."""
+    specs = [Spec(seed, policy=policy) for policy in ("random", "uniform") for seed in range(3)]
+    for claim, spec in zip(take(*specs), specs, strict=True):
+        store.commit(claim, diverged(3) if spec.seed == 1 else result(spec.seed), RUN)
+    store.end_launch(launch, "done")
+    return url
+
+
+def harm(url: str, *statements: str) -> None:
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        for statement in statements:
+            connection.exec_driver_sql(statement)
+    engine.dispose()
+
+
+def only(url: str) -> Finding:
+    """Return the one finding; nothing in the database may have changed."""
+    before = contents(url, columns(url))
+    (found,) = examine(url, key)
+    assert contents(url, columns(url)) == before
+    return found
+
+
+def test_nothing_is_wrong(grid: str) -> None:
+    assert examine(grid, key) == []
+
+
+@pytest.mark.parametrize(
+    ("harms", "severity", "words", "count"),
+    [
+        ("DELETE FROM step WHERE trial_id = 3 AND t = 6", "error", "one step for each t", 1),
+        ("DELETE FROM step WHERE trial_id = 1 AND t = 2", "error", "one step for each t", 1),
+        ("UPDATE step SET t = 7 WHERE t = 6 AND trial_id = 4", "error", "one step for each t", 1),
+        ("DELETE FROM trajectory WHERE trial_id < 3", "error", "without a trajectory", 2),
+        ("UPDATE step SET loss = NULL WHERE trial_id = 1 AND t = 2", "error", "lack a loss", 1),
+        ("UPDATE step SET loss = 1.0 WHERE trial_id = 2 AND t = 5", "error", "one after that", 1),
+        ("UPDATE trial SET final_loss = 9.0 WHERE trial_id = 1", "error", "final loss", 1),
+        ("UPDATE trial SET best_loss = {inf} WHERE trial_id = 1", "error", "not finite", 1),
+        ("UPDATE step SET plan_us = {inf} WHERE t = 0", "error", "not finite", 6),
+        ("UPDATE trial SET owner = 1 WHERE trial_id = 2", "error", "without an owner", 1),
+        ("UPDATE attempt SET outcome = NULL WHERE trial_id = 2", "warning", "attempts", 1),
+        ("UPDATE config SET config_json = '{}' WHERE config_id = 1", "error", "configurations", 1),
+        ("UPDATE trial SET seed = 77 WHERE trial_id = 1", "error", "trials whose key", 1),
+        ("INSERT INTO error VALUES (5, 'h', 'E', 'm', 't')", "note", "errors of no trial", 1),
+        ("UPDATE launch SET state = 'running'", "note", "launches that say", 1),
+    ],
+)  # fmt: skip
+def test_damage_is_found(grid: str, harms: str, severity: str, words: str, count: int) -> None:
+    infinity = "9e999" if grid.startswith("sqlite") else "'infinity'"
+    harm(grid, harms.replace("{inf}", infinity))
+    before = contents(grid, columns(grid))
+    findings = examine(grid, key)
+    assert contents(grid, columns(grid)) == before
+    found = next(one for one in findings if words in one.sentence)
+    assert (found.severity, found.count) == (severity, count)
+    assert f": {count}" in found.sentence
+    assert found.advice
+
+
+def test_rows_of_trials_without_a_result(grid: str) -> None:
+    harm(grid, "UPDATE trial SET status = 'pending' WHERE trial_id = 1")
+    sentences = " ".join(one.sentence for one in examine(grid, key))
+    assert "without a result but with steps: 1" in sentences
+    assert "without a result but with a trajectory: 1" in sentences
+
+
+def test_nan_in_postgresql(postgresql_url: str) -> None:
+    with Store.open(postgresql_url) as store:
+        launch = store.begin_launch(LAUNCH)
+        (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+        store.commit(claim, result(), RUN)
+        store.end_launch(launch, "done")
+    for name in STEP_VALUES[1:]:
+        harm(postgresql_url, f"UPDATE step SET {name} = 'NaN' WHERE t = 1")
+        assert "not finite" in only(postgresql_url).sentence
+        harm(postgresql_url, f"UPDATE step SET {name} = 1.0 WHERE t = 1")
+
+
+def test_claims_of_the_dead(url: str) -> None:
+    with Store.open(url) as store:
+        launch = store.begin_launch(LAUNCH)
+        store.claim(launch, store.register(launch, [Spec(0), Spec(1)]).todo)
+    harm(url, "UPDATE launch SET lease_until = 0")  # for SQLite the process is gone already
+    found = examine(url, key)
+    assert [(one.severity, one.count) for one in found] == [("note", 1), ("note", 2)]
+    assert "trials held by launches that do not run: 2" in found[1].sentence
+
+
+def test_a_launch_that_lives_is_no_finding(store: Store, take: Take, url: str) -> None:
+    take(Spec(0))
+    assert store.recover() == 0
+    assert examine(url, key) == []
+
+
+def test_configurations_without_trials(store: Store, grid: str) -> None:
+    launch = store.begin_launch(LAUNCH)
+    store.register(launch, [Spec(0, policy="never")])
+    store.end_launch(launch, "done")
+    harm(grid, "DELETE FROM trial WHERE status = 'pending'")
+    assert "configurations without a trial: 1" in only(grid).sentence
+
+
+def test_seeds_that_policies_do_not_share(store: Store, grid: str) -> None:
+    launch = store.begin_launch(LAUNCH)
+    (claim,) = store.claim(launch, store.register(launch, [Spec(9)]).todo)
+    store.commit(claim, result(), RUN)
+    store.end_launch(launch, "done")
+    found = only(grid)
+    assert found.severity == "warning"
+    assert "pendulum width 16" in found.sentence
+    assert "random 4, uniform 3; shared by all: 3" in found.sentence
+
+
+def test_other_widths_are_not_compared(store: Store, grid: str) -> None:
+    launch = store.begin_launch(LAUNCH)
+    (claim,) = store.claim(launch, store.register(launch, [Spec(9, width=32)]).todo)
+    store.commit(claim, result(), RUN)
+    store.end_launch(launch, "done")
+    assert examine(grid, key) == []
+
+
+@pytest.fixture
+def path(sqlite_url: str) -> Path:
+    return Path(str(make_url(sqlite_url).database))
+
+
+@pytest.fixture
+def file(sqlite_url: str, path: Path) -> Path:
+    """Return a SQLite database with forty long trials, in one file."""
+    with Store.open(sqlite_url) as store:
+        launch = store.begin_launch(LAUNCH)
+        specs = [Spec(seed, horizon=300) for seed in range(40)]
+        claims = store.claim(launch, store.register(launch, specs).todo)
+        store.commit_many([(claim, result(claim.trial_id, 300), RUN) for claim in claims])
+        store.end_launch(launch, "done")
+    connection = sqlite3.connect(path)
+    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    connection.close()
+    return path
+
+
+def test_files_left_over(file: Path, sqlite_url: str) -> None:
+    assert examine(sqlite_url, key) == []
+    (file.parent / "results.db-locks" / "launch-0123").touch()
+    (file.parent / "results.db.v1-backup.partial").touch()
+    found = only(sqlite_url)
+    assert found.count == 2
+    assert "launch-0123" in found.sentence
+
+
+def test_rows_that_refer_to_nothing(file: Path, sqlite_url: str) -> None:
+    connection = sqlite3.connect(file)
+    connection.execute("UPDATE trial SET error_id = 7 WHERE trial_id < 4")
+    connection.commit()
+    connection.close()
+    found = only(sqlite_url)
+    assert "not there: 3, in trial" in found.sentence
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_overwritten_pages_are_never_read_as_numbers(
+    file: Path, sqlite_url: str, seed: int
+) -> None:
+    """The doctor or the opening says that it is lost, and a reader fails or is right."""
+    with Reader.open(sqlite_url) as reader:
+        right = reader.curves(Spec(horizon=300).config_key).values.tolist()
+    numbers = random.Random(seed)
+    data = bytearray(file.read_bytes())
+    page = numbers.randrange(len(data) // 4096)
+    data[4096 * page : 4096 * (page + 1)] = numbers.randbytes(4096)
+    file.write_bytes(data)
+    try:
+        findings = examine(sqlite_url, key)
+    except StoreError as error:
+        assert "damaged" in str(error) or "not a SQLite database" in str(error)  # noqa: PT017
+        return
+    assert findings[0].severity == "error"
+    try:
+        with Reader.open(sqlite_url) as reader:
+            values = reader.curves(Spec(horizon=300).config_key).values.tolist()
+    except StoreError as error:
+        assert "damaged" in str(error)  # noqa: PT017
+    else:
+        assert values == right

@@ -1,0 +1,145 @@
+"""Whatever is lost on the way to the database and back, each operation is done once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from orchestrate.patience import PatientStore
+from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
+from orchestrate.store import StoreUnavailableError as UnavailableError
+from tests.orchestrate.losses import lose
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+
+FAILURE = Failure("ZeroDivisionError", "no", "here")
+LOSSES = (
+    ["question"],
+    ["answer"],
+    ["question", "answer"],
+    ["answer", "question", "answer"],
+    ["answer", "answer", "answer"],
+)
+SPECS = [Spec(seed) for seed in range(4)]
+
+losses = pytest.mark.parametrize("lost", LOSSES, ids="-".join)
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def patient(store: Store, launch: int, said: list[str]) -> PatientStore:
+    return PatientStore(store, launch, 10.0, said.append)
+
+
+@losses
+def test_a_claim(
+    patient: PatientStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+) -> None:
+    todo = patient.register(SPECS).todo
+    lose(monkeypatch, lost)
+    claims = patient.claim(todo)
+    assert [claim.trial_key for claim in claims] == todo
+    open_attempts = reader.query("SELECT trial_id, attempt FROM attempt WHERE outcome IS NULL")
+    assert sorted(map(tuple, open_attempts)) == sorted((c.trial_id, c.attempt) for c in claims)
+
+
+@losses
+def test_a_claim_takes_nothing_from_others(
+    patient: PatientStore, store: Store, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+) -> None:
+    todo = patient.register(SPECS).todo
+    [held] = patient.claim(todo[:1])
+    [theirs] = store.claim(store.begin_launch(LAUNCH), todo[1:2])
+    lose(monkeypatch, lost)
+    assert [claim.trial_key for claim in patient.claim(todo[1:])] == todo[2:]
+    assert store.commit(theirs, result(), RUN)
+    assert patient.commit([(held, result(), RUN)]) == [True]
+
+
+@losses
+def test_a_commit(
+    patient: PatientStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+) -> None:
+    claims = patient.claim(patient.register(SPECS).todo)
+    lose(monkeypatch, lost)
+    assert patient.commit([(claim, result(claim.trial_id), RUN) for claim in claims]) == [True] * 4
+    curves = reader.curves(SPECS[0].config_key)
+    np.testing.assert_array_equal(curves.values, [result(claim.trial_id).loss for claim in claims])
+
+
+@losses
+def test_a_commit_that_comes_too_late(
+    patient: PatientStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch,
+    lost: list[str],
+) -> None:  # fmt: skip
+    todo = patient.register(SPECS[:2]).todo
+    claims = patient.claim(todo)
+    store.release(launch, todo[:1])
+    other = store.begin_launch(LAUNCH)
+    [theirs] = store.claim(other, todo[:1])
+    assert store.commit(theirs, result(7), RUN)
+    lose(monkeypatch, lost)
+    assert patient.commit([(claim, result(), RUN) for claim in claims]) == [False, True]
+
+
+@losses
+def test_a_failure(
+    patient: PatientStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+) -> None:
+    [claim] = patient.claim(patient.register(SPECS[:1]).todo)
+    lose(monkeypatch, lost)
+    assert patient.fail(claim, FAILURE, RUN)
+    assert len(reader.query("SELECT * FROM v_failures")) == 1
+
+
+def test_a_failure_that_comes_too_late(
+    patient: PatientStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    [claim] = patient.claim(patient.register(SPECS[:1]).todo)
+    store.release(launch)
+    lose(monkeypatch, ["question"])
+    assert not patient.fail(claim, FAILURE, RUN)
+
+
+def test_a_malformed_result_is_not_waited_for(
+    patient: PatientStore, take: Callable[..., list[Claim]], said: list[str]
+) -> None:
+    [claim] = take(Spec(0))
+    with pytest.raises(InvalidResultError):
+        patient.commit([(claim, result(horizon=2), RUN)])
+    assert said == []
+
+
+def test_it_says_once_that_it_waits_and_for_how_long(
+    patient: PatientStore, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose(monkeypatch, ["question"] * 3)
+    patient.recover()
+    assert said[0] == "waiting for up to 10 s: recover was lost."
+    assert said[1].startswith("the database is back after ")
+    assert len(said) == 2
+
+
+def test_patience_ends(
+    store: Store, launch: int, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose(monkeypatch, ["question"] * 1000)
+    start = time.monotonic()
+    with pytest.raises(UnavailableError, match="recover was lost"):
+        PatientStore(store, launch, 0.5, said.append).recover()
+    assert time.monotonic() - start >= 0.5
+
+
+def test_what_waiting_cannot_help_is_raised_at_once(
+    patient: PatientStore, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose(monkeypatch, ["question", "", ""], transient=False)
+    with pytest.raises(UnavailableError, match="recover was lost"):
+        patient.recover()
+    assert said == []

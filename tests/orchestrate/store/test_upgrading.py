@@ -1,0 +1,392 @@
+"""Every released schema becomes the newest one, whole or not at all, on every database."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from sqlalchemy import Engine, create_engine, text
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ProgrammingError
+
+from orchestrate.store import (
+    LaunchAliveError,
+    NoDatabaseError,
+    Reader,
+    SchemaVersionError,
+    Store,
+    StoreError,
+    StoreUnavailableError,
+    address,
+    migrations,
+    upgrade,
+)
+from orchestrate.store.locks import LaunchLocks
+from orchestrate.store.opening import make_backend
+from orchestrate.store.schema import SCHEMA_VERSION
+from tests.orchestrate.store.fakes import LAUNCH, Spec
+from tests.orchestrate.store.processes import CLEAN, hear, kill, running, upgrade_and_tell
+from tests.orchestrate.store.released import VERSIONS, restore
+from tests.orchestrate.store.structure import columns, contents, structure
+
+FAILING = '''
+"""A change that fails half-way."""
+
+import sqlalchemy
+from alembic import op
+
+revision = "99"
+down_revision = "{head}"
+
+
+def upgrade():
+    op.add_column("trial", sqlalchemy.Column("more", sqlalchemy.Integer))
+    op.execute("DELETE FROM step")
+    op.execute("SELECT nonsense FROM nowhere")
+'''
+REBUILDING = '''
+"""A change for which SQLite writes tables anew."""
+
+import sqlalchemy
+from orchestrate.store.migrations.rebuilding import rebuilt
+
+revision = "99"
+down_revision = "{head}"
+
+
+def upgrade():
+    for table in ("step", "trial", "attempt", "launch"):
+        with rebuilt(table) as batch:
+            batch.add_column(sqlalchemy.Column("more", sqlalchemy.Integer))
+'''
+
+
+@pytest.fixture(params=VERSIONS)
+def version(request: pytest.FixtureRequest) -> int:
+    return int(request.param)
+
+
+@pytest.fixture
+def old(version: int, url: str) -> str:
+    restore(version, url)
+    return url
+
+
+@pytest.fixture
+def other_url(tmp_path: Path, url: str, request: pytest.FixtureRequest) -> str:
+    """Return the URL of nothing, of the same kind."""
+    if url.startswith("sqlite"):
+        return f"sqlite:///{tmp_path}/other/results.db"
+    return str(request.getfixturevalue("another_postgresql_url"))
+
+
+@pytest.fixture
+def with_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Return a function that adds a script after the newest one."""
+
+    def add(script: str) -> None:
+        location = tmp_path / "50% migrations"
+        shutil.copytree(migrations.LOCATION, location)
+        script = script.format(head=SCHEMA_VERSION)
+        (location / "versions" / "version_99.py").write_text(script)
+        monkeypatch.setattr(migrations, "LOCATION", location)
+
+    return add
+
+
+def test_there_is_a_script_for_each_version_and_one_database() -> None:
+    scripts = {path.stem for path in (migrations.LOCATION / "versions").glob("version_*.py")}
+    assert scripts == {f"version_{n}" for n in range(1, SCHEMA_VERSION + 1)}
+    assert list(range(1, SCHEMA_VERSION)) == VERSIONS
+
+
+@pytest.mark.parametrize("side", [Store, Reader])
+def test_an_older_one_is_refused_with_the_command(old: str, side: type[Store | Reader]) -> None:
+    with pytest.raises(SchemaVersionError, match="an older program") as caught:
+        side.open(old)
+    assert "'python -m orchestrate upgrade --db " in str(caught.value)
+    assert old.rpartition("options=")[2].replace("sqlite:", "") in str(caught.value)
+
+
+def test_upgraded_equals_created(old: str, other_url: str) -> None:
+    upgrade(old)
+    Store.open(other_url).close()
+    upgraded, created = structure(old), structure(other_url)
+    for database in (upgraded, created):
+        database.pop("sequences", None)  # one has handed out numbers
+    assert upgraded == created
+
+
+def test_every_row_stays_as_it_was(old: str, version: int) -> None:
+    kept = columns(old)
+    before = contents(old, kept)
+    assert len(before["step"]) == 125
+    done = upgrade(old)
+    assert (done.before, done.after) == (version, SCHEMA_VERSION)
+    assert contents(old, kept) == before
+    with Reader.open(old) as reader:
+        assert reader.schema_version() == str(SCHEMA_VERSION)
+        assert sum(cell.n_done for cell in reader.cells()) == 4
+
+
+def test_a_launch_goes_on_after_it(old: str) -> None:
+    upgrade(old)
+    with Store.open(old) as store:
+        assert store.recover() == 2
+        launch = store.begin_launch(LAUNCH)
+        assert launch == 4
+        assert store.register(launch, [Spec()]).todo == [Spec().trial_key]
+        store.end_launch(launch, "done", exit_code=0)
+    with Reader.open(old) as reader:
+        assert reader.query("SELECT exit_code FROM launch ORDER BY launch_id")[3][0] == 0
+
+
+def test_again_there_is_nothing_to_do(old: str) -> None:
+    assert upgrade(old).changed
+    before = structure(old)
+    again = upgrade(old)
+    assert not again.changed
+    assert again.backup is None
+    assert structure(old) == before
+
+
+def _backup_url(url: str, name: str) -> str:
+    return f"sqlite:///{name}" if url.startswith("sqlite") else _in_schema(url, name)
+
+
+def _in_schema(url: str, schema: str) -> str:
+    return f"{url.rpartition('%3D')[0]}%3D{schema}"
+
+
+def test_the_backup_is_what_was_there(old: str, drop: Callable[[str], None]) -> None:
+    before, kept = structure(old), columns(old)
+    rows = contents(old, kept)
+    name = upgrade(old).backup
+    assert name is not None
+    drop(name)
+    backup = _backup_url(old, name)
+    assert structure(backup) == before
+    assert contents(backup, kept) == rows
+    assert upgrade(backup, backup=False).changed
+
+
+def test_a_backup_replaces_no_other(old: str, version: int, drop: Callable[[str], None]) -> None:
+    if old.startswith("sqlite"):
+        taken = f"{_file(old)}.v{version}-backup"
+        Path(taken).write_text("precious")
+    else:
+        taken = f"{_schema(old)}_v{version}_backup"
+        drop(taken)
+        _execute(old, f'CREATE SCHEMA "{taken}"')
+    name = upgrade(old).backup
+    assert name is not None
+    drop(name)
+    assert name in (f"{taken}-2", f"{taken}_2")
+    if old.startswith("sqlite"):
+        assert Path(taken).read_text() == "precious"
+
+
+def test_a_backup_can_be_left_out(old: str) -> None:
+    done = upgrade(old, backup=False)
+    assert done.changed
+    assert done.backup is None
+    assert _backups(old) == []
+
+
+def test_a_failure_in_the_middle_changes_nothing(
+    old: str, with_script: Callable[[str], None]
+) -> None:
+    with_script(FAILING)
+    before, kept = structure(old), columns(old)
+    rows = contents(old, kept)
+    with pytest.raises((StoreUnavailableError, ProgrammingError), match="nowhere"):
+        upgrade(old)
+    assert structure(old) == before
+    assert contents(old, kept) == rows
+    assert _backups(old) == []
+
+
+def test_tables_that_are_written_anew_keep_everything(
+    old: str, with_script: Callable[[str], None]
+) -> None:
+    kept = columns(old)
+    rows = contents(old, kept)
+    upgrade(old)
+    before = structure(old)
+    with_script(REBUILDING)
+    _migrate(old)
+    assert contents(old, kept) == rows
+    after = structure(old)
+    if not old.startswith("sqlite"):
+        after["columns"] = [row for row in after["columns"] if "'more'" not in row]
+        assert after == before
+        return
+    same = [(name, kind, n - (name in MORE), *rest) for name, kind, n, *rest in after["tables"]]
+    assert same == before["tables"]
+    assert _checks(after) == _checks(before)
+    for pragma in ("foreign_key_list", "index_list"):
+        for name in MORE:
+            key = f"{pragma} {name}"
+            assert after[key] == before[key]
+    wanted = [one for one in before["statements"] if one[0] in ("index", "view")]
+    assert [one for one in after["statements"] if one[0] in ("index", "view")] == wanted
+
+
+MORE = ("step", "trial", "attempt", "launch")
+
+
+def _checks(found: dict[str, list[tuple[str, ...]]]) -> list[str]:
+    return [one[3].partition("CHECK")[2].partition("))")[0] for one in found["statements"]]
+
+
+def _migrate(url: str) -> None:
+    backend = make_backend(address.parse(url))
+    with backend.rebuilding() as connection:
+        migrations.migrate(connection, SCHEMA_VERSION)
+    backend.close()
+
+
+def test_a_living_launch_is_left_alone(old: str) -> None:
+    before = structure(old)
+    with ExitStack() as stack:
+        _revive(old, stack)
+        with pytest.raises(LaunchAliveError, match=r"Launch 3 .* on laptop.* is running"):
+            upgrade(old)
+    assert structure(old) == before
+
+
+def _revive(url: str, stack: ExitStack) -> None:
+    """Let the launch that was killed count as alive."""
+    if url.startswith("sqlite"):
+        ((token,),) = _execute(url, "SELECT token FROM launch WHERE state = 'running'")
+        folder = _file(url).with_name(f"{_file(url).name}-locks")
+        folder.mkdir()
+        locks = LaunchLocks(folder)
+        locks.acquire(str(token))
+        stack.callback(locks.close)
+    else:
+        lease = "extract(epoch FROM clock_timestamp()) + 600"
+        _execute(url, f"UPDATE launch SET lease_until = {lease} WHERE state = 'running'")
+
+
+def test_of_two_at_once_one_finds_nothing_to_do(old: str) -> None:
+    barrier = CLEAN.Barrier(2)
+    with ExitStack() as stack:
+        pipes = [stack.enter_context(running(upgrade_and_tell, old, barrier))[1] for _ in range(2)]
+        assert sorted(hear(pipe) for pipe in pipes) == ["nothing to do", "upgraded"]
+    with Reader.open(old) as reader:
+        assert len(reader.query("SELECT * FROM step")) == 125
+
+
+def test_death_in_the_middle_changes_nothing(old: str) -> None:
+    before, kept = structure(old), columns(old)
+    rows = contents(old, kept)
+    with running(upgrade_and_tell, old, None, True) as (process, pipe):
+        assert hear(pipe) == "half"
+        kill(process)
+    assert structure(old) == before
+    assert contents(old, kept) == rows
+    done = upgrade(old)
+    assert done.changed
+
+
+def test_the_newest_is_left_alone_and_a_newer_refused(store: Store, url: str) -> None:
+    assert not upgrade(store.safe_url).changed
+    with store._backend.transaction() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '99'")
+    with pytest.raises(SchemaVersionError, match="a newer program"):
+        upgrade(url)
+
+
+def test_an_empty_database_is_created(url: str) -> None:
+    if url.startswith("sqlite"):
+        _file(url).parent.mkdir()
+        _file(url).touch()
+    done = upgrade(url)
+    assert (done.before, done.after, done.backup) == (None, SCHEMA_VERSION, None)
+    Reader.open(url).close()
+
+
+def test_nothing_is_made_where_there_is_no_file(sqlite_url: str) -> None:
+    with pytest.raises(NoDatabaseError):
+        upgrade(sqlite_url)
+    assert not _file(sqlite_url).parent.exists()
+
+
+def test_a_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "other.db"
+    connection = sqlite3.connect(path)
+    connection.execute("CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL)")
+    connection.execute("INSERT INTO alembic_version VALUES ('ae1027a6acf0')")
+    connection.commit()
+    connection.close()
+    before = path.read_bytes()
+    with pytest.raises(SchemaVersionError, match="not a results database"):
+        upgrade(f"sqlite:///{path}")
+    assert path.read_bytes() == before
+
+
+def test_a_full_disk_refuses_the_backup(sqlite_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    restore(1, sqlite_url)
+    before = structure(sqlite_url)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("orchestrate.store.backup_file.os.fsync", full)
+    with pytest.raises(StoreUnavailableError, match=r"No space left.*--no-backup"):
+        upgrade(sqlite_url)
+    assert structure(sqlite_url) == before
+    assert _backups(sqlite_url) == []
+
+
+def _backups(url: str) -> list[object]:
+    if url.startswith("sqlite"):
+        return list(_file(url).parent.glob("*backup*"))
+    names = _execute(url, "SELECT nspname FROM pg_namespace")
+    return [name for (name,) in names if str(name).startswith(f"{_schema(url)}_")]
+
+
+def _file(url: str) -> Path:
+    return Path(str(make_url(url).database))
+
+
+def test_a_user_who_cannot_make_a_backup_is_told(postgresql_url: str, server: Engine) -> None:
+    restore(1, postgresql_url)
+    schema, role = _schema(postgresql_url), f"guest_{_schema(postgresql_url)[-8:]}"
+    named = (
+        "SELECT relname FROM pg_class WHERE relkind IN ('r', 'v') "
+        "AND relnamespace = to_regnamespace(current_schema())"
+    )
+    with server.begin() as connection:
+        connection.exec_driver_sql(f"CREATE ROLE {role}")
+        connection.exec_driver_sql(f"ALTER SCHEMA {schema} OWNER TO {role}")
+        for (name,) in _execute(postgresql_url, named):
+            connection.exec_driver_sql(f"ALTER TABLE {schema}.{name} OWNER TO {role}")
+    try:
+        guest = f"{postgresql_url}%20-crole%3D{role}"
+        with pytest.raises(StoreError, match=r"right to create a schema.*--no-backup"):
+            upgrade(guest)
+        assert upgrade(guest, backup=False).changed
+    finally:
+        with server.begin() as connection:
+            connection.exec_driver_sql(f"REASSIGN OWNED BY {role} TO CURRENT_USER")
+            connection.exec_driver_sql(f"DROP OWNED BY {role}")
+            connection.exec_driver_sql(f"DROP ROLE {role}")
+
+
+def _schema(url: str) -> str:
+    return url.rpartition("%3D")[2]
+
+
+def _execute(url: str, sql: str) -> list[tuple[object, ...]]:
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        done = connection.execute(text(sql))
+        rows = [tuple(row) for row in done] if done.returns_rows else []
+    engine.dispose()
+    return rows
