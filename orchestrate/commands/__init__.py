@@ -1,0 +1,21 @@
+"""What can be asked of a results database, one file for each command.
+
+A new command is a file with a ``COMMAND`` and a line in ``COMMANDS``.
+"""
+
+from __future__ import annotations
+
+from orchestrate.commands import doctor, export, merge, query, retry, show, status, upgrade
+from orchestrate.commands.command import Command
+
+COMMANDS: tuple[Command, ...] = (
+    status.COMMAND,
+    show.COMMAND,
+    retry.COMMAND,
+    query.COMMAND,
+    export.COMMAND,
+    merge.COMMAND,
+    doctor.COMMAND,
+    upgrade.COMMAND,
+)
+"""In the order in which the help shows them."""

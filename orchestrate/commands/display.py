@@ -1,0 +1,58 @@
+"""Tables and colours for people: in a terminal its width counts, elsewhere a line is a row."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Sequence
+
+from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+_NO_TERMINAL = 100_000  # columns: nothing is folded or cut
+
+
+def console() -> Console:
+    """Return a console on the standard output; colours follow NO_COLOR and the terminal."""
+    width = None if sys.stdout.isatty() else _NO_TERMINAL
+    return Console(file=sys.stdout, width=width, highlight=False, markup=False, emoji=False)
+
+
+def show(*parts: RenderableType) -> None:
+    """Print the parts, one below the other; a table wider than the terminal runs over its edge."""
+    out = console()
+    for part in parts:
+        if isinstance(part, Table):
+            out.width = max(out.width, out.measure(part).minimum)
+        out.print(part, soft_wrap=isinstance(part, str | Text))
+
+
+def table(
+    heads: Sequence[str],
+    *,
+    numbers: Collection[str] = (),
+    styles: Sequence[str] = (),
+    footers: Sequence[str] = (),
+) -> Table:
+    """Return an empty table of columns that do not break; those in ``numbers`` end at the right."""
+    result = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_footer=bool(footers))
+    for i, head in enumerate(heads):
+        result.add_column(
+            head,
+            footer=footers[i] if footers else "",
+            justify="right" if head in numbers else "left",
+            style=styles[i] if styles else "",
+            no_wrap=True,
+            overflow="ignore",
+        )
+    return result
+
+
+def plain(text: str) -> Text:
+    """Return the text with control characters made visible, so that none reaches the terminal."""
+    return Text(
+        "".join(
+            char if char.isprintable() or char == "\n" else repr(char)[1:-1]
+            for char in text.expandtabs()
+        )
+    )

@@ -1,0 +1,38 @@
+"""``upgrade``: bring a database of an older program to the schema of this one."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from orchestrate.commands.command import Command
+from orchestrate.commands.output import say, say_json
+from orchestrate.errors import ExitCode
+from orchestrate.store import Upgrade, upgrade
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--no-backup", action="store_true", help="make no copy first")
+
+
+def run(arguments: argparse.Namespace) -> ExitCode:
+    """Upgrade the database, in one transaction and with a copy beside it."""
+    done = upgrade(arguments.db, backup=not arguments.no_backup)
+    if arguments.json:
+        say_json({**dataclasses.asdict(done), "changed": done.changed})
+    else:
+        say(_sentence(done))
+    return ExitCode.DONE
+
+
+def _sentence(done: Upgrade) -> str:
+    if not done.changed:
+        return f"{done.safe_url} has schema {done.after}, the newest: there is nothing to do."
+    if done.before is None:
+        return f"{done.safe_url} was empty and has schema {done.after} now."
+    kind = "file" if "sqlite" in done.safe_url.partition(":")[0] else "schema"
+    copy = f"a backup is in the {kind} {done.backup}" if done.backup else "no backup was made"
+    return f"{done.safe_url} went from schema {done.before} to {done.after}; {copy}."
+
+
+COMMAND = Command("upgrade", "bring an older database to the newest schema", add_arguments, run)

@@ -1,0 +1,84 @@
+"""One export: rows out of the database, into a file, with a manifest of where they come from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from orchestrate.export import matrices, streams, tables
+from orchestrate.export.atomic import whole
+from orchestrate.export.manifest import provenance
+from orchestrate.export.wanted import Export, ExportError
+from orchestrate.store import Cell, Reader
+
+_STREAMS: dict[str, Callable[[Reader, Sequence[Cell]], streams.Stream]] = {
+    "curves": streams.curves,
+    "trials": streams.trials,
+    "trajectories": streams.trajectories,
+}
+_MATRICES: dict[str, Callable[[Reader, Sequence[Cell]], Generator[matrices.Named, None, None]]] = {
+    "curves": matrices.curves,
+    "trials": matrices.trials,
+    "trajectories": matrices.trajectories,
+}
+_WRITERS = {"csv": tables.write_csv, "parquet": tables.write_parquet}
+
+
+def export(reader: Reader, cells: Sequence[Cell], wanted: Export) -> dict[str, Any]:
+    """Write the file, and after it its manifest; return what the manifest says.
+
+    Both appear whole or not at all. ``reader`` sees one moment, that of ``cells``. Raises
+    ``ExportError``.
+    """
+    _expect_trials(reader, cells, wanted)
+    try:
+        wanted.out.parent.mkdir(parents=True, exist_ok=True)
+        with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
+            content = _write(reader, cells, wanted, out)
+            about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": _hash(out)}
+            document = {
+                "kind": wanted.kind,
+                "format": wanted.format,
+                **about,
+                **content,
+                **provenance(reader, cells, wanted.filters),
+            }
+            manifest.write_text(json.dumps(document, indent=2) + "\n")
+    except OSError as error:
+        raise ExportError(
+            f"{wanted.out} cannot be written ({error.strerror or error}): make room and check "
+            f"that its folder is yours, or choose another --out."
+        ) from error
+    return document
+
+
+def _write(reader: Reader, cells: Sequence[Cell], wanted: Export, out: Path) -> dict[str, Any]:
+    # After an error the cursors must close before the database does.
+    if wanted.format == "npz":
+        with closing(_MATRICES[wanted.kind](reader, cells)) as arrays:
+            return {"arrays": matrices.write(out, arrays)}
+    stream = _STREAMS[wanted.kind](reader, cells)
+    columns = {field.name: str(field.type) for field in stream.schema}
+    with closing(stream.batches):
+        return {"rows": _WRITERS[wanted.format](out, stream), "columns": columns}
+
+
+def _expect_trials(reader: Reader, cells: Sequence[Cell], wanted: Export) -> None:
+    if not cells:
+        raise ExportError(
+            f"{reader.safe_url} holds no trials yet: run a launch that writes to it first."
+        )
+    if wanted.kind != "trials" and not any(cell.n_done + cell.n_diverged for cell in cells):
+        raise ExportError(
+            f"No trial of these is done yet, so that there are no {wanted.kind} to export: run "
+            f"the launch, or see status."
+        )
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,47 @@
+"""Where exported numbers come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib import metadata
+from typing import Any
+
+from orchestrate.passwords import without_password
+from orchestrate.status import counts
+from orchestrate.store import Cell, Reader
+from orchestrate.store.values import now
+
+_WRITERS = "SELECT DISTINCT config_key, launch_id FROM v_trial WHERE launch_id IS NOT NULL"
+
+
+def provenance(
+    reader: Reader, cells: Sequence[Cell], filters: Mapping[str, Sequence[str]]
+) -> dict[str, Any]:
+    """Return database, selection, configurations and launches, without passwords."""
+    keys = {cell.config_key for cell in cells}
+    writers = {row.launch_id for row in reader.rows(_WRITERS) if row.config_key in keys}
+    launches = [asdict(one) for one in reader.launches() if one.launch_id in writers]
+    return {
+        "written": now(),
+        "program": f"dopt {_version()}",
+        "database": reader.safe_url,
+        "schema_version": reader.schema_version(),
+        "filters": {name: list(values) for name, values in filters.items()},
+        "trials": dict(counts(cells)),
+        "missing_values": "empty in csv, null in parquet, NaN in npz: a loss that is not finite",
+        "configs": {cell.config_key: dict(cell.config) for cell in cells},
+        "launches": [_public(launch) for launch in launches],
+    }
+
+
+def _version() -> str:
+    try:
+        return metadata.version("dopt")
+    except metadata.PackageNotFoundError:
+        return "from its source, not installed"
+
+
+def _public(launch: Mapping[str, Any]) -> dict[str, Any]:
+    words = {name: [*map(without_password, launch[name])] for name in ("argv", "overrides")}
+    return {**launch, **words}

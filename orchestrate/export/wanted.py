@@ -1,0 +1,30 @@
+"""What can be exported, and into what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dopt.errors import DoptError
+
+KINDS = ("curves", "trials", "trajectories")
+FORMATS = ("csv", "parquet", "npz")
+
+
+class ExportError(DoptError):
+    """There is nothing to export, or the file cannot be written."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """What to write: one of ``KINDS``, in one of ``FORMATS``, of which configurations."""
+
+    kind: str
+    format: str
+    out: Path
+    filters: Mapping[str, Sequence[str]]
+
+    @property
+    def manifest(self) -> Path:
+        return self.out.with_name(f"{self.out.name}.manifest.json")
