@@ -58,6 +58,13 @@ def raising(spec: TrialSpec) -> TrialResult:
     return quick(spec)
 
 
+def exiting(spec: TrialSpec) -> TrialResult:
+    """Leave, as a script does that is run as a part of something else."""
+    if spec.seed == BROKEN_SEED:
+        raise SystemExit(3)
+    return quick(spec)
+
+
 def deadly(spec: TrialSpec) -> TrialResult:
     """End the worker, as the kernel does when memory runs out."""
     if spec.seed == BROKEN_SEED:
@@ -74,10 +81,12 @@ def malformed(spec: TrialSpec) -> TrialResult:
 
 
 def diverging(spec: TrialSpec) -> TrialResult:
+    return diverged(spec, at=3) if spec.seed == BROKEN_SEED else quick(spec)
+
+
+def diverged(spec: TrialSpec, at: int) -> TrialResult:
+    """Return the same numbers up to a step, and none after it."""
     result = quick(spec)
-    if spec.seed != BROKEN_SEED:
-        return result
-    at = 3
     arrays = {
         name: np.where(np.arange(len(value)) < at, value, np.nan)
         for name, value in vars(result).items()

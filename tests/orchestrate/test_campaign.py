@@ -12,6 +12,7 @@ from tests.orchestrate.standins import (
     BROKEN_SEED,
     deadly,
     diverging,
+    exiting,
     malformed,
     quick,
     raising,
@@ -50,10 +51,19 @@ def test_the_whole_grid_is_registered_before_the_first_trial_runs(launches: Laun
 def test_an_exception_is_recorded_and_the_grid_goes_on(launches: Launches) -> None:
     assert launches(raising) == ExitCode.SOME_FAILED
     assert launches.statuses() == {0: "done", 1: "done", 2: "failed", 3: "done", 4: "done"}
-    assert "1 failed with ZeroDivisionError: the seed is broken" in launches.said[-1]
+    assert "1 failed: ZeroDivisionError: the seed is broken" in launches.said[-1]
     [(cause, text)] = launches.query("SELECT cause, traceback FROM v_failures")
     assert cause == "exception"
     assert "in raising" in text
+
+
+@pytest.mark.parametrize("executor", ["inprocess", "local"])
+def test_a_trial_that_leaves_ends_neither_the_launch_nor_its_worker(
+    launches: Launches, executor: str
+) -> None:
+    assert launches(exiting, executor=executor) == ExitCode.SOME_FAILED
+    assert launches.statuses() == {0: "done", 1: "done", 2: "failed", 3: "done", 4: "done"}
+    assert launches.query("SELECT cause, type FROM v_failures") == [("exception", "SystemExit")]
 
 
 def test_a_failure_is_tried_again_only_when_asked(launches: Launches) -> None:

@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+from orchestrate.campaign import Work
+from orchestrate.store import Reader
 from tests.orchestrate.conftest import ROOT
 
 Command = Callable[..., tuple[int, str, str]]
@@ -48,6 +52,43 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["launch.workers=0"], "launch.workers is 0, but null or a whole number above 0"),
         (["launch.dryrun=true"], "did you mean 'dry_run'"),
         (["store.url=mysql://you:secret@host/db"], "not supported"),
+        (["store.url="], "store.url is '', but a text is expected"),
+        (["store.url=postgresql://you:secret@host:port/db"], "The database URL cannot be read"),
+        (["store.url=sqlite:////dev/null/results.db"], "cannot be made or opened"),
+        (["store.url=sqlite:////dev"], "/dev is a folder, but a file is expected"),
+        (["--cfg", "jobs"], "--cfg 'jobs' is unknown.* did you mean 'job'"),
+        (["--bogus"], "option '--bogus' is unknown"),
+        (["--mutlirun", "seed=1,2"], "did you mean '--multirun'"),
+        (["--package"], "--package/-p: expected one argument"),
+        (["-m", "--cfg", "job"], "-m and --cfg cannot be combined"),
+        (["--resolve"], "--resolve goes with --cfg or --help"),
+        (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor is expected"),
+        (["env="], "env is empty, but one of arm"),
+        (["env=[arm,cartpole]"], "env is the list \\[arm,cartpole\\], .*-m env=a,b"),
+        (["-m", "env=null,arm"], "env 'null' is unknown"),
+        (["pendulum"], "'pendulum' is no setting: write key=value"),
+        (["seed=abc"], "seed is 'abc', but a whole number"),
+        (["seed=1.5"], "seed is 1.5, but a whole number"),
+        (["seed=null"], "seed is null, but a whole number"),
+        (["env.horizon=null"], "env.horizon is null, but a whole number is expected"),
+        (["+evn=arm"], "setting 'evn' is unknown.* did you mean 'env'"),
+        (["++widht=8"], "setting 'widht' is unknown.* did you mean 'width'"),
+        (["-m", "+widht=8,16"], "setting 'widht' is unknown.* did you mean 'width'"),
+        (["+env.foo=1"], "field 'foo' is unknown"),
+        (["+launch.worker=1"], "setting of launch 'worker' is unknown.* did you mean 'workers'"),
+        (["+launch.ray.adress=x"], "setting of launch.ray 'adress' is unknown"),
+        (["+store.path=x"], "setting of store 'path' is unknown"),
+        (["executor=local", "+executor.device=cuda"], "setting of executor 'device' is unknown"),
+        (["experiment=paper"], "experiment=paper is a grid .*: add -m"),
+        (["experiment=width", "width=8", "env=arm"], "is a grid .*policy=d_optimal.*: add -m"),
+        (["-m", "policy=random,uniform", "policy.regularization=1"], "'regularization' is unknown"),
+        (["-m", "env=glob(*)", "env.gravty=1,2"], "did you mean 'gravity'"),
+        (["policy=random_held"], "did you mean 'baseline/random_held'"),
+        (["-m", "hydra/sweeper=basic", "seed=1,2"], "another hydra/sweeper was given"),
+        (["width=1000000"], "would need .* GiB of memory, .* make model.width smaller"),
+        (["env.grid_points=[1000000,1000000]"], "make env.grid_points smaller"),
+        (["policy=random", "env.horizon=1000000000"], "env.horizon is 1,000,000,000 steps, but"),
+        (["-m", "width=8,99999", "launch.memory_gib=1"], "but launch.memory_gib allows 1 GiB"),
     ],
 )
 def test_a_wrong_command_is_one_sentence_and_leaves_nothing(
@@ -96,6 +137,18 @@ def test_a_dry_run_shows_the_grid_and_makes_no_database(
     assert "8 trials, 6 done, 2 to run" in command_line(*grid, "launch.dry_run=true")[1]
 
 
+def test_a_dry_run_tells_its_cells_apart(command_line: Command) -> None:
+    _, output, _ = command_line(
+        "-m", "env=arm,pendulum", "policy=random", "env.mass=2,3", "env.dt=0.01,0.02", "seed=0",
+        "launch.dry_run=true",
+    )  # fmt: skip
+    assert "env.mass applies to env=pendulum only\n" in output
+    assert re.search(r"env +policy +env.dt +env.mass +trials", output)
+    assert re.search(r"arm +random +0.01 +- +1", output)
+    assert re.search(r"pendulum +random +0.02 +3.0 +1", output)
+    assert "6 trials" in output
+
+
 def test_width_reaches_the_model_and_a_model_without_width_runs_once(
     command_line: Command,
 ) -> None:
@@ -113,6 +166,50 @@ def test_the_database_of_the_environment(
     monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/mine.db")
     assert command_line(*SHORT)[0] == 0
     assert (tmp_path / "mine.db").exists()
+
+
+def test_flags_may_stand_anywhere(command_line: Command) -> None:
+    code, output, _ = command_line("env=arm", "--cfg", "job", "width=8", "--package", "env")
+    assert code == 0
+    assert "name: arm" in output
+    code, output, _ = command_line("seed=1,2", "-m", "policy=random", "launch.dry_run=true")
+    assert (code, output.splitlines()[-1]) == (0, "2 trials, 0 done, 2 to run")
+
+
+def test_one_trial_of_an_experiment_is_one_whose_sweeps_are_all_decided(
+    command_line: Command,
+) -> None:
+    decided = ("experiment=smoke", "env=arm", "policy=random", "seed=0")
+    code, output, errors = command_line(*decided, "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    assert "1 trial, 0 done, 1 to run" in output
+
+
+def test_a_setting_holds_for_the_choices_that_have_it(command_line: Command) -> None:
+    code, output, errors = command_line(
+        "-m", "env=arm", "policy=random,uniform,d_optimal", "policy.regularization=1e-2,1e-3",
+        "model.depth=1", "seed=0,1", "launch.dry_run=true",
+    )  # fmt: skip
+    assert (code, errors) == (0, "")
+    assert "policy.regularization applies to policy=d_optimal only\n" in output
+    assert "model.depth" not in output
+    assert "8 trials, 0 done, 8 to run" in output  # 2 random, 2 uniform, 4 D-optimal
+
+
+def test_a_setting_of_a_model_that_one_policy_brings_along(command_line: Command) -> None:
+    code, output, _ = command_line(
+        "-m", "policy=random,oracle", "model.depth=3", "seed=0", "launch.dry_run=true"
+    )
+    assert code == 0
+    assert output.startswith("model.depth applies to model=mlp only\n")
+    assert "2 trials" in output
+
+
+def test_a_helper_that_another_setting_refers_to_is_read(command_line: Command) -> None:
+    arguments = ("-m", "+strength=3,4", "env.gamma=${strength}", "seed=0", "launch.dry_run=true")
+    code, output, errors = command_line(*arguments)
+    assert (code, errors) == (0, "")
+    assert "2 trials" in output
 
 
 def test_every_experiment_is_a_grid(command_line: Command) -> None:
@@ -156,3 +253,32 @@ def test_it_runs_from_any_folder_without_being_installed(tmp_path: Path) -> None
     assert done.stderr == ""
     assert "4 trials, 0 done, 4 to run" in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_may_say_what_no_terminal_shows(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unspeakable(_: TrialSpec) -> TrialResult:
+        raise OSError("cannot read \udcff")
+
+    monkeypatch.setattr("orchestrate.launch.WORK", Work(unspeakable, prepare=lambda: None))
+    code, out, _ = command_line("-m", "seed=0", "env.horizon=5", "executor=inprocess")
+    assert code == 1
+    assert r"1 failed: OSError: cannot read \udcff" in out
+
+
+def test_a_defect_of_the_program_is_not_taken_for_failed_trials(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def broken(*_: object) -> None:
+        raise AssertionError("nobody thought of postgresql://me:secret@host/db")
+
+    monkeypatch.setattr("orchestrate.campaign.Chunks", broken)
+    url = f"sqlite:///{tmp_path}/results.db"
+    code, _, errors = command_line("env=pendulum", f"store.url={url}")
+    assert code == 70
+    assert "Traceback" in errors
+    assert "report it" in errors.splitlines()[-1]
+    assert "secret" not in errors
+    with Reader.open(url) as reader:
+        assert reader.query("SELECT state, exit_code FROM launch")[0] == ("failed", 70)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -158,3 +160,24 @@ def test_the_end_of_ray_itself_is_no_fault_of_a_trial(ray_executor: Executor) ->
     with pytest.raises(InfrastructureError, match="Ray's raylet has ended"):
         drain(ray_executor)
     ray_executor.stop()
+
+
+def test_a_pool_that_cannot_start_all_its_workers_keeps_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+    start = subprocess.Popen
+
+    def refuse_the_second(*words: Any, **options: Any) -> subprocess.Popen[bytes]:
+        if started:
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+        started.append(start(*words, **options))
+        return started[0]
+
+    monkeypatch.setattr(subprocess, "Popen", refuse_the_second)
+    with (
+        pytest.raises(InfrastructureError, match=r"temporarily unavailable\): set launch\.workers"),
+        LocalExecutor(quick, 2),
+    ):
+        pass
+    assert started[0].poll() == -signal.SIGKILL

@@ -161,3 +161,40 @@ def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> No
 def test_sweeps_without_values_are_errors(sample: Sample, override: str, words: str) -> None:
     with pytest.raises((SpecificationError, HydraException), match=words):
         expand(sample.loader, sample.master, [override])
+
+
+MIXED: list[tuple[list[str], list[list[str]]]] = [
+    (
+        ["model=linear,mlp", "model.order=2,3", "seed=range(2)"],
+        [["model=linear", "model.order=2,3", "seed=range(2)"], ["model=mlp", "seed=range(2)"]],
+    ),
+    (
+        ["policy=plain,oracle", "model.half=4", "width=8,9"],
+        [["policy=plain", "model.half=4", "width=8,9"], ["policy=oracle", "width=8,9"]],
+    ),
+    (
+        ["model.order=[1,2]", "env=glob(*)", "model=mlp,linear"],
+        [["model.order=[1,2]", "env=glob(*)", "model=linear"], ["env=glob(*)", "model=mlp"]],
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "parts"), MIXED)
+def test_a_key_that_some_choices_lack_holds_for_the_others(
+    sample: Sample, arguments: list[str], parts: list[list[str]]
+) -> None:
+    """Where stock Hydra refuses the whole, the result is what it gives for each part."""
+    with pytest.raises(HydraException):
+        by_hydra(sample, arguments)
+    expected: Counter[str] = sum((by_hydra(sample, part) for part in parts), Counter())
+    assert by_us(sample, arguments) == expected
+    combinations = expand(sample.loader, sample.master, arguments, sections=SECTIONS)
+    assert {one.unused for one in combinations} >= {()}
+    assert len({one.unused for one in combinations}) == 2
+
+
+@pytest.mark.parametrize("override", ["model.ordr=2,3", "nothere=1", "env.dtt=[1]"])
+def test_a_key_that_every_choice_lacks_is_the_error_of_hydra(sample: Sample, override: str) -> None:
+    same(sample, ["model=linear,mlp", override])
+    with pytest.raises(HydraException):
+        expand(sample.loader, sample.master, ["model=linear,mlp", override])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrate.provenance import launch_record, without_password
+from orchestrate.provenance import launch_record
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -25,6 +25,14 @@ def test_outside_a_repository_there_is_no_commit(tmp_path: Path) -> None:
     assert {"python", "numpy", "numba", "hydra-core"} <= set(record.versions)
 
 
+def test_an_image_without_its_repository_says_the_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_COMMIT", "c" * 40)
+    record = launch_record([], [], tmp_path)
+    assert (record.git_commit, record.git_dirty) == ("c" * 40, None)
+
+
 def test_the_commit_and_what_differs_from_it(tmp_path: Path) -> None:
     git(tmp_path, "init")
     (tmp_path / "code.py").write_text("a = 1\n")
@@ -37,16 +45,27 @@ def test_the_commit_and_what_differs_from_it(tmp_path: Path) -> None:
     dirty = launch_record([], [], tmp_path)
     assert (dirty.git_commit, dirty.git_dirty) == (clean.git_commit, True)
     assert dirty.git_diff_hash is not None
+    (tmp_path / "code.py").write_text("a = 1\n")
+    (tmp_path / "new.py").write_text("b = 1\n")
+    added = launch_record([], [], tmp_path)
+    (tmp_path / "new.py").write_text("b = 2\n")
+    changed = launch_record([], [], tmp_path)
+    hashes = {one.git_diff_hash for one in (clean, dirty, added, changed)}
+    assert len(hashes) == 4
+    assert added.git_dirty
 
 
-@pytest.mark.parametrize(
-    ("text", "safe"),
-    [
-        ("store.url=postgresql://me:pa:ss@host:5432/db", "store.url=postgresql://me:***@host:5432/db"),
-        ("postgresql+psycopg://:pw@host/db", "postgresql+psycopg://:***@host/db"),
-        ("sqlite:///results/results.db", "sqlite:///results/results.db"),
-        ("ray://host:10001", "ray://host:10001"),
-    ],
-)  # fmt: skip
-def test_passwords_are_hidden(text: str, safe: str) -> None:
-    assert without_password(text) == safe
+def test_a_repository_around_an_installed_copy_is_not_that_of_the_code(tmp_path: Path) -> None:
+    git(tmp_path, "init")
+    (tmp_path / "note").write_text("mine\n")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-m", "Add a note")
+    installed = tmp_path / "site-packages"
+    installed.mkdir()
+    assert launch_record([], [], installed).git_commit is None
+
+
+def test_the_processor_and_what_compiles_for_it_are_named(tmp_path: Path) -> None:
+    versions = launch_record([], [], tmp_path).versions
+    assert {"llvmlite", "cpu", "cpu_model", "cpu_features", "platform"} <= set(versions)
+    assert all(versions.values())

@@ -1,0 +1,82 @@
+"""A lab for each test, and the outcome of the same grid where nothing happened."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.machines import servers
+from tests.machines.hosts import Network
+from tests.machines.lab import GRID, SEEDS, Lab, environment
+from tests.machines.outcome import Outcome
+
+HERE = Path(__file__).parent
+SECONDS = 600
+_measured: list[tuple[str, float]] = []
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if HERE in item.path.parents:
+            item.add_marker(pytest.mark.machines)
+            item.add_marker(pytest.mark.timeout(SECONDS))
+            item.add_marker(pytest.mark.xdist_group("machines"))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    for what, seconds in _measured:
+        terminalreporter.write_line(f"{seconds:6.1f} s  {what}")
+
+
+@pytest.fixture
+def measured() -> Callable[[str, float], None]:
+    """Return a function that keeps a time for the end of the report."""
+    return lambda what, seconds: _measured.append((what, seconds))
+
+
+@pytest.fixture(scope="session")
+def namespaces() -> None:
+    """Skip, or fail where that is asked for, without what the hosts are made of."""
+    command = ["unshare", "--net", "--mount", "--pid", "--fork", "--uts", "--mount-proc"]
+    probe = subprocess.run([*command, "ip", "link"], capture_output=True, text=True)
+    reason = probe.stderr.strip() if probe.returncode else ""
+    if not any(Path("/usr/lib/postgresql").glob("*/bin/initdb")):
+        reason = "PostgreSQL's initdb is not installed"
+    if not reason:
+        return
+    message = f"the hosts need root, network namespaces and PostgreSQL: {reason}"
+    if os.environ.get("DOPT_REQUIRE_MACHINES") == "1":
+        pytest.fail(message)
+    pytest.skip(message)
+
+
+@pytest.fixture
+def lab(namespaces: None, request: pytest.FixtureRequest) -> Iterator[Lab]:  # noqa: ARG001
+    with Network(environment()) as network:
+        lab = Lab(network)
+        yield lab
+        if request.session.testsfailed:
+            for host in network.hosts.values():
+                sys.stderr.write(f"--- {host.name}\n{host.logs()}\n")
+
+
+@pytest.fixture(scope="session")
+def undisturbed(namespaces: None, tmp_path_factory: pytest.TempPathFactory) -> Outcome:  # noqa: ARG001
+    """Return the outcome of the grid, run in one process with nothing in its way."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('undisturbed') / 'results.db'}"
+    words = [*GRID, f"seed=range({SEEDS})", "executor=inprocess", f"store.url={url}"]
+    process = subprocess.run(
+        [sys.executable, str(servers.ROOT / "orchestrate/launch.py"), "-m", *words],
+        capture_output=True, text=True, timeout=SECONDS, env={**os.environ, **environment()},
+    )  # fmt: skip
+    assert process.returncode == 0, process.stdout + process.stderr
+    text = subprocess.run(
+        [sys.executable, "-m", "tests.machines.outcome", url],
+        capture_output=True, text=True, timeout=SECONDS, check=True, cwd=servers.ROOT,
+    ).stdout  # fmt: skip
+    return Outcome.from_json(text)

@@ -1,0 +1,106 @@
+"""A PostgreSQL server, a Ray cluster and a desk to launch from, each on a host of its own."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from tests.machines import servers
+from tests.machines.hosts import Host, Network, Process, until
+from tests.machines.outcome import Outcome
+
+GRID = ("env=pendulum", "policy=d_optimal", "width=32")
+SEEDS = 24
+
+
+class Lab:
+    """Hosts of a network by their names; ``desk`` has no cores for trials.
+
+    Attributes
+    ----------
+    network : Network
+        Where links are cut and hosts end.
+    address : str
+        HOST:PORT of the head, once there is one.
+    """
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self.database = servers.Database(network.add("db"))
+        self.address = ""
+
+    def host(self, name: str) -> Host:
+        """Return the host of the name, the newest one."""
+        return self.network.hosts[name] if name in self.network.hosts else self.network.add(name)
+
+    def start_cluster(self, *workers: str, **environment: str) -> None:
+        """Start the head, let the desk join it, and the workers with a core each."""
+        self.address = servers.start_head(self.host("head"), 0, **environment)
+        servers.join(self.host("desk"), self.address, 0, **environment)
+        for worker in workers:
+            self.add_worker(worker, **environment)
+
+    def add_worker(self, name: str, **environment: str) -> None:
+        servers.join(self.host(name), self.address, 1, **environment)
+
+    def launch(
+        self, *words: str, seeds: int = SEEDS, on: str = "desk", witness: bool = False,
+        **environment: str,
+    ) -> Process:  # fmt: skip
+        """Start a launch of the grid, on the cluster if there is one, else in a pool."""
+        where = ["executor=local", "launch.workers=1"]
+        if self.address:
+            where = ["executor=ray", f"launch.ray.address={self.address}"]
+        grid = (*GRID, f"seed=range({seeds})", "launch.chunk_seconds=0.5")
+        program = servers.WITNESS if witness else servers.LAUNCH
+        words = (f"store.url={self.database.url}", *grid, *where, *words)
+        return servers.launch(self.host(on), program, *words, **environment)
+
+    def until_done(self, launched: Process, count: int) -> None:
+        """Wait until so many trials are done, or the launch has ended."""
+        until(
+            lambda: self.done() >= count or not launched.running, 120.0,
+            lambda: f"{count} done trials:\n{launched.output}",
+        )  # fmt: skip
+        assert launched.running, launched.output
+
+    def until_rows(self, launched: Process, table: str, condition: str) -> float:
+        """Wait until there is such a row; return how many seconds that took."""
+        return until(
+            lambda: self.count(table, condition) > 0, 60.0,
+            lambda: f"{table} with {condition}:\n{launched.output}",
+        )  # fmt: skip
+
+    def done(self) -> int:
+        """Return how many trials are done, -1 while the server does not say."""
+        return self.count("trial", "status = 'done'")
+
+    def count(self, table: str, condition: str) -> int:
+        """Return how many rows there are, -1 while the server does not say."""
+        answer = self.ask(f"SELECT count(*) FROM {table} WHERE {condition}")
+        return int(answer) if answer.isdigit() else -1
+
+    def ask(self, sql: str) -> str:
+        """Return what ``psql`` says to a query, errors included."""
+        host = self.host("db")
+        words = ["psql", "-h", "/tmp", "-U", "postgres", "-Atc", sql]
+        process = host.start(*words)
+        process.wait(30.0)
+        return process.output.strip()
+
+    def outcome(self) -> Outcome:
+        """Return all that is in the database."""
+        command = (sys.executable, "-m", "tests.machines.outcome", self.database.url)
+        return Outcome.from_json(self.host("db").run(*command))
+
+
+def environment() -> dict[str, str]:
+    """Return what every program on every host is given."""
+    cache = os.environ.get("DOPT_CACHE") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return {
+        "PYTHONPATH": str(servers.ROOT),
+        "DOPT_CACHE": str(Path(cache).expanduser()),  # nobody compiles again
+        "OMP_NUM_THREADS": "1",
+        "RAY_USAGE_STATS_ENABLED": "0",
+    }

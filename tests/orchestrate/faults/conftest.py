@@ -1,0 +1,79 @@
+"""A laboratory for each test, on each database; one PostgreSQL server of our own for all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.orchestrate.faults.laboratory import PATIENCE_SECONDS, Laboratory
+from tests.orchestrate.faults.outcome import Rows, results
+from tests.orchestrate.faults.program import Order
+from tests.orchestrate.faults.servers import Server, binaries
+
+TRIALS = Order.trials
+
+TRIAL_SECONDS = 0.1
+"""What a trial that takes no time may take on a machine with much else to do."""
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    try:
+        binaries()
+    except FileNotFoundError as error:
+        if os.environ.get("DOPT_REQUIRE_POSTGRES") == "1":
+            pytest.fail(str(error))
+        pytest.skip(str(error))
+    server = Server()
+    yield server
+    server.remove()
+
+
+@pytest.fixture
+def sqlite_url(tmp_path: Path) -> str:
+    return f"sqlite:///{tmp_path}/results/results.db"
+
+
+@pytest.fixture
+def postgresql_url(server: Server) -> str:
+    return server.new_url()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest) -> str:
+    return str(request.getfixturevalue(f"{request.param}_url"))
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Rows]:
+    """Return a function that gives what a grid leaves when nothing happens to it."""
+    known: dict[int, Rows] = {}
+
+    def rows(trials: int) -> Rows:
+        if trials not in known:
+            folder = tmp_path_factory.mktemp("undisturbed")
+            url = f"sqlite:///{folder}/results.db"
+            order = Order(url, executor="inprocess", trials=trials, seconds=0.0)
+            with Laboratory(folder, order, {}).launched() as launched:
+                assert launched.end(TRIAL_SECONDS * trials + PATIENCE_SECONDS) == 0, launched.errors
+            known[trials] = results(url)
+        return known[trials]
+
+    return rows
+
+
+@pytest.fixture
+def laboratory_at(tmp_path: Path, undisturbed: Callable[[int], Rows]) -> Callable[..., Laboratory]:
+    def build(url: str, trials: int = TRIALS, **order: Any) -> Laboratory:
+        return Laboratory(tmp_path, Order(url, trials=trials, **order), undisturbed(trials))
+
+    return build
+
+
+@pytest.fixture
+def laboratory(url: str, laboratory_at: Callable[..., Laboratory]) -> Laboratory:
+    return laboratory_at(url)

@@ -1,0 +1,173 @@
+"""The launch that the faults hit: the real one, of trials that are stand-ins.
+
+Forked from a clean process, or run as ``python -m tests.orchestrate.faults.program ORDER OUTPUT``
+with the order in JSON.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import faulthandler
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psycopg
+
+from orchestrate import launch
+from orchestrate.campaign import Work
+from orchestrate.errors import ExitCode
+from orchestrate.settings import LaunchSettings
+from orchestrate.store import Store
+from orchestrate.store.postgresql import PostgreSQLBackend
+from orchestrate.store.sqlite import SQLiteBackend
+from tests.orchestrate.faults.trials import Standin, grid_of, rest
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is launched.
+
+    Attributes
+    ----------
+    seconds
+        Duration of one trial.
+    trouble
+        What the trial with the broken seed does.
+    pause
+        Where the driver stops for ever: before it claims, in the middle of a commit, or
+        on PostgreSQL in the middle of what it sends: the steps of a trial, or a claim.
+    settings
+        Further settings of the launch.
+    environment
+        Variables of the environment that must be there before the program starts.
+    """
+
+    url: str
+    executor: str = "local"
+    trials: int = 40
+    seconds: float = 0.05
+    trouble: str = ""
+    pause: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+def carry_out(order: Order, output: Path) -> None:
+    """Launch, write what is said to ``output`` and ``output``.err, and exit as a launch does."""
+    for stream, path in ((1, output), (2, errors_beside(output))):
+        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), stream)
+    faulthandler.register(signal.SIGUSR1)
+    # As from a terminal: a test run in the background of a shell leaves Ctrl-C ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if order.environment:
+        _start_anew(order, output)
+    if order.pause:
+        _PAUSES[order.pause](lambda: _stop_for_ever(output.with_suffix(".paused")))
+    sys.exit(_launch(order))
+
+
+def errors_beside(output: Path) -> Path:
+    return output.with_suffix(".err")
+
+
+def _start_anew(order: Order, output: Path) -> None:
+    """Become a new program with the environment, which is no part of what it is told."""
+    told = json.dumps({**dataclasses.asdict(order), "environment": {}})
+    words = [sys.executable, "-m", __name__, told, str(output)]
+    os.execve(sys.executable, words, {**os.environ, **order.environment})
+
+
+def _launch(order: Order) -> int:
+    launch.WORK = Work(Standin(order.seconds, order.trouble), prepare=lambda: None)
+    chosen = {"workers": 2, "chunk_seconds": 0.2, **order.settings}
+    settings = LaunchSettings(order.executor, order.url, **chosen)
+    request = launch.Request((), {}, (), single=False)
+    try:
+        return launch.run(request, grid_of(order.trials), settings)
+    except KeyboardInterrupt:
+        return ExitCode.INTERRUPTED
+
+
+def _pause_before_claim(stop: Callable[[], None]) -> None:
+    def claim(*_: object) -> None:
+        stop()
+
+    Store.claim = claim  # type: ignore[assignment]
+
+
+def _pause_in_commit(stop: Callable[[], None]) -> None:
+    """Stop with half of the steps of the third trial written."""
+    for backend in (SQLiteBackend, PostgreSQLBackend):
+        _pause_backend(backend, stop)
+
+
+def _pause_backend(backend: Any, stop: Callable[[], None]) -> None:
+    insert_steps, calls = backend.insert_steps, []
+
+    def half(self: Any, connection: Any, trial_id: int, values: Any) -> None:
+        calls.append(trial_id)
+        last = len(calls) == 3
+        insert_steps(self, connection, trial_id, values[: len(values) // 2] if last else values)
+        if last:
+            stop()
+
+    backend.insert_steps = half
+
+
+def _pause_in_copy(stop: Callable[[], None]) -> None:
+    """Stop while the server waits for more rows of the third trial."""
+    copies: list[object] = []
+    write_row = psycopg.Copy.write_row
+
+    def some(self: Any, row: Any) -> None:
+        if self not in copies[-1:]:
+            copies.append(self)
+        write_row(self, row)
+        if len(copies) == 3:
+            stop()
+
+    psycopg.Copy.write_row = some  # type: ignore[method-assign]
+
+
+def _pause_in_pipeline(stop: Callable[[], None]) -> None:
+    """Stop while a claim, which also holds the row of its launch, is sent in several messages."""
+    claims: list[object] = []
+    executemany = psycopg.Cursor.executemany
+
+    def some(self: Any, query: Any, rows: Any, **options: Any) -> None:
+        claims.extend([query] if b"INTO attempt" in bytes(query, "ascii") else [])
+        if len(claims) < 3:
+            executemany(self, query, rows, **options)
+            return
+        with self.connection.pipeline():
+            self.execute(query, next(iter(rows)))
+            self.connection.pgconn.send_flush_request()
+            self.connection.pgconn.flush()
+            stop()
+
+    psycopg.Cursor.executemany = some  # type: ignore[assignment]
+
+
+def _stop_for_ever(mark: Path) -> None:
+    mark.touch()
+    time.sleep(3600)
+
+
+_PAUSES = {
+    "claim": _pause_before_claim,
+    "commit": _pause_in_commit,
+    "copy": _pause_in_copy,
+    "pipeline": _pause_in_pipeline,
+}
+
+
+if __name__ == "__main__":
+    time.sleep = rest
+    carry_out(Order(**json.loads(sys.argv[1])), Path(sys.argv[2]))

@@ -1,0 +1,293 @@
+"""The driver under an executor that does what the test says, loses and dies included."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from orchestrate.driver import ATTEMPTS, NODE_LOSSES
+from orchestrate.errors import ExitCode, InfrastructureError
+from orchestrate.executors.base import Event, Executor, Lost, Task
+from orchestrate.executors.task import run_task
+from orchestrate.store import Claim, Store, StoreUnavailableError
+from tests.orchestrate.conftest import Launches
+from tests.orchestrate.losses import lose
+from tests.orchestrate.standins import BROKEN_SEED, quick, raising
+
+Fate = Callable[[Sequence[Task], int], list[Event]]
+"""What becomes of a chunk, whose first trial is submitted for the given time: 1, 2 ..."""
+
+
+class Scripted(Executor):
+    """Lets each chunk end as the script says, and keeps what it was given."""
+
+    def __init__(self, fate: Fate) -> None:
+        self._fate = fate
+        self._chunks: deque[Sequence[Task]] = deque()
+        self._times: Counter[str] = Counter()
+        self.given: list[list[int]] = []
+
+    def start(self) -> None:
+        self.slots = 4
+
+    def submit(self, chunk: Sequence[Task]) -> None:
+        if chunk:
+            self._chunks.append(chunk)
+            self.given.append([task.spec.seed for task in chunk])
+
+    def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # the interface's
+        if not self._chunks:
+            return []
+        chunk = self._chunks.popleft()
+        self._times.update(task.key for task in chunk)
+        return self._fate(chunk, self._times[chunk[0].key])
+
+    @property
+    def pending(self) -> int:
+        return len(self._chunks)
+
+    def stop(self) -> None:
+        self._chunks.clear()
+
+
+@pytest.fixture
+def scripted(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[ExitCode, Scripted]]:
+    """Return a function that launches a grid on a scripted executor."""
+
+    def launch(fate: Fate, seeds: int = 5, **settings: object) -> tuple[ExitCode, Scripted]:
+        executor = Scripted(fate)
+        monkeypatch.setattr("orchestrate.campaign.make_executor", lambda *_: executor)
+        return launches(seeds=seeds, **settings), executor  # type: ignore[arg-type]
+
+    return launch
+
+
+def finish(chunk: Sequence[Task]) -> list[Event]:
+    return [run_task(quick, task) for task in chunk]
+
+
+def keys(chunk: Sequence[Task]) -> tuple[str, ...]:
+    return tuple(task.key for task in chunk)
+
+
+def has_broken(chunk: Sequence[Task]) -> bool:
+    return BROKEN_SEED in [task.spec.seed for task in chunk]
+
+
+Launch = Callable[..., tuple[ExitCode, Scripted]]
+
+
+def test_a_trial_whose_node_is_lost_runs_again_free_of_charge(
+    scripted: Launch, launches: Launches
+) -> None:
+    def fate(chunk: Sequence[Task], time: int) -> list[Event]:
+        if has_broken(chunk) and time < NODE_LOSSES:
+            return [Lost(keys(chunk), "lost its power", blameless=True)]
+        return finish(chunk)
+
+    assert scripted(fate)[0] == ExitCode.DONE
+    assert set(launches.statuses().values()) == {"done"}
+    outcomes = launches.query(
+        "SELECT outcome, count(*) FROM attempt JOIN trial USING (trial_id) "
+        f"WHERE seed = {BROKEN_SEED} GROUP BY outcome ORDER BY outcome"
+    )
+    assert outcomes == [("done", 1), ("released", NODE_LOSSES - 1)]
+
+
+def test_a_trial_that_is_lost_with_every_node_is_given_up(
+    scripted: Launch, launches: Launches
+) -> None:
+    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
+        if has_broken(chunk):
+            return [Lost(keys(chunk), "lost its power", blameless=True)]
+        return finish(chunk)
+
+    assert scripted(fate)[0] == ExitCode.SOME_FAILED
+    statuses = launches.statuses()
+    assert statuses.pop(BROKEN_SEED) == "failed"
+    assert set(statuses.values()) == {"done"}
+    [(cause, message, attempt)] = launches.query("SELECT cause, message, attempt FROM v_failures")
+    assert (cause, attempt) == ("node lost", NODE_LOSSES)
+    assert message == (
+        f"lost {NODE_LOSSES} times with its node, which has lost its power the last time"
+    )
+
+
+def test_the_loss_of_nodes_does_not_count_against_the_attempts(
+    scripted: Launch, launches: Launches
+) -> None:
+    def fate(chunk: Sequence[Task], time: int) -> list[Event]:
+        if has_broken(chunk) and time <= NODE_LOSSES:
+            return [Lost(keys(chunk), "gone", blameless=time != 2)]
+        return finish(chunk)
+
+    assert scripted(fate)[0] == ExitCode.DONE
+    assert set(launches.statuses().values()) == {"done"}
+
+
+def test_a_lost_chunk_is_split_and_only_the_one_to_blame_fails(
+    scripted: Launch, launches: Launches
+) -> None:
+    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
+        if has_broken(chunk):
+            return [Lost(keys(chunk), "been killed", cause="out of memory")]
+        return finish(chunk)
+
+    code, executor = scripted(fate, seeds=200)
+    assert code == ExitCode.SOME_FAILED
+    [(cause, kind)] = launches.query("SELECT cause, type FROM v_failures")
+    assert (cause, kind) == ("out of memory", "WorkerLost")
+    assert executor.given.count([BROKEN_SEED]) >= ATTEMPTS
+    assert set(Counter(launches.statuses().values()).items()) == {("done", 199), ("failed", 1)}
+
+
+def test_a_timeout_is_final(scripted: Launch, launches: Launches) -> None:
+    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
+        if has_broken(chunk):
+            return [Lost(keys(chunk), "timeout after 5 s", cause="timeout", traceback="in C")]
+        return finish(chunk)
+
+    code, executor = scripted(fate)
+    assert code == ExitCode.SOME_FAILED
+    assert executor.given.count([BROKEN_SEED]) == 1
+    assert launches.query("SELECT cause, message, traceback FROM v_failures") == [
+        ("timeout", "timeout after 5 s", "in C")
+    ]
+    assert "1 failed: timeout after 5 s" in launches.said[-1]
+
+
+def test_fail_fast_heeds_every_cause(scripted: Launch, launches: Launches) -> None:
+    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
+        if has_broken(chunk):
+            return [Lost(keys(chunk), "timeout after 5 s", cause="timeout")]
+        return finish(chunk)
+
+    assert scripted(fate, seeds=300, fail_fast=True)[0] == ExitCode.SOME_FAILED
+    assert "pending" in launches.statuses().values()
+    assert "stopped at the first failure" in launches.said[-1]
+
+
+def test_the_end_of_the_executor_frees_the_claims_at_once(
+    scripted: Launch, launches: Launches
+) -> None:
+    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
+        if has_broken(chunk):
+            raise InfrastructureError("The workers are gone: run the same command again.")
+        return finish(chunk)
+
+    with pytest.raises(InfrastructureError, match="workers are gone"):
+        scripted(fate, seeds=50)
+    statuses = Counter(launches.statuses().values())
+    assert statuses["running"] == statuses["failed"] == 0
+    assert statuses["pending"] > 0
+    assert launches.query("SELECT state, exit_code FROM launch") == [("failed", 75)]
+    assert scripted(lambda chunk, _: finish(chunk), seeds=50)[0] == ExitCode.DONE
+
+
+def test_the_first_error_is_the_one_that_is_told(
+    scripted: Launch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fate(_: Sequence[Task], __: int) -> list[Event]:
+        raise InfrastructureError("The workers are gone: run the same command again.")
+
+    lose(monkeypatch, ["question"] * 9, ["end_launch"], transient=False)
+    with pytest.raises(InfrastructureError, match="workers are gone"):
+        scripted(fate)
+
+
+def test_a_full_disk_ends_the_launch_at_once_and_charges_nobody(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        lose(patch, ["", "question"], ["commit_many"], transient=False)
+        with pytest.raises(StoreUnavailableError, match="commit_many was lost"):
+            launches(quick)
+    assert sorted(launches.statuses().values()) == ["done"] + 4 * ["pending"]
+    assert launches(quick) == ExitCode.DONE
+
+
+def test_a_database_that_stays_away_ends_the_launch_and_a_rerun_completes(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        lose(patch, ["", ""] + 1000 * ["question"], ["commit_many", "end_launch"])
+        with pytest.raises(StoreUnavailableError, match="commit_many was lost"):
+            launches(quick, patience=0.5)
+    assert launches.said[-1].startswith("waiting for up to 0.5 s: commit_many was lost")
+    assert launches(quick) == ExitCode.DONE
+    assert set(launches.statuses().values()) == {"done"}
+
+
+def test_lost_questions_and_answers_cost_a_launch_nothing(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lose(monkeypatch, 8 * ["answer", "", "question", "answer", "", ""])
+    assert launches(raising, seeds=20) == ExitCode.SOME_FAILED
+    statuses = launches.statuses()
+    assert statuses.pop(BROKEN_SEED) == "failed"
+    assert set(statuses.values()) == {"done"}
+    assert launches.said[-1].splitlines()[0].startswith("19 of 20 done, 1 failed, 0 diverged now")
+    assert "1 failed: ZeroDivisionError" in launches.said[-1]
+    assert launches.query("SELECT count(*) FROM attempt WHERE outcome IS NULL") == [(0,)]
+
+
+def test_a_failure_that_is_refused_is_another_launchs_to_count(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fail = Store.fail
+
+    def late(store: Store, claim: object, *rest: object) -> bool:
+        store.release(claim.launch)  # type: ignore[attr-defined]
+        return fail(store, claim, *rest)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        calls = iter([late])
+        patch.setattr(Store, "fail", lambda *words: next(calls, fail)(*words))
+        assert launches(raising) == ExitCode.SOME_FAILED
+    assert launches.statuses()[BROKEN_SEED] == "failed"
+    assert launches.query("SELECT attempt FROM v_failures") == [(2,)]
+
+
+def test_a_claim_that_is_done_after_it_was_repeated_is_found_again(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    claim, calls = Store.claim, iter(["lost", "outrun"])
+
+    def outrun(store: Store, launch: int, wanted: Sequence[str]) -> list[Claim]:
+        """Lose the first question, and answer the second one before the first is carried out."""
+        call = next(calls, "")
+        if call == "lost":
+            raise StoreUnavailableError("claim was lost.", transient=True)
+        claims = claim(store, launch, wanted)
+        return [] if call == "outrun" else claims
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "claim", outrun)
+        assert launches(quick) == ExitCode.DONE
+    assert set(launches.statuses().values()) == {"done"}
+    assert launches.query("SELECT count(*) FROM attempt WHERE outcome = 'released'") == [(1,)]
+
+
+def test_trials_that_nobody_may_claim_are_not_asked_for_all_the_time(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    claim, register, calls = Store.claim, Store.register, Counter[str]()
+    start = time.monotonic()
+
+    def locked(store: Store, launch: int, wanted: Sequence[str]) -> list[Claim]:
+        return [] if time.monotonic() < start + 2.0 else claim(store, launch, wanted)
+
+    def counted(store: Store, *words: object) -> object:
+        calls["register"] += 1
+        return register(store, *words)  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "claim", locked)
+        patch.setattr(Store, "register", counted)
+        assert launches(quick) == ExitCode.DONE
+    assert calls["register"] <= 6

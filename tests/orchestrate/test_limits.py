@@ -1,0 +1,248 @@
+"""A trial that takes too long, or too much memory, fails by itself and costs no other anything."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dopt.exploration import run_trial
+from dopt.result import TrialResult
+from orchestrate.errors import ExitCode
+from orchestrate.executors.base import Executor, Finished, Lost, Task, Trouble
+from orchestrate.executors.ending import LastWords
+from orchestrate.executors.limits import Limits, TrialTimeoutError, interrupted_after
+from orchestrate.executors.local import LocalExecutor
+from orchestrate.executors.task import run_task
+from tests.dopt.trials import trial
+from tests.orchestrate.conftest import ROOT, Launches
+from tests.orchestrate.standins import BROKEN_SEED, quick
+from tests.orchestrate.test_executors import drain, seed_of, tasks
+from tests.orchestrate.unruly import deaf, empty, faulty, greedy, greedy_in_a_group, hanging
+
+SEEDS = 6
+EXECUTORS = ("inprocess", "local", "ray")
+WORKERS = ("local", "ray")
+
+
+def failures(launches: Launches) -> list[tuple[object, ...]]:
+    return launches.query("SELECT seed, cause, type, message, attempt FROM v_failures")
+
+
+def only_the_broken_one_failed(launches: Launches) -> bool:
+    statuses = launches.statuses()
+    return statuses.pop(BROKEN_SEED) == "failed" and set(statuses.values()) == {"done"}
+
+
+@pytest.mark.parametrize("executor", EXECUTORS)
+def test_a_hanging_trial_is_interrupted_and_says_where_it_hung(
+    launches: Launches, executor: str
+) -> None:
+    assert launches(hanging, seeds=SEEDS, executor=executor, timeout=1.0) == ExitCode.SOME_FAILED
+    assert only_the_broken_one_failed(launches)
+    assert failures(launches) == [
+        (BROKEN_SEED, "timeout", "TrialTimeoutError", "timeout after 1 s", 1)
+    ]
+    [(text,)] = launches.query("SELECT traceback FROM v_failures")
+    assert "in wait_for_nothing" in text
+    assert "1 failed: timeout after 1 s" in launches.said[-1]
+
+
+@pytest.mark.parametrize("executor", WORKERS)
+def test_native_code_that_heeds_no_signal_ends_with_its_worker(
+    launches: Launches, executor: str
+) -> None:
+    assert launches(deaf, seeds=SEEDS, executor=executor, timeout=1.0) == ExitCode.SOME_FAILED
+    assert only_the_broken_one_failed(launches)
+    assert failures(launches) == [
+        (BROKEN_SEED, "timeout", "TrialTimeoutError", "timeout after 1 s", 1)
+    ]
+    assert launches.query("SELECT count(*) FROM attempt WHERE outcome = 'released'") == [(0,)]
+    if executor == "local":
+        [(text,)] = launches.query("SELECT traceback FROM v_failures")
+        assert "in sleep_natively" in text
+
+
+@pytest.mark.parametrize("executor", WORKERS)
+def test_the_rest_of_its_chunk_runs_without_being_charged(executor: str) -> None:
+    limits = Limits(seconds=1.0)
+    kind: Executor
+    if executor == "local":
+        kind = LocalExecutor(deaf, 1, limits)
+    else:
+        kind = importlib.import_module("orchestrate.executors.ray").RayExecutor(
+            deaf, 1, limits=limits
+        )
+    with kind:
+        kind.submit(tasks([0, 1, BROKEN_SEED, 3, 4]))
+        events = drain(kind)
+    [lost] = [event for event in events if isinstance(event, Lost)]
+    assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED]
+    assert (lost.cause, lost.reason, lost.blameless) == ("timeout", "timeout after 1 s", False)
+    finished = [event for event in events if isinstance(event, Finished)]
+    assert [seed_of(event.key) for event in finished] == [0, 1, 3, 4]
+    assert all(isinstance(event.outcome, TrialResult) for event in finished)
+
+
+def test_a_timeout_is_tried_again_only_when_asked(launches: Launches) -> None:
+    launches(hanging, timeout=0.2)
+    assert launches(quick, timeout=0.2) == ExitCode.SOME_FAILED
+    assert launches(quick, timeout=0.2, retry="failed") == ExitCode.DONE
+    assert launches.statuses()[BROKEN_SEED] == "done"
+
+
+def test_a_long_trial_of_the_kernel_heeds_its_limit(launches: Launches) -> None:
+    spec = trial("quadrotor", "d_optimal", env={"horizon": 4000}, model={"width": 64})
+    launches(run_trial, seeds=1)  # what is compiled on first use is not part of the limit
+    finished = run_task(run_trial, Task(spec.trial_key, spec), Limits(seconds=2.0))
+    assert isinstance(finished.outcome, Trouble)
+    assert finished.outcome.cause == "timeout"
+    assert "in advance" in finished.outcome.traceback
+
+
+def test_no_limit_is_no_limit(launches: Launches) -> None:
+    assert launches(quick, timeout=None) == ExitCode.DONE
+
+
+def test_somebody_elses_timer_goes_on() -> None:
+    rung: list[int] = []
+    handler = signal.signal(signal.SIGALRM, lambda number, _: rung.append(number))
+    timer = signal.setitimer(signal.ITIMER_REAL, 0.5)
+    try:
+        with pytest.raises(TrialTimeoutError), interrupted_after(Limits(seconds=0.05)):
+            time.sleep(60)
+        assert rung == []
+        signal.pause()
+        assert rung == [signal.SIGALRM]
+    finally:
+        signal.signal(signal.SIGALRM, handler)
+        signal.setitimer(signal.ITIMER_REAL, *timer)
+
+
+@pytest.mark.parametrize("executor", WORKERS)
+def test_a_greedy_trial_fails_by_itself(launches: Launches, executor: str) -> None:
+    code = launches(greedy, seeds=SEEDS, executor=executor, memory_gib=1.0)
+    assert code == ExitCode.SOME_FAILED
+    assert only_the_broken_one_failed(launches)
+    [(seed, cause, kind, message, attempt)] = failures(launches)
+    assert (seed, cause, attempt) == (BROKEN_SEED, "out of memory", 1)
+    assert "MemoryError" in str(kind)
+    assert "Unable to allocate" in str(message)
+    [(text,)] = launches.query("SELECT traceback FROM v_failures")
+    assert "in hoard" in text
+
+
+@pytest.fixture
+def small_group(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Make a control group of 600 MiB, where this process may."""
+    old = Path("/sys/fs/cgroup/memory")
+    group = (old if old.is_dir() else old.parent) / f"dopt-test-{os.getpid()}"
+    limit = "memory.limit_in_bytes" if old.is_dir() else "memory.max"
+    try:
+        group.mkdir()
+        (group / limit).write_text(str(600 * 2**20))
+    except OSError as error:
+        pytest.skip(f"no control group can be made: {error}")
+    monkeypatch.setenv("DOPT_TEST_GROUP", str(group))
+    yield group
+    group.rmdir()
+
+
+@pytest.mark.usefixtures("small_group")
+def test_a_trial_that_the_kernel_kills_for_want_of_memory_fails_after_two_attempts(
+    launches: Launches,
+) -> None:
+    assert launches(greedy_in_a_group, seeds=SEEDS, executor="local") == ExitCode.SOME_FAILED
+    assert only_the_broken_one_failed(launches)
+    [(_, cause, kind, message, attempt)] = failures(launches)
+    assert (cause, kind, attempt) == ("out of memory", "WorkerLost", 2)
+    assert "killed by the kernel for want of memory" in str(message)
+
+
+def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("RAY_memory_usage_threshold", "0.0001")
+    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
+    ray = importlib.import_module("orchestrate.executors.ray")
+    with ray.RayExecutor(hanging, 1) as executor:
+        executor.submit(tasks([BROKEN_SEED, 3]))
+        [lost] = drain(executor)
+    assert isinstance(lost, Lost)
+    assert (lost.cause, lost.blameless) == ("out of memory", False)
+    assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED, 3]
+
+
+def test_a_broken_access_to_memory_says_where_it_was(launches: Launches) -> None:
+    assert launches(faulty, seeds=SEEDS, executor="local") == ExitCode.SOME_FAILED
+    assert only_the_broken_one_failed(launches)
+    [(_, cause, _, message, attempt)] = failures(launches)
+    assert (cause, attempt) == ("killed", 2)
+    assert f"killed by signal {int(signal.SIGSEGV)}" in str(message)
+    [(text,)] = launches.query("SELECT traceback FROM v_failures")
+    assert "in faulty" in text
+    [(node, pid)] = launches.query("SELECT node, pid FROM attempt WHERE outcome = 'failed'")
+    assert node == socket.gethostname()
+    assert pid > 0
+
+
+def test_what_is_no_result_fails_its_trial_only(launches: Launches) -> None:
+    assert launches(empty, seeds=SEEDS, executor="local") == ExitCode.SOME_FAILED
+    assert only_the_broken_one_failed(launches)
+    [(_, cause, _, message, _)] = failures(launches)
+    assert cause == "malformed"
+    assert "returned NoneType, but a TrialResult is expected" in str(message)
+
+
+@pytest.mark.parametrize(
+    ("code", "before", "after", "said", "cause"),
+    [
+        (-9, 3, 3, "", "killed"),
+        (-9, 3, 4, "", "out of memory"),
+        (-11, 3, 4, "Fatal Python error", "killed"),
+        (1, 3, 3, "Timeout (0:00:05)!\nThread", "timeout"),
+        (1, 3, 3, "", "killed"),
+    ],
+)
+def test_the_cause_of_an_end(
+    code: int, before: int, after: int, said: str, cause: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    counts = tmp_path / "vmstat"
+    monkeypatch.setattr("orchestrate.executors.ending._COUNTS", counts)
+    counts.write_text(f"nr_free_pages 7\noom_kill {before}\n")
+    words = LastWords()
+    os.write(words.descriptor, said.encode())
+    counts.write_text(f"nr_free_pages 7\noom_kill {after}\n")
+    assert words.explain(code).cause == cause
+
+
+def test_a_worker_that_hears_nothing_ends_with_its_driver() -> None:
+    """Its thread cannot notice the end, because the trial holds the interpreter's lock."""
+    driver = subprocess.Popen(
+        [sys.executable, "-m", "tests.orchestrate.deaf_driver"],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert driver.stdout is not None
+    worker = int(driver.stdout.readline())
+    driver.kill()
+    driver.communicate()
+    end = time.monotonic() + 60.0
+    while _runs(worker):
+        assert time.monotonic() < end, "the worker has outlived its driver"
+        time.sleep(0.05)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
+    except OSError:
+        return False
