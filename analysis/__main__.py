@@ -6,5 +6,11 @@ import sys
 
 from analysis.cli import main
 
-if __name__ == "__main__":
+
+def program() -> None:
+    """Run the command line as a program of its own: ``dopt-analysis``."""
     sys.exit(main(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    program()

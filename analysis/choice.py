@@ -76,6 +76,17 @@ class Filter:
                 )
 
 
+def read_condition(text: str) -> tuple[str, object] | None:
+    """Return path and value, as JSON or text, of ``PATH=VALUE``; None if it is not so written."""
+    path, equals, value = text.partition("=")
+    if not equals or not path:
+        return None
+    try:
+        return path, json.loads(value)
+    except (ValueError, RecursionError):
+        return path, value
+
+
 def choose(candidates: Iterable[Candidate]) -> list[Cell]:
     """Return one configuration for each (environment, policy); raise AnalysisError on a tie."""
     by_environment: dict[str, list[Candidate]] = {}

@@ -7,32 +7,41 @@ missing and ``--allow-partial`` was not given.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from analysis.choice import Filter
+import pandas as pd
+
+from analysis.animation import command as film
+from analysis.choice import Filter, read_condition
 from analysis.divergence import DivergenceRule
 from analysis.errors import AnalysisError, IncompleteError
-from analysis.figures.plot import Request
 from analysis.figures.registry import NAMES, build, partial_warning
 from analysis.loss_curves import Axis
-from analysis.markdown import comparison_markdown, gaps_markdown, summary_markdown
+from analysis.measures import Measure
+from analysis.request import Request, Spread
 from analysis.selection import Selection, select
-from analysis.tables import compare_policies, summarise
+from analysis.serve import command as browser
+from analysis.sheets import Sheet, gaps_sheet
+from analysis.statistics import Statistic
+from analysis.tables import TABLES, TableKind, comparison
 from dopt.errors import DoptError
 from orchestrate.store import Reader
+from orchestrate.usage import Parser
 
 DEFAULT_URL = "sqlite:///results/results.db"
 COLUMNS = ("loss", "reachable_loss")
+FORMATS = ("markdown", "latex", "csv")
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code."""
-    options = parser().parse_args(arguments)
     try:
+        options = parser().read(arguments)
+        if "alone" in options:
+            return int(options.alone(options))
         with Reader.open(options.db) as reader:
             selection = select(reader, _filter(options))
             _check_complete(selection, options.allow_partial)
@@ -50,33 +59,53 @@ def main(arguments: Sequence[str]) -> int:
         return 2
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of all commands."""
-    top = argparse.ArgumentParser(prog="python -m analysis", description=__doc__)
+    top = Parser(prog="python -m analysis", description=__doc__)
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     figures = _command(commands, "figures", _figures, "draw the paper's figures and tables")
     figures.add_argument("--out", type=Path, default=Path("figures"), help="folder (figures/)")
     figures.add_argument("--only", action="append", choices=NAMES, help="this output (repeat)")
     figures.add_argument("--x", choices=list(Axis), default=Axis.STEPS, help="axis of figure 1")
+    figures.add_argument(
+        "--statistic", choices=list(Statistic), default=Statistic.MEAN, help="centre of figure 1"
+    )
+    figures.add_argument(
+        "--style", choices=list(Spread), default=Spread.BAND, help="intervals of figure 1"
+    )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
     summary = _command(commands, "summary", _summary, "mean final losses ± 2 SE, n")
     compare = _command(commands, "compare", _compare, "D-optimal against every baseline, paired")
     compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
+    compare.add_argument(
+        "--measure", choices=list(Measure), default=Measure.FINAL, help="what a trial is judged by"
+    )
     for table in (summary, compare):
-        table.add_argument("--format", choices=("markdown", "csv"), default="markdown")
+        table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
+    for command in (figures, compare):
+        command.add_argument(
+            "--epsilon", type=float, help="loss to reach (median final loss of random inputs)"
+        )
+    animate = commands.add_parser("animate", help=film.HELP, description=film.HELP)
+    animate.set_defaults(alone=film.run)
+    _add_database(animate)
+    film.add_arguments(animate)
+    serve = commands.add_parser("serve", help=browser.HELP, description=browser.HELP)
+    serve.set_defaults(alone=browser.run)
+    _add_database(serve)
+    browser.add_arguments(serve)
     return top
 
 
 def _command(
-    commands: argparse._SubParsersAction[argparse.ArgumentParser],
+    commands: argparse._SubParsersAction[Parser],
     name: str,
     run: object,
     help_text: str,
-) -> argparse.ArgumentParser:
+) -> Parser:
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run)
-    url = os.environ.get("DOPT_DB", DEFAULT_URL)
-    command.add_argument("--db", default=url, help=f"database (DOPT_DB, {DEFAULT_URL})")
+    _add_database(command)
     command.add_argument("--env", nargs="+", default=(), help="only these environments")
     command.add_argument("--policy", nargs="+", default=(), help="only these policies")
     command.add_argument(
@@ -96,36 +125,45 @@ def _command(
     return command
 
 
+def _add_database(command: Parser) -> None:
+    url = os.environ.get("DOPT_DB", DEFAULT_URL)
+    command.add_argument("--db", default=url, help=f"database (DOPT_DB, {DEFAULT_URL})")
+
+
 def _filter(options: argparse.Namespace) -> Filter:
     where = dict(_condition(text) for text in options.where)
     return Filter(tuple(options.env), tuple(options.policy), where)
 
 
 def _condition(text: str) -> tuple[str, object]:
-    path, equals, value = text.partition("=")
-    if not equals or not path:
+    found = read_condition(text)
+    if found is None:
         raise AnalysisError(
             f"--where {text} is no condition, PATH=VALUE is expected: "
             f"write for instance --where model.width=32."
         )
-    try:
-        return path, json.loads(value)
-    except ValueError:
-        return path, value
+    return found
 
 
 def _check_complete(selection: Selection, allow_partial: bool) -> None:
     if selection.gaps and not allow_partial:
         missing = sum(len(gap.seeds) for gap in selection.gaps)
+        table = gaps_sheet(selection.gaps).markdown()
         raise IncompleteError(
-            f"{gaps_markdown(selection.gaps)}\n\nerror: {missing} trials are missing, a complete "
+            f"{table}\n\nerror: {missing} trials are missing, a complete "
             f"grid is expected: run the launch again, narrow the request by --env and --policy, "
             f"or give --allow-partial to go on with what there is."
         )
 
 
 def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    request = Request(DivergenceRule(options.diverged), Axis(options.x))
+    request = Request(
+        DivergenceRule(options.diverged),
+        Axis(options.x),
+        Statistic(options.statistic),
+        Spread(options.style),
+        options.epsilon,
+    )
     names = tuple(options.only or NAMES)
     empty = 0
     for outcome in build(reader, selection, request, options.out, names, force=options.force):
@@ -135,25 +173,30 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
 
 
 def _summary(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    table = summarise(reader, selection, DivergenceRule(options.diverged))
-    text = table.to_csv(index=False) if options.format == "csv" else summary_markdown(table)
-    return _print_table(text, selection)
+    request = Request(DivergenceRule(options.diverged))
+    return _print_table(TABLES["summary"], reader, selection, request, options.format)
 
 
 def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    rule = DivergenceRule(options.diverged)
-    table = compare_policies(reader, selection, options.column, rule)
-    markdown = options.format == "markdown"
-    return _print_table(
-        comparison_markdown(table, rule) if markdown else table.to_csv(index=False), selection
-    )
+    kind = comparison(options.column, Measure(options.measure))
+    request = Request(DivergenceRule(options.diverged), epsilon=options.epsilon)
+    return _print_table(kind, reader, selection, request, options.format)
 
 
-def _print_table(text: str, selection: Selection) -> int:
+def _print_table(
+    kind: TableKind, reader: Reader, selection: Selection, request: Request, form: str
+) -> int:
+    table = kind.measure(reader, selection, request)
     if selection.gaps:
         sys.stderr.write(f"{partial_warning(selection)}\n")
-    sys.stdout.write(text)
+    sys.stdout.write(_text(kind.sheet(table, request), table, form))
     return 0
+
+
+def _text(sheet: Sheet, table: pd.DataFrame, form: str) -> str:
+    if form == "csv":
+        return table.to_csv(index=False)
+    return sheet.latex() if form == "latex" else sheet.markdown()
 
 
 def say(text: str) -> None:

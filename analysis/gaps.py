@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.policies import POLICIES
 from dopt.spec import TrialSpec
+from dopt.systems import SYSTEMS
 from orchestrate.store import Cell
 
 Compatible = Callable[[Cell, Cell], bool]
@@ -47,6 +49,17 @@ def is_possible(policy: Cell, environment: Cell) -> bool:
     except SpecificationError:
         return True
     return True
+
+
+def why_impossible(env: str, policy: str) -> str | None:
+    """Return why an environment cannot have a policy, or None where it can for all we know."""
+    if env not in SYSTEMS or policy not in POLICIES:
+        return None
+    try:
+        POLICIES[policy]().check(SYSTEMS[env]())
+    except IncompatibleError as error:
+        return str(error).partition(": ")[0]
+    return None
 
 
 _SECTIONS = ("env", "policy", "model", "learner")

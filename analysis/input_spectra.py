@@ -35,6 +35,8 @@ class InputSpectra:
         Of the linearised system at the stable equilibrium, damping included [Hz].
     gamma : float
         Bound of the inputs, in ``unit``.
+    diverged : tuple of str
+        Policies of which every trial diverged, and which have no spectrum.
     unit : str
         Unit of the inputs, such as "N".
     """
@@ -44,6 +46,7 @@ class InputSpectra:
     eigenfrequency: float | None
     gamma: float
     unit: str
+    diverged: tuple[str, ...] = ()
 
 
 def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpectra:
@@ -63,6 +66,11 @@ def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpec
         eigenfrequency=mode.frequency / (2 * math.pi) if mode else None,
         gamma=system.gamma,
         unit=unit_of(system.input_labels[0]),
+        diverged=tuple(
+            entry.cell.policy
+            for entry, spectrum in zip(entries, spectra, strict=True)
+            if spectrum is None and entry.finished
+        ),
     )
 
 

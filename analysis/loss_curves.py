@@ -12,7 +12,7 @@ import pandas as pd
 from analysis.divergence import DivergenceRule, Sample
 from analysis.reading import read_sample
 from analysis.selection import Entry, Selection
-from analysis.statistics import Band, mean_band
+from analysis.statistics import Band, Statistic, band
 from dopt.systems import system_from_mapping
 from orchestrate.store import Reader
 
@@ -33,24 +33,38 @@ class LossCurve:
     t: npt.NDArray[np.int64]
     x: npt.NDArray[np.float64]
     band: Band
+    statistic: Statistic
     sample: Sample
 
 
 def measure_curves(
-    reader: Reader, selection: Selection, column: str, rule: DivergenceRule, axis: Axis
+    reader: Reader,
+    selection: Selection,
+    column: str,
+    rule: DivergenceRule,
+    axis: Axis = Axis.STEPS,
+    statistic: Statistic = Statistic.MEAN,
 ) -> tuple[LossCurve, ...]:
     """Return a curve for each entry of the selection, in its order."""
-    return tuple(_measure(reader, entry, column, rule, axis) for entry in selection.entries)
+    return tuple(
+        _measure(reader, entry, column, rule, axis, statistic) for entry in selection.entries
+    )
 
 
 def _measure(
-    reader: Reader, entry: Entry, column: str, rule: DivergenceRule, axis: Axis
+    reader: Reader,
+    entry: Entry,
+    column: str,
+    rule: DivergenceRule,
+    axis: Axis,
+    statistic: Statistic,
 ) -> LossCurve:
     sample = read_sample(reader, entry, column, rule)
     t = np.arange(sample.values.shape[1])
     scale = system_from_mapping(entry.cell.config["env"]).dt if axis is Axis.SECONDS else 1.0
-    band = mean_band(sample.values)
-    return LossCurve(entry.cell.env, entry.cell.policy, t, scale * t.astype(float), band, sample)
+    x, cell = scale * t.astype(float), entry.cell
+    shown = band(sample.values, statistic)
+    return LossCurve(cell.env, cell.policy, t, x, shown, statistic, sample)
 
 
 def tabulate_curves(curves: tuple[LossCurve, ...]) -> pd.DataFrame:
@@ -65,7 +79,7 @@ def _rows(curve: LossCurve) -> pd.DataFrame:
             "policy": curve.policy,
             "t": curve.t,
             "x": curve.x,
-            "mean": curve.band.mean,
+            str(curve.statistic): curve.band.centre,
             "low": curve.band.low,
             "high": curve.band.high,
             "n": curve.band.n,

@@ -18,7 +18,10 @@ FINISHED = ("done", "diverged")
 ENVIRONMENTS = ("pendulum", "cartpole", "arm", "quadrotor")
 """The paper's order; other environments follow by name."""
 
-POLICIES = (REFERENCE, "oracle", "uniform", "periodic", "random", "random_held", "random_sphere")
+POLICIES = (
+    *(REFERENCE, "oracle", "uniform", "periodic", "random", "random_held", "random_sphere"),
+    *("prbs", "multisine", "chirp"),
+)
 """Order of legends and tables; other policies follow by name."""
 
 

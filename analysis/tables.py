@@ -1,124 +1,108 @@
-"""Tables of final losses: a summary, and the reference policy against every baseline."""
+"""All tables by name: what each needs, how it is measured, and how a person reads it."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
 
-import numpy as np
 import pandas as pd
 
-from analysis.choice import REFERENCE
-from analysis.divergence import DivergenceRule
-from analysis.errors import AnalysisError
-from analysis.paired import benjamini_hochberg, compare
-from analysis.reading import read_sample
-from analysis.selection import Entry, Selection
-from analysis.statistics import mean, standard_error
+from analysis.comparisons import YARDSTICK, compare_policies, compare_steps
+from analysis.measures import Measure
+from analysis.request import Request
+from analysis.selection import Selection
+from analysis.sheets import Sheet, comparison_sheet, race_sheet, summary_sheet
+from analysis.summary import summarise
 from orchestrate.store import Reader
 
-Losses = Mapping[int, float]
+
+class Part(Protocol):
+    """Cuts a selection down to what a table shows."""
+
+    def __call__(self, selection: Selection, request: Request = ..., /) -> Selection: ...
 
 
 @dataclass(frozen=True)
-class Finals:
-    """Final losses of one entry by seed, the divergence rule applied, and counts."""
+class TableKind:
+    """A kind of table; ``part`` cuts the selection, without entries the table is not made."""
 
-    env: str
-    policy: str
-    losses: Losses
-    n_finished: int
-    n_diverged: int
-
-    def describe(self) -> str:
-        """Return the count to print, such as ``98/100, 2 diverged``."""
-        used = len(self.losses)
-        if not self.n_diverged:
-            return str(used)
-        return f"{used}/{self.n_finished}, {self.n_diverged} diverged"
+    title: str
+    part: Part
+    measure: Callable[[Reader, Selection, Request], pd.DataFrame]
+    sheet: Callable[[pd.DataFrame, Request], Sheet]
 
 
-def final_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Finals:
-    """Return the loss after the last step of each trial; from the summary column where it is."""
-    diverged = sum(trial.status == "diverged" for trial in entry.trials)
-    if column == "loss" and rule is DivergenceRule.EXCLUDE:
-        losses = entry.final_losses()
-    else:
-        sample = read_sample(reader, entry, column, rule)
-        losses = dict(zip(sample.seeds.tolist(), sample.values[:, -1].tolist(), strict=True))
-    return Finals(entry.cell.env, entry.cell.policy, losses, len(entry.finished), diverged)
-
-
-def summarise(
-    reader: Reader, selection: Selection, rule: DivergenceRule = DivergenceRule.EXCLUDE
-) -> pd.DataFrame:
-    """Return mean and 2 SE of the final losses, one row for each environment and policy."""
-    return pd.DataFrame([_summary(reader, entry, rule) for entry in selection.entries])
-
-
-def _summary(reader: Reader, entry: Entry, rule: DivergenceRule) -> dict[str, object]:
-    grid = final_losses(reader, entry, "loss", rule)
-    reachable = final_losses(reader, entry, "reachable_loss", rule)
-    row: dict[str, object] = {"env": grid.env, "policy": grid.policy}
-    for name, finals in (("loss", grid), ("reachable_loss", reachable)):
-        values = np.array(list(finals.losses.values()), dtype=float)
-        row[name] = float(mean(values))
-        row[f"{name}_2se"] = 2 * float(standard_error(values))
-    return row | {"n": len(grid.losses), "n_diverged": grid.n_diverged}
-
-
-def compare_policies(
-    reader: Reader,
-    selection: Selection,
-    column: str = "loss",
-    rule: DivergenceRule = DivergenceRule.EXCLUDE,
-) -> pd.DataFrame:
-    """Return the reference policy against every baseline, paired over seeds.
-
-    One row for each environment and baseline; ``p_adjusted`` is the Benjamini-Hochberg adjustment
-    of the Wilcoxon p over the whole table.
-    """
-    rows = []
-    for env in selection.environments:
-        finals = [final_losses(reader, entry, column, rule) for entry in selection.of(env)]
-        reference = next((one for one in finals if one.policy == REFERENCE), None)
-        baselines = [one for one in finals if one.policy != REFERENCE]
-        rows += [_comparison(reference, one, column) for one in baselines if reference]
-    if not rows:
-        raise AnalysisError(
-            f"A comparison needs trials of {REFERENCE} and of a baseline in one environment, "
-            f"but only {', '.join(selection.policies)} is selected: run the others, or ask wider."
+def comparison(column: str, measure: Measure) -> TableKind:
+    """Return the comparison of one measure of one column of losses."""
+    where = "grid" if column == "loss" else "reachable set"
+    if measure is Measure.STEPS:
+        return TableKind(
+            f"Steps to a loss, {where}", _raced, partial(_measure_steps, column=column), _race
         )
-    table = pd.DataFrame(rows, columns=_COLUMNS[:-1])
-    table["p_adjusted"] = benjamini_hochberg(table["p_value"].tolist())
-    return table[_COLUMNS]
-
-
-_COLUMNS = [
-    "env",
-    "baseline",
-    "n_pairs",
-    "ratio",
-    "low",
-    "high",
-    "improvement",
-    "p_value",
-    "p_adjusted",
-]
-
-
-def _comparison(reference: Finals, baseline: Finals, column: str) -> dict[str, object]:
-    seeds = sorted(set(reference.losses) & set(baseline.losses))
-    found = compare(
-        np.array([reference.losses[seed] for seed in seeds]),
-        np.array([baseline.losses[seed] for seed in seeds]),
-        _stream(reference.env, baseline.policy, column),
+    title = "Final loss" if measure is Measure.FINAL else "Loss over the whole curve"
+    return TableKind(
+        f"{title} against every baseline, {where}",
+        _compared,
+        partial(_measure_ratios, column=column, measure=measure),
+        partial(_ratios, measure=measure),
     )
-    return {"env": reference.env, "baseline": baseline.policy, **vars(found)}
 
 
-def _stream(*names: str) -> np.random.Generator:
-    """Return a generator of the row's own: its interval does not depend on the other rows."""
-    digest = hashlib.sha256("/".join(names).encode()).digest()
-    return np.random.default_rng(int.from_bytes(digest[:8], "little"))
+_DEFAULT = Request()
+
+
+def _whole(selection: Selection, _: Request = _DEFAULT) -> Selection:
+    return selection
+
+
+def _compared(selection: Selection, _: Request = _DEFAULT) -> Selection:
+    compared = selection.compared()
+    return compared if len(compared.policies) > 1 else Selection(())
+
+
+def _raced(selection: Selection, request: Request = _DEFAULT) -> Selection:
+    """Return the environments that have the yardstick's trials too, if these give the loss."""
+    compared = _compared(selection)
+    if request.epsilon is not None:
+        return compared
+    return compared.only(
+        entry.cell.env
+        for entry in compared.entries
+        if entry.cell.policy == YARDSTICK and entry.final_losses()
+    )
+
+
+def _measure_ratios(
+    reader: Reader, selection: Selection, request: Request, column: str, measure: Measure
+) -> pd.DataFrame:
+    return compare_policies(reader, selection, column, request.rule, measure)
+
+
+def _ratios(table: pd.DataFrame, request: Request, measure: Measure) -> Sheet:
+    return comparison_sheet(table, request.rule, measure)
+
+
+def _measure_steps(
+    reader: Reader, selection: Selection, request: Request, column: str
+) -> pd.DataFrame:
+    return compare_steps(reader, selection, column, request.rule, request.epsilon)
+
+
+def _race(table: pd.DataFrame, request: Request) -> Sheet:
+    return race_sheet(table, request.rule)
+
+
+TABLES = {
+    "summary": TableKind(
+        "Final losses",
+        _whole,
+        lambda reader, selection, request: summarise(reader, selection, request.rule),
+        lambda table, request: summary_sheet(table, request.rule),
+    ),
+    "comparison": comparison("loss", Measure.FINAL),
+    "comparison_auc": comparison("loss", Measure.AUC),
+    "comparison_steps": comparison("loss", Measure.STEPS),
+    "comparison_reachable": comparison("reachable_loss", Measure.FINAL),
+}

@@ -17,10 +17,10 @@ import pandas as pd
 
 from analysis.choice import REFERENCE, departures, flatten
 from analysis.divergence import DivergenceRule
+from analysis.measures import final_losses
 from analysis.reading import read_sample
 from analysis.selection import Entry, Selection
 from analysis.statistics import mean, standard_error
-from analysis.tables import final_losses
 from orchestrate.store import Reader
 
 PARTS = ("plan", "learn", "evaluate")
@@ -173,7 +173,7 @@ def measure_losses(reader: Reader, selection: Selection, rule: DivergenceRule) -
     """Return the final losses of the first line."""
     line = _by_form(selection)[0]
     finals = [final_losses(reader, entry, "loss", rule) for entry in line]
-    losses = [np.array(list(final.losses.values()), dtype=float) for final in finals]
+    losses = [final.values for final in finals]
     return WidthLosses(
         env=line[0].cell.env,
         policy=line[0].cell.policy,

@@ -13,6 +13,7 @@ TAU_TICKS = {0: "0", 1: "π/2", 2: "π", 3: "3π/2", 4: "2π"}
 
 TICKS: dict[float, tuple[float, ...]] = {
     0.8: (1, 1.5, 2, 3, 4, 5, 7),
+    1.0: (1, 2, 3, 5),
     1.5: (1, 2, 5),
     2.5: (1, 3),
     math.inf: (1,),
@@ -36,8 +37,8 @@ def log_text(value: float) -> str:
     if value >= 0.009:
         return f"{value:g}"
     exponent = math.floor(math.log10(value) + 1e-9)
-    factor = round(value / 10.0**exponent)
-    return f"$10^{{{exponent}}}$" if factor == 1 else f"${factor}\\times10^{{{exponent}}}$"
+    factor = round(value / 10.0**exponent, 6)
+    return f"$10^{{{exponent}}}$" if factor == 1 else f"${factor:g}\\times10^{{{exponent}}}$"
 
 
 def angle_ticks(axis: Axis) -> None:

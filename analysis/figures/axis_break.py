@@ -33,7 +33,7 @@ class Parts:
 
 def axis_parts(bands: Sequence[Band]) -> Parts:
     """Return the limits that show some bands, broken at the widest gap if that is wide enough."""
-    shown = [band for band in bands if np.any(band.mean > 0)]
+    shown = [band for band in bands if np.any(band.centre > 0)]
     shown.sort(key=lambda band: _floor(band))
     floors = np.array([_floor(band) for band in shown])
     ratios = floors[1:] / floors[:-1]
@@ -41,22 +41,22 @@ def axis_parts(bands: Sequence[Band]) -> Parts:
         return Parts(band_limits(shown))
     first = int(np.argmax(ratios)) + 1
     low, high = band_limits(shown[first:])
-    top = max(float(np.nanmax(band.mean)) for band in shown)
+    top = max(float(np.nanmax(band.centre)) for band in shown)
     bottom, _ = band_limits(shown[:first])
-    settled = [band.mean[int(SETTLED * len(band.mean)) :] for band in shown[:first]]
+    settled = [band.centre[int(SETTLED * len(band.centre)) :] for band in shown[:first]]
     _, ceiling = log_limits(np.concatenate(settled), margin=1.5)
     return Parts((low, max(high, top)), (bottom, min(ceiling, low)))
 
 
 def _floor(band: Band) -> float:
-    return float(np.min(band.mean[band.mean > 0]))
+    return float(np.min(band.centre[band.centre > 0]))
 
 
 def band_limits(bands: Sequence[Band]) -> Limits:
     """Return limits that show every mean, and the bands down to a third of the lowest mean."""
     if not bands:
         return log_limits(np.empty(0))
-    means = np.concatenate([band.mean for band in bands])
+    means = np.concatenate([band.centre for band in bands])
     low, _ = log_limits(means)
     edges = np.concatenate([edge for band in bands for edge in (band.low, band.high)])
     return log_limits(np.concatenate([means, edges[edges > low / 3]]))

@@ -114,11 +114,18 @@ def caption(spectra: InputSpectra) -> str:
             f" Dashed lines: eigenfrequency f₀ = {spectra.eigenfrequency:.4g} Hz of the linearised "
             f"system at its stable equilibrium, damping included, and its third harmonic."
         )
+    if spectra.diverged:
+        lines += f" Not drawn, because every trial diverged: {', '.join(spectra.diverged)}."
     counts = count_text({one.policy: str(one.spectrum.n) for one in spectra.policies})
     return (
         f"Power spectral density of the inputs in the {environment_title(spectra.env)}: one-sided "
         f"periodogram of every trial (boxcar window, no detrending; its integral is the mean "
         f"square of the input; γ² = {spectra.gamma**2:g}), mean over trials; band: 10 % to "
-        f"90 % quantiles over D-optimal trials; random and periodic in grey; zero and "
-        f"Nyquist frequency not drawn.{lines} Trials: {counts}."
+        f"90 % quantiles over D-optimal trials; {_in_grey(spectra)}zero and Nyquist frequency not "
+        f"drawn.{lines} Trials: {counts}."
     )
+
+
+def _in_grey(spectra: InputSpectra) -> str:
+    names = [one.policy for one in spectra.policies if one.policy in GREYS]
+    return f"{' and '.join(names)} in grey; " if names else ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,11 +17,12 @@ from analysis.counts import count_text
 from analysis.divergence import DivergenceRule
 from analysis.figures.axes import log_ticks, rows_and_columns
 from analysis.figures.axis_break import Limits, axis_parts, mark_break
-from analysis.figures.plot import Plot, Request
+from analysis.figures.plot import Plot
 from analysis.figures.style import GREY, TEXT_WIDTH, environment_title, policy_style
+from analysis.gaps import why_impossible
 from analysis.loss_curves import Axis, LossCurve, measure_curves, tabulate_curves
+from analysis.request import Request, Spread
 from analysis.selection import policy_rank
-from analysis.statistics import BAND
 
 PANEL_HEIGHT = 2.3
 
@@ -28,6 +30,11 @@ NORM = {
     "loss": r"$\Vert f_\theta - f\,\Vert_2$ on the grid",
     "reachable_loss": r"$\Vert f_\theta - f\,\Vert_2$, reachable set",
 }
+
+BARS = 12
+"""Steps at which error bars are drawn."""
+
+_SPREADS = {Spread.BAND: "bands", Spread.ERRORBAR: f"bars at {BARS} steps"}
 
 Numbers = tuple[str, Request, tuple[LossCurve, ...]]
 
@@ -37,13 +44,15 @@ def loss_plot(name: str, column: str) -> Plot[Numbers]:
     return Plot(
         name=name,
         title=f"Loss curves ({column})",
-        statistic=f"mean over trials of {column} at every step",
-        band=BAND,
+        statistic=f"{{centre}} over trials of {column} at every step",
+        band="{interval}",
         part=lambda selection: selection,
         measure=lambda reader, selection, request: (
             column,
             request,
-            measure_curves(reader, selection, column, request.rule, request.axis),
+            measure_curves(
+                reader, selection, column, request.rule, request.axis, request.statistic
+            ),
         ),
         tabulate=lambda numbers: tabulate_curves(numbers[2]),
         draw=draw,
@@ -61,50 +70,94 @@ def draw(numbers: Numbers) -> Figure:
     grid = figure.add_gridspec(rows, columns)
     unit = "steps" if request.axis is Axis.STEPS else "s"
     for index, env in enumerate(envs):
-        panel = _panel(figure, grid[index], [curve for curve in curves if curve.env == env])
+        shown = [curve for curve in curves if curve.env == env]
+        panel = _panel(figure, grid[index], shown, request.spread, list(_absent(curves, env)))
         if index + columns >= len(envs):
             panel[-1].set_xlabel(f"time t [{unit}]")
         if index % columns == 0:
             panel[0].set_ylabel(NORM.get(column, column))
-    handles = legend_handles({curve.policy for curve in curves})
+    handles = legend_handles({curve.policy for curve in curves}, request)
     per_row = 4 if columns > 1 else 2
     figure.legend(handles=handles, loc="outside lower center", ncols=per_row)
     return figure
 
 
-def _panel(figure: Figure, place: SubplotSpec, curves: Sequence[LossCurve]) -> list[Axes]:
+def _panel(
+    figure: Figure,
+    place: SubplotSpec,
+    curves: Sequence[LossCurve],
+    spread: Spread,
+    absent: Sequence[str],
+) -> list[Axes]:
     """Draw one environment, on an axis of two parts where a curve is far below the others."""
     parts = axis_parts([curve.band for curve in curves])
     if parts.lower is None:
         axes = [figure.add_subplot(place)]
-        _lines(axes[0], curves, parts.upper)
+        _lines(axes[0], curves, parts.upper, spread)
     else:
         two = place.subgridspec(2, 1, height_ratios=(2.6, 1), hspace=0.03)
         axes = [figure.add_subplot(two[0]), figure.add_subplot(two[1])]
-        _lines(axes[0], curves, parts.upper)
-        _lines(axes[1], curves, parts.lower)
+        _lines(axes[0], curves, parts.upper, spread)
+        _lines(axes[1], curves, parts.lower, spread)
         mark_break(*axes)
     counts = {policy_style(c.policy).label: c.sample.describe() for c in curves}
-    axes[0].set_title(_title(environment_title(curves[0].env), f"({count_text(counts)})"))
+    text = "; no ".join([count_text(counts), *(policy_style(one).label for one in absent)])
+    axes[0].set_title(_title(environment_title(curves[0].env), f"({text})"))
     return axes
 
 
-def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits) -> None:
+def _absent(curves: Sequence[LossCurve], env: str) -> dict[str, str]:
+    """Return the policies that other environments have and this one cannot, with the reason."""
+    there = {curve.policy for curve in curves if curve.env == env}
+    others = sorted({curve.policy for curve in curves} - there, key=policy_rank)
+    reasons = {policy: why_impossible(env, policy) for policy in others}
+    return {policy: reason for policy, reason in reasons.items() if reason}
+
+
+def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits, spread: Spread) -> None:
     axes.set_yscale("log")
-    for curve in reversed(curves):
+    for place, curve in reversed(list(enumerate(curves))):
         style, band = policy_style(curve.policy), curve.band
-        axes.fill_between(curve.x, band.low, band.high, color=style.colour, alpha=0.18, lw=0)
-        axes.plot(curve.x, band.mean, color=style.colour, ls=style.line, lw=style.width)
+        axes.plot(curve.x, band.centre, color=style.colour, ls=style.line, lw=style.width)
+        if spread is Spread.BAND:
+            axes.fill_between(curve.x, band.low, band.high, color=style.colour, alpha=0.18, lw=0)
+        else:
+            _bars(axes, curve, (place + 1) / (len(curves) + 1))
     axes.set_ylim(*limits)
     log_ticks(axes.yaxis, *limits)
     axes.set_xlim(0, max(_end(curve) for curve in curves))
 
 
+def _bars(axes: Axes, curve: LossCurve, phase: float) -> None:
+    """Draw the interval at a few steps; ``phase`` in (0, 1) keeps the policies' bars apart."""
+    steps = len(curve.x)
+    shown = np.unique(((np.arange(BARS) + phase) * steps / BARS).astype(int))
+    band = curve.band
+    ends = np.array([band.low[shown], band.high[shown]])
+    half = np.nan_to_num(np.abs(ends - band.centre[shown]))
+    axes.errorbar(
+        curve.x[shown], band.centre[shown], half, color=policy_style(curve.policy).colour,
+        ls="none", elinewidth=0.8, capsize=1.6, capthick=0.8,
+    )  # fmt: skip
+
+
+def _breaks(curves: Sequence[LossCurve]) -> str:
+    """Return what an axis with a break is, or nothing where no panel has one."""
+    for env in dict.fromkeys(curve.env for curve in curves):
+        if axis_parts([curve.band for curve in curves if curve.env == env]).lower is not None:
+            return (
+                "An axis with two slanted strokes is broken where no settled curve runs, its two "
+                "parts have different scales. "
+            )
+    return ""
+
+
 def _title(env: str, counts: str) -> str:
-    """Return the title of a panel in one line, or in two where one would not fit."""
+    """Return the title of a panel in one line, or in more, none of which breaks a count."""
     if len(env) + len(counts) < 50:
         return f"{env} {counts}"
-    return f"{env}\n" + textwrap.fill(counts, 56)
+    whole = "; ".join(count.replace(" ", "\N{NO-BREAK SPACE}") for count in counts.split("; "))
+    return f"{env}\n" + textwrap.fill(whole, 56)
 
 
 def _end(curve: LossCurve) -> float:
@@ -113,15 +166,18 @@ def _end(curve: LossCurve) -> float:
     return float(curve.x[-1]) * steps / (steps - 1) if steps > 1 else 1.0
 
 
-def legend_handles(policies: set[str]) -> list[Artist]:
-    """Return a line for each policy, in the order of all figures, and the band's name."""
+def legend_handles(policies: set[str], request: Request) -> list[Artist]:
+    """Return a line for each policy, in the order of all figures, and the interval's name."""
     handles: list[Artist] = []
     for policy in sorted(policies, key=policy_rank):
         style = policy_style(policy)
         handles.append(
             Line2D([], [], color=style.colour, ls=style.line, lw=style.width, label=style.label)
         )
-    return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=BAND)]
+    name = request.statistic.band
+    if request.spread is Spread.BAND:
+        return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=name)]
+    return [*handles, Line2D([], [], ls="none", marker="|", ms=9, mew=1, color=GREY, label=name)]
 
 
 def caption(numbers: Numbers) -> str:
@@ -133,6 +189,8 @@ def caption(numbers: Numbers) -> str:
         + count_text({c.policy: c.sample.describe() for c in curves if c.env == env})
         for env in dict.fromkeys(c.env for c in curves)
     ]
+    envs = dict.fromkeys(curve.env for curve in curves)
+    absent = [f" No line: {why}." for env in envs for why in _absent(curves, env).values()]
     rules = {
         DivergenceRule.EXCLUDE: "A diverged trial leaves its whole curve.",
         DivergenceRule.WORST: "A diverged trial counts with the worst loss of each step.",
@@ -140,8 +198,8 @@ def caption(numbers: Numbers) -> str:
     }
     return (
         f"L² norm of the model's error over the {where} against time t, one panel per environment. "
-        f"Lines: mean over trials; bands: {BAND}; no smoothing. "
-        f"An axis with two slanted strokes is broken where no other curve runs. "
-        f"{rules[request.rule]} Policies of one environment share initial weights and noise for "
-        f"the same seed. Trials: {'. '.join(counts)}."
+        f"Lines: {request.statistic.label} over trials; {_SPREADS[request.spread]}: "
+        f"{request.statistic.band}; no smoothing. "
+        f"{_breaks(curves)}{rules[request.rule]} Policies of one environment share initial "
+        f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )

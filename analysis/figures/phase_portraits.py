@@ -20,6 +20,7 @@ from analysis.figures.style import (
     mathematical,
     policy_style,
 )
+from analysis.numbers import plus_minus
 from analysis.portraits import (
     SEED_RULE,
     Plane,
@@ -29,7 +30,8 @@ from analysis.portraits import (
     tabulate_portraits,
 )
 
-PANEL_HEIGHT = 1.95
+PANEL_HEIGHT = 2.1
+MARGIN = 0.04
 BOX: dict[str, Any] = {
     "facecolor": "#f3f3f3",
     "edgecolor": "#707070",
@@ -67,9 +69,8 @@ def draw(portraits: Portraits) -> Figure:
     _set_axes(panels[0], portraits)
     x_label, y_label = (mathematical(label) for label in portraits.plane.labels)
     for index, axes in enumerate(panels[:last]):
-        lowest = index + columns >= last
-        axes.tick_params(labelbottom=lowest)
-        axes.set_xlabel(x_label if lowest else "")
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(x_label)
         axes.set_ylabel(y_label if index % columns == 0 else "")
     handles = _handles(portraits.seed)
     if last < len(panels):
@@ -91,7 +92,7 @@ def _panel(axes: Axes, portrait: Portrait, plane: Plane) -> None:
     if not len(portrait.line):
         axes.text(0.5, 0.5, "no finished trial", transform=axes.transAxes, ha="center")
     elif portrait.diverged:
-        axes.text(0.02, 0.02, "this trial diverged", transform=axes.transAxes, fontsize=6.5)
+        axes.text(0.06, 0.07, "this trial diverged", transform=axes.transAxes, fontsize=6.5)
 
 
 def count_text(portrait: Portrait) -> str:
@@ -104,23 +105,24 @@ def coverage_text(portrait: Portrait) -> str:
     """Return the coverage in per cent, with its standard error where there is one."""
     if not portrait.n:
         return "coverage unknown"
-    share = f"coverage {100 * portrait.coverage:.1f}"
-    return f"{share} ± {100 * portrait.coverage_error:.1f} %" if portrait.n > 1 else f"{share} %"
+    error = portrait.coverage_error if portrait.n > 1 else 0.0
+    return f"coverage {plus_minus(100 * portrait.coverage, 100 * error)} %"
 
 
 def _set_axes(axes: Axes, portraits: Portraits) -> None:
+    # Not by the axis, whose view interval the panels that share it would not see.
+    axes.set(xlim=_limits(portraits, 0), ylim=_limits(portraits, 1))
     for dimension, axis in enumerate((axes.xaxis, axes.yaxis)):
-        low, high = _extent(portraits, dimension)
-        margin = 0.04 * (high - low)
-        axis.set_view_interval(low - margin, high + margin, ignore=True)
         if portraits.plane.angles[dimension]:
             angle_ticks(axis)
 
 
-def _extent(portraits: Portraits, dimension: int) -> tuple[float, float]:
+def _limits(portraits: Portraits, dimension: int) -> tuple[float, float]:
     values = np.concatenate([panel.line[:, dimension] for panel in portraits.panels])
     values = np.concatenate([values[np.isfinite(values)], portraits.plane.box[dimension]])
-    return float(values.min()), float(values.max())
+    low, high = float(values.min()), float(values.max())
+    margin = MARGIN * (high - low)
+    return low - margin, high + margin
 
 
 def _handles(seed: int) -> list[Line2D | Patch]:

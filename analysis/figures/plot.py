@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import pandas as pd
 from matplotlib.figure import Figure
 
-from analysis.divergence import DivergenceRule
-from analysis.loss_curves import Axis
+from analysis.request import Request
 from analysis.selection import Selection
 from orchestrate.store import Reader
 
 N = TypeVar("N")
-
-
-@dataclass(frozen=True)
-class Request:
-    """Choices that change what is drawn, beside the selection of trials."""
-
-    rule: DivergenceRule = DivergenceRule.EXCLUDE
-    axis: Axis = Axis.STEPS
-
-    def as_dict(self) -> dict[str, str]:
-        return {key: str(value) for key, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -42,6 +30,8 @@ class Plot(Generic[N]):
     """A kind of figure over numbers of type N.
 
     ``part`` cuts the selection down to what this figure shows; without entries it is not drawn.
+    ``statistic`` and ``band`` say in words what is drawn; ``{centre}`` and ``{interval}`` in them
+    stand for what the request asks for.
     """
 
     name: str
@@ -53,6 +43,15 @@ class Plot(Generic[N]):
     tabulate: Callable[[N], pd.DataFrame]
     draw: Callable[[N], Figure]
     caption: Callable[[N], str]
+
+    def words(self, request: Request) -> dict[str, str]:
+        """Return the title, the statistic and the band of a request, for the provenance."""
+        names = {"centre": request.statistic.label, "interval": request.statistic.band}
+        return {
+            "title": self.title,
+            "statistic": self.statistic.format(**names),
+            "band": self.band.format(**names),
+        }
 
     def make(self, reader: Reader, selection: Selection, request: Request) -> Drawing:
         """Read, measure, then draw."""

@@ -11,13 +11,15 @@ from analysis import provenance
 from analysis.figures import publish
 from analysis.figures.input_spectrum import spectrum_plot
 from analysis.figures.loss_curves import loss_plot
+from analysis.figures.page import NAME as PAGE
+from analysis.figures.page import write_page
 from analysis.figures.phase_portraits import phase_plot
-from analysis.figures.plot import Plot, Request
+from analysis.figures.plot import Plot
 from analysis.figures.style import styled
 from analysis.figures.width import cost_plot, loss_against_width_plot
-from analysis.markdown import comparison_markdown, summary_markdown
+from analysis.request import Request
 from analysis.selection import Selection
-from analysis.tables import compare_policies, summarise
+from analysis.tables import TABLES, TableKind
 from orchestrate.store import Reader
 
 PLOTS: dict[str, Plot[Any]] = {
@@ -32,8 +34,8 @@ PLOTS: dict[str, Plot[Any]] = {
         loss_against_width_plot("figure4_width_loss"),
     )
 }
-TABLES = ("summary", "comparison")
 NAMES = (*PLOTS, *TABLES)
+TABLE_FILES = ("md", "tex", "csv")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,34 +55,33 @@ def build(
     *,
     force: bool = False,
 ) -> Iterator[Outcome]:
-    """Write the named outputs into a folder, and say of each what happened."""
+    """Write the named outputs and the page of all into a folder; say of each what happened."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        part = _part(name, selection)
+        part = _part(name, selection, request)
         if not part.entries:
             yield Outcome(name, "not drawn, nothing is stored for it")
             continue
         facts = provenance.describe(reader, part) | {"request": request.as_dict(), "name": name}
         mark = _mark(facts)
-        endings = (*publish.PICTURES, "csv", "txt") if name in PLOTS else ("md", "csv")
+        endings = (*publish.PICTURES, "csv", "txt") if name in PLOTS else TABLE_FILES
         if not force and publish.is_current(folder, name, endings, mark):
             yield Outcome(name, "unchanged")
             continue
         if name in PLOTS:
             facts |= _draw(PLOTS[name], reader, part, request, folder, mark)
         else:
-            _tabulate(name, reader, part, request, folder)
+            facts |= _tabulate(name, TABLES[name], reader, part, request, folder)
         publish.write_provenance(facts | {"fingerprint": mark}, folder, name)
         yield Outcome(name, "written")
+    if write_page(folder, PLOTS, TABLES):
+        yield Outcome(PAGE, "written")
 
 
-def _part(name: str, selection: Selection) -> Selection:
+def _part(name: str, selection: Selection, request: Request) -> Selection:
     if name in PLOTS:
         return PLOTS[name].part(selection)
-    if name == "comparison":
-        compared = selection.compared()
-        return compared if len(compared.policies) > 1 else Selection(())
-    return selection
+    return TABLES[name].part(selection, request)
 
 
 def _mark(facts: dict[str, Any]) -> str:
@@ -108,21 +109,28 @@ def _draw(
         publish.write_pictures(drawing.figure, folder, plot.name, plot.title, mark)
     publish.write_table(drawing.table, folder, plot.name)
     publish.write_text(caption + "\n", folder / f"{plot.name}.txt")
-    return {"title": plot.title, "statistic": plot.statistic, "band": plot.band, "caption": caption}
+    return plot.words(request) | {"caption": caption}
 
 
 def _tabulate(
-    name: str, reader: Reader, selection: Selection, request: Request, folder: Path
-) -> None:
-    if name == "summary":
-        table = summarise(reader, selection, request.rule)
-        text = summary_markdown(table)
-    else:
-        table = compare_policies(reader, selection, "loss", request.rule)
-        text = comparison_markdown(table, request.rule)
+    name: str,
+    kind: TableKind,
+    reader: Reader,
+    selection: Selection,
+    request: Request,
+    folder: Path,
+) -> dict[str, str]:
+    table = kind.measure(reader, selection, request)
+    sheet = kind.sheet(table, request)
     warning = f"{partial_warning(selection)}\n\n" if selection.gaps else ""
     publish.write_table(table, folder, name)
-    publish.write_text(warning + text, folder / f"{name}.md")
+    publish.write_text(warning + sheet.markdown(), folder / f"{name}.md")
+    publish.write_text(_commented(warning) + sheet.latex(), folder / f"{name}.tex")
+    return {"title": kind.title, "caption": warning + sheet.note}
+
+
+def _commented(warning: str) -> str:
+    return f"% {warning.rstrip()}\n" if warning else ""
 
 
 def partial_warning(selection: Selection) -> str:

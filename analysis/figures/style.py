@@ -16,6 +16,8 @@ _OKABE_ITO: tuple[str, ...] = tuple(
 )
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = _OKABE_ITO
 GREY = "#8c8c8c"
+WINE, INDIGO, OLIVE = "#882255", "#332288", "#999933"
+"""Where the sequence ends: of Paul Tol's muted colours, those that are far from the others."""
 
 TEXT_WIDTH = 6.75
 """Width of a figure over the page [inches]."""
@@ -79,6 +81,9 @@ _STYLES = {
     "random": PolicyStyle("random", PURPLE, (0, (2.5, 1.2))),
     "random_held": PolicyStyle("random, held", SKY, (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2))),
     "random_sphere": PolicyStyle("random on the sphere", ORANGE, (0, (8, 2))),
+    "prbs": PolicyStyle("PRBS", WINE, (0, (1.2, 2.4))),
+    "multisine": PolicyStyle("multisine", INDIGO, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2))),
+    "chirp": PolicyStyle("chirp", OLIVE, (0, (6, 2.4))),
 }
 
 

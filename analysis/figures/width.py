@@ -35,6 +35,7 @@ HEIGHT = 3.2
 LOSS_HEIGHT = 2.6
 COLOURS = {"plan": VERMILLION, "learn": BLUE, "evaluate": GREEN}
 MARKERS = {"plan": "o", "learn": "s", "evaluate": "^"}
+FORM_WORDS = {"auto": "the cheapest at each width"}
 FORM_LINES = {"primal": (0, (5, 2)), "dual": (0, (1.5, 1.5)), "sketch": (0, (5, 1.5, 1, 1.5))}
 
 
@@ -74,8 +75,8 @@ def draw_costs(numbers: WidthCosts) -> Figure:
     axes.axhline(numbers.limit_us, color="black", lw=0.8, ls=(0, (5, 2)))
     limit = f"real time: dt = {numbers.limit_us / 1e3:g} ms"
     axes.annotate(
-        limit, (1, numbers.limit_us), xycoords=("axes fraction", "data"), xytext=(-2, -3),
-        textcoords="offset points", ha="right", va="top", fontsize=6.5,
+        limit, (0, numbers.limit_us), xycoords=("axes fraction", "data"), xytext=(3, -3),
+        textcoords="offset points", ha="left", va="top", fontsize=6.5,
     )  # fmt: skip
     for cost in numbers.costs:
         _line(axes, cost, other=cost.form != numbers.costs[0].form)
@@ -123,9 +124,10 @@ def caption_costs(numbers: WidthCosts) -> str:
         f"Time per step against the width of both hidden layers, "
         f"{policy_style(numbers.policy).label} in the {environment_title(numbers.env)}, one "
         f"trial on a core: planning with the update of the information matrix (form: "
-        f"{first.form}), one step of learning, one evaluation of the loss. Points: median over "
-        f"steps and trials; bands: 10 % to 90 % quantiles. Exponents: least squares on logarithms "
-        f"over the upper half of the widths. Dashed: the time between two steps.{beside} "
+        f"{FORM_WORDS.get(first.form, first.form)}), one step of learning, one evaluation of the "
+        f"loss. Points: median over steps and trials; bands: 10 % to 90 % quantiles. Exponents: "
+        f"least squares on logarithms over the upper half of the widths. Dashed: the time between "
+        f"two steps.{beside} "
         f"Trials by width: {count_text(counts)}."
     )
 

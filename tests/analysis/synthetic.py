@@ -76,7 +76,7 @@ def fake_result(spec: TrialSpec, diverged_at: int | None = None) -> TrialResult:
         **columns,
         states=states,
         inputs=inputs,
-        parameters=rng.normal(size=8),
+        parameters=rng.normal(size=spec.model.n_parameters(system)),
         diverged_at=diverged_at,
         wall_seconds=0.1,
         cpu_seconds=0.1,

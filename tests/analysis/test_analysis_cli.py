@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 
 import pytest
@@ -68,6 +69,7 @@ def test_partial_figures_are_drawn_and_marked_on_request(
     assert "figure1: written" in capsys.readouterr().out
     for name in ("figure1.txt", "summary.md"):
         assert (tmp_path / name).read_text().startswith("PARTIAL: 2 trials missing.")
+    assert (tmp_path / "summary.tex").read_text().startswith("% PARTIAL: 2 trials missing.\n")
     assert b"PARTIAL" not in (tmp_path / "figure1.csv").read_bytes()
 
 
@@ -94,6 +96,27 @@ def test_a_wrong_request_is_one_sentence(
     captured = capsys.readouterr()
     assert sentence in captured.err
     assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["sumary"], "command 'sumary' is unknown.* did you mean 'summary'"),
+        ([], "arguments are required: COMMAND: see python -m analysis --help"),
+        (["figures", "--only", "figur1"], "--only 'figur1' is unknown.* did you mean 'figure1'"),
+        (["summary", "--formt", "csv"], "'--formt' is unknown.* did you mean '--format'"),
+        (["summary", "--format", "cvs"], "--format 'cvs' is unknown.* did you mean 'csv'"),
+        (["summary", "--db"], "--db: expected one argument: see python -m analysis summary --help"),
+        (["summary", "more"], "there is a word too many, 'more'"),
+    ],
+)
+def test_wrong_words_are_one_sentence(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert re.fullmatch(f"error: .*{sentence}.*[.?]\n", captured.err), captured.err
     assert captured.out == ""
 
 

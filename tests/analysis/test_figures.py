@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from analysis.choice import Filter
+from analysis.figures.input_spectrum import spectrum_plot
+from analysis.figures.loss_curves import _title, loss_plot
+from analysis.figures.phase_portraits import coverage_text, phase_plot
 from analysis.figures.plot import Request
 from analysis.figures.registry import NAMES, PLOTS, build
+from analysis.portraits import Portrait
 from analysis.selection import Selection, select
 from orchestrate.store import Reader
 
@@ -26,14 +32,16 @@ def folder(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Reader.open(url) as reader:
         outcomes = list(build(reader, select(reader, Filter()), Request(), target))
     assert [(outcome.name, outcome.state) for outcome in outcomes] == [
-        (name, "written") for name in NAMES
+        (name, "written") for name in (*NAMES, "README.md")
     ]
     return target
 
 
 def make(reader: Reader, selection: Selection, target: Path, **options: bool) -> list[str]:
     return [
-        outcome.state for outcome in build(reader, selection, Request(), target, QUICK, **options)
+        outcome.state
+        for outcome in build(reader, selection, Request(), target, QUICK, **options)
+        if outcome.name in QUICK
     ]
 
 
@@ -49,6 +57,16 @@ def test_every_figure_comes_whole(folder: Path, name: str) -> None:
     assert facts["band"]
     assert all(cell["n_finished"] == 5 for cell in facts["cells"])
     assert not list(folder.glob(".*"))
+
+
+def test_the_page_shows_every_output_and_links_to_files_that_exist(folder: Path) -> None:
+    page = (folder / "README.md").read_text()
+    links = re.findall(r"\]\(([^)]+)\)", page)
+    assert set(NAMES) <= {Path(link).stem for link in links}
+    assert all((folder / link).is_file() for link in links)
+    for name in PLOTS:
+        assert (folder / f"{name}.txt").read_text().strip() in page
+    assert "| d_optimal |" not in page.split("## Loss curves")[1]  # tables come first
 
 
 @pytest.mark.parametrize("name", PLOTS)
@@ -71,6 +89,55 @@ def test_captions_name_the_band_and_the_counts(folder: Path) -> None:
     assert "final loss is the median" in (folder / "figure2_phase_pendulum.txt").read_text()
 
 
+def test_a_line_that_cannot_be_is_explained(folder: Path) -> None:
+    words = (folder / "figure1.txt").read_text()
+    assert "No line: policy 'periodic' needs an eigenmode, but env 'quadrotor'" in words
+    assert words.count("No line:") == 1
+    assert "no periodic" in (folder / "figure1.svg").read_text()
+
+
+def test_all_portraits_have_the_same_axes(reader: Reader) -> None:
+    plot = phase_plot("pendulum")
+    panels = plot.make(reader, plot.part(select(reader, Filter())), Request()).figure.axes[:5]
+    assert len({(*axes.get_xlim(), *axes.get_ylim()) for axes in panels}) == 1
+
+
+def test_a_long_title_is_broken_between_counts() -> None:
+    counts = "(n = 4; D-optimal: 3/4, 1 diverged; random: 0/4, 4 diverged)"
+    lines = _title("arm", counts).split("\n")
+    assert lines[0] == "arm"
+    assert [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines[1:]] == [
+        "(n = 4; D-optimal: 3/4, 1 diverged;",
+        "random: 0/4, 4 diverged)",
+    ]
+
+
+def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:
+    alone = select(reader, Filter(("cartpole",), ("d_optimal",)))
+    curves, spectrum = loss_plot("figure1", "loss"), spectrum_plot("cartpole", "spectrum")
+    assert "slanted strokes" not in curves.make(reader, alone, Request()).caption
+    assert "in grey" not in spectrum.make(reader, alone, Request()).caption
+    grey = select(reader, Filter(("cartpole",), ("d_optimal", "random")))
+    assert "; random in grey;" in spectrum.make(reader, grey, Request()).caption
+
+
+@pytest.mark.parametrize(
+    ("coverage", "error", "n", "words"),
+    [
+        (0.1234, 0.00021, 100, "coverage 12.340 ± 0.021 %"),
+        (0.5, 0.02, 9, "coverage 50.0 ± 2.0 %"),
+        (0.125, float("nan"), 1, "coverage 12.5 %"),
+        (float("nan"), float("nan"), 0, "coverage unknown"),
+    ],
+)
+def test_a_coverage_has_the_digits_of_its_error(
+    coverage: float, error: float, n: int, words: str
+) -> None:
+    nowhere = np.empty((0, 2))
+    portrait = Portrait("random", nowhere, np.zeros(2), False, coverage, error, n, 0)
+    assert coverage_text(portrait) == words
+
+
 @pytest.mark.parametrize("epoch", [None, "1700000000"])
 def test_bytes_are_the_same_each_time(
     reader: Reader, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, epoch: str | None
@@ -82,7 +149,7 @@ def test_bytes_are_the_same_each_time(
     for target in ("a", "b"):
         make(reader, selection, tmp_path / target)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
-    assert len(files) == 6 + 3
+    assert len(files) == 6 + 4 + 1
     for file in files:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
     pdf = (tmp_path / "a" / "figure2_spectrum.pdf").read_bytes()
@@ -98,6 +165,13 @@ def test_what_is_unchanged_is_not_drawn_again(reader: Reader, tmp_path: Path) ->
     (tmp_path / "comparison.json").write_text("{ cut off")
     assert make(reader, selection, tmp_path) == ["written", "written"]
     assert make(reader, selection.only(["cartpole"]), tmp_path) == ["unchanged", "written"]
+
+
+def test_steps_to_a_given_loss_need_no_random_inputs(reader: Reader, tmp_path: Path) -> None:
+    pair = select(reader, Filter(("pendulum",), ("d_optimal", "uniform")))
+    for request, state in ((Request(), "not drawn"), (Request(epsilon=1.0), "written")):
+        outcome, *_ = build(reader, pair, request, tmp_path, ("comparison_steps",))
+        assert outcome.state.startswith(state)
 
 
 def test_what_has_no_trials_is_said(reader: Reader, tmp_path: Path) -> None:

@@ -1,14 +1,18 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from analysis.choice import Filter
+from analysis.figures.input_spectrum import caption
 from analysis.input_spectra import measure_spectra, tabulate_spectra, unit_of
 from analysis.selection import select
 from orchestrate.store import Reader
+from tests.analysis.conftest import SHORT
+from tests.analysis.synthetic import fill, make_grid
 
 
 def test_frequencies_inputs_and_counts(reader: Reader) -> None:
@@ -28,6 +32,18 @@ def test_the_power_of_a_bang_bang_input_is_its_bound_squared(reader: Reader) -> 
     spacing = rows.frequency_hz.iloc[1]
     assert rows["mean"].sum() * spacing == pytest.approx(spectra.gamma**2)
     assert np.all(rows["quantile_10"] <= rows["quantile_90"])
+
+
+def test_a_policy_of_which_every_trial_diverged_is_named(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    specs = make_grid(("cartpole",), ("d_optimal", "random"), range(3), **SHORT)
+    lost = {spec.trial_key: 9 for spec in specs if spec.policy.name == "random"}
+    fill(url, specs, diverged=lost)
+    with Reader.open(url) as reader:
+        spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
+    assert [one.policy for one in spectra.policies] == ["d_optimal"]
+    assert spectra.diverged == ("random",)
+    assert "Not drawn, because every trial diverged: random." in caption(spectra)
 
 
 def test_unit_of() -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.paired import benjamini_hochberg, bootstrap_mean, compare, signed_rank
+from analysis.paired import benjamini_hochberg, compare, interval_of_mean, signed_rank
 
 
 def rng() -> np.random.Generator:
@@ -62,6 +62,13 @@ def test_too_few_pairs_have_no_interval() -> None:
     assert one.p_value == 1.0
 
 
+def test_a_loss_of_zero_is_counted_but_has_no_ratio() -> None:
+    found = compare(np.array([0.0, 0.0, 1.0, 3.0]), np.array([0.0, 1.0, 0.0, 4.0]), rng())
+    assert found.improvement == (2 + 1 / 2) / 4
+    assert found.n_pairs == 4
+    assert np.isnan([found.ratio, found.low, found.high, found.p_value]).all()
+
+
 def test_signed_rank_of_a_textbook_case() -> None:
     # ranks 1..6 with the smallest negative: W = 1, of 64 sign patterns 2 have W <= 1
     assert signed_rank(np.array([-1.0, 2, 3, 4, 5, 6])) == pytest.approx(2 * 2 / 64)
@@ -70,7 +77,7 @@ def test_signed_rank_of_a_textbook_case() -> None:
 def test_the_bootstrap_covers_the_mean_about_as_often_as_it_says() -> None:
     repeats, n = 250, 30
     draws = np.random.default_rng(1).normal(loc=-0.5, size=(repeats, n))
-    intervals = [bootstrap_mean(values, np.random.default_rng(2)) for values in draws]
+    intervals = [interval_of_mean(values, np.random.default_rng(2)) for values in draws]
     covered = np.mean([low <= -0.5 <= high for low, high in intervals])
     assert 0.89 < covered < 0.985
 
@@ -87,3 +94,12 @@ def test_benjamini_hochberg_leaves_out_what_was_not_tested() -> None:
     assert adjusted[0] == pytest.approx(0.04)
     assert math.isnan(adjusted[1])
     assert benjamini_hochberg([]) == []
+
+
+@pytest.mark.parametrize("n", [3, 5, 8])
+def test_the_interval_of_few_pairs_covers_as_often_as_it_says(n: int) -> None:
+    repeats = 4000
+    draws = np.random.default_rng(n).normal(loc=-0.5, size=(repeats, n))
+    intervals = [interval_of_mean(values, rng()) for values in draws]
+    covered = np.mean([low <= -0.5 <= high for low, high in intervals])
+    assert covered == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / repeats))

@@ -55,10 +55,20 @@ def test_a_logarithmic_axis_always_has_two_labels(low: float, high: float) -> No
     assert len(shown) >= 2
 
 
+@pytest.mark.parametrize("low", np.geomspace(0.1, 1, 12))
+def test_an_axis_of_nearly_a_decade_has_three_labels(low: float) -> None:
+    axes = Figure().subplots()
+    axes.set_yscale("log")
+    log_ticks(axes.yaxis, low, 7.5 * low)
+    shown = [tick for tick in axes.yaxis.get_majorticklocs() if low <= tick <= 7.5 * low]
+    assert len(shown) >= 3
+
+
 def test_small_ticks_are_powers_of_ten() -> None:
     assert log_text(0.03) == "0.03"
     assert log_text(3e-4) == r"$3\times10^{-4}$"
     assert log_text(1e-3) == r"$10^{-3}$"
+    assert log_text(1.5e-3) == r"$1.5\times10^{-3}$"
 
 
 def test_log_limits_ignore_what_a_logarithm_cannot_show() -> None:

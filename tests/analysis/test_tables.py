@@ -7,13 +7,15 @@ import pandas as pd
 import pytest
 
 from analysis.choice import Filter
+from analysis.comparisons import compare_policies
 from analysis.counts import count_text
 from analysis.divergence import DivergenceRule
 from analysis.errors import AnalysisError
 from analysis.loss_curves import Axis, measure_curves, tabulate_curves
-from analysis.markdown import comparison_markdown, number, p_text, plus_minus, summary_markdown
+from analysis.numbers import number, p_text, plus_minus
 from analysis.selection import select
-from analysis.tables import compare_policies, summarise
+from analysis.sheets import comparison_sheet, summary_sheet
+from analysis.summary import summarise
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fake_result, make_spec
 
@@ -54,7 +56,7 @@ def test_comparison_pairs_the_seeds(reader: Reader) -> None:
         math.log(final("cartpole", "d_optimal", seed) / final("cartpole", "random", seed))
         for seed in seeds
     ]
-    assert row.n_pairs == 4
+    assert (row.n_pairs, row.n_diverged) == (4, 1)
     assert row.ratio == pytest.approx(math.exp(np.mean(logs)))
     assert row.low <= row.ratio <= row.high
     assert row.p_adjusted >= row.p_value
@@ -105,6 +107,7 @@ def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
         (12.345, 0.567, "12.35 ± 0.57"),
         (1234.5, 56.7, "1234 ± 57"),
         (0.01234, 0.00056, "0.01234 ± 0.00056"),
+        (4.021e-5, 6.2e-6, "(4.02 ± 0.62)e-05"),
         (2.0, math.nan, "2.00"),
         (math.nan, math.nan, "–"),
     ],
@@ -125,15 +128,22 @@ def test_numbers() -> None:
 
 def test_markdown_shows_counts_and_dashes() -> None:
     nothing = {"ratio": math.nan, "low": math.nan, "high": math.nan, "improvement": math.nan}
-    row = {"env": "arm", "baseline": "random", "n_pairs": 0, **nothing}
+    row = {"env": "arm", "baseline": "random", "n_pairs": 0, "n_diverged": 3, **nothing}
     table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
-    line = comparison_markdown(table, "exclude").splitlines()[2]
+    assert "Student's below 10 pairs" in comparison_sheet(table, "exclude").note
+    line = comparison_sheet(table, "exclude").markdown().splitlines()[2]
     assert [field.strip() for field in line.strip("|").split("|")] == [
-        "arm", "random", "–", "–", "–", "–", "0",
+        "arm", "random", "–", "–", "–", "–", "0, 3 diverged",
     ]  # fmt: skip
-    values = {"loss": 1.0, "loss_2se": 0.1, "reachable_loss": 2.0, "reachable_loss_2se": 0.2}
+    values = {
+        f"{name}{part}": value
+        for name in ("loss", "reachable_loss")
+        for part, value in (("", 1.0), ("_2se", 0.1), ("_median", 0.9), ("_iqm", 0.95))
+    }
     counts = {"env": "arm", "policy": "random", "n": 98, "n_diverged": 2}
-    assert "1.00 ± 0.10" in summary_markdown(pd.DataFrame([counts | values]))
+    summary = summary_sheet(pd.DataFrame([counts | values]), "worst").markdown()
+    assert "1.00 ± 0.10" in summary
+    assert "Diverged trials: worst." in summary
 
 
 def test_count_text() -> None:

@@ -1,0 +1,1 @@
+"""A stored trial as a moving picture."""

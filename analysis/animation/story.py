@@ -1,0 +1,118 @@
+"""One stored trial as numbers, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.errors import AnalysisError
+from analysis.portraits import Plane, phase_plane
+from analysis.selection import Entry
+from dopt.geometry import Body, body
+from dopt.replay import replay
+from dopt.spec import TrialSpec
+from dopt.systems import System
+from orchestrate.store import Reader
+
+Array = npt.NDArray[np.float64]
+
+MARGIN = 0.08
+"""Share of a range that is left free on each side of it."""
+
+
+@dataclass(frozen=True)
+class Story:
+    """A trial of T steps, seen in k frames.
+
+    Attributes
+    ----------
+    steps : (k,)
+        Steps done at each frame, the first 0.
+    states : (T + 1, d), inputs : (T, m), loss : (T,)
+        As stored; the loss is that on the grid after each step.
+    body : Body or None
+        The system at all states, None where it has none.
+    plane : Plane
+        Phase plane of the system.
+    truth, learned : (T + 1, r), (k, T + 1, r)
+        Accelerations at zero input along the whole trajectory, true and as modelled at each frame.
+    """
+
+    env: str
+    policy: str
+    seed: int
+    system: System
+    steps: npt.NDArray[np.int64]
+    states: Array
+    inputs: Array
+    loss: Array
+    body: Body | None
+    plane: Plane
+    truth: Array
+    learned: Array
+
+
+def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
+    """Read a trial and replay it, to know what its model had learned at each frame.
+
+    Raises
+    ------
+    AnalysisError
+        If the trial is not finished, or its replay does not lead through the stored states.
+    """
+    spec = _specification(entry, seed)
+    stored = reader.trajectory(entry.cell.config_key, seed)
+    curves = reader.curves(entry.cell.config_key)
+    loss = curves.values[int(np.flatnonzero(curves.seeds == seed)[0])]
+    end = int(np.isfinite(loss).sum())
+    steps = np.unique(np.linspace(0, end, frames).round().astype(np.int64))
+    seen = replay(spec, steps.tolist())
+    _check_same(seen.states[: end + 1], stored.states[: end + 1], entry, seed)
+    states = stored.states[: end + 1]
+    learned = [spec.model.predict(spec.system, theta, states) for theta in seen.parameters]
+    return Story(
+        entry.cell.env,
+        entry.cell.policy,
+        seed,
+        spec.system,
+        seen.steps,
+        states,
+        stored.inputs[:end],
+        loss[:end],
+        body(spec.system, states),
+        phase_plane(spec.system),
+        spec.system.learned(states),
+        np.array(learned),
+    )
+
+
+def _specification(entry: Entry, seed: int) -> TrialSpec:
+    finished = {trial.seed for trial in entry.finished}
+    if seed not in finished:
+        listed = ", ".join(map(str, sorted(finished)[:10])) or "none"
+        raise AnalysisError(
+            f"{entry.cell.env} × {entry.cell.policy} has no finished trial of seed {seed}, "
+            f"finished are {listed}: choose one of these with --seed."
+        )
+    config = {key: value for key, value in entry.cell.config.items() if key != "code_version"}
+    return TrialSpec.from_mapping({**config, "seed": seed})
+
+
+def _check_same(replayed: Array, stored: Array, entry: Entry, seed: int) -> None:
+    if not np.allclose(replayed, stored, rtol=1e-6, atol=1e-9):
+        raise AnalysisError(
+            f"Seed {seed} of {entry.cell.env} × {entry.cell.policy} runs another way here than it "
+            f"did when it was stored, so what its model knew is not known: it was run by another "
+            f"version or on another kind of machine, run it again here in a database of its own."
+        )
+
+
+def extent(values: Array, *others: Array) -> tuple[float, float]:
+    """Return limits around all finite values, with a margin."""
+    everything = np.concatenate([np.ravel(part) for part in (values, *others)])
+    finite = everything[np.isfinite(everything)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    room = MARGIN * (high - low) or 1.0
+    return low - room, high + room

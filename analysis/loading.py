@@ -1,0 +1,194 @@
+"""Stored results for a notebook: tidy frames, and matrices with named axes.
+
+import analysis
+
+results = analysis.load(env="pendulum")
+results.trials()                       # one row for each trial
+results.curves("loss")                 # one row for each trial and step
+results.matrix("pendulum", "random")   # losses (seed, t)
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from analysis.choice import Candidate, Filter, choose
+from analysis.errors import AnalysisError
+from analysis.selection import environment_rank, newest, policy_rank
+from orchestrate.store import Cell, Curves, Reader
+
+DEFAULT_URL = "sqlite:///results/results.db"
+STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
+
+_OF_CELL = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """States and inputs of the finished trials of one configuration.
+
+    Attributes
+    ----------
+    seeds : (n,)
+    t : (T + 1,)
+        Time of each state [s].
+    states : (n, T + 1, d)
+        NaN from a divergence on.
+    inputs : (n, T, m)
+    """
+
+    seeds: npt.NDArray[np.int64]
+    t: npt.NDArray[np.float64]
+    states: npt.NDArray[np.float64]
+    inputs: npt.NDArray[np.float64]
+
+
+def load(
+    db: str | None = None,
+    env: str | Iterable[str] = (),
+    policy: str | Iterable[str] = (),
+    where: Mapping[str, object] | None = None,
+) -> Results:
+    """Open a results database for reading.
+
+    Parameters
+    ----------
+    db
+        URL; by default the variable ``DOPT_DB``, else ``sqlite:///results/results.db``.
+    env, policy
+        Names of environments and policies; none means all.
+    where
+        Values of the configuration by dotted path, such as ``{"model.width": 32}``.
+
+    Raises
+    ------
+    NoDatabaseError, SchemaVersionError
+        If there is nothing to read, or it was written by another version of the program.
+    AnalysisError
+        If nothing stored fits.
+    """
+    url = db or os.environ.get("DOPT_DB", DEFAULT_URL)
+    wanted = Filter(_names(env), _names(policy), where or {})
+    return Results(Reader.open(url), wanted)
+
+
+def _names(given: str | Iterable[str]) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
+class Results:
+    """The configurations of a database that fit a request; a context manager that closes it.
+
+    Every method reads the database anew, so that it sees what a running launch has finished.
+    """
+
+    def __init__(self, reader: Reader, wanted: Filter) -> None:
+        self.reader = reader
+        self._wanted = wanted
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.reader.close()
+
+    def configurations(self) -> pd.DataFrame:
+        """Return one row for each configuration, with the number of its trials by status."""
+        table = pd.DataFrame([asdict(cell) for cell in self._cells()])
+        return table.set_index("config_key")
+
+    def trials(self) -> pd.DataFrame:
+        """Return one row for each registered trial: configuration, status, losses, cost, node."""
+        return pd.concat(
+            [
+                _labelled(pd.DataFrame(map(asdict, self.reader.trials(cell.config_key))), cell)
+                for cell in self._cells()
+            ],
+            ignore_index=True,
+        )
+
+    def curves(self, *columns: str) -> pd.DataFrame:
+        """Return one row for each finished trial and step, by default with all columns of a step.
+
+        ``t`` is the step and ``time`` the same in seconds; after a divergence values are NaN.
+        """
+        return pd.concat(
+            [self._tidy(cell, columns or STEP_COLUMNS) for cell in self._cells()],
+            ignore_index=True,
+        )
+
+    def _tidy(self, cell: Cell, columns: tuple[str, ...]) -> pd.DataFrame:
+        read = {name: self.reader.curves(cell.config_key, name) for name in columns}
+        first = next(iter(read.values()))
+        n, steps = first.values.shape
+        frame = pd.DataFrame(
+            {
+                "seed": np.repeat(first.seeds, steps),
+                "t": np.tile(first.t, n),
+                "time": np.tile(cell.dt * first.t, n),
+                "diverged": np.repeat(first.diverged, steps),
+                # A launch may finish a trial between two reads: each column is cut to the first's.
+                **{k: c.values[np.isin(c.seeds, first.seeds)].ravel() for k, c in read.items()},
+            }
+        )
+        return _labelled(frame, cell)
+
+    def matrix(self, env: str, policy: str, column: str = "loss") -> Curves:
+        """Return one column of the steps of a policy in an environment as a matrix (seed, t).
+
+        Where several configurations fit, the one that figures show is taken.
+        """
+        return self.reader.curves(self._one(env, policy).config_key, column)
+
+    def trajectories(self, env: str, policy: str) -> Trajectories:
+        """Return states and inputs of the finished trials of a policy in an environment."""
+        cell = self._one(env, policy)
+        trials = self.reader.trials(cell.config_key)
+        seeds = [trial.seed for trial in trials if trial.status in ("done", "diverged")]
+        if not seeds:
+            raise AnalysisError(f"{env} × {policy} has no finished trial: run the grid first.")
+        paths = [self.reader.trajectory(cell.config_key, seed) for seed in seeds]
+        return Trajectories(
+            seeds=np.array(seeds, dtype=np.int64),
+            t=cell.dt * np.arange(cell.horizon + 1, dtype=np.float64),
+            states=np.stack([path.states for path in paths]),
+            inputs=np.stack([path.inputs for path in paths]),
+        )
+
+    def _one(self, env: str, policy: str) -> Cell:
+        fitting = [cell for cell in self._cells() if cell.env == env]
+        chosen = choose(Candidate(cell, cell.n) for cell in fitting)
+        found = [cell for cell in chosen if cell.policy == policy]
+        if not found:
+            have = ", ".join(sorted({f"{c.env} × {c.policy}" for c in self._cells()}))
+            raise AnalysisError(
+                f"No configuration of {env} × {policy} fits the request, stored are {have}: "
+                f"choose one of these."
+            )
+        return found[0]
+
+    def _cells(self) -> list[Cell]:
+        cells = self.reader.cells()
+        self._wanted.check_where(cells)
+        fitting = newest([cell for cell in cells if self._wanted.accepts(cell)])
+        if not fitting:
+            raise AnalysisError(
+                f"No configuration in {self.reader.safe_url} fits the request, "
+                f"it holds {len(cells)} in all: run the grid first, or ask for less."
+            )
+        return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
+
+
+def _labelled(frame: pd.DataFrame, cell: Cell) -> pd.DataFrame:
+    """Put what tells the configuration in front."""
+    for place, name in enumerate(_OF_CELL):
+        frame.insert(place, name, getattr(cell, name))
+    frame.insert(len(_OF_CELL), "config_key", cell.config_key)
+    return frame

@@ -1,0 +1,49 @@
+"""Numbers as a person reads them; the CSV beside a table has all digits."""
+
+from __future__ import annotations
+
+import math
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with some significant digits, a dash for NaN."""
+    if math.isnan(value):
+        return "–"
+    if value == 0 or not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.{digits - 1}e}" if value else "0"
+    places = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{round(value, places):.{max(places, 0)}f}"
+
+
+def p_text(value: float) -> str:
+    """Return a p-value to two significant digits, a dash for none."""
+    if math.isnan(value):
+        return "–"
+    return f"{value:.2g}" if value >= 1e-4 else f"{value:.0e}"
+
+
+def share(value: float) -> str:
+    """Return a share to two places, a dash for none."""
+    return "–" if math.isnan(value) else f"{value:.2f}"
+
+
+def plus_minus(value: float, error: float) -> str:
+    """Return ``mean ± error``, the error to two digits and the mean to the same place.
+
+    A mean that :func:`number` writes with an exponent has it here too: ``(4.02 ± 0.62)e-05``.
+    """
+    if not error > 0:
+        return number(value)
+    if 0 < abs(value) < 1e-4:
+        exponent = math.floor(math.log10(abs(value)))
+        scale = 10.0**exponent
+        return f"({plus_minus(value / scale, error / scale)})e{exponent:03d}"
+    places = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{places}f} ± {error:.{places}f}"
+
+
+def within(value: float, low: float, high: float) -> str:
+    """Return a number with its interval, or alone where there is none."""
+    if math.isnan(low):
+        return number(value)
+    return f"{number(value)} [{number(low)}, {number(high)}]"

@@ -1,0 +1,151 @@
+"""The grid as a table: a row for each environment and width, a column for each policy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.choice import flatten
+from analysis.gaps import absent_cells
+from analysis.selection import environment_rank, newest, policy_rank
+from analysis.serve.asked import Asked
+from analysis.serve.naming import look
+from analysis.serve.progress import measure
+from analysis.serve.site import Site
+from analysis.statistics import mean, standard_error
+from orchestrate.store import Cell, Reader
+
+_FINAL = """
+SELECT config_key, final_loss FROM v_trial
+WHERE status = 'done' AND final_loss IS NOT NULL ORDER BY config_key, seed
+"""
+
+SHADES = 9
+"""Steps of the heat scale."""
+
+
+def grid(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # what every page takes
+    """Return every configuration with its final loss and the state of its trials."""
+    reader = site.source.reader()
+    state = measure(reader)
+    stored = reader.cells()
+    cells = newest(stored)
+    policies = sorted({cell.policy for cell in cells}, key=policy_rank)
+    finals = site.memory.recall(("final", reader, state["token"]), lambda: _finals(reader))
+    slots = _slots(cells, finals)
+    absent = absent_cells(cells)
+    environments = [
+        {"env": env, "rows": _rows(env, slots, policies, absent)}
+        for env in sorted({cell.env for cell in cells}, key=environment_rank)
+    ]
+    return {
+        "progress": state,
+        "policies": [look(policy) for policy in policies],
+        "environments": environments,
+        "older": len(stored) - len(cells),
+    }
+
+
+Slots = dict[tuple[str, int | None, str], list[dict[str, Any]]]
+
+
+def _slots(cells: Sequence[Cell], finals: dict[str, dict[str, Any]]) -> Slots:
+    """Return the configurations of each (environment, width, policy), shaded and told apart."""
+    slots: Slots = {}
+    nothing = _final(np.empty(0))
+    for env in {cell.env for cell in cells}:
+        own = [cell for cell in cells if cell.env == env]
+        widths = {cell.width for cell in own if cell.width is not None}
+        only = next(iter(widths)) if len(widths) == 1 else None
+        found = [_configuration(cell, finals.get(cell.config_key, nothing)) for cell in own]
+        _shade(found)
+        for cell, one in zip(own, found, strict=True):
+            slots.setdefault((env, cell.width or only, cell.policy), []).append(one)
+    for group in slots.values():
+        _tell_apart(group)
+    return slots
+
+
+def _configuration(cell: Cell, final: dict[str, Any]) -> dict[str, Any]:
+    counts = {
+        "done": cell.n_done,
+        "diverged": cell.n_diverged,
+        "failed": cell.n_failed,
+        "cancelled": cell.n_cancelled,
+        "running": cell.n_running,
+        "pending": cell.n_pending,
+    }
+    return {
+        "config_key": cell.config_key,
+        "width": cell.width,
+        "n": cell.n,
+        "ended": cell.n - cell.n_pending - cell.n_running,
+        "counts": {status: count for status, count in counts.items() if count},
+        "config": flatten(cell.config),
+        **final,
+    }
+
+
+def _finals(reader: Reader) -> dict[str, dict[str, Any]]:
+    """Return the mean final loss and its error of every configuration, in one query."""
+    losses: dict[str, list[float]] = {}
+    for config_key, loss in reader.rows(_FINAL):
+        losses.setdefault(config_key, []).append(loss)
+    return {config_key: _final(np.array(values)) for config_key, values in losses.items()}
+
+
+def _final(values: npt.NDArray[np.float64]) -> dict[str, Any]:
+    return {
+        "loss": float(mean(values)),
+        "loss_2se": 2 * float(standard_error(values)),
+        "n_used": len(values),
+    }
+
+
+def _shade(found: Sequence[dict[str, Any]]) -> None:
+    """Give each configuration of an environment its rank by loss, 0 the lowest, as a shade.
+
+    Ranks, because one loss a thousand times below the others would leave those without contrast.
+    """
+    ranked = sorted((one for one in found if np.isfinite(one["loss"])), key=lambda one: one["loss"])
+    for place, one in enumerate(ranked):
+        one["shade"] = round((SHADES - 1) * place / max(len(ranked) - 1, 1))
+
+
+def _tell_apart(group: Sequence[dict[str, Any]]) -> None:
+    """Replace the configuration by the values in which those of one place of the table differ."""
+    flat = [one.pop("config") for one in group]
+    paths = sorted(
+        path
+        for path in set().union(*flat)
+        if len({repr(config.get(path)) for config in flat}) > 1 and path != "config_key"
+    )
+    for one, config in zip(group, flat, strict=True):
+        one["differs"] = ", ".join(f"{path}={config.get(path)}" for path in paths[:3])
+
+
+def _rows(
+    env: str, slots: Slots, policies: Sequence[str], absent: Sequence[tuple[str, str]]
+) -> list[dict[str, Any]]:
+    widths = {width for name, width, _ in slots if name == env}
+    return [
+        {
+            "width": width,
+            "cells": [
+                {
+                    "policy": policy,
+                    "missing": (env, policy) in absent,
+                    "configurations": slots.get((env, width, policy), []),
+                }
+                for policy in policies
+            ],
+        }
+        for width in _ordered(widths)
+    ]
+
+
+def _ordered(widths: Iterable[int | None]) -> list[int | None]:
+    return sorted(widths, key=lambda width: (width is None, width or 0))

@@ -1,0 +1,128 @@
+"""What stands before every page: only reading, only from this machine, only for its own pages.
+
+A web site that the user visits elsewhere may point a name of its own at 127.0.0.1 (DNS rebinding)
+or load addresses of this server. The first is refused by the Host header, the second by
+Sec-Fetch-Site; the headers of each answer keep pages from running or loading anything foreign.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+METHODS = ("GET", "HEAD")
+LONGEST_QUERY = 16_000
+"""Bytes of a query string; a long SQL statement has a few thousand."""
+
+HEADERS = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        "media-src 'self'; connect-src 'self'; form-action 'self'; base-uri 'none'; "
+        "frame-ancestors 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+
+
+class Guard:
+    """Refuses requests before any page sees them, and sets the headers of every answer.
+
+    ``host`` is the address that the server listens at.
+    """
+
+    def __init__(self, app: ASGIApp, host: str = "127.0.0.1") -> None:
+        self._app = app
+        self._host = host
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers[name] = value
+                headers.setdefault("cache-control", "no-store")
+            await send(message)
+
+        refusal = self._refusal(scope)
+        answer = self._app if refusal is None else _plain(*refusal)
+        await answer(scope, receive, send_with_headers)
+
+    def _refusal(self, scope: Scope) -> tuple[int, str] | None:
+        headers = Headers(scope=scope)
+        if scope["method"] not in METHODS:
+            return 405, f"{scope['method']} is not answered, this server only reads: use GET.\n"
+        if not is_own(headers.getlist("host"), self._host):
+            return 421, (
+                "The Host header names another server: open the address that the command printed.\n"
+            )
+        if headers.get("sec-fetch-site") == "cross-site" and not _is_visit(headers):
+            return 403, "Another web site asked for this: open the page itself.\n"
+        if len(scope["query_string"]) > LONGEST_QUERY:
+            return 414, f"The address is too long, at most {LONGEST_QUERY} bytes after the '?'.\n"
+        return None
+
+
+def _plain(status: int, text: str) -> PlainTextResponse:
+    headers = {"allow": ", ".join(METHODS)} if status == 405 else None
+    return PlainTextResponse(text, status, headers)
+
+
+def _is_visit(headers: Headers) -> bool:
+    """Whether the user followed a link to here, which shows a page and tells the site nothing."""
+    return headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") in (
+        "document",
+        None,
+    )
+
+
+def is_own(hosts: list[str], listening: str) -> bool:
+    """Whether the Host header is one that a browser sends when it means this server.
+
+    A name that somebody else may own is never accepted. An address is, since no name stands for
+    it: any address where the server listens beyond this machine, else that of this machine.
+    """
+    if len(hosts) != 1:
+        return False
+    name = _name(hosts[0])
+    if name is None:
+        return False
+    if name in ("localhost", listening.lower()):
+        return True
+    try:
+        address = ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return address.is_loopback or not is_loopback(listening)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen at is reached from this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def _name(host: str) -> str | None:
+    """Return the Host header without its port and brackets; None where it is malformed."""
+    if host.startswith("["):
+        name, bracket, port = host[1:].partition("]")
+        if not bracket or (port and not port.startswith(":")):
+            return None
+        port = port[1:]
+    else:
+        name, _, port = host.partition(":")
+    if port and not (port.isascii() and port.isdigit()):
+        return None
+    return name.lower() or None

@@ -1,0 +1,55 @@
+"""The database that is shown: opened when it is there, opened anew when it was made anew."""
+
+from __future__ import annotations
+
+import threading
+
+from orchestrate.store import Reader
+from orchestrate.store.address import parse, safe, sqlite_path
+
+Identity = tuple[int, int] | None
+
+
+class Source:
+    """Gives a reader of the database at a URL, in whatever state that database is."""
+
+    def __init__(self, url: str) -> None:
+        parsed = parse(url)
+        self.safe_url = safe(parsed)
+        self._url = url
+        self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
+        self._lock = threading.Lock()
+        self._reader: Reader | None = None
+        self._identity: Identity = None
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the database is a SQLite file."""
+        return self._path is not None
+
+    def reader(self) -> Reader:
+        """Return a reader; raise ``StoreError`` where there is none, or one of another schema."""
+        with self._lock:
+            identity = self._file()
+            if self._reader is None or identity != self._identity:
+                self.close()
+                self._reader = Reader.open(self._url)
+                self._identity = identity
+            return self._reader
+
+    def close(self) -> None:
+        """Give back the connections."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def _file(self) -> Identity:
+        """Return which file lies at the path now: a database may be moved away under a server."""
+        if self._path is None:
+            return None
+        try:
+            found = self._path.stat()
+        except OSError:
+            self.close()
+            return None
+        return found.st_dev, found.st_ino

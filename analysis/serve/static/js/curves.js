@@ -1,0 +1,239 @@
+/** The page of curves: what is drawn, switched by its form, kept in its address, followed live. */
+
+import { errorBars } from "./bars.js";
+import { fillLegend, readLegend } from "./legend.js";
+import { axis, describe, ink, logRange, plot, veil } from "./plot.js";
+
+const HEIGHT = 430;
+const DEFAULTS = { column: "loss", x: "steps", style: "band", range: "main", diverged: "exclude" };
+const ASKED = ["env", "width", "column", "x", "diverged", "where"];
+
+/** @param {string} id */
+const part = (id) => document.getElementById(id);
+const form = /** @type {HTMLFormElement|null} */ (part("controls"));
+const place = part("chart");
+const hidden = new Set(
+  (new URLSearchParams(location.search).get("hide") ?? "").split(",").filter(Boolean),
+);
+let answer = null;
+let chart = null;
+let asking = null;
+
+/** What the form says, without what is usual. */
+function chosen() {
+  const found = new URLSearchParams();
+  for (const [name, value] of new FormData(form)) {
+    if (value !== "" && DEFAULTS[name] !== value) found.set(name, String(value));
+  }
+  return found;
+}
+
+/** Offer the widths of the chosen environment. @param {string|null} wanted */
+function offerWidths(wanted) {
+  const environments = JSON.parse(form.dataset.environments);
+  const env = new FormData(form).get("env");
+  const widths = environments.find((one) => one.env === env)?.widths ?? [];
+  const select = form.elements.namedItem("width");
+  const options = [new Option("default", "")];
+  for (const width of widths) options.push(new Option(String(width), String(width)));
+  select.replaceChildren(...options);
+  select.value = widths.map(String).includes(wanted ?? "") ? wanted : "";
+}
+
+/** Ask the server for the curves and draw them. */
+async function load() {
+  asking?.abort();
+  const mine = (asking = new AbortController());
+  const query = new URLSearchParams([...chosen()].filter(([name]) => ASKED.includes(name)));
+  place.setAttribute("aria-busy", "true");
+  try {
+    const found = await fetch(`/api/curves?${query}`, { signal: mine.signal });
+    const content = await found.json();
+    if (!found.ok) throw new Error(content.error);
+    answer = content;
+    complain("");
+    draw();
+  } catch (error) {
+    if (error.name !== "AbortError") complain(error.message);
+  } finally {
+    if (asking === mine) place.removeAttribute("aria-busy");
+  }
+  part("csv").href = `/api/curves.csv?${query}`;
+}
+
+/** Show a sentence in place of the chart, or none. @param {string} sentence */
+function complain(sentence) {
+  part("problem").textContent = sentence;
+  part("problem").hidden = sentence === "";
+  if (!sentence) return;
+  chart?.destroy();
+  chart = null;
+  answer = null;
+  part("legend").tBodies[0].replaceChildren();
+  part("missing").replaceChildren();
+  place.dataset.shown = "";
+}
+
+/** Keep the address in step, so that it can be sent to somebody. */
+function remember() {
+  const query = chosen();
+  if (hidden.size) query.set("hide", [...hidden].join(","));
+  const text = query.toString().replaceAll("%2C", ",");
+  history.replaceState(null, "", text ? `?${text}` : location.pathname);
+}
+
+/** Draw the answer: three series for each policy, centre, low and high. */
+function draw() {
+  const choice = new FormData(form);
+  const range = chart && chart.zoomed ? { ...chart.scales.x } : null;
+  chart?.destroy();
+  part("heading").textContent = form.querySelector("[name=env]:checked + b").textContent + answer.widths;
+  fillLegend(part("legend"), answer.curves, hidden, toggle);
+  warn();
+  const style = choice.get("style");
+  const unit = choice.get("x") === "seconds" ? "s" : "steps";
+  chart = plot(place, options(style, unit, choice.get("column")), data(), HEIGHT);
+  if (range) chart.setScale("x", { min: range.min, max: range.max });
+  part("band").textContent = style === "none" ? "" : `Interval: ${answer.band}.`;
+  part("legend").tHead.rows[0].cells[0].textContent = "policy";
+  read(null);
+  shown();
+}
+
+/** Columns of uPlot; an interval that reaches towards zero, or below, ends at a quarter of its centre. */
+function data() {
+  const columns = [answer.x];
+  for (const curve of answer.curves) {
+    const low = curve.low.map((value, at) => (value === null ? null : Math.max(value, curve.centre[at] / 4)));
+    columns.push(curve.centre, low, curve.high);
+  }
+  return columns;
+}
+
+function options(style, unit, column) {
+  const series = [{}];
+  const bands = [];
+  answer.curves.forEach((curve, index) => {
+    const show = !hidden.has(curve.policy);
+    const dash = curve.dash.map((piece) => piece * curve.line_width);
+    const first = 1 + 3 * index;
+    series.push(
+      { label: curve.policy, show, stroke: () => ink(curve.colour), width: 1.25 * curve.line_width, dash, points: { show: false } },
+      { label: "low", show, stroke: "transparent", width: 0, points: { show: false } },
+      { label: "high", show, stroke: "transparent", width: 0, points: { show: false } },
+    );
+    bands.push({ series: [first + 2, first + 1], fill: () => veil(curve.colour, 0.17) });
+  });
+  const what = column === "loss" ? "evaluation grid" : "reachable set";
+  return {
+    series,
+    bands: style === "band" ? bands : [],
+    scales: { x: { time: false }, y: { distr: 3, log: 10, range: limits } },
+    axes: [
+      axis(`time t [${unit}]`, false, { size: 38, space: 70 }),
+      axis(`L² error, ${what}`, true, { size: 54 }),
+    ],
+    cursor: { y: false, points: { size: 7, one: false, fill: (u, i) => pointFill(i), stroke: "transparent", width: 0 }, drag: { x: true, y: false } },
+    hooks: {
+      setCursor: [(u) => read(u.cursor.idx ?? null)],
+      setSelect: [(u) => { u.zoomed = true; }],
+      drawSeries: [],
+      draw: style === "errorbar" ? [errorBars(barred)] : [],
+    },
+  };
+}
+
+/** Limits of the loss axis: what is visible, without what runs far below the rest. */
+function limits(_, low, high) {
+  const [bottom, top] = logRange([low, high]);
+  const all = !answer.main || new FormData(form).get("range") === "all";
+  const floor = all ? 0 : answer.main[0];
+  const visible = answer.curves.filter((curve) => !hidden.has(curve.policy));
+  const below = visible.filter((curve) => Math.min(...curve.centre.filter((value) => value > 0)) < floor);
+  const cut = below.length > 0 && below.length < visible.length;
+  const names = below.map((curve) => curve.label).join(", ");
+  part("below").textContent = cut ? `Below this part of the axis: ${names}. ` : "";
+  return cut ? [Math.max(bottom, floor), top] : [bottom, top];
+}
+
+/** The dot of the cursor sits on centres alone. */
+function pointFill(series) {
+  return series % 3 === 1 ? ink(answer.curves[(series - 1) / 3].colour) : "transparent";
+}
+
+/** What the bars need of each curve. */
+function barred() {
+  return answer.curves.map((curve) => ({ ...curve, shown: !hidden.has(curve.policy) }));
+}
+
+/** Read the curves at the cursor, or at the last step. @param {number|null} index */
+function read(index) {
+  if (!answer) return;
+  const last = answer.x.length - 1;
+  const at = index ?? last;
+  const unit = new FormData(form).get("x") === "seconds" ? " s" : "";
+  part("at").textContent =
+    index === null ? `${answer.statistic} at the last step` : `${answer.statistic} at t = ${Number(answer.x[at].toPrecision(6))}${unit}`;
+  readLegend(part("legend"), answer.curves, at);
+}
+
+/** @param {string} policy @param {boolean} on */
+function toggle(policy, on) {
+  if (on) hidden.delete(policy);
+  else hidden.add(policy);
+  const first = 1 + 3 * answer.curves.findIndex((curve) => curve.policy === policy);
+  chart.batch(() => {
+    for (let i = first; i < first + 3; i += 1) chart.setSeries(i, { show: on });
+  });
+  remember();
+  shown();
+}
+
+/** Name what is drawn, for those who cannot see it. */
+function shown() {
+  const curves = answer.curves.filter((curve) => !hidden.has(curve.policy));
+  place.dataset.shown = curves.map((curve) => curve.policy).join(" ");
+  place.dataset.steps = String(answer.x.length);
+  describe(place, `Loss against time in the ${answer.env}: ${curves.map((curve) => curve.label).join(", ")}. The table below has the values.`);
+}
+
+/** Say what is missing from the curves, and what else is stored. */
+function warn() {
+  const notes = answer.notes.map((text) => note("note", `${text}.`));
+  const gaps = answer.missing.map((gap) => `${gap.policy}: ${gap.states} (seeds ${gap.seeds})`);
+  if (gaps.length) notes.unshift(note("warning", `Not all trials have ended: ${gaps.join("; ")}.`));
+  part("missing").replaceChildren(...notes);
+}
+
+function note(kind, text) {
+  const made = document.createElement("p");
+  made.className = kind;
+  made.textContent = text;
+  return made;
+}
+
+/** Move the cursor by keys. @param {KeyboardEvent} event */
+function steer(event) {
+  const move = { ArrowLeft: -1, ArrowRight: 1, PageUp: -25, PageDown: 25 }[event.key];
+  if (!chart || !move) return;
+  event.preventDefault();
+  const now = chart.cursor.idx ?? answer.x.length - 1;
+  const at = Math.min(Math.max(now + move, 0), answer.x.length - 1);
+  chart.setCursor({ left: chart.valToPos(answer.x[at], "x"), top: 10 });
+}
+
+if (form) {
+  offerWidths(new URLSearchParams(location.search).get("width"));
+  form.addEventListener("submit", (event) => event.preventDefault());
+  form.addEventListener("change", (event) => {
+    if (event.target.name === "env") offerWidths(form.elements.namedItem("width").value);
+    remember();
+    if (["style", "range"].includes(event.target.name) && answer) draw();
+    else load();
+  });
+  place.addEventListener("keydown", steer);
+  document.addEventListener("dopt:change", load);
+  load();
+} else {
+  document.addEventListener("dopt:change", () => location.reload());
+}

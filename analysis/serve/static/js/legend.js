@@ -1,0 +1,72 @@
+/** The table below the curves: it names them, switches them on and off, and reads them at a step. */
+
+import { numeral } from "./numbers.js";
+
+const SPACE = "http://www.w3.org/2000/svg";
+
+/** A sample of a policy's line. @param {{colour: string, dash: number[], line_width: number}} look */
+function swatch(look) {
+  const svg = document.createElementNS(SPACE, "svg");
+  const line = document.createElementNS(SPACE, "line");
+  svg.setAttribute("class", "swatch");
+  svg.setAttribute("viewBox", "0 0 34 12");
+  svg.setAttribute("aria-hidden", "true");
+  const given = { x1: 1, x2: 33, y1: 6, y2: 6, "stroke-width": 1.5 * look.line_width };
+  for (const [name, value] of Object.entries(given)) line.setAttribute(name, String(value));
+  if (look.colour === "#000000") line.setAttribute("class", "ink");
+  else line.setAttribute("stroke", look.colour);
+  const dash = look.dash.map((part) => part * look.line_width * 1.3).join(" ");
+  if (dash) line.setAttribute("stroke-dasharray", dash);
+  svg.append(line);
+  return svg;
+}
+
+/**
+ * Fill the table with a row for each curve.
+ * @param {HTMLTableElement} table
+ * @param {object[]} curves as the server gives them
+ * @param {Set<string>} hidden policies that are switched off
+ * @param {(policy: string, shown: boolean) => void} onToggle
+ */
+export function fillLegend(table, curves, hidden, onToggle) {
+  const rows = curves.map((curve) => {
+    const row = document.createElement("tr");
+    const box = document.createElement("input");
+    box.type = "checkbox";
+    box.checked = !hidden.has(curve.policy);
+    box.value = curve.policy;
+    const label = document.createElement("label");
+    label.className = "policy";
+    label.append(box, swatch(curve), curve.label);
+    const name = document.createElement("td");
+    name.append(label);
+    row.append(name, cell(""), cell(""), cell(curve.count));
+    row.classList.toggle("off", !box.checked);
+    box.addEventListener("change", () => {
+      row.classList.toggle("off", !box.checked);
+      onToggle(curve.policy, box.checked);
+    });
+    return row;
+  });
+  const focused = document.activeElement instanceof HTMLInputElement && document.activeElement.value;
+  const kept = focused && table.contains(document.activeElement);
+  table.tBodies[0].replaceChildren(...rows);
+  if (kept) table.querySelector(`input[value="${CSS.escape(focused)}"]`)?.focus();
+}
+
+function cell(text) {
+  const made = document.createElement("td");
+  made.className = "number";
+  made.textContent = text;
+  return made;
+}
+
+/** Write the values of one step into the table. @param {HTMLTableElement} table */
+export function readLegend(table, curves, at) {
+  curves.forEach((curve, index) => {
+    const cells = table.tBodies[0].rows[index].cells;
+    cells[1].textContent = numeral(curve.centre[at]);
+    const known = curve.low[at] !== null && curve.low[at] !== undefined;
+    cells[2].textContent = known ? `${numeral(curve.low[at])} – ${numeral(curve.high[at])}` : "–";
+  });
+}

@@ -1,0 +1,126 @@
+/** The charts of one trial. */
+
+import { drawPhase } from "./phase.js";
+import { numeral } from "./numbers.js";
+import { axis, ink, logRange, plot, theme } from "./plot.js";
+
+const HEIGHT = 290;
+const PAINTS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
+const SILENT = { y: false, drag: { x: true, y: false } };
+const charts = document.getElementById("charts");
+
+/** @param {string} id */
+const part = (id) => document.getElementById(id);
+
+/** A line without points. */
+function line(colour, more = {}) {
+  return { stroke: () => ink(colour), width: 1.6, points: { show: false }, ...more };
+}
+
+function drawLoss(found) {
+  const series = [{}, line(found.look.colour), line(found.look.colour, { dash: [5, 4], width: 1.2 })];
+  const range = () => logRange([...found.loss, ...found.reachable_loss].filter((one) => one !== null));
+  plot(
+    part("loss"),
+    {
+      series,
+      scales: { x: { time: false }, y: { distr: 3, log: 10, range } },
+      axes: [axis("time t [steps]", false, { size: 38 }), axis("L² error", true, { size: 54 })],
+      cursor: SILENT,
+    },
+    [found.t, found.loss, found.reachable_loss],
+    HEIGHT,
+  );
+}
+
+function drawInputs(found) {
+  const times = found.t.map((t) => t * found.dt);
+  const series = [{}, ...found.inputs.map((_, index) => line(paint(found, index), { width: 1.2 }))];
+  plot(
+    part("inputs"),
+    {
+      series,
+      scales: { x: { time: false } },
+      axes: [axis("time [s]", false, { size: 38 }), axis(found.inputs.map((one) => one.label).join(", "), false, { size: 54 })],
+      cursor: SILENT,
+    },
+    [times, ...found.inputs.map((one) => one.values)],
+    HEIGHT,
+  );
+  const names = found.inputs.length > 1 ? `Bound of the norm` : `Bound`;
+  part("inputs-note").textContent = `${names}: γ = ${numeral(found.gamma, 3)}.`;
+}
+
+function paint(found, index) {
+  return found.inputs.length === 1 ? found.look.colour : PAINTS[index % PAINTS.length];
+}
+
+function drawSpectrum(found) {
+  const { frequency, density, eigenfrequency } = found.spectrum;
+  if (!frequency.length) {
+    part("spectrum-note").textContent = "Too few inputs for a spectrum.";
+    return;
+  }
+  const top = Math.max(...density);
+  const range = () => logRange(density.filter((value) => value > top * 1e-5));
+  const clipped = density.map((value) => Math.max(value, top * 1e-7) || null);
+  plot(
+    part("spectrum"),
+    {
+      series: [{}, line(found.look.colour, { width: 1.3 })],
+      scales: { x: { time: false, distr: 3, log: 10, range: () => [frequency[0], frequency.at(-1)] }, y: { distr: 3, log: 10, range } },
+      axes: [axis("frequency [Hz]", true, { size: 38 }), axis("density of u [unit²/Hz]", true, { size: 54 })],
+      cursor: { y: false, drag: { x: false, y: false } },
+      hooks: { draw: eigenfrequency ? [(u) => mark(u, eigenfrequency)] : [] },
+    },
+    [frequency, clipped],
+    HEIGHT,
+  );
+  part("spectrum-note").textContent = eigenfrequency
+    ? `Dashed: eigenfrequency f₀ = ${numeral(eigenfrequency, 3)} Hz at the stable equilibrium, and 3 f₀.`
+    : "The linearised system does not oscillate: there is no eigenfrequency.";
+}
+
+/** Vertical lines at the eigenfrequency and its third harmonic. */
+function mark(u, frequency) {
+  const { ctx, bbox } = u;
+  ctx.save();
+  ctx.strokeStyle = theme("text");
+  ctx.fillStyle = theme("text");
+  ctx.lineWidth = devicePixelRatio;
+  ctx.setLineDash([5 * devicePixelRatio, 3 * devicePixelRatio]);
+  ctx.textAlign = "left";
+  ctx.textBaseline = "alphabetic";
+  ctx.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
+  for (const [factor, text] of [[1, "f₀"], [3, "3 f₀"]]) {
+    const x = u.valToPos(factor * frequency, "x", true);
+    if (x < bbox.left || x > bbox.left + bbox.width) continue;
+    ctx.beginPath();
+    ctx.moveTo(x, bbox.top);
+    ctx.lineTo(x, bbox.top + bbox.height);
+    ctx.stroke();
+    ctx.fillText(text, x + 4 * devicePixelRatio, bbox.top + 11 * devicePixelRatio);
+  }
+  ctx.restore();
+}
+
+/** Ask for the arrays and draw them all. */
+async function load() {
+  try {
+    const answer = await fetch(`/api/trials/${encodeURIComponent(charts.dataset.key)}/arrays`);
+    const found = await answer.json();
+    if (!answer.ok) throw new Error(found.error);
+    drawLoss(found);
+    drawInputs(found);
+    drawSpectrum(found);
+    if (found.phase && part("phase")) {
+      drawPhase(part("phase"), found.phase, found.look.colour, `Path in the plane of ${found.phase.labels.join(" and ")}`);
+    }
+    charts.dataset.drawn = "yes";
+  } catch (error) {
+    part("problem").textContent = error.message;
+    part("problem").hidden = false;
+  }
+}
+
+if (charts) load();

@@ -1,0 +1,152 @@
+"""One trial: what was asked for, what came out, and every attempt at it."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+from analysis.choice import flatten
+from analysis.portraits import phase_plane
+from analysis.serve.asked import Asked, short
+from analysis.serve.errors import NotFoundError
+from analysis.serve.naming import look
+from analysis.serve.progress import measure
+from analysis.serve.site import Site
+from analysis.spectrum import periodogram
+from dopt.errors import SpecificationError
+from dopt.systems import System, system_from_mapping
+from dopt.systems.equilibrium import eigenmode
+from orchestrate.store import Reader, Trajectory
+from orchestrate.store.errors import QueryError
+
+_TRIAL = """
+SELECT v.*, c.config_json, e.traceback FROM v_trial v
+JOIN config c ON c.config_key = v.config_key
+JOIN trial r ON r.trial_id = v.trial_id
+LEFT JOIN error e ON e.error_id = r.error_id
+WHERE v.trial_key = :trial_key
+"""
+_ATTEMPTS = """
+SELECT a.attempt, a.outcome, a.cause, a.launch_id, a.node, a.pid, a.claimed, a.started, a.ended,
+       a.wall_seconds, a.cpu_seconds, a.peak_memory_bytes, e.type, e.message, e.traceback
+FROM attempt a LEFT JOIN error e ON e.error_id = a.error_id
+WHERE a.trial_id = :trial_id ORDER BY a.attempt
+"""
+_LAUNCHES = """
+SELECT launch_id, state, started, ended, host, pid, argv, overrides, git_commit, git_dirty,
+       git_diff_hash, versions
+FROM launch
+WHERE launch_id IN (SELECT launch_id FROM attempt WHERE trial_id = :trial_id) ORDER BY launch_id
+"""
+_STEPS = "SELECT t, loss, reachable_loss FROM step WHERE trial_id = :trial_id ORDER BY t"
+_TEXTS = ("argv", "overrides", "versions")
+
+
+def trial(site: Site, asked: Asked) -> dict[str, Any]:
+    """Return everything that is stored of a trial but its arrays, see ``arrays``."""
+    reader = site.source.reader()
+    row = _row(reader, asked)
+    config = json.loads(row.pop("config_json"))
+    return {
+        "progress": measure(reader),
+        "trial": row,
+        "config": flatten(config),
+        "attempts": _table(reader, _ATTEMPTS, row["trial_id"]),
+        "launches": [
+            one | {name: json.loads(one[name]) for name in _TEXTS}
+            for one in _table(reader, _LAUNCHES, row["trial_id"])
+        ],
+        "has_arrays": row["status"] in ("done", "diverged"),
+        "system_is_known": _system(config) is not None,
+        "look": look(row["policy"]),
+    }
+
+
+def arrays(site: Site, asked: Asked) -> dict[str, Any]:
+    """Return loss, path in the phase plane, inputs and their spectrum, ready to draw."""
+    reader = site.source.reader()
+    row = _row(reader, asked)
+    steps = _table(reader, _STEPS, row["trial_id"])
+    try:
+        trajectory = reader.trajectory(row["config_key"], row["seed"])
+    except QueryError as error:
+        raise NotFoundError(
+            f"Trial {row['trial_key'][:12]} is {row['status']} and has no curve: wait for it."
+        ) from error
+    system = _system(json.loads(row["config_json"]))
+    labels = system.input_labels if system else _numbered(trajectory)
+    return {
+        "t": [step["t"] for step in steps],
+        "loss": [step["loss"] for step in steps],
+        "reachable_loss": [step["reachable_loss"] for step in steps],
+        "diverged_at": row["diverged_at"],
+        "dt": row["dt"],
+        "gamma": row["gamma"],
+        "look": look(row["policy"]),
+        "inputs": [
+            {"label": label, "values": values}
+            for label, values in zip(labels, trajectory.inputs.T, strict=True)
+        ],
+        "spectrum": _spectrum(trajectory, row["dt"], system),
+        "phase": _phase(trajectory, system) if system else None,
+    }
+
+
+def _row(reader: Reader, asked: Asked) -> dict[str, Any]:
+    key = asked.text("trial_key")
+    found = reader.rows(_TRIAL, trial_key=key)
+    if not found:
+        raise NotFoundError(
+            f"There is no trial '{short(key, 20)}' in {reader.safe_url}: choose one of the list."
+        )
+    return dict(zip(found.columns, found[0], strict=True))
+
+
+def _table(reader: Reader, sql: str, trial_id: int) -> list[dict[str, Any]]:
+    found = reader.rows(sql, trial_id=trial_id)
+    return [dict(zip(found.columns, row, strict=True)) for row in found]
+
+
+def _system(config: dict[str, Any]) -> System | None:
+    """Return the system of a configuration, None where it is a user's own and not known here."""
+    try:
+        return system_from_mapping(config["env"])
+    except (SpecificationError, KeyError):
+        return None
+
+
+def _numbered(trajectory: Trajectory) -> tuple[str, ...]:
+    return tuple(f"u{i + 1}" for i in range(trajectory.inputs.shape[1]))
+
+
+def _phase(trajectory: Trajectory, system: System) -> dict[str, Any]:
+    plane = phase_plane(system)
+    points = plane.project(trajectory.states)
+    points = points[np.isfinite(points).all(axis=1)]
+    line = plane.line(points) if len(points) else points
+    return {
+        "x": line[:, 0],
+        "y": line[:, 1],
+        "start": plane.wrapped(points[:1])[0] if len(points) else None,
+        "labels": plane.labels,
+        "angles": plane.angles,
+        "box": plane.box,
+    }
+
+
+def _spectrum(trajectory: Trajectory, dt: float, system: System | None) -> dict[str, Any]:
+    """Return the one-sided periodogram without its ends, whose density counts once."""
+    inputs = trajectory.inputs
+    inputs = inputs[np.isfinite(inputs).all(axis=1)]
+    mode = eigenmode(system) if system else None
+    frequency, density = np.empty(0), np.empty((1, 0))
+    if len(inputs) > 3:
+        frequency, density = periodogram(inputs[None], dt)
+    return {
+        "frequency": frequency[1:-1],
+        "density": density[0, 1:-1],
+        "eigenfrequency": mode.frequency / (2 * math.pi) if mode else None,
+    }

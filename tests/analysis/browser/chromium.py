@@ -1,0 +1,131 @@
+"""A real Chromium, a served database, and a page that forgives nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+import uvicorn
+from playwright.sync_api import Browser, Page, Playwright, sync_playwright
+
+from analysis.serve.app import create_app
+
+ROOT = Path(__file__).resolve().parents[3]
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+]
+PATIENCE = 45.0
+"""Seconds for something to appear on a loaded machine."""
+
+
+def find() -> str:
+    """Return the path of Chromium; skip without one, or fail where DOPT_REQUIRE_BROWSER=1."""
+    path = os.environ.get("DOPT_CHROMIUM") or shutil.which("chromium")
+    if path:
+        return path
+    message = "no chromium is installed (Debian's package, or DOPT_CHROMIUM names another one)"
+    if os.environ.get("DOPT_REQUIRE_BROWSER") == "1":
+        pytest.fail(message)
+    pytest.skip(message)
+
+
+@contextmanager
+def opened() -> Iterator[Browser]:
+    """Start Chromium and end it."""
+    path = find()
+    playwright: Playwright
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def served(url: str, figures: Path) -> Iterator[str]:
+    """Serve a database from a thread of this process; yield the address."""
+    app = create_app(url, figures)
+    server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="warning"))
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    try:
+        wait_until(lambda: server.started, "the start of the server")
+        port = server.servers[0].sockets[0].getsockname()[1]
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        server.should_exit = True
+        thread.join(PATIENCE)
+
+
+@contextmanager
+def commanded(url: str) -> Iterator[str]:
+    """Serve a database with the command itself on a free port; yield the address it prints."""
+    command = [sys.executable, "-m", "analysis", "serve", "--db", url, "--port", "0"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        ready, _, _ = select.select([process.stdout], [], [], PATIENCE)
+        assert ready, "the server says nothing"
+        found = re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline())
+        assert found
+        yield found[0]
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=PATIENCE) == 0
+        process.stdout.close()
+
+
+@contextmanager
+def strict_page(
+    browser: Browser, address: str, complaint: str | None = None, **options: object
+) -> Iterator[Page]:
+    """Open a page of which every request goes to the server and nothing is complained of.
+
+    ``complaint`` is part of the one message that is expected, such as that of a refused request.
+    """
+    faults: list[str] = []
+    context = browser.new_context(base_url=address, **options)  # type: ignore[arg-type]
+    context.set_default_timeout(1000 * PATIENCE)
+    page = context.new_page()
+    host = urlsplit(address).netloc
+
+    def ask(asked: str) -> None:
+        if urlsplit(asked).netloc != host:
+            faults.append(f"asked elsewhere: {asked}")
+
+    def hear(said: str) -> None:
+        if complaint is None or complaint not in said:
+            faults.append(said)
+
+    page.on("request", lambda request: ask(request.url))
+    page.on("console", lambda said: hear(said.text))
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("websocket", lambda socket: faults.append(f"socket: {socket.url}"))
+    yield page
+    context.close()
+    assert not faults
+
+
+def wait_until(true: Callable[[], object], what: str) -> None:
+    """Wait until a function says so."""
+    end = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < end, f"{what} did not happen"
+        time.sleep(0.1)

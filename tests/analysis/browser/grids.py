@@ -1,0 +1,71 @@
+"""Grids of the states that a page must show, in a database of either kind."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from dopt.spec import TrialSpec
+from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
+from tests.analysis.synthetic import fake_result, fill, make_grid
+
+SHORT = {"env": {"horizon": 40}}
+TRACEBACK = "Traceback (most recent call last):\n  <script>alert('no')</script>\nValueError: no"
+FAILURE = Failure("ValueError", "the <b>input</b> is wrong", TRACEBACK)
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+RUN = RunRecord("node-1", 7, 1.5, 1.25, 2**28, NOW, NOW)
+
+
+def mixed(url: str) -> None:
+    """Fill a database with two systems, five policies, two widths and trials of every status."""
+    specs = make_grid(("pendulum", "cartpole"), seeds=range(4), **SHORT)
+    specs += make_grid(
+        ("pendulum",), ("d_optimal", "random"), range(4), model={"width": 4}, **SHORT
+    )
+    left = [spec for spec in specs if spec.policy.name == "periodic" and spec.seed > 1]
+    diverged = {_key(specs, "cartpole", "random", 2): 17}
+    fill(url, specs, skipped=left, diverged=diverged)
+    fail_one(url, left[0])
+
+
+def fail_one(url: str, spec: TrialSpec) -> None:
+    """Claim a trial in a launch of its own and fail it."""
+    with Store.open(url) as store:
+        launch = begin(store)
+        (claim,) = store.claim(launch, [spec.trial_key])
+        assert store.fail(claim, FAILURE, RUN)
+        store.end_launch(launch, "done")
+
+
+def finish(store: Store, launch: int, spec: TrialSpec) -> None:
+    """Claim a trial and commit a made-up result of it."""
+    (claim,) = store.claim(launch, [spec.trial_key])
+    assert store.commit(claim, fake_result(spec), RUN)
+
+
+def begin(store: Store) -> int:
+    """Begin a launch of this process."""
+    return store.begin_launch(LaunchRecord(argv=["test"], overrides=[], host="here", pid=1))
+
+
+def nothing(url: str) -> None:
+    """Make a database without trials."""
+    Store.open(url).close()
+
+
+def one_trial(url: str) -> None:
+    """Make a database with one finished trial."""
+    fill(url, make_grid(("pendulum",), ("d_optimal",), range(1), **SHORT))
+
+
+def all_diverged(url: str) -> None:
+    """Make a database of which every trial diverged, one of them at once."""
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(3), **SHORT)
+    fill(url, specs, diverged={spec.trial_key: 5 * spec.seed for spec in specs})
+
+
+def _key(specs: list[TrialSpec], env: str, policy: str, seed: int) -> str:
+    return next(
+        spec.trial_key
+        for spec in specs
+        if (spec.system.name, spec.policy.name, spec.seed) == (env, policy, seed)
+    )

@@ -1,0 +1,34 @@
+"""A real launch of stand-in trials that take a moment each: ``python -m ... URL SEEDS SECONDS``."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from dopt.result import TrialResult
+from dopt.spec import TrialSpec
+from orchestrate.campaign import Work, launch_grid
+from orchestrate.grid import Grid
+from orchestrate.settings import LaunchSettings
+from orchestrate.store import LaunchRecord
+from tests.analysis.browser.grids import SHORT
+from tests.analysis.synthetic import fake_result, make_grid
+
+
+def main(url: str, seeds: int, seconds: float) -> int:
+    """Launch pendulum trials of two policies into a database."""
+
+    def run(spec: TrialSpec) -> TrialResult:
+        time.sleep(seconds)
+        return fake_result(spec)
+
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(seeds), **SHORT)
+    settings = LaunchSettings(executor="inprocess", store_url=url, workers=1)
+    record = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
+    work = Work(run, prepare=lambda: None)
+    grid = Grid(specs, asked=len(specs), left_out={})
+    return int(launch_grid(grid, settings, record, work, lambda _: None, stream=None))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1], int(sys.argv[2]), float(sys.argv[3])))

@@ -1,0 +1,274 @@
+"""The pages in a real browser: what users click, without a complaint or a stray request."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.analysis.browser import chromium, grids
+from tests.analysis.browser.chromium import PATIENCE, ROOT
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+expect.set_options(timeout=1000 * PATIENCE)
+
+CONTRAST = (Path(__file__).parent / "contrast.js").read_text()
+PATHS = ("/", "/curves", "/trials", "/compare", "/figures", "/sql?q=SELECT env, seed FROM v_trial")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium.opened() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def figures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("figures")
+    icon = ROOT / "analysis" / "serve" / "static" / "icon.svg"
+    (folder / "figure1.svg").write_bytes(icon.read_bytes())
+    (folder / "figure1.txt").write_text("A caption.")
+    (folder / "figure1.json").write_text('{"title": "Loss curves", "statistic": "mean"}')
+    (folder / "summary.csv").write_text("env,policy,loss\narm,random,0.123456\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(sqlite_grid: str, figures: Path) -> Iterator[str]:
+    with chromium.served(sqlite_grid, figures) as found:
+        yield found
+
+
+@pytest.fixture
+def page(browser: Browser, address: str) -> Iterator[Page]:
+    with chromium.strict_page(browser, address) as opened:
+        yield opened
+
+
+@pytest.fixture
+def show(browser: Browser, figures: Path) -> Iterator[Callable[[str], Page]]:
+    """Return a function that serves a database of its own and gives a page of it."""
+    with ExitStack() as stack:
+
+        def open_page(url: str) -> Page:
+            address = stack.enter_context(chromium.served(url, figures))
+            return stack.enter_context(chromium.strict_page(browser, address))
+
+        yield open_page
+
+
+def test_from_the_grid_to_a_trial(page: Page) -> None:
+    page.goto("/")
+    expect(page.locator("#state-text")).to_have_text("45 of 48 trials ended, 1 failed")
+    page.get_by_role("link", name=re.compile("1 diverged")).click()
+    expect(page.locator("tbody tr")).to_have_count(4)
+    page.locator("tbody tr", has_text="diverged").get_by_role("link").click()
+    expect(page.get_by_role("heading", level=1)).to_have_text("cartpole, random, seed 2")
+    page.wait_for_selector("#charts[data-drawn]")
+    expect(page.locator("#charts canvas")).to_have_count(3)
+    assert str(page.locator("#phase path.path").get_attribute("d")).count("L") > 10
+    expect(page.locator("#spectrum-note")).to_contain_text("eigenfrequency")
+    page.get_by_role("link", name="all seeds of this configuration").click()
+    expect(page.locator("tbody tr")).to_have_count(4)
+
+
+def test_curves_follow_the_controls(page: Page) -> None:
+    page.goto("/curves")
+    chart, rows = page.locator("#chart"), page.locator("#legend tbody tr")
+    expect(chart).to_have_attribute("data-shown", "d_optimal oracle uniform periodic random")
+    expect(rows).to_have_count(5)
+    expect(page.locator("#missing")).to_contain_text("periodic: 1 failed, 1 pending (seeds 2-3)")
+    rows.nth(4).get_by_role("checkbox").uncheck()
+    expect(chart).to_have_attribute("data-shown", "d_optimal oracle uniform periodic")
+    page.locator("#legend").get_by_label("oracle").uncheck()
+    page.get_by_role("radio", name="cartpole").check()
+    expect(page.locator("#heading")).to_have_text("cartpole, width 16")
+    expect(chart).to_have_attribute("data-shown", "d_optimal uniform periodic")
+    page.get_by_role("radio", name="seconds").check()
+    page.get_by_role("radio", name="bars").check()
+    page.get_by_role("radio", name="reachable set").check()
+    expect(page).to_have_url(re.compile("env=cartpole.*column=reachable_loss.*x=seconds"))
+    page.reload()
+    expect(chart).to_have_attribute("data-shown", "d_optimal uniform periodic")
+    expect(rows.nth(1).get_by_role("checkbox")).not_to_be_checked()
+    page.get_by_role("radio", name="pendulum").check()
+    page.get_by_label("Width").select_option("4")
+    expect(chart).to_have_attribute("data-shown", "d_optimal")
+
+
+def test_a_wrong_condition_is_one_sentence(browser: Browser, address: str) -> None:
+    with chromium.strict_page(browser, address, complaint="status of 400") as page:
+        page.goto("/curves")
+        page.get_by_label("Where").fill("policy.form=none")
+        page.get_by_label("Where").press("Tab")
+        expect(page.locator("#problem")).to_contain_text("fits no stored configuration")
+        page.get_by_label("Where").fill("")
+        page.get_by_label("Where").press("Tab")
+        expect(page.locator("#problem")).to_be_hidden()
+        expect(page.locator("#legend tbody tr")).to_have_count(5)
+
+
+def test_curves_are_read_by_mouse_and_keys(page: Page) -> None:
+    page.goto("/curves")
+    head, value = page.locator("#at"), page.locator("#legend tbody tr").first.locator("td").nth(1)
+    expect(head).to_have_text("mean at the last step")
+    last = value.inner_text()
+    over = page.locator("#chart .u-over")
+    over.hover(position={"x": 60, "y": 100})
+    expect(head).to_have_text(re.compile(r"mean at t = \d+"))
+    assert value.inner_text() != last
+    page.mouse.move(2, 2)
+    expect(head).to_have_text("mean at the last step")
+    page.locator("#chart").focus()
+    page.keyboard.press("ArrowLeft")
+    expect(head).to_have_text("mean at t = 38")
+    page.keyboard.press("PageUp")
+    expect(head).to_have_text("mean at t = 13")
+
+
+def test_the_list_sorts_filters_and_turns_pages(page: Page) -> None:
+    page.goto("/trials?size=25")
+    expect(page.locator("caption")).to_have_text("48 trials")
+    page.get_by_role("link", name="Next").click()
+    expect(page.locator("tbody tr")).to_have_count(23)
+    expect(page.get_by_role("link", name="Next")).to_have_count(0)
+    page.get_by_role("link", name="Previous").click()
+    expect(page.locator("tbody tr")).to_have_count(25)
+    page.get_by_role("link", name="final loss").click()
+    expect(page.locator("th[aria-sort=ascending]")).to_contain_text("final loss")
+    page.get_by_role("link", name="final loss").click()
+    expect(page.locator("th[aria-sort=descending]")).to_contain_text("final loss")
+    page.get_by_label("Status").select_option("failed")
+    expect(page.locator("tbody tr")).to_have_count(1)
+    assert "policy=" not in page.url
+    page.locator("tbody a").click()
+    expect(page.get_by_role("alert")).to_contain_text("the <b>input</b> is wrong")
+    expect(page.locator("pre")).to_contain_text("<script>alert('no')</script>")
+    page.get_by_role("link", name="Trials", exact=True).click()
+    page.get_by_role("spinbutton", name="Seed").fill("3")
+    page.get_by_role("button", name="Apply").click()
+    expect(page.locator("caption")).to_have_text("12 trials")
+
+
+def test_sql_answers_refuses_and_downloads(browser: Browser, address: str) -> None:
+    with chromium.strict_page(browser, address, complaint="status of 400") as page:
+        use_sql(page)
+
+
+def use_sql(page: Page) -> None:
+    page.goto("/sql")
+    page.get_by_role("link", name="Final losses").click()
+    expect(page.locator("#answer tbody tr")).to_have_count(12)
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download CSV").click()
+    assert download.value.path().read_text().startswith("env,policy,width,n,mean")
+    box = page.get_by_label("Statement")
+    box.fill("DELETE FROM trial")
+    box.press("Control+Enter")
+    expect(page.get_by_role("alert")).to_contain_text("The query failed")
+    expect(box).to_have_value("DELETE FROM trial")
+    box.fill("SELECT trial_key FROM v_trial WHERE status = 'failed'")
+    page.get_by_role("button", name="Run").click()
+    page.locator("#answer tbody a").click()
+    expect(page.locator("h1")).to_contain_text("pendulum, periodic")
+
+
+def test_comparisons_and_figures(page: Page) -> None:
+    page.goto("/compare")
+    expect(page.locator("tbody tr")).to_have_count(8)
+    expect(page.locator("svg.forest")).to_have_count(8)
+    page.get_by_label("Judged by").select_option("steps")
+    expect(page.get_by_role("columnheader", name="P(earlier)")).to_be_visible()
+    page.get_by_role("link", name="Figures", exact=True).click()
+    expect(page.get_by_text("A caption.")).to_be_visible()
+    picture = page.get_by_role("img", name="Loss curves")
+    expect(picture).to_be_visible()
+    assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 0
+    page.get_by_text("Provenance").click()
+    expect(page.get_by_text("statistic")).to_be_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_is_readable_and_fits_a_phone(browser: Browser, address: str, scheme: str) -> None:
+    size = {"viewport": {"width": 390, "height": 800}, "color_scheme": scheme}
+    with chromium.strict_page(browser, address, **size) as page:
+        for path in PATHS:
+            page.goto(path)
+            if path == "/curves":
+                page.wait_for_selector("#chart[data-shown]")
+            overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+            assert page.evaluate(overflow) <= 0, path
+            assert page.evaluate(CONTRAST) == [], path
+            unnamed = "[...document.querySelectorAll('input:not([type=hidden]), select, textarea')]"
+            assert page.evaluate(f"{unnamed}.filter((field) => !field.labels.length).length") == 0
+
+
+def test_pages_follow_a_launch(browser: Browser, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    grids.nothing(url)
+    with (
+        chromium.commanded(url) as address,
+        chromium.strict_page(browser, address) as page,
+    ):
+        page.goto("/")
+        expect(page.locator("#grid")).to_contain_text("holds no trial yet")
+        program = [sys.executable, "-m", "tests.analysis.browser.slow_launch", url, "6", "0.7"]
+        launch = subprocess.Popen(program, cwd=ROOT)
+        expect(page.locator("#state")).to_have_attribute("data-mode", "writing")
+        expect(page.locator(".tile").first).to_contain_text("pending")
+        page.get_by_role("link", name="Curves", exact=True).click()
+        count = page.locator("#legend tbody tr").first.locator("td").nth(3)
+        expect(count).to_have_text(re.compile("[1-5]"))
+        page.evaluate("window.same = true")
+        assert launch.wait(timeout=PATIENCE) == 0
+        expect(count).to_have_text("6")
+        expect(page.locator("#state-text")).to_have_text("12 of 12 trials ended")
+        expect(page.locator("#state")).to_have_attribute("data-mode", "still")
+        assert page.evaluate("window.same") is True, "the page was loaded again"
+
+
+def test_a_database_that_comes_later_appears(browser: Browser, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    with (
+        chromium.served(url, tmp_path) as address,
+        chromium.strict_page(browser, address, complaint="status of 503") as page,
+    ):
+        page.goto("/")
+        expect(page.get_by_role("alert")).to_contain_text("There is no results database")
+        grids.one_trial(url)
+        expect(page.locator(".tile")).to_have_count(1)
+
+
+@pytest.mark.parametrize("state", [grids.nothing, grids.one_trial, grids.all_diverged])
+def test_small_databases_are_shown_without_complaint(
+    show: Callable[[str], Page], tmp_path: Path, state: Callable[[str], None]
+) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    state(url)
+    page = show(url)
+    for path in ("/", "/curves", "/trials", "/figures", "/sql"):
+        page.goto(path)
+        expect(page.locator("h1")).to_be_visible()
+        if path == "/curves" and state is not grids.nothing:
+            page.wait_for_selector("#chart[data-shown]")
+    page.goto("/trials")
+    if state is not grids.nothing:
+        page.locator("tbody a").last.click()
+        page.wait_for_selector("#charts[data-drawn]")
+
+
+def test_the_same_pages_over_postgresql(show: Callable[[str], Page], postgresql_grid: str) -> None:
+    page = show(postgresql_grid)
+    page.goto("/")
+    expect(page.locator(".tile")).to_have_count(12)
+    page.goto("/curves?env=cartpole")
+    expect(page.locator("#legend tbody tr")).to_have_count(5)
+    page.goto("/trials?status=diverged")
+    page.locator("tbody a").click()
+    page.wait_for_selector("#charts[data-drawn]")

@@ -1,0 +1,185 @@
+"""Who may ask, how, and for which file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import quote, urlencode
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from starlette.testclient import TestClient
+
+from analysis.serve.guard import is_own
+
+Visit = Callable[..., TestClient]
+
+
+@pytest.fixture
+def client(sqlite_grid: str, visit: Visit, tmp_path: Path) -> TestClient:
+    folder = tmp_path / "figures"
+    folder.mkdir()
+    (folder / "figure1.png").write_bytes(b"\x89PNG")
+    (folder / "figure1.txt").write_text("A <b>caption</b>.")
+    (folder / "figure1.json").write_text('{"title": "Loss curves", "schema": "1"}')
+    (folder / "summary.csv").write_text("env,policy,loss\narm,random,0.123456\n")
+    (folder / "notes.html").write_text("<script>alert(1)</script>")
+    (folder / ".hidden.png").write_bytes(b"")
+    (folder / "link.png").symlink_to("/etc/passwd")
+    (folder / "sub.png").mkdir()
+    (tmp_path / "secret.txt").write_text("secret")
+    return visit(sqlite_grid, folder)
+
+
+@pytest.mark.parametrize(
+    ("host", "listening", "own"),
+    [
+        ("127.0.0.1:8000", "127.0.0.1", True),
+        ("localhost:8000", "127.0.0.1", True),
+        ("LOCALHOST", "127.0.0.1", True),
+        ("[::1]:8000", "127.0.0.1", True),
+        ("evil.example", "127.0.0.1", False),
+        ("127.0.0.1.evil.example", "127.0.0.1", False),
+        ("localhost.evil.example:8000", "127.0.0.1", False),
+        ("192.168.0.7:8000", "127.0.0.1", False),
+        ("192.168.0.7:8000", "0.0.0.0", True),
+        ("evil.example:8000", "0.0.0.0", False),
+        ("lab:8000", "lab", True),
+        ("127.0.0.1:80x", "127.0.0.1", False),
+        ("[::1", "127.0.0.1", False),
+        ("[::1]x", "127.0.0.1", False),
+        ("", "127.0.0.1", False),
+        ("user@localhost", "127.0.0.1", False),
+    ],
+)
+def test_only_names_of_this_server_are_answered(host: str, listening: str, own: bool) -> None:
+    assert is_own([host], listening) is own
+    assert not is_own([], listening)
+    assert not is_own([host, host], listening)
+
+
+def test_a_foreign_host_sees_nothing(client: TestClient) -> None:
+    for path in ("/", "/api/grid", "/static/style.css", "/figures/figure1.png"):
+        answer = client.get(path, headers={"host": "evil.example"})
+        assert answer.status_code == 421
+        assert "dopt" not in answer.text
+
+
+def test_a_foreign_site_may_link_but_not_load(client: TestClient) -> None:
+    cross = {"sec-fetch-site": "cross-site"}
+    assert client.get("/api/sql?q=SELECT 1", headers=cross).status_code == 403
+    image = {**cross, "sec-fetch-mode": "no-cors", "sec-fetch-dest": "image"}
+    assert client.get("/figures/figure1.png", headers=image).status_code == 403
+    frame = {**cross, "sec-fetch-mode": "navigate", "sec-fetch-dest": "iframe"}
+    assert client.get("/", headers=frame).status_code == 403
+    visit = {**cross, "sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
+    assert client.get("/", headers=visit).status_code == 200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "BREW"])
+def test_it_only_reads(client: TestClient, method: str) -> None:
+    for path in ("/", "/sql", "/api/sql", "/figures/figure1.png", "/static/style.css"):
+        answer = client.request(method, path)
+        assert answer.status_code == 405
+        assert answer.headers["allow"] == "GET, HEAD"
+    assert client.head("/").status_code == 200
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/nothing", "/api/nothing", "/static/style.css", "/figures/figure1.png"]
+)
+def test_every_answer_carries_the_headers(client: TestClient, path: str) -> None:
+    headers = client.get(path).headers
+    policy = headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src 'self'" in policy
+    assert "frame-ancestors 'none'" in policy
+    assert "unsafe" not in policy
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["referrer-policy"] == "no-referrer"
+
+
+def test_the_gallery_shows_pictures_tables_and_captions(client: TestClient) -> None:
+    page = client.get("/figures").text
+    assert 'src="/figures/figure1.png"' in page
+    assert "A &lt;b&gt;caption&lt;/b&gt;." in page
+    assert "0.1235" in page
+    assert "passwd" not in page
+    assert client.get("/figures/figure1.png").content == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "link.png",
+        ".hidden.png",
+        "notes.html",
+        "sub.png",
+        "nothing.png",
+        "..%2Fsecret.txt",
+        "%2e%2e%2fsecret.txt",
+        "..\\secret.txt",
+        "figure1.png%00.txt",
+        "%2Fetc%2Fpasswd",
+    ],
+)
+def test_no_other_file_is_served(client: TestClient, name: str) -> None:
+    for folder in ("figures", "static", "static/js"):
+        answer = client.get(f"/{folder}/{name}")
+        assert answer.status_code == 404
+        assert "secret" not in answer.text.replace("secret.txt", "")
+        assert "root:" not in answer.text
+
+
+def test_addresses_have_bounds(client: TestClient) -> None:
+    assert client.get("/sql?q=" + "x" * 20_000).status_code == 414
+
+
+TEXTS = st.text(max_size=30) | st.sampled_from(
+    ["pendulum", "d_optimal", "loss", "-1", "1e400", "[null, 1]", "[1, 2]", "\0", "%", "'", "desc"]
+)
+NAMES = st.sampled_from(
+    [
+        *("env", "policy", "width", "status", "seed", "config", "launch", "sort", "order", "size"),
+        *("after", "before", "column", "x", "diverged", "where", "measure", "q", "hide"),
+    ]
+)
+PAGES = ("/", "/curves", "/trials", "/compare", "/figures", "/sql")
+DATA = ("progress", "grid", "curves", "trials", "compare", "figures", "sql")
+TABLES = ("curves.csv", "compare.csv", "sql.csv")
+PATHS = st.sampled_from([*PAGES, *(f"/api/{name}" for name in (*DATA, *TABLES))]) | st.builds(
+    lambda base, tail: base + tail,
+    st.sampled_from(["/trials/", "/api/trials/", "/figures/", "/static/", "/"]),
+    st.text(max_size=20),
+)
+
+
+@settings(
+    max_examples=300,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(
+    path=PATHS,
+    query=st.dictionaries(NAMES | st.text(max_size=5), TEXTS, max_size=4),
+    headers=st.dictionaries(
+        st.sampled_from(["accept", "range", "if-none-match", "if-modified-since", "cookie"]),
+        st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=20),
+        max_size=2,
+    ),
+)
+def test_nothing_that_is_asked_breaks_a_page(
+    client: TestClient, path: str, query: dict[str, str], headers: dict[str, str]
+) -> None:
+    address = quote(path, errors="replace") + "?" + urlencode(query, errors="replace")
+    answer = client.get(address, headers=headers)  # an exception of a page is raised here
+    assert answer.status_code in (200, 206, 304, 307, 400, 404, 416), answer.text
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(query=st.binary(max_size=40).map(lambda raw: raw.hex()))
+def test_bytes_that_are_no_text_break_nothing(client: TestClient, query: str) -> None:
+    encoded = "".join(f"%{query[i : i + 2]}" for i in range(0, len(query), 2))
+    for name in ("q", "env", "after", encoded):
+        answer = client.get(f"/api/trials?{name}={encoded}")
+        assert answer.status_code in (200, 400)

@@ -1,0 +1,129 @@
+"""A film shows the stored trial, and what its model really knew at each frame."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from analysis.animation.film import pictures, shoot
+from analysis.animation.stage import build
+from analysis.animation.story import Story, tell
+from analysis.choice import Filter
+from analysis.cli import main
+from analysis.errors import AnalysisError
+from analysis.figures.style import styled
+from analysis.selection import select
+from dopt.exploration import run_trial
+from dopt.systems import SYSTEMS
+from orchestrate.store import LaunchRecord, Reader, Store
+from tests.analysis.synthetic import make_spec
+from tests.orchestrate.store.fakes import RUN
+
+HORIZON = 30
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return real trials, one of each system, and one of the oracle."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('films')}/results.db"
+    specs = [make_spec(env, "d_optimal", 1, env={"horizon": HORIZON}) for env in SYSTEMS]
+    specs.append(make_spec("pendulum", "oracle", 1, env={"horizon": HORIZON}))
+    with Store.open(url) as store:
+        launch = store.begin_launch(LaunchRecord(["test"], [], "here", 1))
+        for claim in store.claim(launch, store.register(launch, specs).todo):
+            spec = next(one for one in specs if one.trial_key == claim.trial_key)
+            store.commit(claim, run_trial(spec), RUN)
+        store.end_launch(launch, "done")
+    return url
+
+
+@pytest.fixture
+def story(url: str) -> Callable[..., Story]:
+    def told(env: str = "pendulum", policy: str = "d_optimal", frames: int = 4) -> Story:
+        with Reader.open(url) as reader:
+            (entry,) = select(reader, Filter((env,), (policy,))).entries
+            return tell(reader, entry, 1, frames)
+
+    return told
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "oracle"])
+def test_the_last_frame_knows_what_was_stored(story: Callable[..., Story], policy: str) -> None:
+    told = story(policy=policy)
+    spec = make_spec("pendulum", policy, 1, env={"horizon": HORIZON})
+    result = run_trial(spec)
+    np.testing.assert_array_equal(told.states, result.states)
+    expected = spec.model.predict(spec.system, result.parameters, result.states)
+    np.testing.assert_allclose(told.learned[-1], expected)
+    assert told.steps.tolist() == [0, 10, 20, 30]
+
+
+def test_learning_brings_the_learned_force_to_the_true_one(story: Callable[..., Story]) -> None:
+    told = story(policy="oracle")
+    errors = np.abs(told.learned - told.truth).mean(axis=(1, 2))
+    assert errors[-1] < 0.1 * errors[0]
+
+
+@pytest.mark.parametrize("env", SYSTEMS)
+def test_every_picture_shows_something_else(story: Callable[..., Story], env: str) -> None:
+    told = story(env)
+    with styled():
+        frames = list(pictures(build(told), 4))
+    assert len({frame.tobytes() for frame in frames}) == 4
+    assert frames[0].shape == frames[-1].shape
+
+
+def test_a_gif_has_all_frames_and_leaves_no_rest(
+    story: Callable[..., Story], tmp_path: Path
+) -> None:
+    target = tmp_path / "new" / "film.gif"
+    shoot(story(), target, 10)
+    with Image.open(target) as film:
+        assert film.n_frames == 4  # type: ignore[attr-defined]
+        assert film.info["duration"] == 100
+    assert [path.name for path in target.parent.iterdir()] == ["film.gif"]
+
+
+@pytest.mark.skipif(not shutil.which("ffmpeg"), reason="the program ffmpeg is not installed")
+def test_an_mp4_is_written_by_ffmpeg(story: Callable[..., Story], tmp_path: Path) -> None:
+    shoot(story(), tmp_path / "film.mp4", 10)
+    assert b"ftyp" in (tmp_path / "film.mp4").read_bytes()[:32]
+
+
+def test_another_ending_is_refused(story: Callable[..., Story], tmp_path: Path) -> None:
+    with pytest.raises(AnalysisError, match=r"a film is a \.gif or an \.mp4"):
+        shoot(story(), tmp_path / "film.avi", 10)
+
+
+def test_a_trial_that_runs_another_way_is_refused(
+    monkeypatch: pytest.MonkeyPatch, story: Callable[..., Story]
+) -> None:
+    honest = Reader.trajectory
+
+    def shifted(self: Reader, key: str, seed: int) -> object:
+        found = honest(self, key, seed)
+        found.states[5:] += 0.1
+        return found
+
+    monkeypatch.setattr(Reader, "trajectory", shifted)
+    with pytest.raises(AnalysisError, match="runs another way here"):
+        story()
+
+
+def test_the_command_picks_a_seed_and_a_name(
+    url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["animate", "quadrotor", "d_optimal", "--db", url, "--frames", "3"]) == 0
+    assert capsys.readouterr().out == "figures/quadrotor_d_optimal.gif: seed 1, 3 pictures\n"
+    assert main(["animate", "pendulum", "d_optimal", "--db", url, "--seed", "9"]) == 2
+    assert "finished are 1" in capsys.readouterr().err
+    assert main(["animate", "pendulum", "uniform", "--db", url]) == 2
+    assert "no trial of policy 'uniform'" in capsys.readouterr().err
+    assert main(["animate", "pendulum", "oracle", "--db", url, "--frames", "0"]) == 2
+    assert "at least 1 is expected" in capsys.readouterr().err
