@@ -1,0 +1,144 @@
+"""The image's files say what they should, as far as reading them can tell."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCKER = ROOT / "docker"
+COMPOSE = yaml.safe_load((DOCKER / "compose.yaml").read_text())
+HOSTS = yaml.safe_load((DOCKER / "compose.hosts.yaml").read_text())
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+OURS = sorted(SERVICES.keys() - {"db"})
+DOCKERFILE = (DOCKER / "Dockerfile").read_text()
+
+
+@pytest.mark.parametrize("service", OURS)
+def test_every_service_of_ours_runs_the_one_image_without_rights(service: str) -> None:
+    wanted = SERVICES[service]
+    assert wanted["image"] == "${DOPT_IMAGE:-dopt}"
+    assert wanted["cap_drop"] == ["ALL"]
+    assert wanted["security_opt"] == ["no-new-privileges:true"]
+    assert "user" not in wanted  # the image's own, which is not root
+    assert not wanted.get("privileged")
+
+
+@pytest.mark.parametrize("service", OURS)
+def test_every_node_and_launch_has_the_settings_of_ray(service: str) -> None:
+    assert (DOCKER / SERVICES[service]["env_file"]).is_file()
+
+
+@pytest.mark.parametrize("services", [COMPOSE["services"], HOSTS["services"]])
+def test_no_variable_and_no_word_holds_a_secret(services: dict[str, dict[str, Any]]) -> None:
+    for service in services.values():
+        for name, value in service.get("environment", {}).items():
+            assert name.endswith(("_FILE", "_PATH")) or not re.search("PASSWORD|TOKEN$", name)
+            assert not re.search(r"://[^/@]*:[^/@]*@", str(value))
+
+
+def test_a_secret_reaches_those_alone_who_need_it() -> None:
+    readers = {name: set(service.get("secrets", [])) for name, service in SERVICES.items()}
+    assert readers == {
+        "db": {"postgres_password"},
+        "head": {"ray_auth_token"},
+        "worker": {"ray_auth_token"},
+        "launch": {"postgres_password", "ray_auth_token"},
+        "analysis": {"postgres_password"},
+        "browser": {"postgres_password"},
+    }
+
+
+def test_a_service_waits_until_those_it_needs_are_healthy() -> None:
+    needs = {name: service.get("depends_on", {}) for name, service in SERVICES.items()}
+    conditions = {
+        (name, needed): needs[name][needed]["condition"] for name in needs for needed in needs[name]
+    }
+    assert conditions.keys() == {
+        ("worker", "head"),
+        ("launch", "head"),
+        ("launch", "db"),
+        ("analysis", "db"),
+        ("browser", "db"),
+    }
+    assert set(conditions.values()) == {"service_healthy"}
+    assert "HEALTHCHECK" in DOCKERFILE
+
+
+def test_no_port_is_open_to_other_machines() -> None:
+    services = [*SERVICES.values(), *HOSTS["services"].values()]
+    ports = [port for service in services for port in service.get("ports", [])]
+    assert len(ports) == 2
+    assert all(port.startswith("127.0.0.1:") for port in ports)
+
+
+def test_the_database_is_asked_by_address() -> None:
+    assert "--host=127.0.0.1" in SERVICES["db"]["healthcheck"]["test"]
+
+
+def test_the_image_does_not_run_as_root() -> None:
+    users = re.findall(r"^USER (\d+):(\d+)$", DOCKERFILE, flags=re.MULTILINE)
+    assert users
+    assert "0" not in users[-1]
+
+
+def test_the_versions_are_the_tested_ones() -> None:
+    assert "--constraint constraints.txt" in DOCKERFILE
+
+
+def test_only_what_is_named_gets_into_a_build() -> None:
+    lines = (ROOT / ".dockerignore").read_text().splitlines()
+    assert next(line for line in lines if line and not line.startswith("#")) == "*"
+    copied = re.findall(r"^COPY (?!--from)(.*) \S+$", DOCKERFILE, flags=re.MULTILINE)
+    sources = {word for line in copied for word in line.split()}
+    assert {line[1:] for line in lines if line.startswith("!")} == sources
+    assert all((ROOT / source).exists() for source in sources)
+
+
+def write_secrets(folder: Path, **variables: str) -> dict[str, str]:
+    script = folder / "secrets.sh"
+    script.write_text((DOCKER / "secrets.sh").read_text())
+    surroundings = {"PATH": os.environ["PATH"], **variables}
+    done = subprocess.run(
+        ["sh", script], env=surroundings, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == done.stderr == ""
+    return {path.name: path.read_text().strip() for path in (folder / "secrets").iterdir()}
+
+
+def test_secrets_come_from_the_environment(tmp_path: Path) -> None:
+    given = write_secrets(tmp_path, POSTGRES_PASSWORD="a b:c", RAY_AUTH_TOKEN="t" * 32)
+    assert given == {"postgres_password": "a b:c", "ray_auth_token": "t" * 32}
+
+
+def test_secrets_are_made_up_once(tmp_path: Path) -> None:
+    made = write_secrets(tmp_path)
+    assert all(len(secret) >= 32 for secret in made.values())
+    assert len(set(made.values())) == 2
+    assert write_secrets(tmp_path, POSTGRES_PASSWORD="other") == made
+
+
+def test_nobody_else_on_the_machine_reads_them(tmp_path: Path) -> None:
+    write_secrets(tmp_path)
+    assert (tmp_path / "secrets").stat().st_mode & 0o777 == 0o700
+    for path in (tmp_path / "secrets").iterdir():
+        assert path.stat().st_mode & 0o777 == 0o644  # the container's user reads its own copy
+
+
+def test_the_readme_names_services_and_variables_that_exist() -> None:
+    section = (ROOT / "README.md").read_text().split("## Three machines")[1].split("\n## ")[0]
+    named = re.findall(
+        r"^    docker compose (?:up|run) (.*?)(?:  #.*)?$", section, flags=re.MULTILINE
+    )
+    words = {word for line in named for word in line.split() if not word.startswith("--")}
+    assert words - {"figures"} == {"db", "head", "worker", "launch", "analysis"}
+    given = set(re.findall(r"(DOPT_\w+)=", section)) - {"DOPT_COMMIT"}
+    assert given == set(re.findall(r"(DOPT_\w+):\?", (DOCKER / "compose.hosts.yaml").read_text()))
+    (files,) = set(re.findall(r"^    export COMPOSE_FILE=(\S+)$", section, flags=re.MULTILINE))
+    assert all((ROOT / file).is_file() for file in files.split(":"))
