@@ -12,10 +12,10 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test lint format grid figures smoke bench clean
+.PHONY: help setup test test-machines soak image lint format grid figures smoke bench clean
 
 help:  ## show the targets
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
 
 setup: $(VENV)/ready  ## create .venv with the tested versions
 
@@ -26,12 +26,25 @@ $(VENV)/ready: pyproject.toml constraints.txt
 
 test: setup  ## run the test suite
 	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadgroup
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadgroup -m 'not soak and not machines and not image'
+
+test-machines: setup  ## run grids on hosts that are lost and cut off, as root, in namespaces
+	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
+	$(BIN)/python -m pytest -m machines tests/machines
+
+soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases
+	$(BIN)/python -m pytest -m soak tests/soak
+
+image: setup  ## build the image and run its services (root on Debian)
+	.ci/image
 
 lint: setup  ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/hadolint --failure-threshold warning docker/Dockerfile .ci/postgres/Dockerfile
+	$(BIN)/check-jsonschema --quiet --builtin-schema vendor.compose-spec docker/compose.yaml docker/compose.hosts.yaml
+	$(BIN)/shellcheck docker/*.sh .ci/run .ci/image .ci/packages .ci/start_postgres .ci/postgres/*.sh
 
 format: setup  ## apply the style
 	$(BIN)/ruff check --fix .

@@ -1,4 +1,7 @@
-"""One core for every numeric library, before any of them is imported; the same examples always."""
+"""One core for every numeric library, before any of them is imported; the same examples always.
+
+Here too: one database for each test, of each kind.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,64 @@ import os
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
-from hypothesis import HealthCheck, settings  # noqa: E402  after the threads are set
+import signal  # noqa: E402  all of these after the threads are set
+import uuid  # noqa: E402
+from collections.abc import Iterator  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import pytest  # noqa: E402
+from hypothesis import HealthCheck, settings  # noqa: E402
+from sqlalchemy import Engine, create_engine, text  # noqa: E402
+from sqlalchemy.exc import OperationalError  # noqa: E402
+
+# As from a terminal: a shell starts what runs in its background with Ctrl-C ignored, and programs
+# that the tests start and interrupt would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile(
     "suite", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("suite")
+
+SERVER = os.environ.get(
+    "DOPT_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres"
+)
+
+
+@pytest.fixture
+def sqlite_url(tmp_path: Path) -> str:
+    return f"sqlite:///{tmp_path}/results/results.db"
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Engine]:
+    engine = create_engine(SERVER, connect_args={"connect_timeout": 3})
+    try:
+        engine.connect().close()
+    except OperationalError as error:
+        _no_server(str(error.orig).splitlines()[0])
+    yield engine
+    engine.dispose()
+
+
+@pytest.fixture
+def postgresql_url(server: Engine) -> Iterator[str]:
+    """URL of a new schema on a running server, dropped afterwards."""
+    schema = f"test_{uuid.uuid4().hex}"
+    with server.begin() as connection:
+        connection.execute(text(f"CREATE SCHEMA {schema}"))
+    yield f"{SERVER}?options=-csearch_path%3D{schema}"
+    with server.begin() as connection:
+        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+
+
+def _no_server(reason: str) -> None:
+    message = f"no PostgreSQL server answers, set DOPT_TEST_POSTGRES to one: {reason}"
+    if os.environ.get("DOPT_REQUIRE_POSTGRES") == "1":
+        pytest.fail(message)
+    pytest.skip(message)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest) -> str:
+    return str(request.getfixturevalue(f"{request.param}_url"))

@@ -22,6 +22,9 @@ ONLY_IN = {
     "torch": ("dopt/reference/", "orchestrate/executors/lockstep.py"),
     "numba": ("dopt/kernel/",),
     "matplotlib": ("analysis/",),
+    "starlette": ("analysis/serve/",),
+    "uvicorn": ("analysis/serve/",),
+    "jinja2": ("analysis/serve/",),
 }
 
 
@@ -68,11 +71,12 @@ def test_the_science_knows_no_effects() -> None:
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
+    shared = ("orchestrate.store", "orchestrate.usage")
     for path in sources("analysis"):
         names = imports(path)
         assert not {name.split(".")[0] for name in names} & {"torch", "ray", "hydra", "numba"}, path
         own = {name for name in names if name.split(".")[0] == "orchestrate"}
-        assert all(name.startswith("orchestrate.store") for name in own), path
+        assert all(name.startswith(shared) for name in own), path
 
 
 def test_nothing_imports_the_analysis_but_itself() -> None:

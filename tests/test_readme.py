@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from orchestrate.commands import COMMANDS as COMMANDS_OF_THE_STORE
 from orchestrate.store import Reader
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -18,6 +21,11 @@ COMMANDS = [
     line.split("#")[0].strip()
     for line in README.splitlines()
     if line.startswith("    python orchestrate/launch.py")
+]
+AFTERWARDS = [
+    line.split("#")[0].strip()
+    for line in README.splitlines()
+    if line.startswith("    python -m orchestrate")
 ]
 QUERIES = re.findall(r"```sql\n(.*?)```", README, flags=re.DOTALL)
 FIGURES = re.findall(r"`python -m analysis figures --only (\w+)`", README)
@@ -57,6 +65,28 @@ def test_every_launch_command_is_accepted(command: str, tmp_path: Path) -> None:
     elif "--help" not in arguments:
         arguments += ["--cfg", "job"]
     done = run(*arguments)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def test_every_command_has_a_line() -> None:
+    shown = {shlex.split(command)[3] for command in AFTERWARDS}
+    assert shown == {command.name for command in COMMANDS_OF_THE_STORE}
+
+
+@pytest.mark.parametrize("command", AFTERWARDS)
+def test_every_command_on_results_works(command: str, database: str, tmp_path: Path) -> None:
+    other = tmp_path / "results" / "other.db"
+    other.parent.mkdir()
+    shutil.copy(database.removeprefix("sqlite:///"), other)
+    done = subprocess.run(
+        [sys.executable, *shlex.split(command)[1:]],
+        cwd=tmp_path,
+        env={**os.environ, "DOPT_DB": database, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout
 

@@ -1,0 +1,98 @@
+"""The wheel holds all that a launch and the analysis need, away from the repository."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import site
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ("dopt", "orchestrate", "analysis", "conf")
+FILES = ("pyproject.toml", "README.md", "LICENSE")
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
+
+pytestmark = pytest.mark.xdist_group("wheel")
+
+
+def run(*command: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command that does not see the repository, whatever PYTHONPATH says to this process."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return subprocess.run(
+        list(map(str, command)),
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a wheel, built from a copy because a build leaves folders behind."""
+    copy = tmp_path_factory.mktemp("sources")
+    for name in SOURCES:
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=ignored)
+    for name in FILES:
+        shutil.copy(ROOT / name, copy)
+    done = run(
+        *PIP, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", "out", ".", folder=copy
+    )
+    assert done.returncode == 0, done.stderr
+    [path] = (copy / "out").glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def programs(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the programs of an environment with the wheel, and with our libraries behind it."""
+    place = tmp_path_factory.mktemp("installed") / "venv"
+    run(sys.executable, "-m", "venv", "--without-pip", place, folder=ROOT)
+    python = place / "bin/python"
+    done = run(*PIP, "--python", python, "install", "--no-deps", "--no-index", wheel, folder=place)
+    assert done.returncode == 0, done.stderr
+    [packages] = place.glob("lib/python*/site-packages")
+    (packages / "libraries.pth").write_text("\n".join(site.getsitepackages()))
+    return place / "bin"
+
+
+def test_every_source_and_every_setting_is_in_it(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    settings = {f"orchestrate/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
+    sources = {
+        str(path.relative_to(ROOT))
+        for package in ("dopt", "orchestrate", "analysis")
+        for path in (ROOT / package).rglob("*.py")
+    }
+    assert len(settings) > 20
+    assert settings <= names
+    assert sources <= names
+    assert not {name.split("/")[0] for name in names} & {"tests", "benchmarks", "conf", "docker"}
+
+
+def test_an_installed_launch_finds_its_settings_and_its_sweeper(
+    programs: Path, tmp_path: Path
+) -> None:
+    grid = ("-m", "experiment=paper", "launch.dry_run=true")
+    for launch in ((programs / "dopt-launch",), (programs / "python", "-m", "orchestrate.launch")):
+        done = run(*launch, *grid, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "1,900 trials, 0 done, 1,900 to run" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("program", ["dopt", "dopt-analysis", "dopt-launch"])
+def test_an_installed_program_explains_itself(programs: Path, tmp_path: Path, program: str) -> None:
+    done = run(programs / program, "--help", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) > 5
+    wrong = run(programs / program, "--nope", folder=tmp_path)
+    assert wrong.returncode == 2, wrong.stderr
+    assert wrong.stderr.startswith("error: ")
