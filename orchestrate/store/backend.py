@@ -88,7 +88,7 @@ class Backend(ABC):
         return uuid.uuid4().hex
 
     @abstractmethod
-    def evict(self, connection: Connection) -> None:
+    def evict(self) -> None:
         """End the transactions of dead launches, which could keep their locks for ever."""
 
     @abstractmethod

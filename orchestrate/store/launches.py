@@ -71,7 +71,6 @@ def recover(connection: Connection, backend: Backend) -> tuple[int, list[str]]:
 
     What is locked just now is left for the next recovery: its transaction ends soon, or is evicted.
     """
-    backend.evict(connection)
     backend.exclusive(connection)
     dead = backend.dead(connection, maybe_alive(connection, skip_locked=True))
     ids = [one.launch_id for one in dead]

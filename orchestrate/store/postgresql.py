@@ -71,7 +71,6 @@ _EVICT = text(
       )
     """
 )
-_LOOK_AGAIN = text("SELECT pg_stat_clear_snapshot()")
 _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
 
 
@@ -103,7 +102,7 @@ class PostgreSQLBackend(Backend):
 
     def exclusive(self, connection: Connection) -> None:
         while not connection.execute(_LOCK).scalar_one():
-            self.evict(connection)
+            self.evict()
             time.sleep(_LOCK_PAUSE)
 
     def members(self, keys: Sequence[str]) -> Select[Any]:
@@ -133,10 +132,11 @@ class PostgreSQLBackend(Backend):
     def token(self) -> str:
         return f"{self._session}-{super().token()}"
 
-    def evict(self, connection: Connection) -> None:
-        if connection.execute(_HAS_LAUNCHES).scalar_one():
-            connection.execute(_LOOK_AGAIN)
-            connection.execute(_EVICT)
+    def evict(self) -> None:
+        # In a transaction of its own, over at once: it reads a table that an upgrade locks.
+        with self.transaction() as connection:
+            if connection.execute(_HAS_LAUNCHES).scalar_one():
+                connection.execute(_EVICT)
 
     def let_go(self, token: str) -> None:
         """Do nothing: a lease runs out by itself."""

@@ -118,7 +118,7 @@ class SQLiteBackend(Backend):
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:  # noqa: ARG002
         return [launch for launch in launches if not self._locks.is_held(launch.token)]
 
-    def evict(self, connection: Connection) -> None:
+    def evict(self) -> None:
         """Do nothing: the kernel has taken the locks of a dead process back."""
 
     def let_go(self, token: str) -> None:

@@ -73,6 +73,7 @@ class Store:
 
     def recover(self) -> int:
         """Put the trials of dead launches back to pending; return how many there were."""
+        self._backend.evict()
         with self._backend.transaction() as connection:
             freed, tokens = launches.recover(connection, self._backend)
         for token in tokens:

@@ -108,7 +108,7 @@ def test_a_database_without_an_encoding_is_read_and_written(without_encoding: st
         assert [row.status for row in reader.trials(Spec().config_key)] == ["done"]
 
 
-def test_a_sleeper_that_sends_its_steps_holds_up_nobody(
+def test_a_sleeper_that_sends_its_steps_is_ended(
     store: Store, open_store: Callable[..., Store], reader: Reader, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     late = open_store(LEASE_SECONDS)
@@ -130,12 +130,34 @@ def test_a_sleeper_that_sends_its_steps_holds_up_nobody(
         freed = store.recover()
         slept = not committed.done()
         wakes.set()
-        assert committed.result(DEADLINE)
+        with pytest.raises(StoreUnavailableError, match="the connection is lost"):
+            committed.result(DEADLINE)
     assert slept, "others waited for the sleeper"
-    assert freed == 1
+    # The server ends its session soon, not at once.
+    assert freed + store.recover() == 2
+    assert not late.commit(sent, result(), RUN)
     assert not late.commit(other, result(1), RUN)
-    rows = reader.query("SELECT trial_id, outcome FROM attempt ORDER BY trial_id")
-    assert [tuple(row) for row in rows] == [(sent.trial_id, "done"), (other.trial_id, "lost")]
+    rows = reader.query("SELECT outcome FROM attempt")
+    assert [tuple(row) for row in rows] == [("lost",), ("lost",)]
+
+
+def test_a_session_of_a_live_launch_is_left_alone(
+    store: Store, open_store: Callable[..., Store]
+) -> None:
+    busy = open_store(LEASE_SECONDS)
+    launch = busy.begin_launch(LAUNCH)
+
+    def work() -> None:
+        with busy._backend.transaction() as connection:
+            connection.execute(text("SELECT pg_sleep(:seconds)"), {"seconds": 4 * LEASE_SECONDS})
+
+    with ThreadPoolExecutor(1) as pool:
+        worked = pool.submit(work)
+        while not worked.done():
+            busy.heartbeat(launch)
+            assert store.recover() == 0
+            time.sleep(LEASE_SECONDS / 5)
+    assert worked.exception() is None
 
 
 def test_the_server_asks_for_a_silent_launch(store: Store) -> None:
