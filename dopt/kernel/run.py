@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import itertools
 import time
 from typing import Any
 
@@ -12,23 +10,14 @@ import numba
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import arguments as args
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
-from dopt.kernel.evaluation import BLOCK
-from dopt.kernel.information import PENDING_ROWS, SMALL
+from dopt.kernel.setup import constants, empty_record, initial_state
 from dopt.kernel.trial import advance
-from dopt.learning import Adam
-from dopt.models import MLP
-from dopt.policies import DOptimal, Uniform
-from dopt.policies.base import OpenLoop
-from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.result import TrialResult
-from dopt.spec import Cell, TrialSpec
-from dopt.systems.base import System
-from dopt.systems.features import KINDS
+from dopt.spec import TrialSpec
 
 FIRST_STEPS = 300
 """Steps of a trial before it is known what a step costs; those of the paper have no more."""
@@ -52,11 +41,11 @@ class KernelTrial:
 
     def __init__(self, spec: TrialSpec) -> None:
         self.spec = spec
-        self.constants = _constants(spec.cell)
+        self.constants = constants(spec.cell)
         draws = draw(spec)
         self.randomness = args.Randomness(*_fields(draws, args.Randomness))
-        self.state = _initial_state(spec, draws.weights)
-        self.record = _empty_record(spec.system)
+        self.state = initial_state(spec, draws.weights)
+        self.record = empty_record(spec.system)
         self.done = 0
         self.diverged_at: int | None = None
 
@@ -131,182 +120,3 @@ _compiled_for: set[tuple[Any, ...]] = set()
 
 def _fields(source: object, kind: Any) -> list[Any]:
     return [getattr(source, name) for name in kind._fields]
-
-
-@functools.lru_cache(maxsize=64)
-def _constants(
-    cell: Cell,
-) -> tuple[args.World, args.Network, args.Rules, args.Evaluation]:
-    """Return everything that the trials of a cell share."""
-    system = cell.system
-    world = args.World(
-        np.array(system.parameters),
-        np.array(system.linear_form),
-        np.array(system.learned_rows),
-        system.n_inputs,
-        system.dt,
-        system.gamma,
-        system.state_limit,
-    )
-    network = _network(cell)
-    return world, network, _rules(cell), _evaluation(system, network, evaluation_set(system))
-
-
-def _network(cell: Cell) -> args.Network:
-    system = cell.system
-    if isinstance(cell.model, MLP):
-        kind, sizes = args.MLP_MODEL, cell.model.layer_sizes(system)
-    else:
-        kind, sizes = args.LINEAR_MODEL, (len(system.features), 1, system.n_learned)
-    lengths = [(n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes)]
-    return args.Network(
-        kind,
-        np.array(sizes),
-        np.cumsum([0, *lengths[:-1]]),
-        np.array([KINDS.index(feature.kind) for feature in system.features]),
-        np.array([feature.index for feature in system.features]),
-        np.array(system.feature_scales),
-    )
-
-
-def _rules(cell: Cell) -> args.Rules:
-    policies = {OpenLoop: args.OPEN_LOOP, Uniform: args.UNIFORM, DOptimal: args.D_OPTIMAL}
-    policy = next(code for kind, code in policies.items() if isinstance(cell.policy, kind))
-    steps = cell.policy.iterations if isinstance(cell.policy, Uniform) else 0
-    adam = cell.learner if isinstance(cell.learner, Adam) else Adam()
-    return args.Rules(
-        policy,
-        steps,
-        args.ADAM if isinstance(cell.learner, Adam) else args.LEAST_SQUARES,
-        adam.learning_rate,
-        adam.beta_1,
-        adam.beta_2,
-        adam.epsilon,
-        adam.window,
-        _form(cell),
-        cell.policy.regularization if isinstance(cell.policy, DOptimal) else 1.0,
-    )
-
-
-def _evaluation(system: System, network: args.Network, points: EvaluationSet) -> args.Evaluation:
-    if network.kind == args.LINEAR_MODEL:
-        return _linear_evaluation(system, points)
-    columns = [system.featurize(points.states).T, points.accelerations.T]
-    parts = [slice(0, points.n_grid), slice(points.n_grid, None)]
-    features, targets, sizes = zip(
-        *(_blocks(columns[0][:, part], columns[1][:, part]) for part in parts), strict=True
-    )
-    blocks = np.concatenate(features)
-    return args.Evaluation(
-        blocks.astype(np.float32),
-        blocks,
-        np.concatenate(targets),
-        np.concatenate(sizes),
-        np.zeros((0, 0, 0)),
-        np.zeros((0, 0)),
-        len(sizes[0]),
-        len(sizes[0]) + len(sizes[1]),
-        _size(points.accelerations),
-    )
-
-
-def _blocks(features: args.Floats, targets: args.Floats) -> tuple[Any, Any, Any]:
-    """Cut columns of points, (·, N), into padded blocks, (blocks, ·, BLOCK), and their sizes."""
-    n = features.shape[1]
-    starts = range(0, n, BLOCK)
-    sizes = np.array([min(BLOCK, n - start) for start in starts], dtype=np.int64)
-
-    def cut(columns: args.Floats) -> args.Floats:
-        padded = np.zeros((len(columns), BLOCK * len(starts)))
-        padded[:, :n] = columns
-        return np.ascontiguousarray(padded.reshape(len(columns), -1, BLOCK).swapaxes(0, 1))
-
-    return cut(features), cut(targets), sizes
-
-
-def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation:
-    offset, *units = (
-        np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.states.T), form)), axis=-1)
-        for form in system.linear_form
-    )
-    regressors = np.stack([unit - offset for unit in units], axis=-1)
-    return args.Evaluation(
-        np.zeros((0, 0, 0), dtype=np.float32),
-        np.zeros((0, 0, 0)),
-        np.zeros((0, 0, 0)),
-        np.zeros(0, dtype=np.int64),
-        np.ascontiguousarray(regressors),
-        np.ascontiguousarray(points.accelerations - offset),
-        points.n_grid,
-        len(points.states),
-        _size(points.accelerations),
-    )
-
-
-def _size(targets: args.Floats) -> float:
-    """Return the root mean square norm of targets, (N, r)."""
-    return float(np.sqrt(np.mean(np.sum(targets**2, axis=1))))
-
-
-def _initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:
-    system, learner = spec.system, spec.learner
-    window = learner.window if isinstance(learner, Adam) else 0
-    return args.State(
-        weights.copy(),
-        np.zeros(len(weights)),
-        np.zeros(len(weights)),
-        *_information(spec, len(weights)),
-        np.zeros((len(system.features), window)),
-        np.zeros((system.n_learned, window)),
-    )
-
-
-def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, args.Sketch]:
-    """Return the initial information in the chosen form; the other forms are empty."""
-    policy = spec.policy
-    form = _form(spec.cell)
-    size, dual, sketch = 0, _empty_dual(spec, 0), count_sketch(0, 1)
-    if form == args.PRIMAL and isinstance(policy, DOptimal):
-        size = q
-    elif form == args.DUAL:
-        dual = _empty_dual(spec, spec.system.horizon)
-    elif form == args.SKETCH and isinstance(policy, DOptimal):
-        size = policy.sketch_size
-        sketch = count_sketch(q, size)
-    regularization = policy.regularization if isinstance(policy, DOptimal) else 1.0
-    covariance = args.Covariance(
-        np.eye(size) / regularization,
-        np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
-        np.zeros(1, dtype=np.int64),
-    )
-    return covariance, dual, args.Sketch(*sketch, size)
-
-
-def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
-    depth, width, r = 1, 1, spec.system.n_learned
-    if isinstance(spec.model, MLP):
-        depth, width = spec.model.depth, spec.model.width
-    return args.Dual(
-        np.empty((states, len(spec.system.features))),
-        np.empty((depth, states, width)),
-        np.empty((r, depth, states, width)),
-        np.empty((r * states, r * states)),
-        np.zeros(1, dtype=np.int64),
-    )
-
-
-def _form(cell: Cell) -> int:
-    """Return the form of the information matrix, PRIMAL where there is none."""
-    if not isinstance(cell.policy, DOptimal):
-        return args.PRIMAL
-    n_rows = cell.system.n_learned * cell.system.horizon
-    names = {"primal": args.PRIMAL, "dual": args.DUAL, "sketch": args.SKETCH}
-    return names[cell.policy.chosen_form(cell.model.n_parameters(cell.system), n_rows)]
-
-
-def _empty_record(system: System) -> args.Record:
-    steps = system.horizon
-    states = np.zeros((steps + 1, system.n_states))
-    states[0] = system.initial_state
-    rows = (np.full(steps, np.nan) for _ in range(5))
-    return args.Record(states, np.zeros((steps, system.n_inputs)), *rows)

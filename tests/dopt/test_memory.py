@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.kernel import run
+from dopt.kernel import setup
 from dopt.randomness import draw
 from dopt.spec import LARGEST_HORIZON, TrialSpec
 from tests.dopt.trials import PAIRS, trial
@@ -25,8 +25,8 @@ def held(spec: TrialSpec) -> int:
     """Return the bytes of what a trial is made of in the kernel, its evaluation aside."""
     draws = draw(spec)
     arrays = (draws.noise, draws.inputs, draws.components, draws.ties)
-    state = run._initial_state(spec, draws.weights)
-    return size(arrays) + size(run._empty_record(spec.system)) + size(state)
+    state = setup.initial_state(spec, draws.weights)
+    return size(arrays) + size(setup.empty_record(spec.system)) + size(state)
 
 
 @pytest.mark.parametrize(("env", "policy"), PAIRS)
