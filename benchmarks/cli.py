@@ -27,6 +27,7 @@ QUESTIONS = (
     "startup",
     "expansion",
     "figures",
+    "pages",
 )
 HEADERS = ("question", "what", "measured", "target", "of target", "others", "× others", "note")
 LEGEND = (

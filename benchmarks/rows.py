@@ -12,7 +12,7 @@ class Target:
     Attributes
     ----------
     number
-        Of the target in the list of eight that the report explains.
+        Of the target in the list of nine that the report explains.
     value
         Bound, in the unit of the row.
     at_least
