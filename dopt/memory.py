@@ -11,7 +11,7 @@ import math
 from dopt.learning import Learner
 from dopt.learning.adam import Adam
 from dopt.models import MLP, Model
-from dopt.policies import DOptimal, Policy
+from dopt.policies import DOptimal, Informed, Policy
 from dopt.systems import System
 
 NUMBER = 8
@@ -52,11 +52,12 @@ def _information(policy: Policy, q: int, n_rows: int, n_factors: int) -> dict[st
 
     The inverse is made from an identity matrix, which makes two of them for a moment.
     """
-    if not isinstance(policy, DOptimal):
+    if not isinstance(policy, Informed):
         return {}
     form = policy.chosen_form(q, n_rows)
     if form == "primal":
         return {"model.width": 2 * q**2 + 16 * q}
     if form == "dual":
         return {"env.horizon": n_rows**2 + n_factors}
-    return {"policy.sketch_size": 2 * policy.sketch_size**2, "model.width": 2 * q}
+    size = policy.sketch_size if isinstance(policy, DOptimal) else 0
+    return {"policy.sketch_size": 2 * size**2, "model.width": 2 * q}

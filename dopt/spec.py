@@ -16,7 +16,7 @@ from dopt.learning.recursive_least_squares import RecursiveLeastSquares
 from dopt.memory import memory_by_setting
 from dopt.models import MODELS, Linear, Model
 from dopt.models.mlp import MLP
-from dopt.policies import POLICIES, DOptimal, Oracle, Policy
+from dopt.policies import POLICIES, Informed, Oracle, Policy
 from dopt.policies.base import OpenLoop
 from dopt.registry import build, section_of
 from dopt.systems import SYSTEMS, System
@@ -61,7 +61,7 @@ class Cell:
         linear = isinstance(self.model, Linear)
         if isinstance(self.policy, Oracle) and not linear:
             raise _mismatch("policy 'oracle'", "model 'linear'", f"model '{self.model.name}'")
-        if linear and not isinstance(self.policy, DOptimal):
+        if linear and not isinstance(self.policy, Informed):
             raise _mismatch("model 'linear'", "policy 'oracle'", f"policy '{self.policy.name}'")
         if linear and getattr(self.policy, "form", "auto") not in ("auto", "primal"):
             form = f"policy.form '{getattr(self.policy, 'form', '')}'"

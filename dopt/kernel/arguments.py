@@ -54,6 +54,7 @@ class Rules(NamedTuple):
     beta_2: float
     epsilon: float
     window: int
+    informed: bool  # whether the policy plans with M
     form: int  # of the information matrix: PRIMAL, DUAL or SKETCH
     regularization: float  # λ of M₀ = λI
 

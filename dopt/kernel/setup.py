@@ -14,7 +14,7 @@ from dopt.kernel.evaluation import BLOCK
 from dopt.kernel.information import PENDING_ROWS, SMALL
 from dopt.learning import Adam
 from dopt.models import MLP
-from dopt.policies import DOptimal, Uniform
+from dopt.policies import DOptimal, Informed, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.spec import Cell, TrialSpec
@@ -72,9 +72,15 @@ def _rules(cell: Cell) -> args.Rules:
         adam.beta_2,
         adam.epsilon,
         adam.window,
+        isinstance(cell.policy, Informed),
         _form(cell),
-        cell.policy.regularization if isinstance(cell.policy, DOptimal) else 1.0,
+        _regularization(cell),
     )
+
+
+def _regularization(cell: Cell) -> float:
+    """Return λ of M₀ = λI, 1 where there is no M."""
+    return cell.policy.regularization if isinstance(cell.policy, Informed) else 1.0
 
 
 def _evaluation(system: System, network: args.Network, points: EvaluationSet) -> args.Evaluation:
@@ -155,16 +161,15 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, a
     policy = spec.policy
     form = _form(spec.cell)
     size, dual, sketch = 0, _empty_dual(spec, 0), count_sketch(0, 1)
-    if form == args.PRIMAL and isinstance(policy, DOptimal):
+    if form == args.PRIMAL and isinstance(policy, Informed):
         size = q
     elif form == args.DUAL:
         dual = _empty_dual(spec, spec.system.horizon)
     elif form == args.SKETCH and isinstance(policy, DOptimal):
         size = policy.sketch_size
         sketch = count_sketch(q, size)
-    regularization = policy.regularization if isinstance(policy, DOptimal) else 1.0
     covariance = args.Covariance(
-        np.eye(size) / regularization,
+        np.eye(size) / _regularization(spec.cell),
         np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
         np.zeros(1, dtype=np.int64),
     )
@@ -186,7 +191,7 @@ def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
 
 def _form(cell: Cell) -> int:
     """Return the form of the information matrix, PRIMAL where there is none."""
-    if not isinstance(cell.policy, DOptimal):
+    if not isinstance(cell.policy, Informed):
         return args.PRIMAL
     n_rows = cell.system.n_learned * cell.system.horizon
     names = {"primal": args.PRIMAL, "dual": args.DUAL, "sketch": args.SKETCH}

@@ -192,7 +192,7 @@ def advance(
         clock_3 = monotonic_microseconds()
         if not within(state.theta, np.inf):
             return t
-        if rules.policy == D_OPTIMAL:
+        if rules.informed:
             inform(accelerations, world, network, rules, state, x, target)
         clock_4 = monotonic_microseconds()
         loss = model_error(network, state.theta, points, 0, points.n_grid, evaluating)

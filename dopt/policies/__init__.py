@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dopt.policies.base import Policy
+from dopt.policies.base import Informed, Policy
 from dopt.policies.chirp import Chirp
 from dopt.policies.d_optimal import DOptimal
 from dopt.policies.multisine import Multisine
@@ -33,6 +33,7 @@ __all__ = [
     "PRBS",
     "Chirp",
     "DOptimal",
+    "Informed",
     "Multisine",
     "Oracle",
     "Periodic",

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import Checked
+from dopt.fields import Checked, quantity
 from dopt.systems.base import System
 
 Array = npt.NDArray[np.float64]
@@ -42,6 +42,29 @@ class OpenLoop(Policy):
 @dataclass(frozen=True, kw_only=True)
 class ClosedLoop(Policy):
     """A policy that plans each input from the past and the current model."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Informed(ClosedLoop):
+    """A closed-loop policy that plans with the information matrix M of the parameters.
+
+    M₀ = λI, and M_{t+1} = M_t + JᵀJ with J at (x_t, u_t) and the parameters after the learning step
+    of time t. The first input is uniform on the sphere.
+
+    Parameters
+    ----------
+    regularization : float
+        λ.
+    """
+
+    regularization: float = quantity(1e-3, bound="positive")
+
+    @abstractmethod
+    def chosen_form(self, n_parameters: int, n_rows: int) -> str:
+        """Return how M is held for q parameters and N rows in the whole trial.
+
+        It is "primal", "dual" or "sketch" (:class:`dopt.policies.d_optimal.DOptimal`).
+        """
 
 
 def on_sphere(vectors: Array, radius: float) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.fields import quantity
-from dopt.policies.base import ClosedLoop
+from dopt.policies.base import Informed
 
 SMALL_PRIMAL = 600
 LARGE_DUAL = 4000
@@ -17,12 +17,10 @@ _SKETCH_SEED = 1_406_2
 
 
 @dataclass(frozen=True, kw_only=True)
-class DOptimal(ClosedLoop):
+class DOptimal(Informed):
     """Maximise the linearised one-step information gain of one learned component (equation 7).
 
-    The component k is drawn uniformly among the learned ones at each step. The first input is
-    uniform on the sphere. M₀ = λI, and M_{t+1} = M_t + JᵀJ with J at (x_t, u_t) and the parameters
-    after the learning step of time t.
+    The component k is drawn uniformly among the learned ones at each step.
 
     M is held in one of three forms. ``primal`` keeps M⁻¹, q × q. ``dual`` keeps the Gram matrix of
     the N rows seen and never builds a q × q matrix; it chooses the same inputs. ``sketch`` projects
@@ -42,7 +40,6 @@ class DOptimal(ClosedLoop):
 
     name: ClassVar[str] = "d_optimal"
 
-    regularization: float = quantity(1e-3, bound="positive")
     form: str = quantity("auto", choices=("auto", "primal", "dual", "sketch"))
     sketch_size: int = quantity(256, "dimensions", "positive")
 

@@ -13,7 +13,7 @@ from torch.func import jacrev, vmap
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.policies import DOptimal, Uniform
+from dopt.policies import DOptimal, Informed, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
@@ -81,7 +81,7 @@ class Lockstep:
 
     def _regularization(self) -> float:
         policy = self.cell.policy
-        return policy.regularization if isinstance(policy, DOptimal) else 1.0
+        return policy.regularization if isinstance(policy, Informed) else 1.0
 
     def _allocate(self) -> None:
         n, T = len(self.specs), self.system.horizon
@@ -93,7 +93,7 @@ class Lockstep:
         self.project: Callable[[Tensor], Tensor] = lambda rows: rows
         self.columns = {name: np.full((n, T), np.nan) for name in COLUMNS}
         self.information: Tensor | None = None
-        if isinstance(self.cell.policy, DOptimal):
+        if isinstance(self.cell.policy, Informed):
             self._choose_form(self.cell.policy)
             size = self.project(self.theta).shape[1]
             prior = self._regularization() * torch.eye(size).to(self.theta)
@@ -103,13 +103,14 @@ class Lockstep:
         self.truth = self._tensor(points.accelerations)
         self.n_grid = points.n_grid
 
-    def _choose_form(self, policy: DOptimal) -> None:
+    def _choose_form(self, policy: Informed) -> None:
         """Plan in the space of a sketch where the specification says so.
 
         The dual form is an algorithm of the kernel for the same M; the reference builds M.
         """
         q, n_rows = self.theta.shape[1], self.system.n_learned * self.system.horizon
         if policy.chosen_form(q, n_rows) == "sketch":
+            assert isinstance(policy, DOptimal)
             buckets, signs = count_sketch(q, policy.sketch_size)
             matrix = torch.zeros(q, policy.sketch_size).to(self.theta)
             matrix[torch.arange(q), torch.tensor(buckets)] = torch.tensor(signs).to(self.theta)
