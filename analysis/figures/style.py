@@ -16,8 +16,8 @@ _OKABE_ITO: tuple[str, ...] = tuple(
 )
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = _OKABE_ITO
 GREY = "#8c8c8c"
-WINE, INDIGO, OLIVE = "#882255", "#332288", "#999933"
-"""Where the sequence ends: of Paul Tol's muted colours, those that are far from the others."""
+CYAN, WINE, INDIGO, OLIVE = "#7fc4e8", "#882255", "#332288", "#999933"
+"""Where the sequence ends: as Paul Tol's muted colours, those that are far from the others."""
 
 TEXT_WIDTH = 6.75
 """Width of a figure over the page [inches]."""
@@ -73,13 +73,14 @@ class PolicyStyle:
     width: float = 1.2
 
 
+# The policies of the paper come first: their greys, as printed, are as far apart as can be.
 _STYLES = {
     "d_optimal": PolicyStyle("D-optimal", VERMILLION, "-", 1.6),
     "oracle": PolicyStyle("oracle", BLACK, (0, (4, 1.5))),
-    "uniform": PolicyStyle("uniform", GREEN, (0, (6, 1.2, 1.2, 1.2))),
+    "uniform": PolicyStyle("uniform", PURPLE, (0, (6, 1.2, 1.2, 1.2))),
     "periodic": PolicyStyle("periodic", BLUE, (0, (1.2, 1.2)), 1.4),
-    "random": PolicyStyle("random", PURPLE, (0, (2.5, 1.2))),
-    "random_held": PolicyStyle("random, held", SKY, (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2))),
+    "random": PolicyStyle("random", CYAN, (0, (2.5, 1.2))),
+    "random_held": PolicyStyle("random, held", GREEN, (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2))),
     "random_sphere": PolicyStyle("random on the sphere", ORANGE, (0, (8, 2))),
     "prbs": PolicyStyle("PRBS", WINE, (0, (1.2, 2.4))),
     "multisine": PolicyStyle("multisine", INDIGO, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2))),

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,12 +14,30 @@ from analysis.figures.style import mathematical, policy_style
 from dopt.policies import POLICIES
 
 
+PAPER = ("oracle", "periodic", "d_optimal", "uniform", "random")
+BEYOND = {path.stem for path in Path("conf/policy/beyond").glob("*.yaml")}
+CLASSICAL = [policy for policy in POLICIES if policy not in BEYOND]
+
+
 def test_no_two_policies_look_alike() -> None:
     for one, other in itertools.combinations(POLICIES, 2):
         a, b = policy_style(one), policy_style(other)
-        assert a.line != b.line, (one, other)
-        assert math.dist(to_rgb(a.colour), to_rgb(b.colour)) > 0.25, (one, other)
+        assert (a.colour, a.line) != (b.colour, b.line), (one, other)
         assert a.label != b.label
+
+
+@pytest.mark.parametrize("group", [CLASSICAL, ["d_optimal", *BEYOND & set(POLICIES)]])
+def test_policies_of_one_figure_differ_in_colour(group: list[str]) -> None:
+    for one, other in itertools.combinations(group, 2):
+        a, b = policy_style(one), policy_style(other)
+        assert a.line != b.line, (one, other)
+        assert math.dist(to_rgb(a.colour), to_rgb(b.colour)) > 0.2, (one, other)
+
+
+def test_the_policies_of_the_paper_differ_in_grey() -> None:
+    """As ITU-R BT.601 turns colours into grey, which is what a printer does."""
+    greys = sorted(np.dot(to_rgb(policy_style(p).colour), (0.299, 0.587, 0.114)) for p in PAPER)
+    assert min(np.diff(greys)) > 0.1
 
 
 def test_every_colour_is_seen_on_white() -> None:
