@@ -13,7 +13,6 @@ from analysis.figures.axes import angle_text, log_limits, log_text, log_ticks, r
 from analysis.figures.style import mathematical, policy_style
 from dopt.policies import POLICIES
 
-
 PAPER = ("oracle", "periodic", "d_optimal", "uniform", "random")
 BEYOND = {path.stem for path in Path("conf/policy/beyond").glob("*.yaml")}
 CLASSICAL = [policy for policy in POLICIES if policy not in BEYOND]
