@@ -20,7 +20,15 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-_STREAMS = {"noise": 0, "weights": 1, "inputs": 2, "components": 3, "ties": 4}
+_STREAMS = {
+    "noise": 0,
+    "weights": 1,
+    "inputs": 2,
+    "components": 3,
+    "ties": 4,
+    "planner": 5,
+    "updater": 6,
+}
 
 
 def stream(seed: int, name: str) -> np.random.Generator:

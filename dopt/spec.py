@@ -12,12 +12,13 @@ from typing import ClassVar
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.fields import Checked, quantity
 from dopt.learning import LEARNERS, Learner
+from dopt.learning.base import Updated
 from dopt.learning.recursive_least_squares import RecursiveLeastSquares
 from dopt.memory import memory_by_setting
 from dopt.models import MODELS, Linear, Model
 from dopt.models.mlp import MLP
 from dopt.policies import POLICIES, Informed, Oracle, Policy
-from dopt.policies.base import OpenLoop
+from dopt.policies.base import OpenLoop, Planned
 from dopt.registry import build, section_of
 from dopt.systems import SYSTEMS, System
 
@@ -43,7 +44,8 @@ class Cell:
     """A trial without its seed: one cell of a grid.
 
     ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
-    agree to rounding only, which grows over a trial: so it is part of the trial's identity.
+    agree to rounding only, which grows over a trial: so it is part of the trial's identity. What
+    the kernel does not know runs on the reference alone.
     """
 
     system: System
@@ -76,16 +78,30 @@ class Cell:
             )
 
     def _check_runnable(self) -> None:
-        """Refuse parts of a user's own that no path can run: all but systems and open loops."""
-        parts = ((self.policy, POLICIES), (self.model, MODELS), (self.learner, LEARNERS))
-        for part, registry in parts:
+        """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""
+        for part, registry, bases in (
+            (self.policy, POLICIES, (OpenLoop, Planned)),
+            (self.model, MODELS, ()),
+            (self.learner, LEARNERS, (Updated,)),
+        ):
             shipped: Collection[type] = registry.values()
-            if type(part) not in shipped and not isinstance(part, OpenLoop):
+            if type(part) not in shipped and not isinstance(part, bases):
+                derived = " or ".join(base.__name__ for base in bases)
+                own = f"derive it from {derived}, or take one of" if derived else "take one of"
                 raise SpecificationError(
-                    f"{part.section} is a {type(part).__name__} of your own, but only systems and "
-                    f"policies derived from OpenLoop can be so: take one of "
-                    f"{', '.join(sorted(registry))}."
+                    f"{part.section} is a {type(part).__name__} of your own, which brings nothing "
+                    f"to run: {own} {', '.join(sorted(registry))}."
                 )
+        foreign = [part for part in self._parts if not part.compiled]
+        if self.path == "kernel" and foreign:
+            raise SpecificationError(
+                f"path is 'kernel', but {foreign[0].section} '{foreign[0].name}' is not written "
+                f"for it: set path to 'reference', or leave it out."
+            )
+
+    @property
+    def _parts(self) -> tuple[System, Policy, Model, Learner]:
+        return self.system, self.policy, self.model, self.learner
 
     def _check_size(self) -> None:
         """Refuse what no machine can run, such as a mistyped number of zeros."""
@@ -118,9 +134,8 @@ class Cell:
     @functools.cached_property
     def canonical_json(self) -> str:
         """Sorted, compact JSON of the content and the code version, without the seed."""
-        parts = (self.system, self.policy, self.model, self.learner)
         content: dict[str, object] = {"code_version": CODE_VERSION, "path": self.path}
-        content |= {key: section_of(part) for key, part in zip(_SECTIONS, parts, strict=True)}
+        content |= {key: section_of(part) for key, part in zip(_SECTIONS, self._parts, strict=True)}
         return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
     @functools.cached_property
@@ -157,8 +172,8 @@ class TrialSpec(Checked):
         ----------
         given : mapping
             Sections ``env``, ``policy``, ``model`` and ``learner``, each with a ``name`` and the
-            fields that differ from their defaults, the ``seed`` and, if it is not the kernel, the
-            execution ``path``.
+            fields that differ from their defaults, the ``seed`` and the execution ``path``; without
+            one, it is the kernel where that knows all parts, and the reference elsewhere.
 
         Raises
         ------
@@ -171,13 +186,13 @@ class TrialSpec(Checked):
             if key not in (*_SECTIONS, "path", "seed"):
                 raise unknown_name("configuration key", key, (*_SECTIONS, "path", "seed"))
         sections = {key: _section(given, key) for key in _SECTIONS}
-        cell = Cell(
-            build("env", SYSTEMS, sections["env"]),
-            build("policy", POLICIES, sections["policy"]),
-            build("model", MODELS, sections["model"]),
-            build("learner", LEARNERS, sections["learner"]),
-            str(given.get("path", "kernel")),
-        )
+        system = build("env", SYSTEMS, sections["env"])
+        policy = build("policy", POLICIES, sections["policy"])
+        model = build("model", MODELS, sections["model"])
+        learner = build("learner", LEARNERS, sections["learner"])
+        compiled = all(part.compiled for part in (system, policy, model, learner))
+        path = str(given.get("path", "kernel" if compiled else "reference"))
+        cell = Cell(system, policy, model, learner, path)
         return cls(cell, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
 
     def with_seed(self, seed: int) -> TrialSpec:

@@ -132,7 +132,8 @@ def _run(
     _count(tally, state)
     say(opening(grid, state, settings, store.safe_url))
     if tally.left:
-        prepare = work.prepare if settings.path == "kernel" else None
+        compiled = any(trial.cell.path == "kernel" for trial in grid.trials)
+        prepare = work.prepare if compiled else None
         if prepare:
             with _said_if_slow("compiling the kernel, which is kept for later launches", say):
                 prepare()

@@ -63,7 +63,10 @@ class LaunchSettings:
 
     @property
     def path(self) -> str:
-        """Execution path of the trials: a batch in lockstep is the reference's."""
+        """Execution path of the trials: the kernel where it knows all parts.
+
+        A batch in lockstep is the reference's.
+        """
         return "reference" if self.executor == "lockstep" else "kernel"
 
     @classmethod

@@ -17,10 +17,14 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Model(Checked):
-    """A parametric model of the r learned accelerations of a system."""
+    """A parametric model of the r learned accelerations of a system.
+
+    ``compiled`` says whether the kernel runs it; what it does not runs on the reference path.
+    """
 
     section: ClassVar[str] = "model"
     name: ClassVar[str]
+    compiled: ClassVar[bool] = True
 
     @abstractmethod
     def n_parameters(self, system: System) -> int:

@@ -1,12 +1,13 @@
 """What every policy specification declares.
 
 A policy is either open-loop, and gives its whole input sequence before the trial, or closed-loop,
-and names the plan that chooses each input from what was observed.
+and names the plan that chooses each input from what was observed. A closed-loop policy that the
+kernel does not know brings its plan along, a :class:`Planner`.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,16 +16,21 @@ import numpy.typing as npt
 
 from dopt.fields import Checked, quantity
 from dopt.systems.base import System
+from dopt.view import View
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Policy(Checked):
-    """A rule that chooses the input u_t, ‖u_t‖ ≤ γ."""
+    """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.
+
+    ``compiled`` says whether the kernel runs it; what it does not runs on the reference path.
+    """
 
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
+    compiled: ClassVar[bool] = True
 
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
@@ -65,6 +71,31 @@ class Informed(ClosedLoop):
 
         It is "primal", "dual" or "sketch" (:class:`dopt.policies.d_optimal.DOptimal`).
         """
+
+
+class Planner(ABC):
+    """The plan of one trial; it may keep what it learns itself."""
+
+    @abstractmethod
+    def choose(self, view: View) -> Array:
+        """Return the input u_t, (m,), ‖u_t‖ ≤ γ, after t ≥ 1 steps: the first one is random.
+
+        An input that is not finite ends the trial as diverged.
+        """
+
+    def observe(self, view: View) -> None:  # noqa: B027  # most plans keep nothing
+        """Take in a step that was just done and learned from, t ≥ 1: x_{t-1}, u_{t-1} and x_t."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Planned(ClosedLoop):
+    """A closed-loop policy whose plan is written in numpy; it runs on the reference path."""
+
+    compiled: ClassVar[bool] = False
+
+    @abstractmethod
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:
+        """Return the plan of a new trial; all that is random in it comes from ``rng``."""
 
 
 def on_sphere(vectors: Array, radius: float) -> Array:

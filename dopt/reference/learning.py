@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
 from dopt.learning import Adam, Learner
 from dopt.reference.models import Accelerations
+
+
+class BatchLearner(Protocol):
+    """Learning in a batch of n trials."""
+
+    def learn(self, states: Tensor, targets: Tensor) -> None:
+        """Take one step on states (n, t + 1, d) and observed accelerations (n, t + 1, r)."""
 
 
 class AdamLearner:
@@ -61,7 +70,7 @@ class LeastSquaresLearner:
 
 def learner_for(
     learner: Learner, model: Accelerations, theta: Tensor, regularization: float
-) -> AdamLearner | LeastSquaresLearner:
+) -> BatchLearner:
     """Return the batch learner of a specification; it writes into ``theta`` (n, q)."""
     if isinstance(learner, Adam):
         return AdamLearner(learner, model, theta)

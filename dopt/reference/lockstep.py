@@ -13,13 +13,15 @@ from torch.func import jacrev, vmap
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
+from dopt.learning.base import Updated
 from dopt.policies import DOptimal, Informed, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
-from dopt.reference.learning import learner_for
+from dopt.reference.learning import BatchLearner, learner_for
 from dopt.reference.models import model_function, network_function
+from dopt.reference.own import OwnLearner, observe, planned_inputs, planners_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, uniform_inputs
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
@@ -68,9 +70,12 @@ class Lockstep:
             flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
             self.theta = flat.to(device).repeat(len(specs), 1)
         self._allocate()
-        self.learner = learner_for(
-            self.cell.learner, self.model, self.theta, self._regularization()
-        )
+        self.planners = planners_for(self.specs)
+        if isinstance(self.cell.learner, Updated):
+            self.learner: BatchLearner = OwnLearner(self.cell.learner, self)
+        else:
+            regularization = self._regularization()
+            self.learner = learner_for(self.cell.learner, self.model, self.theta, regularization)
         self._rows = vmap(jacrev(self.model))
 
     def _tensor(self, values: npt.NDArray[np.float64]) -> Tensor:
@@ -121,6 +126,8 @@ class Lockstep:
         policy, x = self.cell.policy, self.states[:, t]
         if isinstance(policy, OpenLoop) or t == 0:
             return self.open_loop[:, t]
+        if self.planners:
+            return planned_inputs(self, t)
         if isinstance(policy, Uniform):
             seen = self.states[:, : t + 1]
             return uniform_inputs(self.system, self.model, self.theta, seen, policy.iterations)
@@ -154,6 +161,7 @@ class Lockstep:
 
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
+        observe(self, t)
         if self.information is not None:
             J = self.project(self._rows(self.theta, self.states[:, t]))
             self.information = self.information + J.mT @ J

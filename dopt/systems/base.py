@@ -41,11 +41,12 @@ class System(Checked):
 
     The two equations are static methods over sequences of scalars, arrays or tensors, so that one
     definition serves the simulator, the evaluation, automatic differentiation and the compiled
-    kernel.
+    kernel. ``compiled`` says whether the kernel runs it.
     """
 
     section: ClassVar[str] = "env"
     name: ClassVar[str]
+    compiled: ClassVar[bool] = True
     physical: ClassVar[tuple[str, ...]]
     linear_parameters: ClassVar[tuple[str, ...]] = ()
     state_labels: ClassVar[tuple[str, ...]]

@@ -122,7 +122,7 @@ def test_a_wrong_system_is_refused_in_a_sentence(path: str, sentence: str) -> No
     [
         ("Nameless", "a class with a 'name' of its own"),
         ("Thief", "a class with a 'name' of its own"),
-        ("Closed", "policies derived from OpenLoop"),
+        ("Closed", "derive it from OpenLoop or Planned"),
     ],
 )
 def test_a_wrong_policy_is_refused_in_a_sentence(name: str, sentence: str) -> None:

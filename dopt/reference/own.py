@@ -1,0 +1,110 @@
+"""Plans and updates that are written one trial at a time, for the trials of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dopt.errors import SpecificationError
+from dopt.learning.base import Updated
+from dopt.policies.base import Array, Planned, Planner, Policy
+from dopt.randomness import stream
+from dopt.reference.view import TrialView
+from dopt.spec import TrialSpec
+from dopt.systems.base import System
+
+if TYPE_CHECKING:
+    from dopt.reference.lockstep import Lockstep
+
+ROUNDING = 1e-9
+"""Share of γ by which an input may exceed it."""
+
+TORCH_PLANNERS: dict[type[Policy], Callable[[Any, System, np.random.Generator], Planner]] = {}
+"""Plans of shipped policies that are written in torch; those in numpy make their own."""
+
+
+def planners_for(specs: Sequence[TrialSpec]) -> list[Planner]:
+    """Return the plan of each trial; none for a policy that this package plans in lockstep."""
+    policy = specs[0].policy
+    make = TORCH_PLANNERS.get(type(policy))
+    if isinstance(policy, Planned):
+        make = type(policy).planner
+    if make is None:
+        return []
+    return [make(policy, spec.system, stream(spec.seed, "planner")) for spec in specs]
+
+
+def planned_inputs(batch: Lockstep, t: int) -> Tensor:
+    """Return the inputs u_t, (n, m), of the trials' own plans; diverged ones get a random one.
+
+    Raises
+    ------
+    SpecificationError
+        If an input has the wrong shape or a norm above γ.
+    """
+    inputs = batch.open_loop[:, t].clone()
+    for i in _alive(batch):
+        chosen = np.asarray(batch.planners[i].choose(TrialView(batch, i, t)), dtype=np.float64)
+        _check(batch, chosen, t)
+        inputs[i] = torch.as_tensor(chosen).to(inputs)
+    return inputs
+
+
+def observe(batch: Lockstep, t: int) -> None:
+    """Let the plans take in what step t has brought."""
+    if batch.planners:
+        for i in _alive(batch):
+            batch.planners[i].observe(TrialView(batch, i, t + 1))
+
+
+class OwnLearner:
+    """The updates of a learner of one's own, one trial after the other."""
+
+    def __init__(self, learner: Updated, batch: Lockstep) -> None:
+        self._batch = batch
+        self._updaters = [
+            learner.updater(spec.system, stream(spec.seed, "updater")) for spec in batch.specs
+        ]
+
+    def learn(self, states: Tensor, targets: Tensor) -> None:  # noqa: ARG002  # the view has them
+        """Update the parameters after states (n, t + 1, d).
+
+        Raises
+        ------
+        SpecificationError
+            If there are not as many parameters as before.
+        """
+        for i in _alive(self._batch):
+            updated = self._updaters[i].update(TrialView(self._batch, i, states.shape[1]))
+            theta = np.asarray(updated, dtype=np.float64)
+            if theta.shape != self._batch.theta[i].shape:
+                raise SpecificationError(
+                    f"learner '{self._batch.cell.learner.name}' returned parameters of shape "
+                    f"{theta.shape}, but {tuple(self._batch.theta[i].shape)} is expected: correct "
+                    f"its update."
+                )
+            self._batch.theta[i] = torch.as_tensor(theta).to(self._batch.theta)
+
+
+def _alive(batch: Lockstep) -> list[int]:
+    diverged: list[bool] = batch.diverged[:, 0].tolist()
+    return [i for i, ended in enumerate(diverged) if not ended]
+
+
+def _check(batch: Lockstep, chosen: Array, t: int) -> None:
+    system, name = batch.system, batch.cell.policy.name
+    if chosen.shape != (system.n_inputs,):
+        raise SpecificationError(
+            f"policy '{name}' chose an input of shape {chosen.shape} at step {t}, but "
+            f"{(system.n_inputs,)} is expected: correct its plan."
+        )
+    norm = float(np.linalg.norm(chosen))
+    if norm > system.gamma * (1 + ROUNDING):
+        raise SpecificationError(
+            f"policy '{name}' chose an input of norm {norm:.6g} at step {t}, but env.gamma is "
+            f"{system.gamma:g}: scale it down."
+        )

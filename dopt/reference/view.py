@@ -1,0 +1,68 @@
+"""A trial of a batch as its plan or its update of one's own sees it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, jvp, vmap
+
+from dopt.reference.dynamics import flow, input_matrix
+from dopt.view import Array, View
+
+if TYPE_CHECKING:
+    from dopt.reference.lockstep import Lockstep
+
+
+class TrialView(View):
+    """Trial ``index`` of a batch after t steps.
+
+    Attributes
+    ----------
+    model : callable
+        a_θ(x) over tensors: parameters (q,) and state (d,) to accelerations (r,).
+    theta : (q,) tensor
+        Parameters, for plans that are written in torch.
+    """
+
+    def __init__(self, batch: Lockstep, index: int, t: int) -> None:
+        self.system, self.t = batch.system, t
+        self.model, self.theta = batch.model, batch.theta[index].clone()
+        self.states = _array(batch.states[index, : t + 1])
+        self.inputs = _array(batch.inputs[index, :t])
+        self.accelerations = _array(batch.targets[index, :t])
+        self.parameters = _array(self.theta)
+
+    def predict(self, states: Array) -> Array:
+        return _array(vmap(self.model, in_dims=(None, 0))(self.theta, self.tensor(states)))
+
+    def jacobian(self, state: Array) -> Array:
+        return _array(jacrev(self.model)(self.theta, self.tensor(state)))
+
+    def jacobian_change(self, state: Array, directions: Array) -> Array:
+        def rows(x: Tensor) -> Tensor:
+            J: Tensor = jacrev(self.model)(self.theta, x)
+            return J
+
+        x = self.tensor(state)
+        return _array(vmap(lambda along: jvp(rows, (x,), (along,))[1])(self.tensor(directions)))
+
+    def following(self, state: Array, inputs: Array) -> Array:
+        x, u = self.tensor(state), self.tensor(inputs)
+        x = x.expand(len(u), -1)
+        accelerations = vmap(self.model, in_dims=(None, 0))(self.theta, x)
+        return _array(x + self.system.dt * flow(self.system, x, u, accelerations))
+
+    def input_matrix(self, state: Array) -> Array:
+        return _array(input_matrix(self.system, self.tensor(state)))
+
+    def tensor(self, values: Array) -> Tensor:
+        """Return values as a tensor where the model is."""
+        return torch.as_tensor(values, dtype=self.theta.dtype, device=self.theta.device)
+
+
+def _array(values: Tensor) -> Array:
+    """Return a copy, so that nobody can change the trial."""
+    array: Array = values.detach().cpu().numpy().copy()
+    return array

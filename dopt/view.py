@@ -1,0 +1,62 @@
+"""What a plan or an update of one's own sees of a running trial, in numpy."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.systems.base import System
+
+Array = npt.NDArray[np.float64]
+
+
+class View(ABC):
+    """A trial after t steps: what was observed, and the model as it is now.
+
+    Attributes
+    ----------
+    system : System
+        Sizes, known part, γ and dt are what an explorer may use of it; its accelerations are not.
+    t : int
+        Number of steps done.
+    states : (t + 1, d)
+        x_0 ... x_t.
+    inputs : (t, m)
+        u_0 ... u_{t-1}.
+    accelerations : (t, r)
+        Observed at x_0 ... x_{t-1}: (x_{s+1} - x_s)/dt less the known part, in the learned rows.
+    parameters : (q,)
+        Parameters θ of the model.
+    """
+
+    system: System
+    t: int
+    states: Array
+    inputs: Array
+    accelerations: Array
+    parameters: Array
+
+    @abstractmethod
+    def predict(self, states: Array) -> Array:
+        """Return the modelled accelerations a_θ(x), (N, r), of states, (N, d)."""
+
+    @abstractmethod
+    def jacobian(self, state: Array) -> Array:
+        """Return ∂a_θ(x)/∂θ, (r, q), at a state, (d,)."""
+
+    @abstractmethod
+    def jacobian_change(self, state: Array, directions: Array) -> Array:
+        """Return the derivative of the Jacobian along k directions (k, d) of the state: (k, r, q).
+
+        With the columns of :meth:`input_matrix` it is what Proposition 1 calls D B.
+        """
+
+    @abstractmethod
+    def following(self, state: Array, inputs: Array) -> Array:
+        """Return the predicted next states x + dt f_θ(x, u), (N, d), for inputs (N, m) at (d,)."""
+
+    @abstractmethod
+    def input_matrix(self, state: Array) -> Array:
+        """Return B = dt ∂f/∂u, (d, m), at a state, (d,)."""

@@ -1,0 +1,116 @@
+"""Policies and learners of a user's own, written in numpy: copies of shipped ones, and bad ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from dopt.learning.base import Updated, Updater
+from dopt.policies.base import Array, Planned, Planner
+from dopt.systems import System
+from dopt.view import View
+
+
+@dataclass(frozen=True, kw_only=True)
+class Copy(Planned):
+    """Algorithm 2 for one input and one learned acceleration, in the words of Proposition 1."""
+
+    name: ClassVar[str] = "copy"
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return CopyPlanner(system)
+
+
+class CopyPlanner(Planner):
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self._information: Array | None = None
+
+    def choose(self, view: View) -> Array:
+        assert self._information is not None
+        center = view.following(view.states[-1], np.zeros((1, 1)))[0]
+        g = view.jacobian(center)[0]
+        changes = view.jacobian_change(center, view.input_matrix(center).T)[:, 0]
+        v = -changes @ np.linalg.solve(self._information, g)
+        chosen: Array = -self._system.gamma * np.sign(v)
+        return chosen
+
+    def observe(self, view: View) -> None:
+        J = view.jacobian(view.states[-2])
+        before = 1e-3 * np.eye(J.shape[1]) if self._information is None else self._information
+        self._information = before + J.T @ J
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wild(Planned):
+    """Chooses what it may not: ``scale`` times γ, in ``size`` inputs; or gets lost."""
+
+    name: ClassVar[str] = "wild"
+
+    scale: float = 2.0
+    size: int = 1
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return WildPlanner(system.gamma * self.scale, self.size)
+
+
+class WildPlanner(Planner):
+    def __init__(self, value: float, size: int) -> None:
+        self._inputs = np.full(size, value)
+
+    def choose(self, view: View) -> Array:
+        return np.where(view.t < 5, 0.0, self._inputs) if len(self._inputs) == 1 else self._inputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lost(Wild):
+    name: ClassVar[str] = "lost"
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return WildPlanner(np.nan, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coin(Planned):
+    """±γ by chance."""
+
+    name: ClassVar[str] = "coin"
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:
+        return CoinPlanner(system.gamma, rng)
+
+
+class CoinPlanner(Planner):
+    def __init__(self, gamma: float, rng: np.random.Generator) -> None:
+        self._gamma, self._rng = gamma, rng
+
+    def choose(self, view: View) -> Array:
+        return self._rng.choice([-self._gamma, self._gamma], size=view.inputs.shape[1])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Descent(Updated):
+    """Adam on the newest sample, as printed in Algorithm 1; ``extra`` parameters are a mistake."""
+
+    name: ClassVar[str] = "descent"
+
+    extra: int = 0
+
+    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
+        return DescentUpdater(self.extra)
+
+
+class DescentUpdater(Updater):
+    def __init__(self, extra: int) -> None:
+        self._first, self._second, self._extra = np.zeros(1), np.zeros(1), extra
+
+    def update(self, view: View) -> Array:
+        x, y = view.states[-2], view.accelerations[-1]
+        gradient = 2 * (view.predict(x[None])[0] - y) @ view.jacobian(x)
+        self._first = 0.9 * self._first + 0.1 * gradient
+        self._second = 0.999 * self._second + 0.001 * gradient**2
+        scale = np.sqrt(self._second / (1 - 0.999**view.t)) + 1e-8
+        theta = view.parameters - 2e-3 * self._first / (1 - 0.9**view.t) / scale
+        return np.concatenate([theta, np.zeros(self._extra)])
