@@ -7,20 +7,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from dopt.coverage import TURN, turns, wrap
+
 Array = npt.NDArray[np.float64]
-
-TURN = 2 * math.pi
-
-
-def wrap(angle: Array, centre: float = 0.0) -> Array:
-    """Return angles moved by whole turns into [centre - π, centre + π)."""
-    return angle - TURN * turns(angle, centre)
-
-
-def turns(angle: Array, centre: float = 0.0) -> Array:
-    """Return the number of whole turns between each angle and its wrapped value."""
-    count: Array = np.floor((angle - centre + math.pi) / TURN)
-    return count
 
 
 def wrapped_line(line: Array, axis: int, centre: float = 0.0) -> Array:

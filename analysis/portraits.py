@@ -10,12 +10,12 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.choice import REFERENCE
-from analysis.coverage import Box, coverage
 from analysis.errors import AnalysisError
-from analysis.phase import wrap, wrapped_line
+from analysis.phase import wrapped_line
 from analysis.selection import Entry, Selection
 from analysis.statistics import mean, standard_error
-from dopt.systems import System, system_from_mapping
+from dopt.coverage import Plane
+from dopt.systems import system_from_mapping
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]
@@ -50,19 +50,8 @@ class Portrait:
     n_diverged: int
 
 
-@dataclass(frozen=True)
-class Plane:
-    """The phase plane of a system: state indices, labels, which axes are angles, box."""
-
-    axes: tuple[int, int]
-    labels: tuple[str, str]
-    angles: tuple[bool, bool]
-    centres: tuple[float, float]
-    box: Box
-
-    def project(self, states: Array) -> Array:
-        """Return the points (n, 2) of states (n, d), angles not wrapped."""
-        return states[:, list(self.axes)]
+class DrawnPlane(Plane):
+    """A phase plane and the lines in it."""
 
     def line(self, points: Array) -> Array:
         """Return the line to draw through points (n, 2)."""
@@ -71,14 +60,6 @@ class Plane:
                 points = wrapped_line(points, axis, self.centres[axis])
         return points
 
-    def wrapped(self, points: Array) -> Array:
-        """Return points (n, 2) with angles inside one turn around the centre."""
-        inside = points.copy()
-        for axis in range(2):
-            if self.angles[axis]:
-                inside[:, axis] = wrap(points[:, axis], self.centres[axis])
-        return inside
-
 
 @dataclass(frozen=True)
 class Portraits:
@@ -86,38 +67,8 @@ class Portraits:
 
     env: str
     seed: int
-    plane: Plane
+    plane: DrawnPlane
     panels: tuple[Portrait, ...]
-
-
-def phase_plane(system: System) -> Plane:
-    """Return the phase plane of a system; angles are centred on its stable equilibrium.
-
-    So small oscillations about it are not broken, wherever the angle is measured from. A box
-    that covers the whole turn moves with the centre.
-    """
-    axes = system.phase_plane
-    rest = system.equilibrium or (0.0,) * system.n_states
-    angles = (axes[0] in system.angle_indices, axes[1] in system.angle_indices)
-    centres = (
-        rest[axes[0]] if angles[0] else 0.0,
-        rest[axes[1]] if angles[1] else 0.0,
-    )
-    given = system.grid_box()
-    sides = [
-        _side(given[axis], centre) if turning else given[axis]
-        for axis, centre, turning in zip(axes, centres, angles, strict=True)
-    ]
-    labels = (system.state_labels[axes[0]], system.state_labels[axes[1]])
-    return Plane(axes, labels, angles, centres, (sides[0], sides[1]))
-
-
-def _side(side: tuple[float, float], centre: float) -> tuple[float, float]:
-    low, high = side
-    if high - low > 2 * np.pi - 1e-9:
-        return centre - np.pi, centre + np.pi
-    shift = float(wrap(np.array((low + high) / 2), centre)) - (low + high) / 2
-    return low + shift, high + shift
 
 
 def median_seed(losses: dict[int, float]) -> int:
@@ -141,12 +92,12 @@ def measure_portraits(reader: Reader, selection: Selection, env: str) -> Portrai
     """Return the portraits of one environment."""
     entries = selection.of(env)
     seed = choose_seed(entries)
-    plane = phase_plane(system_from_mapping(entries[0].cell.config["env"]))
+    plane = DrawnPlane.of(system_from_mapping(entries[0].cell.config["env"]))
     panels = tuple(_portrait(reader, entry, seed, plane) for entry in entries)
     return Portraits(env, seed, plane, panels)
 
 
-def _portrait(reader: Reader, entry: Entry, seed: int, plane: Plane) -> Portrait:
+def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Portrait:
     key, finished = entry.cell.config_key, entry.finished
     status = {trial.seed: trial.status for trial in finished}
     points = np.empty((0, 2))
@@ -166,9 +117,8 @@ def _portrait(reader: Reader, entry: Entry, seed: int, plane: Plane) -> Portrait
     )
 
 
-def _share(reader: Reader, key: str, seed: int, plane: Plane) -> float:
-    points = plane.project(reader.trajectory(key, seed).states)
-    return coverage(plane.wrapped(points), plane.box)
+def _share(reader: Reader, key: str, seed: int, plane: DrawnPlane) -> float:
+    return plane.coverage(reader.trajectory(key, seed).states)
 
 
 def tabulate_portraits(portraits: Portraits) -> pd.DataFrame:

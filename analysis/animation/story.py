@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis.errors import AnalysisError
-from analysis.portraits import Plane, phase_plane
+from analysis.portraits import DrawnPlane
 from analysis.selection import Entry
 from dopt.geometry import Body, body
 from dopt.replay import replay
@@ -34,7 +34,7 @@ class Story:
         As stored; the loss is that on the grid after each step.
     body : Body or None
         The system at all states, None where it has none.
-    plane : Plane
+    plane : DrawnPlane
         Phase plane of the system.
     truth, learned : (T + 1, r), (k, T + 1, r)
         Accelerations at zero input along the whole trajectory, true and as modelled at each frame.
@@ -49,7 +49,7 @@ class Story:
     inputs: Array
     loss: Array
     body: Body | None
-    plane: Plane
+    plane: DrawnPlane
     truth: Array
     learned: Array
 
@@ -82,7 +82,7 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
         stored.inputs[:end],
         loss[:end],
         body(spec.system, states),
-        phase_plane(spec.system),
+        DrawnPlane.of(spec.system),
         spec.system.learned(states),
         np.array(learned),
     )

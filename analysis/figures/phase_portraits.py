@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from analysis.coverage import CELLS
 from analysis.figures.axes import angle_ticks, rows_and_columns
 from analysis.figures.plot import Plot
 from analysis.figures.style import (
@@ -23,12 +22,13 @@ from analysis.figures.style import (
 from analysis.numbers import plus_minus
 from analysis.portraits import (
     SEED_RULE,
-    Plane,
+    DrawnPlane,
     Portrait,
     Portraits,
     measure_portraits,
     tabulate_portraits,
 )
+from dopt.coverage import CELLS
 
 PANEL_HEIGHT = 2.1
 MARGIN = 0.04
@@ -80,7 +80,7 @@ def draw(portraits: Portraits) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, portrait: Portrait, plane: Plane) -> None:
+def _panel(axes: Axes, portrait: Portrait, plane: DrawnPlane) -> None:
     (left, right), (bottom, top) = plane.box
     axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, zorder=0.5, **BOX))
     style = policy_style(portrait.policy)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from analysis.choice import flatten
-from analysis.portraits import phase_plane
+from analysis.portraits import DrawnPlane
 from analysis.serve.asked import Asked, short
 from analysis.serve.errors import NotFoundError
 from analysis.serve.naming import look
@@ -123,7 +123,7 @@ def _numbered(trajectory: Trajectory) -> tuple[str, ...]:
 
 
 def _phase(trajectory: Trajectory, system: System) -> dict[str, Any]:
-    plane = phase_plane(system)
+    plane = DrawnPlane.of(system)
     points = plane.project(trajectory.states)
     points = points[np.isfinite(points).all(axis=1)]
     line = plane.line(points) if len(points) else points

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.phase import TURN, turns, wrap, wrapped_line
+from analysis.phase import wrapped_line
+from dopt.coverage import TURN, turns, wrap
 
 ANGLES = st.lists(st.floats(-30, 30), min_size=1, max_size=30)
 CENTRES = st.sampled_from([0.0, math.pi, -1.0])

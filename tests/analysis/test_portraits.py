@@ -10,10 +10,10 @@ from analysis.errors import AnalysisError
 from analysis.portraits import (
     measure_portraits,
     median_seed,
-    phase_plane,
     tabulate_portraits,
 )
 from analysis.selection import select
+from dopt.coverage import Plane
 from dopt.systems import SYSTEMS
 from orchestrate.store import Reader
 
@@ -27,7 +27,7 @@ def test_median_seed() -> None:
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_every_system_rests_inside_its_box(name: str) -> None:
     system = SYSTEMS[name]()
-    plane = phase_plane(system)
+    plane = Plane.of(system)
     rest = np.array([system.equilibrium or (0.0,) * system.n_states])
     x, y = plane.wrapped(plane.project(rest))[0]
     (left, right), (bottom, top) = plane.box
@@ -36,7 +36,7 @@ def test_every_system_rests_inside_its_box(name: str) -> None:
 
 
 def test_the_cartpole_is_centred_on_hanging() -> None:
-    plane = phase_plane(SYSTEMS["cartpole"]())
+    plane = Plane.of(SYSTEMS["cartpole"]())
     assert plane.box[0] == pytest.approx((0, 2 * math.pi))
     assert plane.angles == (True, False)
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.coverage import coverage
+from dopt.coverage import coverage
 
 BOX = ((-1.0, 1.0), (0.0, 4.0))
 
