@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from dopt.control.assessment import assessed
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
 
@@ -11,7 +12,7 @@ Path = Literal["kernel", "reference"]
 
 
 def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
-    """Run a trial; its numbers depend on nothing but its specification.
+    """Run a trial and assess it; its numbers depend on nothing but its specification.
 
     Parameters
     ----------
@@ -23,7 +24,7 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     if (path or spec.cell.path) == "reference":
         from dopt.reference.lockstep import run_trials
 
-        return run_trials([spec])[0]
+        return assessed(spec, run_trials([spec])[0])
     from dopt.kernel.run import run_trial_in_kernel
 
-    return run_trial_in_kernel(spec)
+    return assessed(spec, run_trial_in_kernel(spec))

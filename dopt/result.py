@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+
+class Assessment(NamedTuple):
+    """A number that says what a trial was worth after t explored steps.
+
+    The measures and their meanings are :data:`dopt.control.assessment.MEASURES`; a value that is
+    not finite stands for an overflow.
+    """
+
+    t: int
+    measure: str
+    value: float
 
 
 @dataclass(frozen=True)
@@ -32,7 +46,12 @@ class TrialResult:
         First step at which the state left the system's limit or a number was not finite. All rows
         from there on are NaN.
     wall_seconds, cpu_seconds : float
-        Duration of the whole trial.
+        Duration of the exploration.
+    checkpoints : mapping of int to (q,)
+        Parameters of the model after the numbers of steps at which the trial is to be assessed, up
+        to a divergence.
+    assessments : tuple of Assessment
+        What was measured there; empty where the trial has no task.
     """
 
     loss: Array
@@ -46,6 +65,8 @@ class TrialResult:
     diverged_at: int | None
     wall_seconds: float
     cpu_seconds: float
+    checkpoints: Mapping[int, Array] = field(default_factory=dict)
+    assessments: tuple[Assessment, ...] = ()
 
     @property
     def diverged(self) -> bool:

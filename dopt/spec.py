@@ -9,6 +9,7 @@ import json
 from collections.abc import Collection, Mapping
 from typing import ClassVar
 
+from dopt.control import Control, task_from
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.fields import Checked, quantity
 from dopt.learning import LEARNERS, Learner
@@ -37,6 +38,7 @@ LARGEST_MEMORY = 2**40
 PATHS = ("kernel", "reference")
 
 _SECTIONS = ("env", "policy", "model", "learner")
+_KEYS = (*_SECTIONS, "task", "path", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +47,8 @@ class Cell:
 
     ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
     agree to rounding only, which grows over a trial: so it is part of the trial's identity. What
-    the kernel does not know runs on the reference alone.
+    the kernel does not know runs on the reference alone. ``task`` is what the trial is assessed by
+    on the way, and no part of its identity where there is none.
     """
 
     system: System
@@ -53,10 +56,13 @@ class Cell:
     model: Model
     learner: Learner
     path: str = "kernel"
+    task: Control | None = None
 
     def __post_init__(self) -> None:
         if self.path not in PATHS:
             raise unknown_name("path", self.path, PATHS)
+        if self.task is not None:
+            object.__setattr__(self, "task", self.task.resolved(self.system))
         self._check_runnable()
         self.policy.check(self.system)
         self._check_size()
@@ -136,6 +142,8 @@ class Cell:
         """Sorted, compact JSON of the content and the code version, without the seed."""
         content: dict[str, object] = {"code_version": CODE_VERSION, "path": self.path}
         content |= {key: section_of(part) for key, part in zip(_SECTIONS, self._parts, strict=True)}
+        if self.task is not None:
+            content["task"] = section_of(self.task)
         return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
     @functools.cached_property
@@ -173,7 +181,8 @@ class TrialSpec(Checked):
         given : mapping
             Sections ``env``, ``policy``, ``model`` and ``learner``, each with a ``name`` and the
             fields that differ from their defaults, the ``seed`` and the execution ``path``; without
-            one, it is the kernel where that knows all parts, and the reference elsewhere.
+            one, it is the kernel where that knows all parts, and the reference elsewhere. A
+            section ``task`` with a name other than "none" says how the trial is assessed.
 
         Raises
         ------
@@ -183,8 +192,8 @@ class TrialSpec(Checked):
             If the choices are valid one by one but make no sense together.
         """
         for key in given:
-            if key not in (*_SECTIONS, "path", "seed"):
-                raise unknown_name("configuration key", key, (*_SECTIONS, "path", "seed"))
+            if key not in _KEYS:
+                raise unknown_name("configuration key", key, _KEYS)
         sections = {key: _section(given, key) for key in _SECTIONS}
         system = build("env", SYSTEMS, sections["env"])
         policy = build("policy", POLICIES, sections["policy"])
@@ -192,7 +201,7 @@ class TrialSpec(Checked):
         learner = build("learner", LEARNERS, sections["learner"])
         compiled = all(part.compiled for part in (system, policy, model, learner))
         path = str(given.get("path", "kernel" if compiled else "reference"))
-        cell = Cell(system, policy, model, learner, path)
+        cell = Cell(system, policy, model, learner, path, task_from(given.get("task")))
         return cls(cell, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
 
     def with_seed(self, seed: int) -> TrialSpec:
@@ -216,6 +225,15 @@ class TrialSpec(Checked):
         return self.cell.learner
 
     @property
+    def task(self) -> Control | None:
+        return self.cell.task
+
+    @property
+    def assessed_steps(self) -> tuple[int, ...]:
+        """Numbers of explored steps after which the trial is assessed, none without a task."""
+        return self.task.assessed_steps(self.system.horizon) if self.task else ()
+
+    @property
     def config_json(self) -> str:
         """Canonical JSON without the seed."""
         return self.cell.canonical_json
@@ -231,7 +249,7 @@ class TrialSpec(Checked):
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()
 
     def canonical_json(self) -> str:
-        """Return the sorted, compact JSON of the content; "seed" sorts last."""
+        """Return the compact JSON of the content: sorted, but for the seed, which comes last."""
         return f'{self.config_json[:-1]},"seed":{self.seed}}}'
 
     def to_mapping(self) -> dict[str, object]:

@@ -90,7 +90,9 @@ def test_a_library_is_seen_by_one_layer(module: str) -> None:
         assert path.startswith(ONLY_IN[module]), f"{path} imports {module}"
 
 
-@pytest.mark.parametrize("folder", ["systems", "models", "policies", "learning", "planning"])
+@pytest.mark.parametrize(
+    "folder", ["systems", "models", "policies", "learning", "planning", "control"]
+)
 def test_what_a_trial_is_does_not_depend_on_how_it_is_run(folder: str) -> None:
     for path in sources(f"dopt/{folder}"):
         for name in imports(path):

@@ -76,7 +76,12 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     """Run a whole trial in compiled code."""
     wall, cpu = time.perf_counter(), time.process_time()
     trial = KernelTrial(spec)
-    _advance_in_pieces(trial)
+    checkpoints = {}
+    for step in spec.assessed_steps:
+        _advance_in_pieces(trial, step)
+        if trial.diverged_at is None:
+            checkpoints[step] = trial.state.theta.copy()
+    _advance_in_pieces(trial, spec.system.horizon)
     record, end = trial.record, trial.diverged_at
     if end is not None:
         for rows in record:
@@ -87,15 +92,16 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
         diverged_at=end,
         wall_seconds=time.perf_counter() - wall,
         cpu_seconds=time.process_time() - cpu,
+        checkpoints=checkpoints,
     )
 
 
-def _advance_in_pieces(trial: KernelTrial) -> None:
-    """Run a trial to its end; the numbers do not depend on where it is cut."""
-    horizon, steps = trial.spec.system.horizon, FIRST_STEPS
-    while trial.done < horizon and trial.diverged_at is None:
+def _advance_in_pieces(trial: KernelTrial, last: int) -> None:
+    """Run a trial up to a step; the numbers do not depend on where it is cut."""
+    steps = FIRST_STEPS
+    while trial.done < last and trial.diverged_at is None:
         before, start = trial.done, time.perf_counter()
-        trial.advance(min(horizon, before + steps))
+        trial.advance(min(last, before + steps))
         rate = (trial.done - before) / (time.perf_counter() - start)
         steps = max(1, int(rate * PIECE_SECONDS))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,8 @@ from dopt.reference.own import OwnLearner, observe, planned_inputs, planners_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, uniform_inputs
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
+
+Array = npt.NDArray[np.float64]
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
@@ -214,14 +216,20 @@ def run_trials(
     """
     wall, cpu = time.perf_counter(), time.process_time()
     batch = Lockstep(specs, device, module)
-    for t in range(batch.system.horizon):
-        batch.step(t)
+    checkpoints = {}
+    for t in range(batch.system.horizon + 1):
+        if t in specs[0].assessed_steps:
+            checkpoints[t] = batch.theta.cpu().numpy().copy()
+        if t < batch.system.horizon:
+            batch.step(t)
     n = len(specs)
     seconds = ((time.perf_counter() - wall) / n, (time.process_time() - cpu) / n)
-    return [_result(batch, i, *seconds) for i in range(n)]
+    return [_result(batch, i, checkpoints, *seconds) for i in range(n)]
 
 
-def _result(batch: Lockstep, i: int, wall: float, cpu: float) -> TrialResult:
+def _result(
+    batch: Lockstep, i: int, checkpoints: Mapping[int, Array], wall: float, cpu: float
+) -> TrialResult:
     """Cut trial i out of the batch; its rows end where it diverged."""
     states, inputs = batch.states[i].cpu().numpy(), batch.inputs[i].cpu().numpy()
     columns = {name: rows[i].copy() for name, rows in batch.columns.items()}
@@ -240,4 +248,5 @@ def _result(batch: Lockstep, i: int, wall: float, cpu: float) -> TrialResult:
         diverged_at=end,
         wall_seconds=wall,
         cpu_seconds=cpu,
+        checkpoints={t: theta[i] for t, theta in checkpoints.items() if end is None or t <= end},
     )

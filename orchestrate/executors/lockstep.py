@@ -71,12 +71,15 @@ class LockstepExecutor(Executor):
 
 def run_batch(tasks: Sequence[Task], device: str) -> list[Finished]:
     """Run tasks of one configuration in lockstep; an exception is every task's."""
+    from dopt.control.assessment import assessed
     from dopt.reference.lockstep import run_trials
 
     started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
     outcomes: Sequence[TrialResult | Trouble]
     try:
-        outcomes = run_trials([task.spec for task in tasks], device)
+        specs = [task.spec for task in tasks]
+        results = run_trials(specs, device)
+        outcomes = [assessed(spec, result) for spec, result in zip(specs, results, strict=True)]
     except Exception as error:
         outcomes = [trouble(error)] * len(tasks)
     share = Usage(

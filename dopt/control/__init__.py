@@ -1,0 +1,30 @@
+"""What exploration is for: control with the learned model, and other measures of it.
+
+A trial with a ``task`` section is assessed at some of its steps: the model that it has learned by
+then plans a control task on the true system, beside the true model under the same planner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dopt.control.task import Control
+from dopt.errors import SpecificationError
+from dopt.registry import build
+
+TASKS: dict[str, type[Control]] = {Control.name: Control}
+
+
+def task_from(section: object) -> Control | None:
+    """Return the task that a configuration section describes; None without one, or for "none"."""
+    if section is None:
+        return None
+    if not isinstance(section, Mapping):
+        raise SpecificationError(
+            f"configuration key 'task' is {section!r}, but a section with a name and fields is "
+            f"expected: choose task=control, or task=none."
+        )
+    return None if section.get("name") == "none" else build("task", TASKS, section)
+
+
+__all__ = ["TASKS", "Control", "task_from"]

@@ -1,0 +1,111 @@
+"""One control episode: the plant is the true system with its noise, the planner has a model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.control.planner import CrossEntropy, Objective
+from dopt.control.prediction import Accelerations, predict
+from dopt.control.task import Control, Goal
+from dopt.systems.base import System
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What a controller achieved.
+
+    Attributes
+    ----------
+    states : (steps + 1, d)
+    inputs : (steps, m)
+    cost : float
+        Sum over the steps; infinite or NaN where the plant left the system's limit.
+    success : bool
+        Whether the last states are at the goal.
+    """
+
+    states: Array
+    inputs: Array
+    cost: float
+    success: bool
+
+
+def run_episode(
+    system: System,
+    task: Control,
+    accelerations: Accelerations,
+    noise: Array,
+    rng: np.random.Generator,
+) -> Episode:
+    """Control the true system by model-predictive control with a model of its accelerations.
+
+    Every ``hold`` steps the planner looks ``hold * lookahead`` steps ahead from the state that it
+    observes; the first input of the plan is held, the others start the next plan.
+
+    Parameters
+    ----------
+    accelerations
+        The model, or the true accelerations for the oracle.
+    noise : (steps, d)
+        w_t of the plant.
+    rng
+        Draws of the planner.
+    """
+    goal = task.on(system)
+    planner = CrossEntropy(system.gamma, task.samples, task.iterations, task.elites)
+    plan = np.zeros((goal.lookahead, system.n_inputs))
+    states = np.empty((goal.steps + 1, system.n_states))
+    states[0] = goal.initial_state
+    inputs = np.empty((goal.steps, system.n_inputs))
+    for t in range(goal.steps):
+        if t % goal.hold == 0:
+            if t:
+                plan = np.concatenate([plan[1:], np.zeros_like(plan[:1])])
+            plan = planner.plan(_objective(system, goal, accelerations, states[t]), plan, rng)
+        inputs[t] = plan[0]
+        step = predict(system, system.learned, states[t : t + 1], plan[None, :1])
+        states[t + 1] = step[0, 0] + noise[t]
+    cost = float(np.sum(costs(system, goal, states[1:], inputs)))
+    if not np.all(np.abs(states) <= system.state_limit):
+        return Episode(states, inputs, math.inf, success=False)
+    return Episode(states, inputs, cost, succeeds(system, goal, states))
+
+
+def _objective(system: System, goal: Goal, accelerations: Accelerations, state: Array) -> Objective:
+    def objective(plans: Array) -> Array:
+        inputs = np.repeat(plans, goal.hold, axis=1)
+        states = predict(
+            system, accelerations, np.broadcast_to(state, (len(plans), len(state))), inputs
+        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            total: Array = costs(system, goal, states, inputs.swapaxes(0, 1)).sum(axis=0)
+        return total
+
+    return objective
+
+
+def costs(system: System, goal: Goal, states: Array, inputs: Array) -> Array:
+    """Return the cost, (...), of being in states (..., d) after inputs (..., m)."""
+    errors = states - np.array(goal.goal)
+    angles = list(system.angle_indices)
+    squares = errors**2
+    squares[..., angles] = 2.0 - 2.0 * np.cos(errors[..., angles])
+    total: Array = squares @ np.array(goal.state_weights)
+    total += goal.input_weight * np.sum(inputs**2, axis=-1)
+    return total
+
+
+def succeeds(system: System, goal: Goal, states: Array) -> bool:
+    """Tell whether the last ``settle_steps`` of states (n, d) are at the goal."""
+    errors = states[-goal.settle_steps :] - np.array(goal.goal)
+    angles = list(system.angle_indices)
+    errors[:, angles] = np.angle(np.exp(1j * errors[:, angles]))
+    tolerances = np.array(goal.tolerances)
+    asked = tolerances > 0.0
+    return bool(np.all(np.abs(errors[:, asked]) <= tolerances[asked]))

@@ -1,0 +1,70 @@
+"""How far a model is off when it predicts many steps on its own."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.control.prediction import Accelerations, predict
+from dopt.evaluation import evaluation_set
+from dopt.policies.base import on_sphere
+from dopt.systems.base import System
+
+Array = npt.NDArray[np.float64]
+
+STARTS = 256
+"""Held-out states from which the predictions start."""
+
+HOLD_STEPS = 10
+"""Steps for which a held-out input is held."""
+
+_SEED = 20_230_201
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """True trajectories that no trial learns from.
+
+    Attributes
+    ----------
+    starts : (N, d)
+        States of the reachable set (:func:`dopt.evaluation.reachable_states`).
+    inputs : (N, n, m)
+        Random inputs on the sphere ‖u‖ = γ, held for 10 steps.
+    states : (n, N, d)
+        True states after each step, without noise.
+    """
+
+    starts: Array
+    inputs: Array
+    states: Array
+
+
+@functools.lru_cache(maxsize=16)
+def held_out(system: System, steps: int) -> HeldOut:
+    """Return the trajectories of n steps; a function of the system's parameters alone."""
+    points = evaluation_set(system)
+    starts = points.states[points.n_grid :][:STARTS]
+    rng = np.random.default_rng(_SEED)
+    draws = rng.standard_normal((len(starts), -(-steps // HOLD_STEPS), system.n_inputs))
+    inputs = np.repeat(on_sphere(draws, system.gamma), HOLD_STEPS, axis=1)[:, :steps]
+    return HeldOut(starts, inputs, predict(system, system.learned, starts, inputs))
+
+
+def free_run_error(system: System, accelerations: Accelerations, steps: int) -> float:
+    """Return the relative root mean square error of predictions over 1 ... n steps.
+
+    The squared error of each state component is divided by the mean square of its true change
+    since the start, and the mean over the components is taken: 1 is the error of the prediction
+    that nothing changes, 0 that of the true model. No unit. Infinite or NaN where the model's
+    prediction overflows.
+    """
+    truth = held_out(system, steps)
+    predicted = predict(system, accelerations, truth.starts, truth.inputs)
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.mean((predicted - truth.states) ** 2, axis=(0, 1))
+    changes = np.mean((truth.states - truth.starts) ** 2, axis=(0, 1))
+    return float(np.sqrt(np.mean(errors / changes)))

@@ -1,0 +1,40 @@
+"""Many states one step or many steps on, under the true accelerations or modelled ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.models.base import Model
+from dopt.systems.base import System
+
+Array = npt.NDArray[np.float64]
+
+Accelerations = Callable[[Array], Array]
+"""Accelerations (N, r) of states (N, d)."""
+
+
+def modelled(system: System, model: Model, parameters: Array) -> Accelerations:
+    """Return the accelerations of a model with parameters (q,)."""
+    return lambda states: model.predict(system, parameters, states)
+
+
+def predict(system: System, accelerations: Accelerations, states: Array, inputs: Array) -> Array:
+    """Return the states, (H, N, d), after each step from states (N, d) under inputs (N, H, m).
+
+    The Euler map of equation 2 without noise; numbers that overflow become infinite or NaN.
+    """
+    by_step = np.ascontiguousarray(np.moveaxis(inputs, (1, 2), (0, 1)))
+    visited = np.empty((len(by_step) + 1, system.n_states, len(states)))
+    visited[0] = states.T
+    rows = list(system.learned_rows)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for x, u, following in zip(visited, by_step, visited[1:], strict=False):
+            for row, known in enumerate(system.known(tuple(x), tuple(u), system.parameters)):
+                following[row] = known
+            following[rows] += accelerations(x.T).T
+            following *= system.dt
+            following += x
+    return visited[1:].swapaxes(1, 2)
