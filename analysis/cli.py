@@ -21,6 +21,7 @@ from analysis.errors import AnalysisError, IncompleteError
 from analysis.figures.registry import NAMES, build, partial_warning
 from analysis.loss_curves import Axis
 from analysis.measures import Measure
+from analysis.report import command as report
 from analysis.request import Request, Spread
 from analysis.selection import Selection, select
 from analysis.serve import command as browser
@@ -86,6 +87,9 @@ def parser() -> Parser:
         command.add_argument(
             "--epsilon", type=float, help="loss to reach (median final loss of random inputs)"
         )
+    compared = _command(commands, "report", None, report.HELP)
+    report.add_arguments(compared)
+    compared.set_defaults(alone=lambda options: report.run(options, _filter(options)))
     animate = commands.add_parser("animate", help=film.HELP, description=film.HELP)
     animate.set_defaults(alone=film.run)
     _add_database(animate)

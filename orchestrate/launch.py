@@ -9,7 +9,8 @@ import io
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -87,6 +88,20 @@ def read_command_line() -> Request | None:
     return requests[0]() if requests else None
 
 
+@contextmanager
+def _errors_let_through() -> Iterator[None]:
+    """Make Hydra raise its errors instead of printing them; workers do not inherit that."""
+    before = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = before
+
+
 def _grid_request(config: DictConfig, combinations: list[Combination]) -> Request:
     launch = _plain(config, LAUNCH_SECTIONS)
     return Request(combinations, launch, _words(config.hydra.overrides.task), single=False)
@@ -123,10 +138,10 @@ def main() -> int:
         # The words of an exception may hold what a terminal does not know.
         sys.stdout.reconfigure(errors="backslashreplace")
     debug = os.environ.get("HYDRA_FULL_ERROR") == "1"
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then lets its errors through to us
     try:
         sys.argv[1:] = ordered(sys.argv[1:], CONFIGURATION)
-        request = read_command_line()
+        with _errors_let_through():
+            request = read_command_line()
         if request is None:
             return ExitCode.DONE
         grid = build_grid(request.combinations, alone=request.single)

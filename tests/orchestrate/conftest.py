@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -66,6 +67,7 @@ def command_line(
             code = int(launch.main())
         except SystemExit as end:
             code = int(end.code or 0)
+        assert "HYDRA_FULL_ERROR" not in os.environ, "what runs after a launch would inherit it"
         captured = capsys.readouterr()
         return code, captured.out, captured.err
 

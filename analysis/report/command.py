@@ -1,0 +1,86 @@
+"""``python -m analysis report``: compare everything that was run, on one page."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from analysis import provenance
+from analysis.choice import Filter
+from analysis.errors import IncompleteError
+from analysis.figures import publish
+from analysis.figures.style import styled
+from analysis.gaps import Gap
+from analysis.report import numbers, page, picture
+from analysis.report.variants import Field, fields
+from analysis.selection import Selection
+from analysis.sheets import gaps_sheet
+from orchestrate.store import Reader
+
+HELP = "compare every policy, model and learner with D-optimal inputs, on one page"
+NAME = "report"
+PAGE = "README.md"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that only this command has."""
+    parser.add_argument("--out", type=Path, default=Path("report"), help="folder (report/)")
+
+
+def run(options: argparse.Namespace, wanted: Filter) -> int:
+    """Write the page, the picture, the CSV and the provenance; 0."""
+    with Reader.open(options.db) as reader, reader.moment() as moment:
+        found = fields(moment, wanted)
+        gaps = [gap for field in found for gap in _gaps(field)]
+        if gaps and not options.allow_partial:
+            raise IncompleteError(_refusal(gaps))
+        table = numbers.adjust([numbers.tabulate_field(moment, field) for field in found])
+        selection = Selection(tuple(one.entry for field in found for one in field.variants))
+        facts = provenance.describe(moment, selection)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with styled():
+        mark = publish.fingerprint({"cells": facts["cells"], "selection": facts["selection"]})
+        title = "Ratios of final losses"
+        publish.write_pictures(picture.draw(table), options.out, NAME, title, mark)
+    publish.write_table(table, options.out, NAME)
+    notes = [f"{field.env}: {note}" for field in found for note in field.notes]
+    if gaps:
+        notes.insert(0, f"PARTIAL: {sum(len(gap.seeds) for gap in gaps)} trials are missing")
+    text = page.write(table, notes, _origin(facts), f"{NAME}.png")
+    publish.write_text(text, options.out / PAGE)
+    publish.write_provenance(facts, options.out, NAME)
+    sys.stdout.write(f"{options.out / PAGE}: {len(table)} variants\n")
+    return 0
+
+
+def _origin(facts: dict[str, object]) -> str:
+    versions = facts["versions"]
+    assert isinstance(versions, dict)
+    cells = facts["cells"]
+    assert isinstance(cells, list)
+    trials = sum(cell["n_finished"] for cell in cells)
+    return (
+        f"Made by dopt {versions['dopt']} from {trials:,} trials of {len(cells)} configurations in "
+        f"`{facts['database']}`. The numbers are in [{NAME}.csv]({NAME}.csv), where they come from "
+        f"in [{NAME}.json]({NAME}.json)."
+    )
+
+
+def _gaps(field: Field) -> Iterable[Gap]:
+    """Yield what a variant lacks of the seeds that any other of the environment has."""
+    seeds = {trial.seed for one in field.variants for trial in one.entry.trials}
+    for one in field.variants:
+        missing = seeds - {trial.seed for trial in one.entry.finished}
+        if missing:
+            yield Gap(field.env, one.label, tuple(sorted(missing)), f"{len(missing)} not finished")
+
+
+def _refusal(gaps: list[Gap]) -> str:
+    missing = sum(len(gap.seeds) for gap in gaps)
+    return (
+        f"{gaps_sheet(gaps).markdown()}\n\nerror: {missing} trials are missing, the same seeds of "
+        f"every variant are expected: run the launch again, narrow the request by --env, --policy "
+        f"and --where, or give --allow-partial to go on with what there is."
+    )

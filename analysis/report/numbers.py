@@ -1,0 +1,133 @@
+"""The numbers of a report: each variant against the reference, paired over the seeds they share."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from analysis.coverage import coverage
+from analysis.divergence import DivergenceRule
+from analysis.measures import final_losses, mean_losses
+from analysis.paired import benjamini_hochberg, compare
+from analysis.portraits import Plane, phase_plane
+from analysis.reading import read_curves
+from analysis.report.variants import Field, Variant
+from analysis.statistics import mean, standard_error
+from dopt.systems import system_from_mapping
+from orchestrate.store import Reader
+
+Array = npt.NDArray[np.float64]
+Scores = Mapping[int, float]
+
+MEASURES = ("loss", "reachable_loss", "auc", "coverage")
+"""What variants are compared by; of coverage more is better, of the others less."""
+
+LEVEL = 0.05
+"""Adjusted p below which a report says that a variant is better or worse."""
+
+
+def tabulate_field(reader: Reader, field: Field) -> pd.DataFrame:
+    """Return one row for each variant of an environment, the reference first."""
+    plane = phase_plane(system_from_mapping(field.reference.entry.cell.config["env"]))
+    scores = {one.label: _scores(reader, one, plane) for one in field.variants}
+    return pd.DataFrame(
+        [_row(reader, field, one, scores[one.label], scores) for one in field.variants]
+    )
+
+
+def adjust(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Join the tables and adjust each measure's p-values over the whole report."""
+    table = pd.concat(tables, ignore_index=True)
+    for measure in MEASURES:
+        table[f"{measure}_p_adjusted"] = benjamini_hochberg(table[f"{measure}_p"].tolist())
+    return table
+
+
+def verdict(row: Mapping[str, object], measure: str = "loss") -> str:
+    """Return "better" or "worse" than the reference, or "open" where the test does not tell."""
+    p, ratio = _float(row[f"{measure}_p_adjusted"]), _float(row[f"{measure}_ratio"])
+    if not p < LEVEL or math.isnan(ratio):
+        return "open"
+    return "better" if (ratio < 1) != (measure == "coverage") else "worse"
+
+
+def _float(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _scores(reader: Reader, variant: Variant, plane: Plane) -> dict[str, Scores]:
+    entry, rule = variant.entry, DivergenceRule.EXCLUDE
+    return {
+        "loss": final_losses(reader, entry, "loss", rule).by_seed,
+        "reachable_loss": final_losses(reader, entry, "reachable_loss", rule).by_seed,
+        "auc": mean_losses(reader, entry, "loss", rule).by_seed,
+        "coverage": _coverages(reader, variant, plane),
+    }
+
+
+def _coverages(reader: Reader, variant: Variant, plane: Plane) -> Scores:
+    key = variant.entry.cell.config_key
+
+    def share(seed: int) -> float:
+        points = plane.project(reader.trajectory(key, seed).states)
+        return coverage(plane.wrapped(points), plane.box)
+
+    return {seed: share(seed) for seed in variant.entry.final_losses()}
+
+
+def _row(
+    reader: Reader,
+    field: Field,
+    variant: Variant,
+    own: Mapping[str, Scores],
+    scores: Mapping[str, Mapping[str, Scores]],
+) -> dict[str, object]:
+    trials = variant.entry.finished
+    row: dict[str, object] = {
+        "env": field.env,
+        "variant": variant.label,
+        "policy": variant.entry.cell.policy,
+        "model": variant.entry.cell.model,
+        "learner": variant.entry.cell.learner,
+        "n": len(own["loss"]),
+        "n_diverged": sum(trial.status == "diverged" for trial in trials),
+        "plan_us": _typical(reader, variant, "plan_us"),
+        "learn_us": _typical(reader, variant, "learn_us"),
+    }
+    reference = scores[field.reference.label]
+    for measure in MEASURES:
+        values = np.array(list(own[measure].values()))
+        row[measure] = float(mean(values)) if len(values) else math.nan
+        row[f"{measure}_2se"] = 2 * float(standard_error(values)) if len(values) else math.nan
+        row |= _against(own[measure], reference[measure], field.env, variant.label, measure)
+    return row
+
+
+def _against(own: Scores, reference: Scores, *names: str) -> dict[str, float]:
+    """Return the ratio to the reference over the shared seeds; nothing for the reference itself."""
+    measure = names[-1]
+    columns = ("ratio", "low", "high", "improvement", "p")
+    if own is reference:
+        return {f"{measure}_{column}": math.nan for column in columns}
+    seeds = sorted(set(own) & set(reference))
+    ours, theirs = (np.array([one[seed] for seed in seeds]) for one in (own, reference))
+    found = compare(ours, theirs, _stream(*names))
+    values = (found.ratio, found.low, found.high, found.improvement, found.p_value)
+    return {f"{measure}_{column}": value for column, value in zip(columns, values, strict=True)}
+
+
+def _typical(reader: Reader, variant: Variant, column: str) -> float:
+    """Return the median over all steps of all trials."""
+    values = read_curves(reader, variant.entry, column).values
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else math.nan
+
+
+def _stream(*names: str) -> np.random.Generator:
+    """Return a generator of the row's own, so that its interval does not depend on the others."""
+    digest = hashlib.sha256("/".join(("report", *names)).encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "little"))

@@ -1,0 +1,54 @@
+"""The picture of a report: ratios of the final loss to the reference's, one panel a system."""
+
+from __future__ import annotations
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from analysis.figures.style import BLUE, GREY, TEXT_WIDTH, VERMILLION, environment_title
+from analysis.report.numbers import LEVEL, verdict
+
+_LOOK = {"better": (BLUE, "o"), "worse": (VERMILLION, "s"), "open": (GREY, "D")}
+_INCHES_PER_ROW = 0.16
+_INCHES_PER_PANEL = 0.62
+
+CAPTION = (
+    "Final loss of every variant by that of D-optimal inputs (geometric mean over shared seeds) "
+    "with its 95 % interval, the best at the top. Circles: better, squares: worse, diamonds: not "
+    f"told apart at an adjusted p of {LEVEL}."
+)
+
+
+def draw(table: pd.DataFrame) -> Figure:
+    """Return the figure of a table of :func:`analysis.report.numbers.adjust`."""
+    panels = dict(iter(table.groupby("env", sort=False)))
+    shown = {env: _ranked(part) for env, part in panels.items()}
+    heights = [_INCHES_PER_PANEL + _INCHES_PER_ROW * len(part) for part in shown.values()]
+    figure = Figure(figsize=(TEXT_WIDTH, sum(heights)), layout="constrained")
+    axes = figure.subplots(len(shown), 1, height_ratios=heights, squeeze=False)[:, 0]
+    for panel, (env, part) in zip(axes, shown.items(), strict=True):
+        _panel(panel, part)
+        panel.set_title(environment_title(str(env)))
+    axes[-1].set_xlabel("final loss / final loss of D-optimal inputs")
+    return figure
+
+
+def _ranked(part: pd.DataFrame) -> pd.DataFrame:
+    known = part[part["loss_ratio"].notna()]
+    return known.sort_values("loss_ratio", ascending=False, kind="stable")
+
+
+def _panel(axes: Axes, part: pd.DataFrame) -> None:
+    for place, row in enumerate(part.to_dict("records")):
+        colour, marker = _LOOK[verdict({str(key): value for key, value in row.items()})]
+        ratio = float(row["loss_ratio"])
+        ends = [[ratio - float(row["loss_low"])], [float(row["loss_high"]) - ratio]]
+        axes.errorbar(
+            ratio, place, xerr=ends, fmt=marker, color=colour, markersize=3.5, elinewidth=1.0
+        )
+    axes.axvline(1.0, color="black", linewidth=0.8)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(part)), list(part["variant"]), fontsize=6.5)
+    axes.set_ylim(-0.7, len(part) - 0.3)
+    axes.grid(axis="y", visible=False)

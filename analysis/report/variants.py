@@ -1,0 +1,147 @@
+"""Everything that was run in one environment, each configuration under a label of its own.
+
+Figures and tables compare policies under one setting of model and learner. A report compares the
+settings too: a variant is a policy together with what sets it apart from the others of its name.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from analysis.choice import REFERENCE, Filter, departures, flatten
+from analysis.errors import AnalysisError
+from analysis.selection import Entry, environment_rank, newest, policy_rank
+from orchestrate.store import Reader
+
+_SETTING = ("model", "learner")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One configuration of an environment, and how it is called."""
+
+    label: str
+    entry: Entry
+
+
+@dataclass(frozen=True)
+class Field:
+    """The variants of one environment, the reference first, and what was left out."""
+
+    env: str
+    variants: tuple[Variant, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def reference(self) -> Variant:
+        return self.variants[0]
+
+    @property
+    def others(self) -> tuple[Variant, ...]:
+        return self.variants[1:]
+
+
+def fields(reader: Reader, wanted: Filter) -> list[Field]:
+    """Return the variants of every environment that has the reference policy and another.
+
+    Raises
+    ------
+    AnalysisError
+        If no environment has both.
+    """
+    cells = [cell for cell in newest(list(reader.cells())) if wanted.accepts(cell)]
+    entries = [Entry(cell, tuple(reader.trials(cell.config_key))) for cell in cells]
+    names = sorted({cell.env for cell in cells}, key=environment_rank)
+    found = [_field(env, [entry for entry in entries if entry.cell.env == env]) for env in names]
+    whole = [field for field in found if field is not None]
+    if not whole:
+        raise AnalysisError(
+            f"A report needs trials of {REFERENCE} and of another variant in one environment, but "
+            f"{reader.safe_url} has none: run 'python orchestrate/launch.py -m experiment=beyond'."
+        )
+    return whole
+
+
+def _field(env: str, entries: Sequence[Entry]) -> Field | None:
+    kept = _one_world(entries)
+    references = [entry for entry in kept if entry.cell.policy == REFERENCE]
+    if not references or len(kept) < 2:
+        return None
+    reference = min(references, key=lambda entry: departures(entry.cell))
+    labels = _labels(kept, reference)
+    variants = [Variant(labels[entry.cell.config_key], entry) for entry in kept]
+    first = replace(next(one for one in variants if one.entry is reference))
+    rest = [one for one in variants if one.entry is not reference]
+    rest.sort(key=lambda one: (policy_rank(one.entry.cell.policy), one.label))
+    left = len(entries) - len(kept)
+    notes = (f"{left} configurations of another env section, task or fewer trials",) if left else ()
+    return Field(env, (first, *rest), notes)
+
+
+def _one_world(entries: Sequence[Entry]) -> list[Entry]:
+    """Return the entries of the env section with most trials, one for each policy and setting."""
+    totals: Counter[str] = Counter()
+    for entry in entries:
+        totals[_section(entry, "env")] += len(entry.trials)
+    world = max(totals, key=lambda section: (totals[section], section))
+    best: dict[tuple[str, ...], Entry] = {}
+    for entry in entries:
+        if _section(entry, "env") != world:
+            continue
+        key = tuple(_section(entry, name) for name in ("policy", *_SETTING, "path"))
+        if key not in best or _weight(entry) > _weight(best[key]):
+            best[key] = entry
+    return list(best.values())
+
+
+def _section(entry: Entry, name: str) -> str:
+    return json.dumps(entry.cell.config.get(name), sort_keys=True)
+
+
+def _weight(entry: Entry) -> tuple[bool, int]:
+    """Prefer a configuration whose trials also did a task, then the one with more trials."""
+    return bool(entry.cell.config.get("task")), len(entry.trials)
+
+
+def _labels(entries: Sequence[Entry], reference: Entry) -> dict[str, str]:
+    labels: dict[str, str] = {}
+    for policy in {entry.cell.policy for entry in entries}:
+        own = [entry for entry in entries if entry.cell.policy == policy]
+        labels |= {one.cell.config_key: _label(one, own, reference) for one in own}
+    return labels
+
+
+def _label(entry: Entry, own: Iterable[Entry], reference: Entry) -> str:
+    """Return the policy and, where it was run in several ways, how this one differs."""
+    flat = [flatten(one.cell.config) for one in own]
+    differing = {
+        path for path in set().union(*flat) if len({repr(config.get(path)) for config in flat}) > 1
+    }
+    mine, usual = flatten(entry.cell.config), flatten(reference.cell.config)
+    parts = [
+        _part(section, mine, usual, differing)
+        for section in (*_SETTING, "policy", "path")
+        if any(path == section or path.startswith(f"{section}.") for path in differing)
+    ]
+    name = entry.cell.policy.replace("_", " ")
+    return ", ".join([name, *(part for part in parts if part)])
+
+
+def _part(
+    section: str, mine: Mapping[str, object], usual: Mapping[str, object], differing: set[str]
+) -> str:
+    """Return how a section differs from the usual one: by its name or by its values."""
+    if section == "path":
+        return f"path {mine['path']}" if mine["path"] != usual["path"] else ""
+    name = f"{section}.name"
+    if section in _SETTING and mine.get(name) != usual.get(name):
+        return str(mine.get(name)).replace("_", " ")
+    paths = sorted(path for path in differing if path.startswith(f"{section}."))
+    return " ".join(
+        f"{path.partition('.')[2]}={mine[path]}"
+        for path in paths
+        if path in mine and mine[path] != usual.get(path)
+    )
