@@ -39,10 +39,14 @@ def memory_by_setting(
         # states and their mesh, targets, and features in both precisions
         "env.grid_points": N * (2 * d + 2 * r + 2 * p),
         # parameters, two moments, gradient, and the copies for the evaluation
-        "model.width": 6 * q,
+        "model.width" if isinstance(model, MLP) else "model": 6 * q,
         "learner.window": window * (p + r + (L + 3) * max(w, r)),
     }
-    for setting, count in _information(policy, q, r * T, T * (p + L * w * (1 + r))).items():
+    if model.compiled:
+        information = _information(policy, q, r * T, T * (p + L * w * (1 + r)))
+    else:
+        information = _information_of_module(policy, q, r * T)
+    for setting, count in information.items():
         numbers[setting] = numbers.get(setting, 0) + count
     return {setting: NUMBER * count for setting, count in numbers.items()}
 
@@ -61,3 +65,12 @@ def _information(policy: Policy, q: int, n_rows: int, n_factors: int) -> dict[st
         return {"env.horizon": n_rows**2 + n_factors}
     size = policy.sketch_size if isinstance(policy, DOptimal) else 0
     return {"policy.sketch_size": 2 * size**2, "model.width": 2 * q}
+
+
+def _information_of_module(policy: Policy, q: int, n_rows: int) -> dict[str, int]:
+    """Return the numbers of M, its factor and its update, which the reference holds as they are."""
+    if not isinstance(policy, Informed):
+        return {}
+    if isinstance(policy, DOptimal) and policy.chosen_form(q, n_rows) == "sketch":
+        return {"policy.sketch_size": 3 * policy.sketch_size**2}
+    return {"model": 3 * q**2}

@@ -13,7 +13,7 @@ import importlib
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Checked
@@ -42,8 +42,17 @@ def build(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obj
     return cls(**{key: value for key, value in given.items() if key not in _ABOUT})
 
 
+@runtime_checkable
+class Wrapper(Protocol):
+    """A specification of something that is no dataclass of ours, which writes its own section."""
+
+    def to_section(self) -> dict[str, object]: ...
+
+
 def section_of(item: Checked) -> dict[str, object]:
     """Return the configuration section that :func:`build` turns into ``item``."""
+    if isinstance(item, Wrapper):
+        return item.to_section()
     fields = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
     listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
     return {"name": getattr(item, "name", None), **_origin(type(item)), **listed}
@@ -68,7 +77,7 @@ def _shipped(section: str, registry: Mapping[str, type[T]], given: Mapping[str, 
 def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, object]) -> type[T]:
     """Import a class of the user's own and see that it fits."""
     path = str(given[TARGET])
-    cls: Any = _imported(section, path)
+    cls: Any = imported(section, path)
     wanted = _base(next(iter(registry.values())))
     if not (isinstance(cls, type) and issubclass(cls, wanted) and dataclasses.is_dataclass(cls)):
         raise _unfit(section, path, f"a dataclass derived from dopt's {wanted.__name__}")
@@ -84,11 +93,12 @@ def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obje
             f"{section}.name is '{given['name']}', but {path} is called '{name}': "
             f"leave {section}.name out, or correct it."
         )
-    _check_source(section, path, own, given)
+    check_source(section, path, own, given)
     return own
 
 
-def _check_source(section: str, path: str, cls: type[Checked], given: Mapping[str, object]) -> None:
+def check_source(section: str, path: str, cls: type, given: Mapping[str, object]) -> None:
+    """Refuse a section that was stored when the file of its class was another one."""
     if given.get(SOURCE, source_digest(cls)) != source_digest(cls):
         raise SpecificationError(
             f"{section} asks for {path} as it was in another state of its file: "
@@ -101,7 +111,8 @@ def _base(cls: type[Checked]) -> type[Checked]:
     return next(base for base in cls.__mro__ if "section" in base.__dict__)
 
 
-def _imported(section: str, path: str) -> object:
+def imported(section: str, path: str) -> object:
+    """Return what a dotted path names, or raise SpecificationError."""
     module, _, name = path.rpartition(".")
     try:
         return getattr(importlib.import_module(module), name)

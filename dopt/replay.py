@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -34,19 +35,29 @@ class Replay:
     states: Array
 
 
+class Run(Protocol):
+    """A trial that can be advanced in pieces and looked at in between."""
+
+    @property
+    def diverged_at(self) -> int | None: ...
+    @property
+    def parameters(self) -> Array: ...
+    @property
+    def states(self) -> Array: ...
+    def advance(self, last: int) -> None: ...
+
+
 def replay(spec: TrialSpec, steps: Sequence[int]) -> Replay:
-    """Run a trial in the kernel and note the parameters after ascending numbers of steps.
+    """Run a trial on its path and note the parameters after ascending numbers of steps.
 
     Raises
     ------
     SpecificationError
         If the numbers do not ascend or lie beyond the horizon.
     """
-    from dopt.kernel.run import KernelTrial
-
     if any(a >= b for a, b in itertools.pairwise(steps)):
         raise SpecificationError(f"the steps {list(steps)} do not ascend: sort them.")
-    trial = KernelTrial(spec)
+    trial = _run(spec)
     seen: list[int] = []
     parameters: list[Array] = []
     for step in steps:
@@ -54,10 +65,20 @@ def replay(spec: TrialSpec, steps: Sequence[int]) -> Replay:
         if trial.diverged_at is not None:
             break
         seen.append(step)
-        parameters.append(trial.state.theta.copy())
+        parameters.append(trial.parameters.copy())
     q = spec.model.n_parameters(spec.system)
     return Replay(
         np.array(seen, dtype=np.int64),
         np.array(parameters).reshape(-1, q),
-        trial.record.states.copy(),
+        trial.states.copy(),
     )
+
+
+def _run(spec: TrialSpec) -> Run:
+    if spec.cell.path == "reference":
+        from dopt.reference.pieces import ReferenceTrial
+
+        return ReferenceTrial(spec)
+    from dopt.kernel.run import KernelTrial
+
+    return KernelTrial(spec)

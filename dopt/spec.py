@@ -20,7 +20,7 @@ from dopt.models import MODELS, Linear, Model
 from dopt.models.mlp import MLP
 from dopt.policies import POLICIES, Informed, Oracle, Policy
 from dopt.policies.base import OpenLoop, Planned
-from dopt.registry import build, section_of
+from dopt.registry import TARGET, build, section_of
 from dopt.systems import SYSTEMS, System
 
 CODE_VERSION = 1
@@ -87,16 +87,15 @@ class Cell:
         """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""
         for part, registry, bases in (
             (self.policy, POLICIES, (OpenLoop, Planned)),
-            (self.model, MODELS, ()),
             (self.learner, LEARNERS, (Updated,)),
         ):
             shipped: Collection[type] = registry.values()
             if type(part) not in shipped and not isinstance(part, bases):
                 derived = " or ".join(base.__name__ for base in bases)
-                own = f"derive it from {derived}, or take one of" if derived else "take one of"
                 raise SpecificationError(
                     f"{part.section} is a {type(part).__name__} of your own, which brings nothing "
-                    f"to run: {own} {', '.join(sorted(registry))}."
+                    f"to run: derive it from {derived}, or take one of "
+                    f"{', '.join(sorted(registry))}."
                 )
         foreign = [part for part in self._parts if not part.compiled]
         if self.path == "kernel" and foreign:
@@ -197,7 +196,7 @@ class TrialSpec(Checked):
         sections = {key: _section(given, key) for key in _SECTIONS}
         system = build("env", SYSTEMS, sections["env"])
         policy = build("policy", POLICIES, sections["policy"])
-        model = build("model", MODELS, sections["model"])
+        model = _model(sections["model"])
         learner = build("learner", LEARNERS, sections["learner"])
         compiled = all(part.compiled for part in (system, policy, model, learner))
         path = str(given.get("path", "kernel" if compiled else "reference"))
@@ -272,6 +271,15 @@ class TrialSpec(Checked):
             "dt": self.system.dt,
             "gamma": self.system.gamma,
         }
+
+
+def _model(section: Mapping[str, object]) -> Model:
+    """Return a registered model, or a network of the user's own, for which torch is loaded."""
+    if TARGET not in section:
+        return build("model", MODELS, section)
+    from dopt.reference.module import Module
+
+    return Module.from_section(section)
 
 
 def _shown(value: object) -> str:

@@ -49,6 +49,16 @@ class KernelTrial:
         self.done = 0
         self.diverged_at: int | None = None
 
+    @property
+    def parameters(self) -> args.Floats:
+        """Parameters of the model, (q,)."""
+        return self.state.theta
+
+    @property
+    def states(self) -> args.Floats:
+        """States x_0 ... x_T, (T + 1, d)."""
+        return self.record.states
+
     def advance(self, last: int) -> None:
         """Run the steps up to ``last``, unless the trial has diverged.
 

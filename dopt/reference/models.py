@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -18,13 +18,22 @@ Accelerations = Callable[[Tensor, Tensor], Tensor]
 """a_θ(x): parameters (q,) and state (d,) to accelerations (r,)."""
 
 
+@runtime_checkable
+class Networked(Protocol):
+    """A model that is a torch network (:class:`dopt.reference.module.Module`)."""
+
+    def module(self, system: System) -> nn.Module: ...
+
+
 def model_function(system: System, model: Model) -> Accelerations:
     """Return a_θ of a registered model."""
     if isinstance(model, MLP):
         return network_function(system, tanh_network(model.layer_sizes(system)))
     if isinstance(model, Linear):
         return linear_function(system)
-    raise TypeError(f"model {model!r} is neither MLP nor Linear: give its module instead.")
+    if isinstance(model, Networked):
+        return network_function(system, model.module(system))
+    raise TypeError(f"model {model!r} is no MLP, Linear or Module: give its module instead.")
 
 
 def tanh_network(sizes: tuple[int, ...]) -> nn.Module:
@@ -42,6 +51,7 @@ def network_function(system: System, module: nn.Module) -> Accelerations:
     """
     shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
     lengths = [shape.numel() for shape in shapes.values()]
+    buffers = dict(module.named_buffers())
 
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
         parts = theta.split(lengths)
@@ -49,6 +59,7 @@ def network_function(system: System, module: nn.Module) -> Accelerations:
             name: part.view(shape)
             for (name, shape), part in zip(shapes.items(), parts, strict=True)
         }
+        weights |= {name: buffer.to(x.device) for name, buffer in buffers.items()}
         phi = feature_values(system.features, system.feature_scales, x.unbind(-1))
         out: Tensor = functional_call(module, weights, (torch.stack(phi, dim=-1),))
         return out
