@@ -10,14 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.coverage import coverage
 from analysis.divergence import DivergenceRule
 from analysis.measures import final_losses, mean_losses
 from analysis.paired import benjamini_hochberg, compare
-from analysis.portraits import Plane, phase_plane
 from analysis.reading import read_curves
 from analysis.report.variants import Field, Variant
 from analysis.statistics import mean, standard_error
+from dopt.coverage import Plane
 from dopt.systems import system_from_mapping
 from orchestrate.store import Reader
 
@@ -33,7 +32,7 @@ LEVEL = 0.05
 
 def tabulate_field(reader: Reader, field: Field) -> pd.DataFrame:
     """Return one row for each variant of an environment, the reference first."""
-    plane = phase_plane(system_from_mapping(field.reference.entry.cell.config["env"]))
+    plane = Plane.of(system_from_mapping(field.reference.entry.cell.config["env"]))
     scores = {one.label: _scores(reader, one, plane) for one in field.variants}
     return pd.DataFrame(
         [_row(reader, field, one, scores[one.label], scores) for one in field.variants]
@@ -72,12 +71,8 @@ def _scores(reader: Reader, variant: Variant, plane: Plane) -> dict[str, Scores]
 
 def _coverages(reader: Reader, variant: Variant, plane: Plane) -> Scores:
     key = variant.entry.cell.config_key
-
-    def share(seed: int) -> float:
-        points = plane.project(reader.trajectory(key, seed).states)
-        return coverage(plane.wrapped(points), plane.box)
-
-    return {seed: share(seed) for seed in variant.entry.final_losses()}
+    seeds = variant.entry.final_losses()
+    return {seed: plane.coverage(reader.trajectory(key, seed).states) for seed in seeds}
 
 
 def _row(

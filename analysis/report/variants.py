@@ -70,7 +70,7 @@ def _field(env: str, entries: Sequence[Entry]) -> Field | None:
     references = [entry for entry in kept if entry.cell.policy == REFERENCE]
     if not references or len(kept) < 2:
         return None
-    reference = min(references, key=lambda entry: departures(entry.cell))
+    reference = min(references, key=lambda entry: (-_company(entry, kept), departures(entry.cell)))
     labels = _labels(kept, reference)
     variants = [Variant(labels[entry.cell.config_key], entry) for entry in kept]
     first = replace(next(one for one in variants if one.entry is reference))
@@ -79,6 +79,12 @@ def _field(env: str, entries: Sequence[Entry]) -> Field | None:
     left = len(entries) - len(kept)
     notes = (f"{left} configurations of another env section, task or fewer trials",) if left else ()
     return Field(env, (first, *rest), notes)
+
+
+def _company(entry: Entry, entries: Sequence[Entry]) -> int:
+    """Return how many entries share the model and the learner of this one."""
+    own = [_section(entry, name) for name in _SETTING]
+    return sum([_section(one, name) for name in _SETTING] == own for one in entries)
 
 
 def _one_world(entries: Sequence[Entry]) -> list[Entry]:

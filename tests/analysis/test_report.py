@@ -1,0 +1,153 @@
+"""The report compares every variant that is stored, and says so where the news is bad."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from analysis.__main__ import main
+from analysis.choice import Filter
+from analysis.errors import AnalysisError
+from analysis.report import numbers, page
+from analysis.report.variants import Field, fields
+from orchestrate.store import Reader
+from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec
+
+SHORT = {"env": {"horizon": 40}}
+SEEDS = range(12)
+ONE_SAMPLE = {"learner": {"name": "adam", "window": 1}}
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return two systems, four policies, and the reference with another learner and form too."""
+    address = f"sqlite:///{tmp_path_factory.mktemp('report')}/results.db"
+    policies = ("d_optimal", "oracle", "uniform", "random")
+    specs = make_grid(("pendulum", "quadrotor"), policies, SEEDS, **SHORT)
+    specs += make_grid(("pendulum",), ("d_optimal", "random"), SEEDS, **SHORT, **ONE_SAMPLE)
+    dual = {"policy": {"form": "dual"}}
+    specs += make_grid(("pendulum",), ("d_optimal",), SEEDS, **SHORT, **dual)
+    lost = next(s for s in specs if (s.system.name, s.policy.name) == ("quadrotor", "random"))
+    fill(address, specs, diverged={lost.trial_key: 20})
+    return address
+
+
+@pytest.fixture
+def reader(url: str) -> Iterator[Reader]:
+    with Reader.open(url) as opened:
+        yield opened
+
+
+@pytest.fixture
+def pendulum(reader: Reader) -> Field:
+    return fields(reader, Filter(("pendulum",)))[0]
+
+
+def test_every_variant_has_a_label_of_its_own(pendulum: Field) -> None:
+    assert pendulum.reference.label == "d optimal"
+    assert [one.label for one in pendulum.others] == [
+        "d optimal, adam",
+        "d optimal, form=dual",
+        "oracle",
+        "uniform",
+        "random",
+        "random, adam",
+    ]
+
+
+def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Field) -> None:
+    table = numbers.adjust([numbers.tabulate_field(reader, pendulum)]).set_index("variant")
+    finals = {
+        name: np.log([fake_result(make_spec("pendulum", name, s, **SHORT)).loss[-1] for s in SEEDS])
+        for name in ("d_optimal", "uniform")
+    }
+    difference = finals["uniform"] - finals["d_optimal"]
+    row = table.loc["uniform"]
+    assert row["loss_ratio"] == pytest.approx(np.exp(difference.mean()))
+    assert row["loss_p"] == pytest.approx(stats.wilcoxon(difference).pvalue)
+    assert row["loss_low"] < row["loss_ratio"] < row["loss_high"]
+    assert row["reachable_loss_ratio"] == pytest.approx(row["loss_ratio"])
+    assert row["n"] == 12
+    assert 0 < row["coverage"] < 1
+    assert math.isnan(table.loc["d optimal", "loss_ratio"])
+
+
+def test_p_values_are_adjusted_over_the_whole_report(reader: Reader) -> None:
+    table = numbers.adjust(
+        [numbers.tabulate_field(reader, field) for field in fields(reader, Filter())]
+    )
+    tested = table["loss_p"].dropna()
+    assert len(tested) == 9  # but for the two references
+    expected = stats.false_discovery_control(tested)
+    assert table["loss_p_adjusted"].dropna().to_list() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "p", "measure", "said"),
+    [
+        (0.5, 0.01, "loss", "better"),
+        (2.0, 0.01, "loss", "worse"),
+        (0.5, 0.2, "loss", "open"),
+        (0.5, math.nan, "loss", "open"),
+        (2.0, 0.01, "coverage", "better"),
+        (0.5, 0.01, "coverage", "worse"),
+    ],
+)
+def test_a_verdict_needs_the_adjusted_test(ratio: float, p: float, measure: str, said: str) -> None:
+    row = {f"{measure}_ratio": ratio, f"{measure}_p_adjusted": p}
+    assert numbers.verdict(row, measure) == said
+
+
+def test_a_page_calls_what_is_worse_worse() -> None:
+    unknown = dict.fromkeys(
+        [f"{m}_{c}" for m in numbers.MEASURES for c in ("ratio", "low", "high", "p", "p_adjusted")],
+        math.nan,
+    )
+    usual = {"env": "arm", "loss": 1.0, "loss_2se": 0.1, "coverage": 0.3, "coverage_2se": 0.1}
+    usual |= {"plan_us": 2.0, "learn_us": 30.0, "n": 20, "n_diverged": 0}
+    bad = {"loss_ratio": 1.5, "loss_low": 1.2, "loss_high": 1.9, "loss_p_adjusted": 1e-3}
+    rows = [{"variant": "d optimal"}, {"variant": "look-ahead", **bad}, {"variant": "max"}]
+    table = pd.DataFrame([{**usual, **unknown, **row} for row in rows])
+    text = page.write(table, ["arm: one"], "origin", "report.png")
+    assert "better: none; worse: look-ahead (1.50); not told apart: max" in text
+    assert "1.50 [1.20, 1.90]" in text
+    assert "- arm: one" in text
+
+
+def test_the_command_writes_a_page_with_picture_and_provenance(url: str, tmp_path: Path) -> None:
+    folder = tmp_path / "report"
+    assert main(["report", "--db", url, "--out", str(folder)]) == 0
+    names = {path.name for path in folder.iterdir()}
+    assert {"README.md", "report.csv", "report.json", "report.png", "report.svg"} <= names
+    text = (folder / "README.md").read_text()
+    assert "| random, adam " in text
+    assert "11, 1 diverged" in text
+    again = (folder / "report.png").read_bytes()
+    assert main(["report", "--db", url, "--out", str(folder)]) == 0
+    assert (folder / "report.png").read_bytes() == again
+    assert (folder / "README.md").read_text() == text
+
+
+def test_missing_trials_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    url = f"sqlite:///{tmp_path}/partial.db"
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(3), **SHORT)
+    fill(url, specs, skipped=specs[-1:])
+    words = ["report", "--db", url, "--out", str(tmp_path / "out")]
+    assert main(words) == 3
+    assert "1 trials are missing" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main([*words, "--allow-partial"]) == 0
+    assert "PARTIAL: 1 trials are missing" in (tmp_path / "out/README.md").read_text()
+
+
+def test_a_report_of_one_variant_is_refused(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/one.db"
+    fill(url, make_grid(("pendulum",), ("d_optimal",), range(2), **SHORT))
+    with Reader.open(url) as reader, pytest.raises(AnalysisError, match="of another variant"):
+        fields(reader, Filter())
