@@ -29,7 +29,9 @@ def check_alone(words: Sequence[str], hydra: DictConfig, folder: Path) -> None:
     """
     named = {word.lstrip("+").partition("=")[0] for word in words}
     usual = OmegaConf.select(OmegaConf.load(folder / "config.yaml"), "hydra.sweeper.params")
-    sweeps = OmegaConf.select(hydra, "sweeper.params") or {}
+    sweeps = dict(OmegaConf.select(hydra, "sweeper.params") or {})
+    for grid in OmegaConf.select(hydra, "sweeper.grids") or []:
+        sweeps |= grid
     left = [
         f"{key}={value}"
         for key, value in sweeps.items()

@@ -4,7 +4,7 @@ Annotations are not postponed here: Hydra's scan executes a plugin before it is 
 where a dataclass would look up postponed ones.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,16 +13,22 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from orchestrate.grid import Combination
 from orchestrate.hydra_plugins.dopt_grid._expansion import expand
 from orchestrate.hydra_plugins.dopt_grid._unread import check_keys
 
 
 @dataclass
 class GridSweeperConf:
-    """``params`` are sweeps that hold unless the command line names the same key."""
+    """``params`` are sweeps that hold unless the command line names the same key.
+
+    ``grids`` asks for several grids at once: each entry is laid over ``params``, and trials that
+    are in more than one of them run once.
+    """
 
     _target_: str = "hydra_plugins.dopt_grid.sweeper.GridSweeper"
     params: dict[str, str] = field(default_factory=dict)
+    grids: list[dict[str, str]] = field(default_factory=list)
 
 
 ConfigStore.instance().store(
@@ -36,8 +42,8 @@ class GridSweeper(Sweeper):
     The task function gets a pair: the configuration without the sweeps, and the combinations.
     """
 
-    def __init__(self, params: Mapping[str, str]) -> None:
-        self.params = params
+    def __init__(self, params: Mapping[str, str], grids: Sequence[Mapping[str, str]] = ()) -> None:
+        self.grids = [{**params, **grid} for grid in grids] or [dict(params)]
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
@@ -47,7 +53,16 @@ class GridSweeper(Sweeper):
         self.settings = config
 
     def sweep(self, arguments: list[str]) -> Any:
-        defaults = [f"{key}={value}" for key, value in self.params.items()]
-        arguments = defaults + arguments
-        combinations = expand(self.loader, self.settings, arguments, check=check_keys)
+        combinations = [
+            combination
+            for grid in self.grids
+            for combination in self._expand([*_words(grid), *arguments])
+        ]
         return self.task_function((self.settings, combinations))
+
+    def _expand(self, arguments: list[str]) -> list[Combination]:
+        return expand(self.loader, self.settings, arguments, check=check_keys)
+
+
+def _words(grid: Mapping[str, str]) -> list[str]:
+    return [f"{key}={value}" for key, value in grid.items()]
