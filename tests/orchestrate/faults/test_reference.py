@@ -1,0 +1,96 @@
+"""Trials that the kernel does not know, killed with their launch and taken up again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dopt.spec import TrialSpec
+from orchestrate.store import NoDatabaseError, Reader, StoreError
+from tests.orchestrate.conftest import ROOT
+from tests.orchestrate.faults.outcome import Rows, flaws, results
+
+EXAMPLE = ROOT / "docs" / "example"
+TRIALS = 6
+PATIENCE_SECONDS = 200.0
+
+
+def command(url: str) -> list[str]:
+    """Return the command of a grid of a policy and a network that only the reference runs."""
+    words = ["--config-dir", str(EXAMPLE / "conf"), "-m", "env=boat", "env.horizon=60"]
+    words += ["policy=curiosity", "model=residual", f"seed=range({TRIALS})"]
+    words += ["executor=local", "launch.workers=1", "launch.chunk_seconds=0.1"]
+    return [sys.executable, str(ROOT / "orchestrate" / "launch.py"), *words, f"store.url={url}"]
+
+
+def started(url: str) -> subprocess.Popen[str]:
+    path = os.pathsep.join([str(ROOT), str(EXAMPLE)])
+    return subprocess.Popen(
+        command(url),
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def done(url: str) -> int:
+    try:
+        with Reader.open(url) as reader:
+            return int(reader.query("SELECT count(*) FROM trial WHERE status = 'done'")[0][0])
+    except (NoDatabaseError, StoreError):
+        return 0
+
+
+def numbers(url: str) -> Rows:
+    """Return what the trials left, without what they took."""
+    found = results(url)
+    return found | {"curve": [row[:4] for row in found["curve"]]}
+
+
+def test_a_killed_launch_of_reference_trials_goes_on(tmp_path: Path) -> None:
+    url, undisturbed = (f"sqlite:///{tmp_path / name}.db" for name in ("killed", "whole"))
+    process, end = started(url), time.monotonic() + PATIENCE_SECONDS
+    while done(url) < 2:
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    before = done(url)
+    assert 2 <= before < TRIALS
+    assert flaws(url) == []
+    for one in (url, undisturbed):
+        again = started(one)
+        said, _ = again.communicate(timeout=PATIENCE_SECONDS)
+        assert again.returncode == 0, said
+        if one == url:
+            assert f"{before} of {TRIALS} already done" in said
+    assert flaws(url) == []
+    assert done(url) == TRIALS
+    assert numbers(url) == numbers(undisturbed)
+
+
+def test_what_was_stored_is_read_back_as_the_trial_that_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also the network's arguments, the digest of its file and the path."""
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    process = started(url)
+    said, _ = process.communicate(timeout=PATIENCE_SECONDS)
+    assert process.returncode == 0, said
+    with Reader.open(url) as reader:
+        cells = reader.cells()
+    assert {cell.config["path"] for cell in cells} == {"reference"}
+    assert {cell.config["model"]["width"] for cell in cells} == {16}
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    for cell in cells:
+        config = {key: part for key, part in cell.config.items() if key != "code_version"}
+        assert TrialSpec.from_mapping({**config, "seed": 0}).config_key == cell.config_key
