@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from dopt.policies.base import on_sphere
 from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox, transitions
 from dopt.systems.equilibrium import eigenmode
 
 Array = npt.NDArray[np.float64]
@@ -41,10 +42,38 @@ class EvaluationSet:
 
 @functools.lru_cache(maxsize=64)
 def evaluation_set(system: System) -> EvaluationSet:
-    """Return the points of a system; a function of its parameters alone."""
+    """Return the points of a system; a function of its parameters alone.
+
+    Of a black box they are held-out transitions: in place of the grid those under random inputs,
+    in place of the reachable set those under square waves and a chirp.
+    """
+    if isinstance(system, BlackBox):
+        return _held_out(system)
     grid = system.grid()
     states = np.concatenate([grid, reachable_states(system)])
     return EvaluationSet(states, system.learned(states), len(grid))
+
+
+def _held_out(system: BlackBox) -> EvaluationSet:
+    """Return transitions of runs that no trial sees, with fixed seeds."""
+    rng, wanted = np.random.default_rng(_SEED), math.prod(system.grid_points)
+    rounds = math.ceil(2 * wanted / (len(HELD_STEPS) * system.horizon))
+    held = [sequence for _ in range(rounds) for sequence in _held(system, rng)]
+    grid = _sampled(system, held, wanted, rng)
+    waves = _sampled(system, _waves(system), REACHABLE_POINTS, rng)
+    states, accelerations = (np.concatenate(parts) for parts in zip(grid, waves, strict=True))
+    return EvaluationSet(states, accelerations, len(grid[0]))
+
+
+def _sampled(
+    system: BlackBox, sequences: list[Array], wanted: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return states (N, d) and accelerations (N, r) of at most the wanted transitions."""
+    runs = [transitions(system, inputs, seed) for seed, inputs in enumerate(sequences)]
+    states, accelerations, there = (np.concatenate(parts) for parts in zip(*runs, strict=True))
+    found = np.flatnonzero(there)
+    chosen = np.sort(rng.choice(found, min(wanted, len(found)), replace=False))
+    return states[chosen], accelerations[chosen]
 
 
 def reachable_states(system: System) -> Array:

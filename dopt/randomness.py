@@ -28,6 +28,7 @@ _STREAMS = {
     "ties": 4,
     "planner": 5,
     "updater": 6,
+    "environment": 7,
     "control_noise": 7,
     "control_plans": 8,
 }

@@ -22,6 +22,7 @@ from dopt.policies import POLICIES, Informed, Oracle, Policy
 from dopt.policies.base import OpenLoop, Planned
 from dopt.registry import TARGET, build, section_of
 from dopt.systems import SYSTEMS, System
+from dopt.systems.black_box import BlackBox
 
 CODE_VERSION = 1
 """Raised whenever a change of the code changes the numbers of a trial."""
@@ -62,6 +63,8 @@ class Cell:
         if self.path not in PATHS:
             raise unknown_name("path", self.path, PATHS)
         if self.task is not None:
+            if isinstance(self.system, BlackBox):
+                raise _mismatch("a task", "a system with equations", f"env '{self.system.name}'")
             object.__setattr__(self, "task", self.task.resolved(self.system))
         self._check_runnable()
         self.policy.check(self.system)

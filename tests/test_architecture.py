@@ -21,6 +21,7 @@ ONLY_IN = {
     "psycopg": ("orchestrate/store/",),
     "torch": ("dopt/reference/", "orchestrate/executors/lockstep.py"),
     "numba": ("dopt/kernel/",),
+    "gymnasium": ("dopt/gymnasium/",),
     "matplotlib": ("analysis/",),
     "starlette": ("analysis/serve/",),
     "uvicorn": ("analysis/serve/",),

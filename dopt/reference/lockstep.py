@@ -18,6 +18,7 @@ from dopt.policies import DOptimal, Informed, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
+from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.learning import BatchLearner, learner_for
 from dopt.reference.models import model_function, network_function
@@ -93,7 +94,11 @@ class Lockstep:
     def _allocate(self) -> None:
         n, T = len(self.specs), self.system.horizon
         self.states = self._unset(n, T + 1, self.system.n_states)
-        self.states[:, 0] = self._tensor(np.array(self.system.initial_state))
+        self.episodes = episodes_for(self.specs)
+        if self.episodes:
+            self.states[:, 0] = initial_states(self.episodes)
+        else:
+            self.states[:, 0] = self._tensor(np.array(self.system.initial_state))
         self.diverged = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
         self.inputs = self._unset(n, T, self.system.n_inputs)
         self.targets = self._unset(n, T, self.system.n_learned)
@@ -148,8 +153,11 @@ class Lockstep:
     def act(self, t: int, u: Tensor) -> None:
         """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""
         x = self.states[:, t]
-        step = flow(self.system, x, u, true_accelerations(self.system, x))
-        following = x + self.system.dt * step + self.noise[:, t]
+        if self.episodes:
+            u, following = stepped(self.episodes, u)
+        else:
+            step = flow(self.system, x, u, true_accelerations(self.system, x))
+            following = x + self.system.dt * step + self.noise[:, t]
         observed = (following - x) / self.system.dt - known_flow(self.system, x, u)
         self.inputs[:, t] = u
         self.states[:, t + 1] = following

@@ -1,0 +1,35 @@
+"""Systems that are stepped one trial after the other, for the trials of a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dopt.randomness import stream
+from dopt.spec import TrialSpec
+from dopt.systems.black_box import BlackBox, Episode
+
+
+def episodes_for(specs: Sequence[TrialSpec]) -> list[Episode]:
+    """Return the run of each trial, started from its seed; none for a system with equations."""
+    system = specs[0].system
+    if not isinstance(system, BlackBox):
+        return []
+    seeds = [int(stream(spec.seed, "environment").integers(2**31)) for spec in specs]
+    return [system.episode(seed) for seed in seeds]
+
+
+def initial_states(episodes: Sequence[Episode]) -> Tensor:
+    """Return x_0 of every run, (n, d)."""
+    return torch.tensor(np.stack([episode.state for episode in episodes]))
+
+
+def stepped(episodes: Sequence[Episode], u: Tensor) -> tuple[Tensor, Tensor]:
+    """Apply inputs (n, m); return what was applied, (n, m), and the next states, (n, d)."""
+    inputs = u.cpu().numpy()
+    applied = [episode.step(row) for episode, row in zip(episodes, inputs, strict=True)]
+    states = [episode.state for episode in episodes]
+    return torch.tensor(np.stack(applied)).to(u), torch.tensor(np.stack(states)).to(u)

@@ -1,0 +1,106 @@
+"""A system that can only be stepped: nobody knows the equations of what is to be learned."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.errors import SpecificationError
+from dopt.fields import quantity
+from dopt.systems.base import Array, System
+
+
+class Episode(Protocol):
+    """One run of a black box from its start."""
+
+    @property
+    def state(self) -> Array:
+        """State x_t, (d,)."""
+
+    def step(self, inputs: Array) -> Array:
+        """Apply what is possible of an input (m,), and return what was applied, (m,).
+
+        The state is NaN once the run is over.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlackBox(System):
+    """A system whose next state comes from somewhere else, such as a simulator.
+
+    Declared are what it is called, which rows of the state derivative are learned, the features and
+    the known part: the kinematics and the effect of the inputs, which the model of the package, one
+    of accelerations at zero input, does not learn. All of its numbers are observed by differences:
+    y_t = (x_{t+1} - x_t)/dt less the known part. There is no process noise but its own, and it
+    starts where its reset leaves it, the same for all policies of a seed. A run that ends early is
+    one that diverged.
+
+    The truth at a state of one's choice is unknown, so that the loss is the root mean square error
+    of the modelled accelerations over transitions of runs of its own, which no trial sees: under
+    random inputs for the loss, at most as many as the product of ``grid_points``, and under square
+    waves and a chirp for the reachable loss (:func:`dopt.evaluation.evaluation_set`).
+    """
+
+    compiled: ClassVar[bool] = False
+    physical: ClassVar[tuple[str, ...]] = ()
+
+    noise: float = quantity(0.0, bound="nonnegative")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.noise:
+            raise SpecificationError(
+                f"env.noise is {self.noise:g}, but to {self.name} none can be added: leave it out."
+            )
+        if self.equilibrium is not None:
+            raise SpecificationError(
+                f"env '{self.name}' declares an equilibrium, but a black box cannot be linearised "
+                f"about one: leave it out."
+            )
+
+    def _check_size(self, field: str, size: int) -> None:
+        if field != "initial_state":
+            super()._check_size(field, size)
+        elif self.initial_state:
+            raise SpecificationError(
+                f"env.initial_state is given, but {self.name} starts where its reset leaves it: "
+                f"leave it out."
+            )
+
+    @abstractmethod
+    def episode(self, seed: int) -> Episode:
+        """Start a run; the seed decides about all that is random in it."""
+
+    @staticmethod
+    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG004
+        raise SpecificationError(
+            "the true accelerations of a black box are unknown: use what was observed of it, or "
+            "another env."
+        )
+
+    def observed(self, states: Array, following: Array, inputs: Array) -> Array:
+        """Return the accelerations, (N, r), seen in transitions: states (N, d), inputs (N, m)."""
+        known = self.known(tuple(states.T), tuple(inputs.T), self.parameters)
+        flow = np.stack(np.broadcast_arrays(*known), axis=-1)
+        difference: Array = (following - states) / self.dt - flow
+        return difference[:, list(self.learned_rows)]
+
+
+def transitions(
+    system: BlackBox, inputs: Array, seed: int
+) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+    """Run an episode; return states (T, d), accelerations (T, r) and which of them there are."""
+    episode = system.episode(seed)
+    states = np.empty((len(inputs) + 1, system.n_states))
+    applied = np.empty_like(inputs)
+    states[0] = episode.state
+    for t, u in enumerate(inputs):
+        applied[t] = episode.step(u)
+        states[t + 1] = episode.state
+    seen = system.observed(states[:-1], states[1:], applied)
+    inside = np.all(np.abs(states) <= system.state_limit, axis=1)
+    return states[:-1], seen, inside[:-1] & inside[1:]

@@ -1,0 +1,175 @@
+"""Gymnasium, both ways."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.evaluation import evaluation_set
+from dopt.exploration import run_trial
+from dopt.reference.lockstep import run_trials
+from dopt.spec import TrialSpec
+from dopt.systems import SYSTEMS
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra: pip install dopt[gymnasium]")
+
+import dopt.gymnasium  # noqa: E402
+from tests.dopt.own_environments import DRAG  # noqa: E402
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "example"
+POINT = "tests.dopt.own_environments.Point"
+IDS = [f"dopt/{''.join(map(str.capitalize, name.split('_')))}-v0" for name in SYSTEMS]
+
+
+def specification(
+    target: str = POINT, policy: str = "d_optimal", seed: int = 0, **env: Any
+) -> TrialSpec:
+    return TrialSpec.from_mapping(
+        {
+            "env": {"_target_": target, **env},
+            "policy": {"name": policy},
+            "model": {"name": "mlp", "width": 8},
+            "learner": {"name": "adam_window"},
+            "seed": seed,
+        }
+    )
+
+
+@pytest.mark.parametrize("identity", IDS)
+@pytest.mark.filterwarnings("ignore:.*symmetric and normalized space")  # inputs are in their units
+def test_a_system_passes_the_checker_of_gymnasium(identity: str) -> None:
+    from gymnasium.utils.env_checker import check_env
+
+    check_env(gymnasium.make(identity).unwrapped)
+
+
+def test_an_environment_steps_the_system_with_bounded_energy() -> None:
+    environment = dopt.gymnasium.Exploration({"name": "quadrotor", "noise": 0.0})
+    system = environment.system
+    start, _ = environment.reset(seed=0)
+    np.testing.assert_array_equal(start, system.initial_state)
+    u = np.full(system.n_inputs, system.gamma)
+    reached, _, _, _, said = environment.step(u)
+    assert np.linalg.norm(said["input"]) == pytest.approx(system.gamma)
+    np.testing.assert_allclose(said["input"] / u, said["input"][0] / u[0])
+    expected = start + system.dt * system.derivative(start, said["input"])
+    np.testing.assert_allclose(reached, expected, rtol=1e-12)
+
+
+def test_the_reward_is_the_information_about_random_features() -> None:
+    """Its sum is half the log determinant of the whole information matrix over the first one."""
+    environment = dopt.gymnasium.Exploration(SYSTEMS["pendulum"]())
+    state, _ = environment.reset(seed=3)
+    states, rewards = [state], []
+    for _ in range(20):
+        state, reward, *_ = environment.step(environment.action_space.sample())
+        states.append(state)
+        rewards.append(reward)
+    p, units = 3, 64
+    weights = environment._layer[: p * units].reshape(units, p)
+    hidden = np.tanh(
+        environment.system.featurize(np.array(states)) @ weights.T + environment._layer[p * units :]
+    )
+    h = np.column_stack([hidden, np.ones(len(states))])
+    first = 1e-3 * np.eye(units + 1) + np.outer(h[0], h[0])
+    gain = np.linalg.slogdet(first + h[1:].T @ h[1:])[1] - np.linalg.slogdet(first)[1]
+    assert sum(rewards) == pytest.approx(gain / 2, rel=1e-6)
+    assert min(rewards) > 0
+
+
+def test_an_environment_ends_where_the_system_diverges_or_the_horizon_is_reached() -> None:
+    small = dopt.gymnasium.Exploration({"name": "pendulum", "state_limit": 0.01})
+    small.reset(seed=0)
+    ends = [small.step(np.array([2.0]))[2] for _ in range(5)]
+    assert any(ends)
+    environment = gymnasium.make("dopt/Arm-v0")
+    environment.reset(seed=0)
+    flags = [environment.step(np.zeros(2))[2:4] for _ in range(SYSTEMS["arm"]().horizon)]
+    assert flags[-1] == (False, True)
+    assert not any(truncated for _, truncated in flags[:-1])
+
+
+def test_transitions_of_a_black_box_show_its_accelerations() -> None:
+    system = specification().system
+    points = evaluation_set(system)
+    assert points.n_grid == 50
+    assert len(points.states) > 50
+    np.testing.assert_allclose(points.accelerations, -DRAG * points.states[:, 1:], atol=1e-5)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random", "random_held"])
+def test_every_policy_explores_a_black_box(policy: str) -> None:
+    result = run_trial(specification(policy=policy, horizon=150))
+    assert result.diverged_at is None
+    assert result.loss[-1] < 0.5 * result.loss[0]
+    assert np.abs(result.inputs).max() <= 2.0
+    speeds, inputs = result.states[:, 1], result.inputs[:, 0]
+    expected = speeds[:-1] + 0.1 * (inputs - DRAG * speeds[:-1])
+    np.testing.assert_allclose(speeds[1:], expected, atol=1e-6)
+
+
+def test_the_seed_decides_about_the_start_and_policies_share_it() -> None:
+    first, second = (run_trial(specification(policy=p)) for p in ("random", "d_optimal"))
+    other = run_trial(specification(seed=1))
+    assert first.states[0, 0] == second.states[0, 0] != other.states[0, 0]
+    np.testing.assert_array_equal(second.states, run_trial(specification()).states)
+
+
+def test_black_boxes_in_lockstep_are_those_run_alone() -> None:
+    specs = [specification(seed=seed) for seed in range(3)]
+    for together, spec in zip(run_trials(specs), specs, strict=True):
+        np.testing.assert_allclose(together.states, run_trial(spec).states, rtol=1e-9)
+
+
+def test_an_episode_that_ends_is_a_trial_that_diverged() -> None:
+    spec = specification(id="dopt_tests/Walled-v0", policy="random_held", horizon=200)
+    result = run_trial(spec)
+    assert result.diverged_at is not None
+    assert np.isfinite(result.loss[: result.diverged_at]).all()
+    assert np.isnan(result.loss[result.diverged_at :]).all()
+
+
+def test_an_angle_is_followed_over_the_full_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    spec = specification("swing.Swing", "random_held")
+    states = run_trial(spec).states
+    assert np.abs(np.diff(states[:, 0])).max() < 8.0 * spec.system.dt * (1 + 1e-5)
+    points = evaluation_set(spec.system)
+    assert np.abs(points.states[:, 0]).max() > math.pi
+    slow = np.abs(points.states[:, 1]) < 7.0  # beyond 8 rad/s the environment cuts the rate
+    truth = 15.0 * np.sin(points.states[slow, :1])
+    np.testing.assert_allclose(points.accelerations[slow], truth, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("env", "sentence"),
+    [
+        ({"id": "Pendulun-v1"}, "Gymnasium cannot make .*Pendul"),
+        ({"id": "dopt_tests/Buttons-v0"}, r"are Discrete\(3\), but a Box of 1 numbers"),
+        ({"gamma": 3.0}, "env.gamma is 3, but the actions of .* go to 2 only"),
+        ({"dt": 0.05}, "env.dt is 0.05 s, but a step of .* takes 0.1 s"),
+        ({"noise": 0.1}, "env.noise is 0.1, but to point none can be added"),
+        ({"initial_state": [0.0, 0.0]}, "env.initial_state is given, but point starts where"),
+        ({"target": "tests.dopt.own_environments.Blurred"}, r"makes a state of shape \(1,\)"),
+        ({"grid_points": [2, 2]}, "env.grid_points has 2 entries"),
+    ],
+)
+def test_a_wrong_environment_is_refused_in_a_sentence(env: dict[str, Any], sentence: str) -> None:
+    target = env.pop("target", POINT)
+    with pytest.raises(SpecificationError, match=sentence):
+        run_trial(specification(target, **env))
+
+
+def test_what_needs_the_truth_is_refused() -> None:
+    spec = specification()
+    with pytest.raises(SpecificationError, match="unknown"):
+        spec.system.learned(np.zeros((1, 2)))
+    with pytest.raises(IncompatibleError, match="a task goes with a system with equations"):
+        TrialSpec.from_mapping(spec.to_mapping() | {"task": {"name": "control"}})
+    with pytest.raises(SpecificationError, match="env 'point' is not written for it"):
+        TrialSpec.from_mapping(spec.to_mapping() | {"path": "kernel"})
