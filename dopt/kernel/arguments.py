@@ -15,9 +15,10 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 MLP_MODEL, LINEAR_MODEL = 0, 1
-OPEN_LOOP, UNIFORM, D_OPTIMAL = 0, 1, 2
+OPEN_LOOP, UNIFORM, D_OPTIMAL, SEARCH = 0, 1, 2, 3
 ADAM, LEAST_SQUARES = 0, 1
 PRIMAL, DUAL, SKETCH = 0, 1, 2
+JOINT, SUM, TRACE, A_OPTIMAL, E_OPTIMAL, TASK = 0, 1, 2, 3, 4, 5
 
 
 class World(NamedTuple):
@@ -43,10 +44,26 @@ class Network(NamedTuple):
     feature_scales: Floats  # (p,)
 
 
+class Search(NamedTuple):
+    """Plans among which a policy searches (:mod:`dopt.policies.search`); none in others."""
+
+    candidates: Floats  # (C, m)
+    score: int  # JOINT, SUM, TRACE, A_OPTIMAL, E_OPTIMAL or TASK
+    steps: int  # H
+    switch: int  # steps after which the input may switch, H where it may not
+    stride: int
+    budget_us: float
+    task_states: Floats  # (n, d)
+    starts: Floats  # (b, q) of the Krylov space
+    subspace: int
+
+
 class Rules(NamedTuple):
     """Policy and learner."""
 
-    policy: int  # OPEN_LOOP, UNIFORM or D_OPTIMAL
+    policy: int  # OPEN_LOOP, UNIFORM, D_OPTIMAL or SEARCH
+    all_components: bool  # whether D_OPTIMAL sums over the components
+    search: Search
     ascent_steps: int  # of the uniform policy
     learner: int  # ADAM or LEAST_SQUARES
     learning_rate: float

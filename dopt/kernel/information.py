@@ -35,7 +35,8 @@ def inner(a: Any, b: Any) -> float:
 
 
 @vectorized
-def _add_multiple(y: Any, factor: float, x: Any) -> None:
+def add_multiple(y: Any, factor: float, x: Any) -> None:
+    """Add factor x to y."""
     for i in range(x.shape[0]):
         y[i] += factor * x[i]
 
@@ -149,7 +150,7 @@ def multiply_rows(covariance: Covariance, rows: Any, out: Any) -> None:
     for n in range(covariance.n_pending[0]):
         pending = covariance.pending[n]
         for i in range(k):
-            _add_multiple(out[i], -inner(pending, rows[i]), pending)
+            add_multiple(out[i], -inner(pending, rows[i]), pending)
 
 
 @vectorized
@@ -197,7 +198,7 @@ def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> N
         row = scratch[k]
         for i in range(k):
             residuals[k] -= L[k, i] * residuals[i]
-            _add_multiple(row, -L[k, i], scratch[i])
+            add_multiple(row, -L[k, i], scratch[i])
         residuals[k] /= L[k, k]
         for j in range(row.shape[0]):
             row[j] /= L[k, k]

@@ -103,21 +103,24 @@ def d_optimal_input(
     tie: Any,
     u: Any,
 ) -> None:
-    """Write the maximiser of (g + D B u)ᵀ M⁻¹ (g + D B u) on the sphere, (m,)."""
+    """Write the maximiser of (g + D B u)ᵀ M⁻¹ (g + D B u), or its sum, on the sphere, (m,)."""
     bar = predicted_state(known, accelerations, world, network, state.theta, x)
     columns = input_columns(known, world, bar)
-    S = planning_forms(
-        accelerations,
-        complex_accelerations,
-        world,
-        network,
-        rules,
-        state,
-        bar,
-        columns,
-        component,
-    )
     m = columns.shape[0]
+    S = np.zeros((1 if m == 1 else 1 + m, 1 + m))
+    for k in range(world.learned_rows.shape[0]):
+        if rules.all_components or k == component:
+            S += planning_forms(
+                accelerations,
+                complex_accelerations,
+                world,
+                network,
+                rules,
+                state,
+                bar,
+                columns,
+                k,
+            )
     if m == 1:
         up = S[0, 1] > 0.0 or (S[0, 1] == 0.0 and tie[0] > 0.0)
         u[0] = world.gamma if up else -world.gamma

@@ -14,9 +14,20 @@ from dopt.kernel.evaluation import BLOCK
 from dopt.kernel.information import PENDING_ROWS, SMALL
 from dopt.learning import Adam
 from dopt.models import MLP
-from dopt.policies import DOptimal, Informed, Uniform
+from dopt.planning.task_states import task_states
+from dopt.policies import (
+    DOptimal,
+    EOptimal,
+    Informed,
+    Lookahead,
+    Search,
+    TaskOptimal,
+    TraceLinearized,
+    Uniform,
+)
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
+from dopt.policies.search import SCORES
 from dopt.spec import Cell, TrialSpec
 from dopt.systems.base import System
 from dopt.systems.features import KINDS
@@ -59,12 +70,19 @@ def _network(cell: Cell) -> args.Network:
 
 
 def _rules(cell: Cell) -> args.Rules:
-    policies = {OpenLoop: args.OPEN_LOOP, Uniform: args.UNIFORM, DOptimal: args.D_OPTIMAL}
+    policies = {
+        OpenLoop: args.OPEN_LOOP,
+        Uniform: args.UNIFORM,
+        DOptimal: args.D_OPTIMAL,
+        Search: args.SEARCH,
+    }
     policy = next(code for kind, code in policies.items() if isinstance(cell.policy, kind))
     steps = cell.policy.iterations if isinstance(cell.policy, Uniform) else 0
     adam = cell.learner if isinstance(cell.learner, Adam) else Adam()
     return args.Rules(
         policy,
+        isinstance(cell.policy, TraceLinearized),
+        _search(cell),
         steps,
         args.ADAM if isinstance(cell.learner, Adam) else args.LEAST_SQUARES,
         adam.learning_rate,
@@ -75,6 +93,29 @@ def _rules(cell: Cell) -> args.Rules:
         isinstance(cell.policy, Informed),
         _form(cell),
         _regularization(cell),
+    )
+
+
+def _search(cell: Cell) -> args.Search:
+    """Return the plans of a policy that searches."""
+    policy, system, q = cell.policy, cell.system, cell.model.n_parameters(cell.system)
+    steps, score = 0, args.JOINT
+    candidates = np.zeros((0, system.n_inputs))
+    if isinstance(policy, Search):
+        steps, score = policy.steps(system), SCORES.index(policy.score)
+        candidates = policy.candidates(system)
+    return args.Search(
+        candidates,
+        score,
+        steps,
+        steps // 2 if steps > 1 else steps,
+        policy.stride if isinstance(policy, Lookahead) else 1,
+        policy.budget_us if isinstance(policy, Search) else 0.0,
+        task_states(system, policy)
+        if isinstance(policy, TaskOptimal)
+        else np.zeros((0, system.n_states)),
+        policy.starts(q, system.n_learned) if isinstance(policy, EOptimal) else np.zeros((0, q)),
+        policy.subspace if isinstance(policy, EOptimal) else 0,
     )
 
 

@@ -13,6 +13,7 @@ from dopt.kernel.arguments import (
     LEAST_SQUARES,
     LINEAR_MODEL,
     OPEN_LOOP,
+    SEARCH,
     SKETCH,
     Evaluation,
     Network,
@@ -22,6 +23,7 @@ from dopt.kernel.arguments import (
     State,
     World,
 )
+from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
 from dopt.kernel.dual import dual_absorb
 from dopt.kernel.evaluation import evaluation_buffers, model_error
@@ -29,6 +31,7 @@ from dopt.kernel.information import absorb
 from dopt.kernel.learning import adam_step, remember
 from dopt.kernel.model import add_linear, all_components, network_rows, regressors
 from dopt.kernel.policies import d_optimal_input, uniform_input
+from dopt.kernel.search import search_input
 from dopt.kernel.sketch import sketched
 
 
@@ -65,6 +68,9 @@ def plan(
             tie,
             u,
         )
+    elif rules.policy == SEARCH:
+        x, tie = states[t], randomness.ties[t]
+        search_input(known, accelerations, world, network, rules, state, x, tie, u)
     else:
         steps = rules.ascent_steps
         uniform_input(known, accelerations, world, network, state, states, t, steps, u)
@@ -128,15 +134,6 @@ def inform(
     for k in range(r if rules.learner == LEAST_SQUARES else 0):
         for i in range(q):
             state.theta[i] += residuals[k] * scratch[k, i]
-
-
-@compiled
-def within(x: Any, limit: float) -> bool:
-    """Tell whether every entry is finite and within the limit."""
-    inside = True
-    for i in range(x.shape[0]):
-        inside = inside and abs(x[i]) <= limit
-    return inside
 
 
 @called_from_python

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dopt.policies.a_optimal import AOptimal
 from dopt.policies.base import Informed, Policy
 from dopt.policies.chirp import Chirp
 from dopt.policies.d_optimal import DOptimal
+from dopt.policies.e_optimal import EOptimal
+from dopt.policies.exact import Exact
+from dopt.policies.lookahead import Lookahead
 from dopt.policies.multisine import Multisine
 from dopt.policies.oracle import Oracle
 from dopt.policies.periodic import Periodic
 from dopt.policies.prbs import PRBS
 from dopt.policies.random import RandomGaussian, RandomHeld, RandomSphere
+from dopt.policies.search import Search
+from dopt.policies.task import TaskOptimal
+from dopt.policies.trace import Trace
+from dopt.policies.trace_linearized import TraceLinearized
 from dopt.policies.uniform import Uniform
 
 POLICIES: dict[str, type[Policy]] = {
@@ -25,15 +33,26 @@ POLICIES: dict[str, type[Policy]] = {
         Periodic,
         DOptimal,
         Oracle,
+        TraceLinearized,
+        Exact,
+        Trace,
+        AOptimal,
+        EOptimal,
+        TaskOptimal,
+        Lookahead,
     )
 }
 
 __all__ = [
     "POLICIES",
     "PRBS",
+    "AOptimal",
     "Chirp",
     "DOptimal",
+    "EOptimal",
+    "Exact",
     "Informed",
+    "Lookahead",
     "Multisine",
     "Oracle",
     "Periodic",
@@ -41,5 +60,9 @@ __all__ = [
     "RandomGaussian",
     "RandomHeld",
     "RandomSphere",
+    "Search",
+    "TaskOptimal",
+    "Trace",
+    "TraceLinearized",
     "Uniform",
 ]

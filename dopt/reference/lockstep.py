@@ -14,7 +14,7 @@ from torch.func import jacrev, vmap
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.learning.base import Updated
-from dopt.policies import DOptimal, Informed, Uniform
+from dopt.policies import DOptimal, Informed, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
@@ -23,7 +23,8 @@ from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.learning import BatchLearner, learner_for
 from dopt.reference.models import model_function, network_function
 from dopt.reference.own import OwnLearner, observe, planned_inputs, planners_for
-from dopt.reference.planning import d_optimal_inputs, quadratic_problem, uniform_inputs
+from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
+from dopt.reference.search import searched_inputs
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
 
@@ -139,16 +140,14 @@ class Lockstep:
             seen = self.states[:, : t + 1]
             return uniform_inputs(self.system, self.model, self.theta, seen, policy.iterations)
         assert self.information is not None
-        problem = quadratic_problem(
-            self.system,
-            self.model,
-            self.theta,
-            self.information,
-            x,
-            self.components[:, t],
-            self.project,
-        )
-        return d_optimal_inputs(problem, self.system.gamma, self.ties[:, t])
+        given = (self.system, self.model, self.theta, self.information, x)
+        if isinstance(policy, Search):
+            return searched_inputs(policy, *given, self.ties[:, t])
+        components = self.components[:, t : t + 1]
+        if isinstance(policy, TraceLinearized):
+            components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)
+        problems = [quadratic_problem(*given, k, self.project) for k in components.unbind(1)]
+        return d_optimal_inputs(summed(problems), self.system.gamma, self.ties[:, t])
 
     def act(self, t: int, u: Tensor) -> None:
         """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""

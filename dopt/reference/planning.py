@@ -65,6 +65,14 @@ def quadratic_problem(
     return QuadraticProblem(Q, v)
 
 
+def summed(problems: list[QuadraticProblem]) -> QuadraticProblem:
+    """Return the problem whose objective is the sum of all."""
+    return QuadraticProblem(
+        torch.stack([problem.Q for problem in problems]).sum(dim=0),
+        torch.stack([problem.v for problem in problems]).sum(dim=0),
+    )
+
+
 def _factor(information: Tensor) -> Tensor:
     """Return the Cholesky factors of M; NaN where M is not positive definite, or NaN itself."""
     factor, failed = torch.linalg.cholesky_ex(information)

@@ -1,0 +1,167 @@
+"""Paths of the learned model and the rows of J along them, in compiled code.
+
+Legend beside :mod:`dopt.kernel.arguments`: H steps of a plan, n rows along a path.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dopt.kernel import network as nn
+from dopt.kernel.arguments import LINEAR_MODEL, Covariance, Floats, Network, Rules, World
+from dopt.kernel.checks import within
+from dopt.kernel.compiler import compiled, vectorized
+from dopt.kernel.information import add_multiple, inner, multiply_rows
+from dopt.kernel.model import add_linear, regressors
+
+FEW_ROWS = 24
+"""Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
+
+
+class Path(NamedTuple):
+    """A path in the making; written in place."""
+
+    states: Floats  # (H + 1, d)
+    outputs: Floats  # (H + 1, r), a_θ at the states
+    rows: Floats  # (n + r, q), J along the path; the last r are spare
+    products: Floats  # (n, q), J M⁻¹, or L⁻¹ J M⁻¹ once a score has needed it
+    factor: Floats  # (n, n), the Cholesky factor L of I + J M⁻¹ Jᵀ in the lower triangle
+    inverse: Floats  # (q, q), A of M⁻¹ = A - VᵀV; empty where few products are needed
+    flow: Floats  # (d,)
+    phi: Floats  # (p,)
+    hidden: Floats  # (L, w)
+    deltas: Floats  # (L, w)
+
+
+@compiled
+def new_path(world: World, network: Network, rules: Rules, covariance: Covariance, d: int) -> Path:
+    """Return an empty path."""
+    search, r, q = rules.search, world.learned_rows.shape[0], covariance.upper.shape[0]
+    C, H = search.candidates.shape[0], search.steps
+    n = r * (H // search.stride)
+    size = q if n * C > FEW_ROWS else 0
+    path = Path(
+        np.empty((H + 1, d)),
+        np.empty((H + 1, r)),
+        np.empty((n + r, q)),
+        np.empty((n, q)),
+        np.zeros((n, n)),
+        np.empty((size, size)),
+        np.empty(d),
+        np.empty(network.sizes[0]),
+        np.empty((network.offsets.shape[0] - 1, network.sizes[1])),
+        np.empty((network.offsets.shape[0] - 1, network.sizes[1])),
+    )
+    for i in range(size):
+        for j in range(i, size):
+            path.inverse[i, j] = covariance.upper[i, j]
+            path.inverse[j, i] = covariance.upper[i, j]
+    return path
+
+
+@compiled
+def look(
+    accelerations: Any, world: World, network: Network, theta: Any, path: Path, i: int, rows: Any
+) -> None:
+    """Write a_θ and J, (r, q), at state i of the path."""
+    x, out = path.states[i], path.outputs[i]
+    if network.kind == LINEAR_MODEL:
+        regressors(accelerations, world, x, rows, out)
+        add_linear(rows, theta, out)
+        return
+    nn.features_at(network, x, path.phi)
+    nn.activations_at(network, theta, path.phi, path.hidden, out)
+    for k in range(rows.shape[0]):
+        nn.back_signals(network, theta, path.hidden, k, path.deltas)
+        nn.parameter_gradient(network, path.phi, path.hidden, path.deltas, k, rows[k])
+
+
+@compiled
+def roll(
+    known: Any,
+    accelerations: Any,
+    world: World,
+    network: Network,
+    rules: Rules,
+    theta: Any,
+    path: Path,
+    u: Any,
+    first: int,
+    last: int,
+) -> bool:
+    """Hold u from state ``first`` of the path to state ``last``; tell whether it stays in bounds.
+
+    x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written, times the
+    root of the stride.
+    """
+    r, stride = world.learned_rows.shape[0], rules.search.stride
+    spare = path.products.shape[0]
+    for i in range(first, last):
+        x, following = path.states[i], path.states[i + 1]
+        known(x, u, world.parameters, path.flow)
+        for k in range(r):
+            path.flow[world.learned_rows[k]] += path.outputs[i, k]
+        for j in range(x.shape[0]):
+            following[j] = x[j] + world.dt * path.flow[j]
+        if not within(following, world.state_limit):
+            return False
+        block = r * ((i + 1) // stride - 1) if (i + 1) % stride == 0 else spare
+        rows = path.rows[block : block + r]
+        look(accelerations, world, network, theta, path, i + 1, rows)
+        if stride > 1:
+            scale(rows, np.sqrt(stride))
+    return True
+
+
+@compiled
+def scale(rows: Any, factor: float) -> None:
+    """Multiply a matrix by a number in place."""
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            rows[i, j] *= factor
+
+
+@vectorized
+def weigh(covariance: Covariance, path: Path, first: int, last: int) -> None:
+    """Write the products of rows ``first`` to ``last`` with M⁻¹."""
+    rows, out = path.rows[first:last], path.products[first:last]
+    if path.inverse.shape[0] == 0:
+        multiply_rows(covariance, rows, out)
+        return
+    np.dot(rows, path.inverse, out)
+    for n in range(covariance.n_pending[0]):
+        pending = covariance.pending[n]
+        for i in range(rows.shape[0]):
+            add_multiple(out[i], -inner(pending, rows[i]), pending)
+
+
+@vectorized
+def log_determinant(path: Path, first: int, last: int, block: int) -> float:
+    """Extend the factor L by rows ``first`` to ``last``; return the growth of log det.
+
+    Only rows of the same block of so many are taken together: all of them for the determinant of
+    the whole path, r for those of its states one by one.
+    """
+    L = path.factor
+    total = 0.0
+    for i in range(first, last):
+        start = i - i % block
+        for j in range(start, i + 1):
+            value = inner(path.products[i], path.rows[j])
+            value -= inner(L[i, start:j], L[j, start:j])
+            L[i, j] = np.sqrt(1.0 + value) if i == j else value / L[j, j]
+        total += 2.0 * np.log(L[i, i])
+    return total
+
+
+@vectorized
+def whiten(path: Path, n: int) -> None:
+    """Replace the first n products V by L⁻¹V, given the factor."""
+    for i in range(n):
+        row = path.products[i]
+        for j in range(i):
+            add_multiple(row, -path.factor[i, j], path.products[j])
+        for j in range(row.shape[0]):
+            row[j] /= path.factor[i, i]

@@ -1,0 +1,55 @@
+"""Look-ahead: inputs that are held, or switched once, along the learned model's path."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dopt.fields import quantity
+from dopt.policies.search import Search
+from dopt.systems.base import System
+from dopt.systems.equilibrium import eigenmode
+
+PERIOD_SHARE = 0.6
+STEPS_WITHOUT_PERIOD = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lookahead(Search):
+    """Score "hold u" and "hold u for H/2 steps, then u'" over all candidates u and u'.
+
+    One step is blind where an input acts through an integrator: a rotation moves a quadrotor
+    sideways only later. The first input of the best of the C² plans is applied, and the plan is
+    made anew at the next step.
+
+    Parameters
+    ----------
+    horizon : int
+        H; 0 takes 0.6 periods of the least damped oscillation about the stable equilibrium, and 10
+        steps where there is none.
+    criterion : {"joint", "sum"}
+        ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` that of each state's
+        rows alone, summed over the path.
+    stride : int
+        Every how many steps a state's rows are taken; each then counts so many times.
+    """
+
+    name: ClassVar[str] = "lookahead"
+
+    directions: int = quantity(8, "directions", "positive")
+    horizon: int = quantity(0, "steps", "nonnegative")
+    criterion: str = quantity("joint", choices=("joint", "sum"))
+    stride: int = quantity(1, "steps", "positive")
+
+    @property
+    def score(self) -> str:
+        return self.criterion
+
+    def steps(self, system: System) -> int:
+        if self.horizon:
+            return self.horizon
+        mode = eigenmode(system)
+        if mode is None:
+            return STEPS_WITHOUT_PERIOD
+        return max(1, round(PERIOD_SHARE * 2 * math.pi / mode.frequency / system.dt))

@@ -1,0 +1,151 @@
+"""Search for the best plan over a batch of trials, all plans at once (:mod:`dopt.policies.search`).
+
+======  ==================================================  =============
+symbol  meaning                                             shape
+======  ==================================================  =============
+J       rows along a path, times the root of the stride     (..., N, q)
+V       J M⁻¹                                               (..., N, q)
+S       J M⁻¹ Jᵀ                                            (..., N, N)
+======  ==================================================  =============
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from dopt.planning.task_states import task_states
+from dopt.policies import EOptimal, Lookahead, Search, TaskOptimal
+from dopt.policies.search import TIE_MARGIN
+from dopt.reference.dynamics import flow
+from dopt.reference.models import Accelerations
+from dopt.systems.base import System
+
+
+def searched_inputs(
+    policy: Search,
+    system: System,
+    model: Accelerations,
+    theta: Tensor,
+    information: Tensor,
+    x: Tensor,
+    ties: Tensor,
+) -> Tensor:
+    """Return the first inputs of the best plans, (n, m).
+
+    Given are parameters (n, q), M (n, q, q), states (n, d) and tie-breaking directions (n, m).
+    """
+    candidates = torch.tensor(policy.candidates(system)).to(x)
+    pairs = plans(policy, system, len(candidates))
+    inputs = candidates[torch.tensor(pairs)]
+    states = vmap(lambda p, z: paths(policy, system, model, p, z, inputs))(theta, x)
+    stride = policy.stride if isinstance(policy, Lookahead) else 1
+    seen = states[:, :, stride - 1 :: stride]
+    rows = vmap(vmap(vmap(jacrev(model), (None, 0)), (None, 0)))(theta, seen) * stride**0.5
+    score = score_function(policy, system, model)
+    values = vmap(vmap(score, (0, None, None)))(rows, theta, torch.linalg.inv_ex(information)[0])
+    inside = (states.abs() <= system.state_limit).flatten(2).all(dim=2)
+    values = torch.where(inside & values.isfinite(), values, -torch.inf)
+    return chosen(values, inputs[:, 0], ties)
+
+
+def plans(policy: Search, system: System, count: int) -> list[tuple[int, int]]:
+    """Return the plans as pairs of candidates, before and after the switch."""
+    if policy.steps(system) == 1:
+        return [(c, c) for c in range(count)]
+    return list(itertools.product(range(count), range(count)))
+
+
+def paths(
+    policy: Search, system: System, model: Accelerations, theta: Tensor, x: Tensor, inputs: Tensor
+) -> Tensor:
+    """Return the states predicted from one state (d,) under inputs (plans, 2, m): (plans, H, d)."""
+    steps = policy.steps(system)
+    states = [x.expand(len(inputs), -1)]
+    for i in range(steps):
+        u = inputs[:, 0 if i < max(1, steps // 2) else 1]
+        accelerations = vmap(model, (None, 0))(theta, states[-1])
+        states.append(states[-1] + system.dt * flow(system, states[-1], u, accelerations))
+    return torch.stack(states[1:], dim=1)
+
+
+Score = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+def score_function(policy: Search, system: System, model: Accelerations) -> Score:
+    """Return the score of one path from its rows, (B, r, q), the parameters (q,) and M⁻¹ (q, q)."""
+
+    def joint(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+        return _log_determinant(rows.flatten(0, 1), inverse)
+
+    def separate(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+        values: Tensor = vmap(_log_determinant, (0, None))(rows, inverse)
+        return values.sum()
+
+    def trace(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+        J = rows.flatten(0, 1)
+        return ((J @ inverse) * J).sum()
+
+    def average(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+        return decrease(rows, inverse).diagonal().sum()
+
+    def eigenvalue(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
+        assert isinstance(policy, EOptimal)
+        starts = torch.tensor(policy.starts(len(theta), system.n_learned)).to(theta)
+        Q = krylov_basis(inverse, starts, policy.subspace)
+        values: Tensor = torch.linalg.eigvalsh(Q @ (inverse - decrease(rows, inverse)) @ Q.mT)
+        return -values[-1]
+
+    def task(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
+        assert isinstance(policy, TaskOptimal)
+        states = torch.tensor(task_states(system, policy)).to(theta)
+        G = vmap(jacrev(model), (None, 0))(theta, states).flatten(0, 1)
+        return ((G @ decrease(rows, inverse)) * G).sum()
+
+    scores = {"joint": joint, "sum": separate, "trace": trace, "a": average}
+    return (scores | {"e": eigenvalue, "task": task})[policy.score]
+
+
+def _log_determinant(rows: Tensor, inverse: Tensor) -> Tensor:
+    """Return log det(I + J M⁻¹ Jᵀ) for J, (N, q)."""
+    S = rows @ inverse @ rows.mT
+    value: Tensor = torch.linalg.slogdet(torch.eye(len(S)).to(S) + S)[1]
+    return value
+
+
+def decrease(rows: Tensor, inverse: Tensor) -> Tensor:
+    """Return M⁻¹ - (M + JᵀJ)⁻¹ for the rows of J, (B, r, q)."""
+    J = rows.flatten(0, 1)
+    V = J @ inverse
+    solved = torch.linalg.solve(torch.eye(len(J)).to(J) + V @ J.mT, V)
+    lost: Tensor = V.mT @ solved
+    return lost
+
+
+def krylov_basis(inverse: Tensor, starts: Tensor, size: int) -> Tensor:
+    """Return an orthonormal basis, (K, q), of the block Krylov space of M⁻¹ from starts, (b, q).
+
+    Directions that add nothing are zero.
+    """
+    basis: list[Tensor] = []
+    for j in range(min(size, len(inverse))):
+        row = starts[j] if j < len(starts) else inverse @ basis[j - len(starts)]
+        before = torch.linalg.vector_norm(row)
+        for _ in range(2):
+            for other in basis:
+                row = row - (other @ row) * other
+        after = torch.linalg.vector_norm(row)
+        basis.append(torch.where(after > 1e-9 * before, row / after, 0.0))
+    return torch.stack(basis)
+
+
+def chosen(values: Tensor, first: Tensor, ties: Tensor) -> Tensor:
+    """Return the first inputs, (n, m), of the best of plans with values (n, P); NaN if none."""
+    best = values.amax(dim=1, keepdim=True)
+    equal = values >= best - TIE_MARGIN * best.abs()
+    along = torch.where(equal, ties @ first.mT, -torch.inf)
+    return torch.where(best > -torch.inf, first[along.argmax(dim=1)], torch.nan)
