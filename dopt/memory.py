@@ -11,7 +11,7 @@ import math
 from dopt.learning import Learner
 from dopt.learning.adam import Adam
 from dopt.models import MLP, Model
-from dopt.policies import DOptimal, Informed, Policy
+from dopt.policies import DOptimal, EOptimal, Informed, Lookahead, Policy, Search, TaskOptimal
 from dopt.systems import System
 
 NUMBER = 8
@@ -46,8 +46,9 @@ def memory_by_setting(
         information = _information(policy, q, r * T, T * (p + L * w * (1 + r)))
     else:
         information = _information_of_module(policy, q, r * T)
-    for setting, count in information.items():
-        numbers[setting] = numbers.get(setting, 0) + count
+    for part in (information, _search(policy, system, model)):
+        for setting, count in part.items():
+            numbers[setting] = numbers.get(setting, 0) + count
     return {setting: NUMBER * count for setting, count in numbers.items()}
 
 
@@ -74,3 +75,23 @@ def _information_of_module(policy: Policy, q: int, n_rows: int) -> dict[str, int
     if isinstance(policy, DOptimal) and policy.chosen_form(q, n_rows) == "sketch":
         return {"policy.sketch_size": 3 * policy.sketch_size**2}
     return {"model": 3 * q**2}
+
+
+def _search(policy: Policy, system: System, model: Model) -> dict[str, int]:
+    """Return the numbers of a search: M⁻¹ in full, the rows of a path, all scores.
+
+    The kernel holds one path at a time, the reference all of them.
+    """
+    if not isinstance(policy, Search):
+        return {}
+    q, r, steps = model.n_parameters(system), system.n_learned, policy.steps(system)
+    rows = r * (steps // policy.stride_of(system) if isinstance(policy, Lookahead) else steps)
+    count = policy.count if isinstance(policy, TaskOptimal) else 0
+    subspace = min(q, policy.subspace) if isinstance(policy, EOptimal) else 0
+    return {
+        "model.width" if isinstance(model, MLP) else "model": q**2 + r * q,
+        "policy.horizon": 2 * rows * q + rows**2 + steps * (system.n_states + r),
+        "policy.directions": policy.directions**2 * (1 if model.compiled else 2 * rows * q),
+        "policy.count": count * (r * q + system.n_states),
+        "policy.subspace": subspace * (2 * q + 2 * subspace) + (r + 1) * q,
+    }

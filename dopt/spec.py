@@ -18,7 +18,7 @@ from dopt.learning.recursive_least_squares import RecursiveLeastSquares
 from dopt.memory import memory_by_setting
 from dopt.models import MODELS, Linear, Model
 from dopt.models.mlp import MLP
-from dopt.policies import POLICIES, Informed, Oracle, Policy
+from dopt.policies import POLICIES, Informed, Oracle, Policy, Search
 from dopt.policies.base import OpenLoop, Planned
 from dopt.registry import TARGET, build, section_of
 from dopt.systems import SYSTEMS, System
@@ -69,6 +69,8 @@ class Cell:
         self._check_runnable()
         self.policy.check(self.system)
         self._check_size()
+        if isinstance(self.policy, Search) and self.policy.budget_us and self.path != "kernel":
+            raise _mismatch("policy.budget_us", "path 'kernel'", f"path '{self.path}'")
         linear = isinstance(self.model, Linear)
         if isinstance(self.policy, Oracle) and not linear:
             raise _mismatch("policy 'oracle'", "model 'linear'", f"model '{self.model.name}'")

@@ -50,7 +50,10 @@ def _orthogonalize(basis: Any, j: int) -> None:
 @compiled
 def largest_eigenvalue(projected: Any, basis: Any, removed: Any) -> float:
     """Return the largest eigenvalue of M⁻¹ - WᵀW in the space, W = ``removed``, (r, q)."""
-    W = np.dot(removed, basis.T)
-    values, _ = np.linalg.eigh(projected - np.dot(W.T, W))
-    largest: float = values[-1]
+    W, K = np.dot(removed, basis.T), projected.shape[0]
+    left = projected.copy()
+    for k in range(W.shape[0]):
+        for i in range(K):
+            add_multiple(left[i], -W[k, i], W[k])
+    largest: float = np.linalg.eigvalsh(left)[K - 1]
     return largest

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dopt.kernel import network as nn
-from dopt.kernel.arguments import LINEAR_MODEL, Covariance, Floats, Network, Rules, World
+from dopt.kernel.arguments import LINEAR_MODEL, Covariance, Floats, Network, Search, World
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.information import add_multiple, inner, multiply_rows
@@ -36,9 +36,11 @@ class Path(NamedTuple):
 
 
 @compiled
-def new_path(world: World, network: Network, rules: Rules, covariance: Covariance, d: int) -> Path:
+def new_path(
+    world: World, network: Network, search: Search, covariance: Covariance, d: int
+) -> Path:
     """Return an empty path."""
-    search, r, q = rules.search, world.learned_rows.shape[0], covariance.upper.shape[0]
+    r, q = world.learned_rows.shape[0], covariance.upper.shape[0]
     C, H = search.candidates.shape[0], search.steps
     n = r * (H // search.stride)
     size = q if n * C > FEW_ROWS else 0
@@ -84,7 +86,7 @@ def roll(
     accelerations: Any,
     world: World,
     network: Network,
-    rules: Rules,
+    search: Search,
     theta: Any,
     path: Path,
     u: Any,
@@ -96,7 +98,7 @@ def roll(
     x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written, times the
     root of the stride.
     """
-    r, stride = world.learned_rows.shape[0], rules.search.stride
+    r, stride = world.learned_rows.shape[0], search.stride
     spare = path.products.shape[0]
     for i in range(first, last):
         x, following = path.states[i], path.states[i + 1]
@@ -107,8 +109,11 @@ def roll(
             following[j] = x[j] + world.dt * path.flow[j]
         if not within(following, world.state_limit):
             return False
-        block = r * ((i + 1) // stride - 1) if (i + 1) % stride == 0 else spare
-        rows = path.rows[block : block + r]
+        wanted = (i + 1) % stride == 0
+        block = r * ((i + 1) // stride - 1) if wanted else spare
+        # A network's output comes without rows; those of the linear model are its output.
+        count = r if wanted or network.kind == LINEAR_MODEL else 0
+        rows = path.rows[block : block + count]
         look(accelerations, world, network, theta, path, i + 1, rows)
         if stride > 1:
             scale(rows, np.sqrt(stride))

@@ -110,7 +110,7 @@ def d_optimal_input(
     S = np.zeros((1 if m == 1 else 1 + m, 1 + m))
     for k in range(world.learned_rows.shape[0]):
         if rules.all_components or k == component:
-            S += planning_forms(
+            forms = planning_forms(
                 accelerations,
                 complex_accelerations,
                 world,
@@ -121,6 +121,9 @@ def d_optimal_input(
                 columns,
                 k,
             )
+            for i in range(S.shape[0]):
+                for j in range(S.shape[1]):
+                    S[i, j] += forms[i, j]
     if m == 1:
         up = S[0, 1] > 0.0 or (S[0, 1] == 0.0 and tie[0] > 0.0)
         u[0] = world.gamma if up else -world.gamma

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from typing import Any
 
-import numba
 import numpy as np
 
 from dopt.errors import SpecificationError
 from dopt.kernel import arguments as args
-from dopt.kernel.cache import one_compiler_at_a_time
-from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN, compiled_equations
+from dopt.kernel.equations import compiled_equations
+from dopt.kernel.loop import compiled_loop, compiled_search
 from dopt.kernel.setup import constants, empty_record, initial_state
-from dopt.kernel.trial import advance
 from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
@@ -77,7 +74,8 @@ class KernelTrial:
         world, network, rules, points = self.constants
         equations = compiled_equations(self.spec.system)
         call = (world, network, rules, self.randomness, points, self.state, self.record)
-        self.done = int(_loop_for(*call)(*equations, *call, self.done, last))
+        loop, search = compiled_loop(call), compiled_search(call)
+        self.done = int(loop(*equations, search, *call, self.done, last))
         if self.done < last:
             self.diverged_at = self.done
 
@@ -114,24 +112,6 @@ def _advance_in_pieces(trial: KernelTrial, last: int) -> None:
         trial.advance(min(last, before + steps))
         rate = (trial.done - before) / (time.perf_counter() - start)
         steps = max(1, int(rate * PIECE_SECONDS))
-
-
-def _loop_for(*call: Any) -> Any:
-    """Return the loop, compiled for function pointers: once for all systems."""
-    loop: Any = advance
-    kinds = tuple(numba.typeof(argument) for argument in call)
-    if kinds not in _compiled_for:
-        signatures = (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)
-        pointers = [numba.types.FunctionType(signature) for signature in signatures]
-        name = f"loop-{hashlib.sha256(str(kinds).encode()).hexdigest()[:16]}"
-        with one_compiler_at_a_time(name):
-            loop.compile((*pointers, *kinds, numba.int64, numba.int64))
-        loop.disable_compile()
-        _compiled_for.add(kinds)
-    return loop
-
-
-_compiled_for: set[tuple[Any, ...]] = set()
 
 
 def _fields(source: object, kind: Any) -> list[Any]:

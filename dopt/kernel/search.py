@@ -13,10 +13,10 @@ from dopt.kernel.arguments import (
     SUM,
     TASK,
     TRACE,
+    Covariance,
     Floats,
     Network,
-    Rules,
-    State,
+    Search,
     World,
 )
 from dopt.kernel.compiler import compiled, monotonic_microseconds, vectorized
@@ -38,8 +38,9 @@ class Problem(NamedTuple):
 
     world: World
     network: Network
-    rules: Rules
-    state: State
+    search: Search
+    theta: Floats
+    covariance: Covariance
     path: Path
     yardstick: Yardstick
     end: float  # when the time is spent [µs]
@@ -51,21 +52,39 @@ def search_input(
     accelerations: Any,
     world: World,
     network: Network,
-    rules: Rules,
-    state: State,
+    search: Search,
+    theta: Any,
+    covariance: Covariance,
     x: Any,
     tie: Any,
     u: Any,
 ) -> None:
     """Write the first input of the best plan that was found in time, (m,)."""
-    end = monotonic_microseconds() + rules.search.budget_us
-    path = new_path(world, network, rules, state.covariance, x.shape[0])
-    yardstick = _yardstick(accelerations, world, network, rules, state, path)
+    end = monotonic_microseconds() + search.budget_us
+    path = new_path(world, network, search, covariance, x.shape[0])
+    yardstick = _yardstick(accelerations, world, network, search, theta, covariance, path)
     for i in range(x.shape[0]):
         path.states[0, i] = x[i]
-    look(accelerations, world, network, state.theta, path, 0, path.rows[path.products.shape[0] :])
-    problem = Problem(world, network, rules, state, path, yardstick, end)
-    _choose(_values(known, accelerations, problem), rules.search.candidates, tie, u)
+    look(accelerations, world, network, theta, path, 0, path.rows[path.products.shape[0] :])
+    problem = Problem(world, network, search, theta, covariance, path, yardstick, end)
+    _choose(_values(known, accelerations, problem), search.candidates, tie, u)
+
+
+@compiled
+def no_search(
+    known: Any,  # noqa: ARG001  # the signature is that of the search
+    accelerations: Any,  # noqa: ARG001
+    world: World,  # noqa: ARG001
+    network: Network,  # noqa: ARG001
+    search: Search,  # noqa: ARG001
+    theta: Any,  # noqa: ARG001
+    covariance: Covariance,  # noqa: ARG001
+    x: Any,  # noqa: ARG001
+    tie: Any,  # noqa: ARG001
+    u: Any,
+) -> None:
+    """Stand where a policy needs no search, which takes long to compile."""
+    u[:] = np.nan
 
 
 @compiled
@@ -74,7 +93,7 @@ def _values(known: Any, accelerations: Any, problem: Problem) -> Any:
 
     In a hurry the plans without a switch come first, then the switches from the best of these.
     """
-    search = problem.rules.search
+    search = problem.search
     unhurried, switching = search.budget_us == 0.0, search.switch < search.steps
     C = search.candidates.shape[0]
     values = np.full((C, C), -np.inf)
@@ -86,18 +105,31 @@ def _values(known: Any, accelerations: Any, problem: Problem) -> Any:
         if unhurried and switching:
             _switches(known, accelerations, problem, c, begun, values[c])
     if switching and not unhurried:
-        for c in np.argsort(-np.diag(values)):
+        begun_from = np.zeros(C, np.bool_)
+        for _ in range(C):
             if _late(problem):
                 break
+            c = _best_hold(values, begun_from)
+            begun_from[c] = True
             begun = _begin(known, accelerations, problem, c)
             _switches(known, accelerations, problem, c, begun, values[c])
     return values
 
 
 @compiled
+def _best_hold(values: Any, done: Any) -> int:
+    """Return the candidate with the best plan without a switch among those that are not done."""
+    best = -1
+    for c in range(values.shape[0]):
+        if not done[c] and (best < 0 or values[c, c] > values[best, best]):
+            best = c
+    return best
+
+
+@compiled
 def _late(problem: Problem) -> bool:
     """Tell whether the time of this step is spent."""
-    late: bool = problem.rules.search.budget_us > 0.0 and monotonic_microseconds() >= problem.end
+    late: bool = problem.search.budget_us > 0.0 and monotonic_microseconds() >= problem.end
     return late
 
 
@@ -116,7 +148,7 @@ def _switches(
 @compiled
 def _begin(known: Any, accelerations: Any, problem: Problem, c: int) -> float:
     """Roll the path under candidate c up to the switch; return log det of its rows so far."""
-    switch = problem.rules.search.switch
+    switch = problem.search.switch
     if not _roll(known, accelerations, problem, c, 0, switch):
         return -np.inf
     return _gain(problem, 0, switch)
@@ -128,7 +160,7 @@ def _finish(known: Any, accelerations: Any, problem: Problem, c: int, begun: flo
 
     It is -∞ where the path leaves the bounds of a state, or the score is not finite.
     """
-    search = problem.rules.search
+    search = problem.search
     if begun == -np.inf:
         return begun
     if not _roll(known, accelerations, problem, c, search.switch, search.steps):
@@ -142,21 +174,19 @@ def _finish(known: Any, accelerations: Any, problem: Problem, c: int, begun: flo
 @compiled
 def _roll(known: Any, accelerations: Any, problem: Problem, c: int, first: int, last: int) -> bool:
     """Hold candidate c from state ``first`` to state ``last`` of the path."""
-    world, network, rules = problem.world, problem.network, problem.rules
-    theta, u = problem.state.theta, rules.search.candidates[c]
-    inside: bool = roll(
-        known, accelerations, world, network, rules, theta, problem.path, u, first, last
-    )
+    world, network, search, theta = problem.world, problem.network, problem.search, problem.theta
+    path, u = problem.path, search.candidates[c]
+    inside: bool = roll(known, accelerations, world, network, search, theta, path, u, first, last)
     return inside
 
 
 @compiled
 def _gain(problem: Problem, first: int, last: int) -> float:
     """Return the growth of log det by the rows of steps ``first`` to ``last``."""
-    path, search = problem.path, problem.rules.search
+    path, search = problem.path, problem.search
     r = problem.world.learned_rows.shape[0]
     first, last = r * (first // search.stride), r * (last // search.stride)
-    weigh(problem.state.covariance, path, first, last)
+    weigh(problem.covariance, path, first, last)
     block = r if search.score == SUM else path.products.shape[0]
     gain: float = log_determinant(path, first, last, block)
     return gain
@@ -183,30 +213,32 @@ def _other_score(score: int, path: Path, yardstick: Yardstick) -> float:
 
 @compiled
 def _yardstick(
-    accelerations: Any, world: World, network: Network, rules: Rules, state: State, path: Path
+    accelerations: Any,
+    world: World,
+    network: Network,
+    search: Search,
+    theta: Any,
+    covariance: Covariance,
+    path: Path,
 ) -> Yardstick:
     """Return what the score needs at these parameters and this M⁻¹."""
-    search, q, r = rules.search, state.theta.shape[0], world.learned_rows.shape[0]
+    q, r = theta.shape[0], world.learned_rows.shape[0]
     if search.score == E_OPTIMAL:
-        basis, projected = krylov_space(state.covariance, search.starts, search.subspace)
+        basis, projected = krylov_space(covariance, search.starts, search.subspace)
         return Yardstick(basis, projected)
     n = search.task_states.shape[0] if search.score == TASK else 0
     rows = np.empty((n * r, q))
     for s in range(n):
         for i in range(path.flow.shape[0]):
             path.states[0, i] = search.task_states[s, i]
-        look(accelerations, world, network, state.theta, path, 0, rows[s * r : (s + 1) * r])
+        look(accelerations, world, network, theta, path, 0, rows[s * r : (s + 1) * r])
     return Yardstick(rows, np.empty((0, 0)))
 
 
 @compiled
 def _choose(values: Any, candidates: Any, tie: Any, u: Any) -> None:
     """Write the candidate that begins the best plan; ``tie`` decides among equal ones."""
-    best = np.max(values)
-    u[:] = np.nan
-    if best == -np.inf:
-        return
-    preferred = -np.inf
+    best, preferred = np.max(values), -np.inf
     for c in range(values.shape[0]):
         along = np.dot(candidates[c], tie)
         if np.max(values[c]) >= best - TIE_MARGIN * abs(best) and along > preferred:

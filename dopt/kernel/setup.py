@@ -104,16 +104,17 @@ def _search(cell: Cell) -> args.Search:
     if isinstance(policy, Search):
         steps, score = policy.steps(system), SCORES.index(policy.score)
         candidates = policy.candidates(system)
+    states = np.zeros((0, system.n_states))
+    if isinstance(policy, TaskOptimal):
+        states = task_states(system, policy)
     return args.Search(
         candidates,
         score,
         steps,
         steps // 2 if steps > 1 else steps,
-        policy.stride if isinstance(policy, Lookahead) else 1,
+        policy.stride_of(system) if isinstance(policy, Lookahead) else 1,
         policy.budget_us if isinstance(policy, Search) else 0.0,
-        task_states(system, policy)
-        if isinstance(policy, TaskOptimal)
-        else np.zeros((0, system.n_states)),
+        states,
         policy.starts(q, system.n_learned) if isinstance(policy, EOptimal) else np.zeros((0, q)),
         policy.subspace if isinstance(policy, EOptimal) else 0,
     )

@@ -31,7 +31,6 @@ from dopt.kernel.information import absorb
 from dopt.kernel.learning import adam_step, remember
 from dopt.kernel.model import add_linear, all_components, network_rows, regressors
 from dopt.kernel.policies import d_optimal_input, uniform_input
-from dopt.kernel.search import search_input
 from dopt.kernel.sketch import sketched
 
 
@@ -40,6 +39,7 @@ def plan(
     known: Any,
     accelerations: Any,
     complex_accelerations: Any,
+    search: Any,
     world: World,
     network: Network,
     rules: Rules,
@@ -70,7 +70,8 @@ def plan(
         )
     elif rules.policy == SEARCH:
         x, tie = states[t], randomness.ties[t]
-        search_input(known, accelerations, world, network, rules, state, x, tie, u)
+        theta, covariance = state.theta, state.covariance
+        search(known, accelerations, world, network, rules.search, theta, covariance, x, tie, u)
     else:
         steps = rules.ascent_steps
         uniform_input(known, accelerations, world, network, state, states, t, steps, u)
@@ -141,6 +142,7 @@ def advance(
     known: Any,
     accelerations: Any,
     complex_accelerations: Any,
+    search: Any,
     world: World,
     network: Network,
     rules: Rules,
@@ -169,6 +171,7 @@ def advance(
             known,
             accelerations,
             complex_accelerations,
+            search,
             world,
             network,
             rules,

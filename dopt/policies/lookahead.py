@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+from dopt.errors import IncompatibleError
 from dopt.fields import quantity
 from dopt.policies.search import Search
 from dopt.systems.base import System
@@ -13,6 +14,7 @@ from dopt.systems.equilibrium import eigenmode
 
 PERIOD_SHARE = 0.6
 STEPS_WITHOUT_PERIOD = 10
+STATES_OF_A_PATH = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +34,23 @@ class Lookahead(Search):
         ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` that of each state's
         rows alone, summed over the path.
     stride : int
-        Every how many steps a state's rows are taken; each then counts so many times.
+        Every how many steps a state's rows are taken; each then counts so many times. 0 takes a
+        fifth of the plan's steps: neighbouring rows are nearly the same.
     """
 
     name: ClassVar[str] = "lookahead"
 
     directions: int = quantity(8, "directions", "positive")
     horizon: int = quantity(0, "steps", "nonnegative")
-    criterion: str = quantity("joint", choices=("joint", "sum"))
-    stride: int = quantity(1, "steps", "positive")
+    criterion: str = quantity("sum", choices=("joint", "sum"))
+    stride: int = quantity(0, "steps", "nonnegative")
+
+    def check(self, system: System) -> None:
+        if self.stride > self.steps(system):
+            raise IncompatibleError(
+                f"policy.stride is {self.stride} steps, but the plans have {self.steps(system)}: "
+                f"make it smaller, or policy.horizon larger."
+            )
 
     @property
     def score(self) -> str:
@@ -53,3 +63,7 @@ class Lookahead(Search):
         if mode is None:
             return STEPS_WITHOUT_PERIOD
         return max(1, round(PERIOD_SHARE * 2 * math.pi / mode.frequency / system.dt))
+
+    def stride_of(self, system: System) -> int:
+        """Return every how many steps of a plan a state's rows are taken."""
+        return self.stride or max(1, self.steps(system) // STATES_OF_A_PATH)

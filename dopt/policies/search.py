@@ -19,8 +19,7 @@ SCORES = ("joint", "sum", "trace", "a", "e", "task")
 TIE_MARGIN = 1e-9
 """Plans whose scores differ by less than this relative margin are equal."""
 
-_REPULSIONS = 200
-_REPULSION_STEP = 0.1
+_REPULSIONS = 400
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +29,8 @@ class Search(Informed):
     From x_t the model runs x ← x + dt f_θ(x, u) without linearisation. The rows J at the states of
     the path, all r learned components of each, are what the plan would add to M; a score says what
     they are worth. The plan is made anew at each step. Among plans of equal score a random
-    direction decides. M⁻¹ is held as a q × q matrix.
+    direction decides, as it does where every path leaves the bounds of a state: such a path has no
+    score. M⁻¹ is held as a q × q matrix.
 
     With a time budget plans are scored one after the other until it is spent, and the best so far
     is taken: the result then depends on the clock and on the machine. Without one it is
@@ -78,11 +78,14 @@ def sphere_directions(m: int, count: int) -> Array:
         angles = 2 * np.pi * np.arange(count) / count
         return np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = _quasirandom(m, count)
-    for _ in range(_REPULSIONS):
+    for i in range(_REPULSIONS):
         gaps = points[:, None] - points
         distances = np.linalg.norm(gaps, axis=-1) + np.eye(count)
         force = (gaps / distances[..., None] ** 3).sum(axis=1)
-        points = on_sphere(points + _REPULSION_STEP / count * force, 1.0)
+        force -= (force * points).sum(axis=1, keepdims=True) * points
+        largest = np.linalg.norm(force, axis=1).max() + 1e-300
+        step = (1 - i / _REPULSIONS) * count ** (-1 / (m - 1))
+        points = on_sphere(points + step / (2 * largest) * force, 1.0)
     return points
 
 

@@ -43,7 +43,7 @@ def searched_inputs(
     pairs = plans(policy, system, len(candidates))
     inputs = candidates[torch.tensor(pairs)]
     states = vmap(lambda p, z: paths(policy, system, model, p, z, inputs))(theta, x)
-    stride = policy.stride if isinstance(policy, Lookahead) else 1
+    stride = policy.stride_of(system) if isinstance(policy, Lookahead) else 1
     seen = states[:, :, stride - 1 :: stride]
     rows = vmap(vmap(vmap(jacrev(model), (None, 0)), (None, 0)))(theta, seen) * stride**0.5
     score = score_function(policy, system, model)
@@ -83,15 +83,17 @@ def score_function(policy: Search, system: System, model: Accelerations) -> Scor
         return _log_determinant(rows.flatten(0, 1), inverse)
 
     def separate(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
-        values: Tensor = vmap(_log_determinant, (0, None))(rows, inverse)
-        return values.sum()
+        total: Tensor = vmap(_log_determinant, (0, None))(rows, inverse).sum()
+        return total
 
     def trace(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
         J = rows.flatten(0, 1)
-        return ((J @ inverse) * J).sum()
+        total: Tensor = ((J @ inverse) * J).sum()
+        return total
 
     def average(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
-        return decrease(rows, inverse).diagonal().sum()
+        total: Tensor = decrease(rows, inverse).diagonal().sum()
+        return total
 
     def eigenvalue(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
         assert isinstance(policy, EOptimal)
@@ -104,7 +106,8 @@ def score_function(policy: Search, system: System, model: Accelerations) -> Scor
         assert isinstance(policy, TaskOptimal)
         states = torch.tensor(task_states(system, policy)).to(theta)
         G = vmap(jacrev(model), (None, 0))(theta, states).flatten(0, 1)
-        return ((G @ decrease(rows, inverse)) * G).sum()
+        total: Tensor = ((G @ decrease(rows, inverse)) * G).sum()
+        return total
 
     scores = {"joint": joint, "sum": separate, "trace": trace, "a": average}
     return (scores | {"e": eigenvalue, "task": task})[policy.score]
@@ -144,8 +147,8 @@ def krylov_basis(inverse: Tensor, starts: Tensor, size: int) -> Tensor:
 
 
 def chosen(values: Tensor, first: Tensor, ties: Tensor) -> Tensor:
-    """Return the first inputs, (n, m), of the best of plans with values (n, P); NaN if none."""
+    """Return the first inputs, (n, m), of the best of plans with values (n, P)."""
     best = values.amax(dim=1, keepdim=True)
     equal = values >= best - TIE_MARGIN * best.abs()
     along = torch.where(equal, ties @ first.mT, -torch.inf)
-    return torch.where(best > -torch.inf, first[along.argmax(dim=1)], torch.nan)
+    return first[along.argmax(dim=1)]

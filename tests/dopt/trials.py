@@ -1,4 +1,4 @@
-"""Small trials for tests: named choices, few evaluation points, a short horizon."""
+"""Small trials for tests: named choices, few evaluation points, short horizons and plans."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from dopt.spec import TrialSpec
 from dopt.systems import SYSTEMS
 
 SMALL_GRIDS = {"pendulum": (4, 4), "cartpole": (3, 4, 3), "arm": (2, 2, 2, 2), "quadrotor": (4, 4)}
+SMALL_SEARCHES = {"lookahead": {"horizon": 6, "directions": 4}, "task": {"count": 8}}
 
 
 def trial(env: str, policy: str, seed: int = 0, /, **fields: Mapping[str, Any]) -> TrialSpec:
@@ -18,7 +19,7 @@ def trial(env: str, policy: str, seed: int = 0, /, **fields: Mapping[str, Any]) 
     linear = policy == "oracle"
     sections: dict[str, dict[str, Any]] = {
         "env": {"name": env, "horizon": 30, "grid_points": SMALL_GRIDS[env]},
-        "policy": {"name": policy},
+        "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
         "model": {"name": "linear" if linear else "mlp"},
         "learner": {"name": "recursive_least_squares" if linear else "adam_window"},
     }
