@@ -85,6 +85,13 @@ _STYLES = {
     "prbs": PolicyStyle("PRBS", WINE, (0, (1.2, 2.4))),
     "multisine": PolicyStyle("multisine", INDIGO, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2))),
     "chirp": PolicyStyle("chirp", OLIVE, (0, (6, 2.4))),
+    "lookahead": PolicyStyle("look-ahead", BLACK, (0, (9, 1)), 1.6),
+    "exact": PolicyStyle("exact gain", BLUE, (0, (5, 1))),
+    "trace": PolicyStyle("trace", CYAN, (0, (2, 1))),
+    "trace_linearized": PolicyStyle("trace, linearised", ORANGE, (0, (3, 1, 1, 1))),
+    "a_optimal": PolicyStyle("A-optimal", PURPLE, (0, (7, 1.5))),
+    "e_optimal": PolicyStyle("E-optimal", OLIVE, (0, (1, 2))),
+    "task": PolicyStyle("task-optimal", GREEN, (0, (5, 1, 1, 1, 1, 1))),
 }
 
 
