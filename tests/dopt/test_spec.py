@@ -19,19 +19,21 @@ SECTIONS = {"env": "system", "policy": "policy", "model": "model", "learner": "l
 def every_field(spec: TrialSpec) -> list[tuple[str, str, Any]]:
     """Return (section, field, another valid value) for every field of a trial."""
     return [
-        (section, field.name, other(getattr(getattr(spec, attribute), field.name)))
+        (section, field.name, other(getattr(getattr(spec, attribute), field.name), field, spec))
         for section, attribute in SECTIONS.items()
         for field in dataclasses.fields(getattr(spec, attribute))
     ]
 
 
-def other(value: Any) -> Any:
+def other(value: Any, field: dataclasses.Field[Any], spec: TrialSpec) -> Any:
     if value is None:
         return 1.5
     if isinstance(value, str):
-        return "primal"
+        return next(choice for choice in field.metadata["choices"] if choice != value)
+    if value == ():
+        return spec.system.initial_state
     if isinstance(value, tuple):
-        return [other(value[0]), *value[1:]]
+        return [other(value[0], field, spec), *value[1:]]
     return 0.5 * value if 0 < value < 1 else value + 1
 
 
