@@ -10,7 +10,7 @@ from dopt.errors import IncompatibleError, SpecificationError
 from dopt.registry import name_of
 from dopt.spec import Cell, TrialSpec
 
-TRIAL_SECTIONS = ("env", "policy", "model", "learner", "seed")
+TRIAL_SECTIONS = ("env", "policy", "model", "learner", "task", "seed")
 """The parts of a configuration that make a trial."""
 
 

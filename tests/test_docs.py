@@ -41,8 +41,8 @@ def filled(request: pytest.FixtureRequest) -> str:
     return url
 
 
-def test_there_are_ten_queries() -> None:
-    assert len(QUERIES) >= 10
+def test_there_are_eleven_queries() -> None:
+    assert len(QUERIES) == 11
 
 
 def test_every_query_answers_on_both_databases(filled: str) -> None:

@@ -38,6 +38,17 @@ TRIALS = pa.schema(
 """One row for each trial, with or without a result."""
 
 
+ASSESSMENTS = pa.schema(
+    [
+        ("config", _TEXT),
+        *_NAMES,
+        *_SIZES,
+        *(("seed", _WHOLE), ("status", _TEXT), ("t", _WHOLE), ("measure", _TEXT), ("value", _REAL)),
+    ]
+)
+"""One row for each measure of a trial after t explored steps."""
+
+
 def trajectories(n_states: int, n_inputs: int) -> pa.Schema:
     """Return the columns of trajectories: one row for each t from 0 to T, without an input at T."""
     kept = [field for field in CURVES if field.name not in STEP_COLUMNS]

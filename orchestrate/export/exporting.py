@@ -19,11 +19,13 @@ _STREAMS: dict[str, Callable[[Reader, Sequence[Cell]], streams.Stream]] = {
     "curves": streams.curves,
     "trials": streams.trials,
     "trajectories": streams.trajectories,
+    "assessments": streams.assessments,
 }
 _MATRICES: dict[str, Callable[[Reader, Sequence[Cell]], Generator[matrices.Named, None, None]]] = {
     "curves": matrices.curves,
     "trials": matrices.trials,
     "trajectories": matrices.trajectories,
+    "assessments": matrices.assessments,
 }
 _WRITERS = {"csv": tables.write_csv, "parquet": tables.write_parquet}
 
@@ -71,6 +73,11 @@ def _expect_trials(reader: Reader, cells: Sequence[Cell], wanted: Export) -> Non
     if not cells:
         raise ExportError(
             f"{reader.safe_url} holds no trials yet: run a launch that writes to it first."
+        )
+    if wanted.kind == "assessments" and not any(reader.measures(c.config_key) for c in cells):
+        raise ExportError(
+            "No trial of these was assessed, so that there are no assessments to export: run them "
+            "with task=control."
         )
     if wanted.kind != "trials" and not any(cell.n_done + cell.n_diverged for cell in cells):
         raise ExportError(

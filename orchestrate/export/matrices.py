@@ -75,6 +75,16 @@ def trajectories(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None
         yield f"{name}/diverged", np.array(diverged, dtype=np.bool_), ("seed",)
 
 
+def assessments(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None, None]:
+    """Yield each measure of the finished trials, (seed, t), with its seeds and numbers of steps."""
+    for name, cell in zip(names(cells), cells, strict=True):
+        for measure in reader.measures(cell.config_key):
+            found = reader.assessments(cell.config_key, measure)
+            yield f"{name}/{measure}", found.values, ("seed", "t")
+            yield f"{name}/{measure}/seed", found.seeds, ("seed",)
+            yield f"{name}/{measure}/t", found.t, ("t",)
+
+
 def trials(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None, None]:
     """Yield the columns of the table of trials; a missing number is NaN, a missing text empty."""
     table = streams.trials(reader, cells)

@@ -39,6 +39,10 @@ JOIN trajectory j ON j.trial_id = r.trial_id
 WHERE c.config_key = :config_key AND r.status IN ('done', 'diverged')
 ORDER BY r.seed
 """
+_ASSESSMENTS = """
+SELECT seed, status, t, measure, value FROM v_assessment
+WHERE config_key = :config_key AND status IN ('done', 'diverged') ORDER BY seed, t, measure
+"""
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,11 @@ def trajectories(reader: Reader, cells: Sequence[Cell]) -> Stream:
     return Stream(schema, _trajectories(reader, cells, schema))
 
 
+def assessments(reader: Reader, cells: Sequence[Cell]) -> Stream:
+    """Return what finished trials were worth, sorted by configuration, seed, t and measure."""
+    return Stream(columns.ASSESSMENTS, _assessments(reader, cells))
+
+
 def steps(reader: Reader, cell: Cell) -> Generator[list[Sequence[Any]], None, None]:
     """Yield (seed, status, t, *STEP_COLUMNS) of the finished trials, in batches, by seed and t."""
     yield from reader.batches(ROWS, _CURVES, config_key=cell.config_key)
@@ -87,6 +96,14 @@ def _curves(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, 
             names = ("seed", "status", "t", *columns.STEP_COLUMNS)
             values = dict(zip(names, zip(*rows, strict=True), strict=True))
             yield _batch(columns.CURVES, {**_constants(cell), **values}, len(rows))
+
+
+def _assessments(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, None, None]:
+    for cell in cells:
+        for rows in reader.batches(ROWS, _ASSESSMENTS, config_key=cell.config_key):
+            names = ("seed", "status", "t", "measure", "value")
+            values = dict(zip(names, zip(*rows, strict=True), strict=True))
+            yield _batch(columns.ASSESSMENTS, {**_constants(cell), **values}, len(rows))
 
 
 def _trials(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, None, None]:

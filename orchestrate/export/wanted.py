@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dopt.errors import DoptError
 
-KINDS = ("curves", "trials", "trajectories")
+KINDS = ("curves", "trials", "trajectories", "assessments")
 FORMATS = ("csv", "parquet", "npz")
 
 

@@ -29,7 +29,7 @@ from orchestrate.store.records import (
     Result,
     RunRecord,
 )
-from orchestrate.store.rows import Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
+from orchestrate.store.rows import Assessments, Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
 from orchestrate.store.schema import RETRIED
 from orchestrate.store.store import Store
 from orchestrate.store.upgrading import Upgrade, upgrade
@@ -37,6 +37,7 @@ from orchestrate.store.upgrading import Upgrade, upgrade
 __all__ = [
     "LEASE_SECONDS",
     "RETRIED",
+    "Assessments",
     "Cell",
     "Claim",
     "Curves",

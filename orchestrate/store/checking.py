@@ -18,6 +18,7 @@ def check_result(trial_key: str, result: Result) -> None:
     _expect_shape(trial_key, result, "inputs", (n, None))
     _expect_shape(trial_key, result, "parameters", (None,))
     _check_divergence(trial_key, result)
+    _check_assessments(trial_key, result)
 
 
 def _expect_shape(
@@ -45,6 +46,19 @@ def _check_divergence(trial_key: str, result: Result) -> None:
         raise _refusal(trial_key, f"'diverged_at' is {at}, expected a step below {len(loss)}")
     if at is not None and loss[at:].any():
         raise _refusal(trial_key, f"there are losses after the divergence at step {at}")
+
+
+def _check_assessments(trial_key: str, result: Result) -> None:
+    seen: set[tuple[int, str]] = set()
+    for row in result.assessments:
+        if not 0 <= row.t <= result.n_steps:
+            raise _refusal(
+                trial_key,
+                f"'{row.measure}' is of step {row.t}, expected one from 0 to {result.n_steps}",
+            )
+        if (row.t, row.measure) in seen:
+            raise _refusal(trial_key, f"'{row.measure}' of step {row.t} is there twice")
+        seen.add((row.t, row.measure))
 
 
 def check_horizon(trial_key: str, n_rows: int, horizon: int) -> None:

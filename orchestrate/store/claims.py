@@ -12,6 +12,7 @@ from orchestrate.store.records import Claim
 from orchestrate.store.schema import (
     OUTCOME_COLUMNS,
     RETRIED,
+    assessment,
     attempt,
     step,
     trajectory,
@@ -100,7 +101,7 @@ def retry(
     if trial_keys is not None:
         which = which & trial.c.trial_key.in_(backend.members(trial_keys))
     chosen = select(trial.c.trial_id).where(which)
-    for table in (step, trajectory):
+    for table in (step, trajectory, assessment):
         connection.execute(delete(table).where(table.c.trial_id.in_(chosen)))
     pending = {"status": "pending", **dict.fromkeys((*OUTCOME_COLUMNS, "launch_id", "error_id"))}
     return connection.execute(update(trial).where(which).values(pending)).rowcount

@@ -29,6 +29,18 @@ _ATTEMPTS = (
 _STEPS = f"SELECT t, {', '.join(STEP_VALUES)} FROM step WHERE trial_id = :trial_id ORDER BY t"
 
 
+_ASSESSMENTS = (
+    "SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure"
+)
+# The trials of a configuration are assessed alike: one with fewer numbers has lost some.
+_EXPECTED = (
+    "SELECT max(n) FROM (SELECT count(*) AS n FROM assessment a "
+    "JOIN trial r ON r.trial_id = a.trial_id JOIN trial o ON o.config_id = r.config_id "
+    "WHERE o.trial_id = :trial_id AND o.status = 'done' AND r.status = 'done' "
+    "GROUP BY a.trial_id) AS counts"
+)
+
+
 @dataclass(frozen=True)
 class Curve:
     """What a trial that ran to its end left behind.
@@ -38,10 +50,13 @@ class Curve:
     steps : (T, number of STEP_VALUES)
     trajectory
         The row of the table, without the number of the trial.
+    assessments
+        Rows of the table, each a step, a measure and its value.
     """
 
     steps: Array
     trajectory: dict[str, Any]
+    assessments: list[tuple[int, str, float | None]]
 
 
 class Source:
@@ -91,9 +106,14 @@ def curve(moment: Reader, trial_id: int, horizon: int) -> Curve | None:
         or not np.array_equal(steps[:, 0], np.arange(horizon))
     ):
         return None
+    assessments = [tuple(row) for row in moment.rows(_ASSESSMENTS, trial_id=trial_id)]
+    ((expected,),) = moment.rows(_EXPECTED, trial_id=trial_id)
+    if expected is not None and len(assessments) != expected:
+        return None
     row = dict(zip(arrays.columns, arrays[0], strict=True))
     del row["trial_id"]
-    return Curve(steps[:, 1:], {key: _bytes(value) for key, value in row.items()})
+    packed = {key: _bytes(value) for key, value in row.items()}
+    return Curve(steps[:, 1:], packed, assessments)
 
 
 def _bytes(value: Any) -> Any:

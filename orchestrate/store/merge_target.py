@@ -13,6 +13,7 @@ from orchestrate.store.merge_source import Curve, Source
 from orchestrate.store.schema import (
     OUTCOME_COLUMNS,
     STEP_VALUES,
+    assessment,
     attempt,
     config,
     error,
@@ -24,6 +25,9 @@ from orchestrate.store.schema import trajectory as trajectory_table
 
 _COPIED = ("status", *OUTCOME_COLUMNS)
 _NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
+_ASSESSMENTS = select(assessment.c.t, assessment.c.measure, assessment.c.value).order_by(
+    assessment.c.t, assessment.c.measure
+)
 _STEPS = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
 
 
@@ -75,6 +79,7 @@ class Target:
             self._connection.execute(
                 insert(trajectory_table), {"trial_id": trial_id, **curve.trajectory}
             )
+            self._write_assessments(trial_id, curve)
 
     def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
         """Tell whether both databases hold the same numbers; times may differ."""
@@ -86,12 +91,23 @@ class Target:
         arrays = self._connection.execute(
             select(trajectory_table).where(trajectory_table.c.trial_id == where)
         ).one_or_none()
+        rows = self._connection.execute(_ASSESSMENTS.where(assessment.c.trial_id == where))
         return (
-            mine.shape == there.steps.shape
+            sorted(map(tuple, rows)) == sorted(there.assessments)
+            and mine.shape == there.steps.shape
             and np.array_equal(mine[:, _NUMBERS], there.steps[:, _NUMBERS], equal_nan=True)
             and arrays is not None
             and all(getattr(arrays, name) == value for name, value in there.trajectory.items())
         )
+
+    def _write_assessments(self, trial_id: int, curve: Curve) -> None:
+        names = ("t", "measure", "value")
+        rows = [
+            {"trial_id": trial_id, **dict(zip(names, row, strict=True))}
+            for row in curve.assessments
+        ]
+        if rows:
+            self._connection.execute(insert(assessment), rows)
 
     def _write_trial(
         self, row: Mapping[str, Any], here: Row[Any] | None, attempts: Sequence[Mapping[str, Any]]

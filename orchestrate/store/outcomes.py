@@ -24,7 +24,14 @@ from orchestrate.store.backend import Backend
 from orchestrate.store.checking import check_horizon, check_result
 from orchestrate.store.packing import DTYPE, pack
 from orchestrate.store.records import Array, Claim, Failure, Result, RunRecord
-from orchestrate.store.schema import STEP_VALUES, attempt, error, trajectory, trial
+from orchestrate.store.schema import (
+    STEP_VALUES,
+    assessment,
+    attempt,
+    error,
+    trajectory,
+    trial,
+)
 from orchestrate.store.values import finite, plain, storable, utc_text
 
 _RUN_COLUMNS = ("node", "wall_seconds", "cpu_seconds", "peak_memory_bytes")
@@ -76,6 +83,7 @@ _SET_ERROR = (
     .values(error_id=bindparam("error_id"))
 )
 _INSERT_TRAJECTORY = insert(trajectory)
+_INSERT_ASSESSMENT = insert(assessment)
 _INSERT_ERROR = text(
     "INSERT INTO error (hash, type, message, traceback) "
     "VALUES (:hash, :type, :message, :traceback) ON CONFLICT (hash) DO NOTHING"
@@ -91,6 +99,7 @@ class Outcome:
     summary: dict[str, Any]
     steps: Array
     trajectory: dict[str, Any]
+    assessments: list[dict[str, Any]]
 
 
 def prepare(claim: Claim, result: Result, run: RunRecord) -> Outcome:
@@ -108,7 +117,9 @@ def prepare(claim: Claim, result: Result, run: RunRecord) -> Outcome:
         "cause": None,
         **_run_row(run),
     }
-    return Outcome(claim, summary, steps, _trajectory_row(claim, result))
+    return Outcome(
+        claim, summary, steps, _trajectory_row(claim, result), _assessment_rows(claim, result)
+    )
 
 
 def _trajectory_row(claim: Claim, result: Result) -> dict[str, Any]:
@@ -116,6 +127,18 @@ def _trajectory_row(claim: Claim, result: Result) -> dict[str, Any]:
     for name in ("states", "inputs", "parameters"):
         row[f"{name}_shape"], row[name] = pack(getattr(result, name))
     return row
+
+
+def _assessment_rows(claim: Claim, result: Result) -> list[dict[str, Any]]:
+    return [
+        {
+            "trial_id": claim.trial_id,
+            "t": int(row.t),
+            "measure": row.measure,
+            "value": finite(row.value),
+        }
+        for row in result.assessments
+    ]
 
 
 def _run_row(run: RunRecord) -> dict[str, Any]:
@@ -138,6 +161,8 @@ def write(connection: Connection, backend: Backend, outcome: Outcome) -> bool:
     check_horizon(outcome.claim.trial_key, len(outcome.steps), horizon)
     backend.insert_steps(connection, outcome.claim.trial_id, outcome.steps)
     connection.execute(_INSERT_TRAJECTORY, outcome.trajectory)
+    if outcome.assessments:
+        connection.execute(_INSERT_ASSESSMENT, outcome.assessments)
     _end_attempt(connection, outcome.claim, outcome.summary)
     return True
 

@@ -20,8 +20,8 @@ from orchestrate.store.faults import translated, translated_query
 from orchestrate.store.packing import unpack
 from orchestrate.store.questions import ask
 from orchestrate.store.records import Array
-from orchestrate.store.rows import Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
-from orchestrate.store.schema import STEP_VALUES, config, step, trajectory, trial
+from orchestrate.store.rows import Assessments, Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
+from orchestrate.store.schema import STEP_VALUES, assessment, config, step, trajectory, trial
 
 _CELLS = text(
     "SELECT p.config_key, p.env, p.policy, p.model, p.learner, p.width, p.depth, p.horizon, p.dt, "
@@ -33,6 +33,10 @@ _TRIALS = text(
     "SELECT seed, trial_key, status, attempt, n_steps, diverged_at, final_loss, best_loss, "
     "wall_seconds, cpu_seconds, peak_memory_bytes, node, launch_id, error_type, error_message "
     "FROM v_trial WHERE config_key = :config_key ORDER BY seed"
+)
+
+_MEASURES = (
+    "SELECT DISTINCT measure FROM v_assessment WHERE config_key = :config_key ORDER BY measure"
 )
 
 
@@ -132,6 +136,27 @@ class Reader:
             diverged=np.array([status == "diverged" for _, status in trials], dtype=np.bool_),
         )
 
+    def assessments(self, config_key: str, measure: str) -> Assessments:
+        """Return one measure of all done and diverged trials; none where nothing was assessed.
+
+        Raises ``QueryError`` where the configuration is unknown.
+        """
+        with self._snapshot() as connection:
+            config_id, _ = _config(connection, config_key)
+            finished = (trial.c.config_id == config_id) & trial.c.status.in_(("done", "diverged"))
+            columns = (trial.c.seed, trial.c.status, assessment.c.t, assessment.c.value)
+            rows = connection.execute(
+                select(*columns)
+                .join(assessment, assessment.c.trial_id == trial.c.trial_id)
+                .where(finished, assessment.c.measure == measure)
+                .order_by(trial.c.seed)
+            ).all()
+        return _assessments(rows)
+
+    def measures(self, config_key: str) -> list[str]:
+        """Return the names of what the trials of a configuration were assessed by."""
+        return [row.measure for row in self.rows(_MEASURES, config_key=config_key)]
+
     def trajectory(self, config_key: str, seed: int) -> Trajectory:
         """Return the arrays of one trial; raise ``QueryError`` where it has none."""
         names = ("states", "inputs", "parameters")
@@ -210,6 +235,22 @@ def _numbers(result: CursorResult[Any]) -> Array:
     """
     rows = cast("Iterable[tuple[float | None]]", result.cursor)
     return np.fromiter(chain.from_iterable(rows), np.float64)
+
+
+def _assessments(rows: Sequence[Sequence[Any]]) -> Assessments:
+    """Return (seed, status, t, value) rows, sorted by seed, as a matrix."""
+    status = {seed: status for seed, status, _, _ in rows}
+    places = {seed: i for i, seed in enumerate(status)}
+    columns = {t: j for j, t in enumerate(sorted({t for _, _, t, _ in rows}))}
+    values = np.full((len(places), len(columns)), np.nan)
+    for seed, _, t, value in rows:
+        values[places[seed], columns[t]] = np.nan if value is None else value
+    return Assessments(
+        seeds=np.array([*places], dtype=np.int64),
+        t=np.array([*columns], dtype=np.int64),
+        values=values,
+        diverged=np.array([one == "diverged" for one in status.values()], dtype=np.bool_),
+    )
 
 
 def _check_column(column: str) -> None:

@@ -28,6 +28,17 @@ class Registrable(Protocol):
         """Values of env, policy, model, learner, width, depth, horizon, dt and gamma."""
 
 
+class Measured(Protocol):
+    """A number that says what a trial was worth after t steps."""
+
+    @property
+    def t(self) -> int: ...
+    @property
+    def measure(self) -> str: ...
+    @property
+    def value(self) -> float: ...
+
+
 class Result(Protocol):
     """A trial after it ran; :class:`dopt.result.TrialResult` is one and explains the fields."""
 
@@ -55,6 +66,8 @@ class Result(Protocol):
     def final_loss(self) -> float | None: ...
     @property
     def best_loss(self) -> float | None: ...
+    @property
+    def assessments(self) -> Sequence[Measured]: ...
 
 
 @dataclass(frozen=True)

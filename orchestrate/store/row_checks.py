@@ -71,6 +71,39 @@ CHECKS = (
     ),
     Check(
         "error",
+        "trials without a result but with an assessment",
+        REBUILD,
+        f"{_TRIAL} WHERE NOT {FINISHED} AND EXISTS "
+        "(SELECT 1 FROM assessment a WHERE a.trial_id = r.trial_id) ORDER BY r.trial_id",
+    ),
+    Check(
+        "error",
+        "done trials that lack some of the assessments of their configuration",
+        REBUILD,
+        f"{_TRIAL} LEFT JOIN (SELECT trial_id, count(*) AS n FROM assessment GROUP BY trial_id) a "
+        "ON a.trial_id = r.trial_id "
+        "JOIN (SELECT s.config_id, max(s.n) AS most FROM (SELECT o.config_id, count(*) AS n "
+        "FROM assessment b JOIN trial o ON o.trial_id = b.trial_id WHERE o.status = 'done' "
+        "GROUP BY o.config_id, o.trial_id) s GROUP BY s.config_id) m ON m.config_id = r.config_id "
+        "WHERE r.status = 'done' AND coalesce(a.n, 0) <> m.most ORDER BY r.trial_id",
+    ),
+    Check(
+        "error",
+        "done trials with a task but without an assessment",
+        REBUILD,
+        f"""{_TRIAL} WHERE r.status = 'done' AND c.config_json LIKE '%"task":{{%' """
+        "AND NOT EXISTS (SELECT 1 FROM assessment a WHERE a.trial_id = r.trial_id) "
+        "ORDER BY r.trial_id",
+    ),
+    Check(
+        "error",
+        "trials with an assessment that is not finite, not NULL",
+        REBUILD,
+        f"{_TRIAL} WHERE EXISTS (SELECT 1 FROM assessment a WHERE a.trial_id = r.trial_id "
+        f"AND {not_finite('a', ('value',))}) ORDER BY r.trial_id",
+    ),
+    Check(
+        "error",
         "trials that run without an owner, or have one and do not run",
         REBUILD,
         f"{_TRIAL} WHERE (r.status = 'running') <> (r.owner IS NOT NULL) ORDER BY r.trial_id",

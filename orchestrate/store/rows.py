@@ -75,6 +75,24 @@ class Curves:
 
 
 @dataclass(frozen=True)
+class Assessments:
+    """One measure of all n finished trials of a configuration, after k numbers of steps.
+
+    Attributes
+    ----------
+    seeds : (n,) int64, ascending
+    t : (k,) int64, ascending
+    values : (n, k) float64, NaN where it is not finite or a trial diverged before that step
+    diverged : (n,) bool
+    """
+
+    seeds: npt.NDArray[np.int64]
+    t: npt.NDArray[np.int64]
+    values: Array
+    diverged: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class TrialRow:
     """Summary of one trial; None where it has not got that far."""
 

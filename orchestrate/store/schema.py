@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Number of the newest script in ``migrations/versions``, which leads from the one before it."""
 
 STATUSES = ("pending", "running", "done", "diverged", "failed", "cancelled")
@@ -180,6 +180,15 @@ trajectory = _table(
     Column("inputs", LargeBinary, nullable=False),
     _text("parameters_shape"),
     Column("parameters", LargeBinary, nullable=False),
+)
+
+assessment = _table(
+    "assessment",
+    _trial_key(primary_key=True),
+    Column("t", Integer, primary_key=True, autoincrement=False),
+    Column("measure", Text, primary_key=True),
+    Column("value", _Real),
+    rowid=False,
 )
 
 attempt = _table(

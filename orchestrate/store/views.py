@@ -62,6 +62,13 @@ JOIN trial r ON r.trial_id = a.trial_id
 JOIN config c ON c.config_id = r.config_id
 """
 
+_ASSESSMENT = f"""
+SELECT {_CONFIG}, c.horizon, r.seed, r.trial_key, r.status, a.t, a.measure, a.value
+FROM config c
+JOIN trial r ON r.config_id = c.config_id
+JOIN assessment a ON a.trial_id = r.trial_id
+"""
+
 # In the order in which they must be created.
 VIEWS = {
     "v_trial": _TRIAL,
@@ -69,4 +76,5 @@ VIEWS = {
     "v_curve_stats": _CURVE_STATS,
     "v_progress": _PROGRESS,
     "v_failures": _FAILURES,
+    "v_assessment": _ASSESSMENT,
 }

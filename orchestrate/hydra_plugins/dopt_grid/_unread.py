@@ -11,7 +11,18 @@ from omegaconf import DictConfig, OmegaConf
 from dopt.errors import unknown_name
 from orchestrate.hydra_plugins.dopt_grid._overlay import interpolations
 
-KNOWN = ("env", "policy", "model", "learner", "seed", "width", "launch", "store", "executor")
+KNOWN = (
+    "env",
+    "policy",
+    "model",
+    "learner",
+    "task",
+    "seed",
+    "width",
+    "launch",
+    "store",
+    "executor",
+)
 """The top-level keys that a launch reads; Hydra's own come beside them."""
 
 

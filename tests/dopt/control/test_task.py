@@ -87,7 +87,7 @@ def test_a_system_of_ones_own_is_told_what_to_give() -> None:
         ({"checkpoints": [31]}, r"holds step 31, but a trial has 30 steps"),
         ({"checkpoints": [0]}, r"task\.checkpoints\[0\] is 0"),
         ({"elites": 65}, r"task\.elites is 65, but .* at most task\.samples"),
-        ({"settle_steps": 301}, r"task\.settle_steps is 301, .* at most task\.steps"),
+        ({"settle_steps": 401}, r"task\.settle_steps is 401, .* at most task\.steps"),
         ({"stpes": 3}, r"did you mean 'steps'\?"),
         ({"name": "contrl"}, r"did you mean 'control'\?"),
     ],

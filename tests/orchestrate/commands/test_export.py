@@ -18,7 +18,7 @@ import pytest
 from orchestrate.export import streams, tables
 from orchestrate.store import Claim, Store
 from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, run_now
-from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, diverged, result
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, assessed, diverged, result
 
 Run = Callable[..., Answer]
 ROOT = Path(__file__).resolve().parents[3]
@@ -90,6 +90,29 @@ class TestTables:
             inputs = chosen[["input_0", "input_1"]]
             np.testing.assert_array_equal(inputs[:-1], expected.inputs)
             assert inputs.iloc[-1].isna().all()  # nothing is applied at the end
+
+    def test_assessments(self, command: Run, tmp_path: Path, store: Store, grid: int) -> None:
+        refused = command("export", "assessments", "--out", str(tmp_path / "none.csv"))
+        assert refused.code != 0
+        assert "task=control" in refused.err
+        (claim,) = store.claim(grid, store.register(grid, [Spec(9)]).todo)
+        store.commit(claim, assessed(9), run_now())
+        expected = assessed(9).assessments
+        for ending in ("csv", "parquet"):
+            out = tmp_path / f"assessments.{ending}"
+            assert command("export", "assessments", "--out", str(out)).code == 0
+            frame = read(out)
+            assert [*frame.measure] == [row.measure for row in expected]
+            assert [*frame.t] == [row.t for row in expected]
+            assert [*frame.value][:-1] == [row.value for row in expected][:-1]
+            assert np.isnan([*frame.value][-1])
+        out = tmp_path / "assessments.npz"
+        assert command("export", "assessments", "--out", str(out)).code == 0
+        with np.load(out) as arrays:
+            costs = [row.value for row in expected if row.measure == "cost"]
+            (name,) = (name for name in arrays if name.endswith("/cost"))
+            np.testing.assert_array_equal(arrays[name], [costs])
+            np.testing.assert_array_equal(arrays[f"{name}/t"], [0, 3, 7])
 
     def test_null_is_null_in_parquet(self, command: Run, tmp_path: Path) -> None:
         out = tmp_path / "curves.parquet"

@@ -16,11 +16,17 @@ _RESULTS = {
     "trajectory": "SELECT r.seed, p.dtype, p.states_shape, p.states, p.inputs_shape, p.inputs, "
     "p.parameters_shape, p.parameters "
     "FROM trajectory p JOIN trial r ON r.trial_id = p.trial_id ORDER BY r.seed",
+    "assessment": "SELECT r.seed, a.t, a.measure, a.value "
+    "FROM assessment a JOIN trial r ON r.trial_id = a.trial_id ORDER BY r.seed, a.t, a.measure",
 }
 
 _FINISHED = "r.status IN ('done', 'diverged')"
 _STEPS = "(SELECT count(*) FROM step s WHERE s.trial_id = r.trial_id)"
 _TRAJECTORIES = "(SELECT count(*) FROM trajectory p WHERE p.trial_id = r.trial_id)"
+_ASSESSMENTS = "(SELECT count(*) FROM assessment b WHERE b.trial_id = r.trial_id)"
+_MOST = (
+    "(SELECT coalesce(max(n), 0) FROM (SELECT count(*) AS n FROM assessment GROUP BY trial_id) k)"
+)
 _ATTEMPTS = "(SELECT count(*) FROM attempt a WHERE a.trial_id = r.trial_id)"
 _WITH_ATTEMPTS = "trial r JOIN attempt a ON a.trial_id = r.trial_id"
 
@@ -29,6 +35,8 @@ _FLAWS = {
     f"WHERE {_STEPS} <> CASE WHEN {_FINISHED} THEN c.horizon ELSE 0 END",
     "has not one trajectory for its curve": "SELECT r.seed FROM trial r "
     f"WHERE {_TRAJECTORIES} <> CASE WHEN {_FINISHED} THEN 1 ELSE 0 END",
+    "has part of an assessment": "SELECT r.seed FROM trial r "
+    f"WHERE {_ASSESSMENTS} <> CASE WHEN {_FINISHED} THEN {_MOST} ELSE 0 END",
     "was finished twice": f"SELECT r.seed FROM {_WITH_ATTEMPTS} "
     "WHERE a.outcome IN ('done', 'diverged') GROUP BY r.seed HAVING count(*) > 1",
     "has attempts that nobody counted": "SELECT r.seed FROM trial r "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import select
 import signal
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dopt.result import TrialResult
+from dopt.result import Assessment, TrialResult
 from dopt.spec import TrialSpec
 from orchestrate.grid import Grid
 from tests.orchestrate.standins import diverged, quick, specification
@@ -45,8 +46,10 @@ def rest(seconds: float) -> None:
 
 
 def outcome(spec: TrialSpec) -> TrialResult:
-    """Return the numbers of a trial; every fifth one diverges."""
-    return diverged(spec, at=3) if spec.seed % DIVERGING == 0 else quick(spec)
+    """Return the numbers of a trial, assessed on the way; every fifth one diverges."""
+    result = diverged(spec, at=3) if spec.seed % DIVERGING == 0 else quick(spec)
+    rows = [Assessment(t, "cost", spec.seed + t / 8) for t in (0, 1, 3)]
+    return dataclasses.replace(result, assessments=tuple(rows))
 
 
 def grid_of(trials: int) -> Grid:

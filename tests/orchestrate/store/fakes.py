@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from dopt.result import Assessment
 from orchestrate.store import LaunchRecord, RunRecord
 
 Array = npt.NDArray[np.float64]
@@ -87,6 +88,7 @@ class FakeResult:
     n_steps: int
     final_loss: float | None
     best_loss: float | None
+    assessments: tuple[Assessment, ...] = ()
 
 
 def result(seed: int = 0, horizon: int = HORIZON) -> FakeResult:
@@ -103,6 +105,13 @@ def result(seed: int = 0, horizon: int = HORIZON) -> FakeResult:
         final_loss=float(steps[0][-1]),
         best_loss=float(steps[0].min()),
     )
+
+
+def assessed(seed: int = 0) -> FakeResult:
+    """Return a result with a number that is not finite among those of its assessment."""
+    random = np.random.default_rng(1000 + seed)
+    rows = [Assessment(t, name, random.random()) for t in (0, 3, 7) for name in ("cost", "error")]
+    return replace(result(seed), assessments=(*rows[:-1], rows[-1]._replace(value=np.inf)))
 
 
 def diverged(at: int, seed: int = 0, value: float = np.nan) -> FakeResult:

@@ -14,7 +14,7 @@ from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Finding, Reader, Store, StoreError, examine
 from orchestrate.store.schema import STEP_VALUES
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
 from tests.orchestrate.store.structure import columns, contents
 
 Take = Callable[..., list[Claim]]
@@ -91,6 +91,36 @@ def test_rows_of_trials_without_a_result(grid: str) -> None:
     sentences = " ".join(one.sentence for one in examine(grid, key))
     assert "without a result but with steps: 1" in sentences
     assert "without a result but with a trajectory: 1" in sentences
+
+
+@pytest.mark.parametrize(
+    ("harms", "words"),
+    [
+        ("DELETE FROM assessment WHERE trial_id = 1 AND t = 3", "lack some of the assessments"),
+        ("DELETE FROM assessment WHERE trial_id = 1", "lack some of the assessments"),
+        ("UPDATE trial SET status = 'failed' WHERE trial_id = 1", "but with an assessment: 1"),
+        ("UPDATE assessment SET value = {inf} WHERE trial_id = 2 AND t = 0", "assessment that is"),
+    ],
+)
+def test_damaged_assessments(store: Store, take: Take, url: str, harms: str, words: str) -> None:
+    for claim, seed in zip(take(Spec(0), Spec(1)), (0, 1), strict=True):
+        store.commit(claim, assessed(seed), RUN)
+    store.end_launch(1, "done")
+    assert examine(url, key) == []
+    infinity = "9e999" if url.startswith("sqlite") else "'infinity'"
+    harm(url, harms.replace("{inf}", infinity))
+    assert words in " ".join(one.sentence for one in examine(url, key))
+
+
+def test_a_task_without_an_assessment(store: Store, take: Take, url: str) -> None:
+    (claim,) = take(Spec())
+    store.commit(claim, result(), RUN)
+    store.end_launch(1, "done")
+    document = '{"task":{"name":"control"}}'
+    digest = hashlib.sha256(document.encode()).hexdigest()
+    harm(url, f"UPDATE config SET config_json = '{document}', config_key = '{digest}'")
+    sentences = " ".join(one.sentence for one in examine(url))
+    assert "done trials with a task but without an assessment: 1" in sentences
 
 
 def test_nan_in_postgresql(postgresql_url: str) -> None:

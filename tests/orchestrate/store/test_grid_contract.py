@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from orchestrate.store import Claim, Failure, Reader, Store
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
 
 OpenStore = Callable[..., Store]
 Take = Callable[..., list[Claim]]
@@ -146,8 +147,10 @@ class TestRetry:
 
     def test_forgets_a_divergence(self, store: Store, take: Take, reader: Reader) -> None:
         (claim,) = take(Spec())
-        store.commit(claim, diverged(2), RUN)
+        kept = tuple(row for row in assessed().assessments if row.t == 0)
+        store.commit(claim, replace(diverged(2), assessments=kept), RUN)
         store.retry("diverged")
+        assert reader.query("SELECT * FROM assessment") == []
         assert reader.query("SELECT * FROM step") == []
         assert reader.query("SELECT * FROM trajectory") == []
         (again,) = take(Spec())

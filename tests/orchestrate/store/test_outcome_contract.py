@@ -9,8 +9,18 @@ from datetime import datetime
 import numpy as np
 import pytest
 
+from dopt.result import Assessment
 from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
-from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, FakeResult, Spec, diverged, result
+from tests.orchestrate.store.fakes import (
+    HORIZON,
+    LAUNCH,
+    RUN,
+    FakeResult,
+    Spec,
+    assessed,
+    diverged,
+    result,
+)
 
 Take = Callable[..., list[Claim]]
 
@@ -26,6 +36,45 @@ class TestCommit:
         arrays = reader.trajectory(Spec().config_key, 0)
         for name in ("states", "inputs", "parameters"):
             np.testing.assert_array_equal(getattr(arrays, name), getattr(sent, name), strict=True)
+
+    def test_gives_back_the_assessments(self, store: Store, take: Take, reader: Reader) -> None:
+        for claim, seed in zip(take(Spec(0), Spec(1)), (0, 1), strict=True):
+            assert store.commit(claim, assessed(seed), RUN)
+        rows = [row for seed in (0, 1) for row in assessed(seed).assessments]
+        found = reader.assessments(Spec().config_key, "cost")
+        assert (found.seeds.tolist(), found.t.tolist()) == ([0, 1], [0, 3, 7])
+        costs = [row.value for row in rows if row.measure == "cost"]
+        assert found.values.ravel().tolist() == costs
+        errors = reader.assessments(Spec().config_key, "error").values
+        assert np.isnan(errors[:, 2]).all()
+        assert np.isfinite(errors[:, :2]).all()
+        assert reader.query("SELECT count(*) FROM assessment WHERE value IS NULL") == [(2,)]
+        assert reader.measures(Spec().config_key) == ["cost", "error"]
+        assert reader.assessments(Spec().config_key, "nothing").values.shape == (0, 0)
+
+    @pytest.mark.parametrize(
+        ("row", "words"),
+        [
+            (Assessment(8, "cost", 1.0), "'cost' is of step 8, expected one from 0 to 7"),
+            (Assessment(3, "cost", 1.0), "'cost' of step 3 is there twice"),
+        ],
+    )
+    def test_refuses_assessments_that_do_not_fit(
+        self, store: Store, take: Take, reader: Reader, row: Assessment, words: str
+    ) -> None:
+        (claim,) = take(Spec())
+        sent = replace(assessed(), assessments=(*assessed().assessments, row))
+        with pytest.raises(InvalidResultError, match=words):
+            store.commit(claim, sent, RUN)
+        assert reader.query("SELECT * FROM assessment") == []
+
+    def test_writes_no_assessment_without_its_claim(
+        self, store: Store, launch: int, take: Take, reader: Reader
+    ) -> None:
+        (claim,) = take(Spec())
+        store.release(launch)
+        assert not store.commit(claim, assessed(), RUN)
+        assert reader.query("SELECT * FROM assessment") == []
 
     @pytest.mark.parametrize("horizon", [1, 99, 100, 101, 250])
     def test_numbers_the_steps(
