@@ -37,7 +37,10 @@ LINKS = [
 def filled(request: pytest.FixtureRequest) -> str:
     """Return a small grid in a database of each kind."""
     url = str(request.getfixturevalue(f"{request.param}_url"))
-    fill(url, make_grid(("pendulum", "cartpole"), seeds=range(8), env={"horizon": 40}))
+    short = {"env": {"horizon": 40}}
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    fill(url, make_grid(("pendulum", "cartpole"), seeds=range(8), **short))
+    fill(url, make_grid(("pendulum",), ("random",), seeds=range(8), **short, **task))
     return url
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from dopt.errors import IncompatibleError
 from dopt.models import MLP
-from dopt.result import TrialResult
+from dopt.result import Assessment, TrialResult
 from dopt.spec import TrialSpec
 from dopt.systems import System
 from dopt.systems.equilibrium import eigenmode
@@ -34,7 +34,7 @@ def make_spec(system: str, name: str, seed: int, **sections: Mapping[str, object
         "seed": seed,
     }
     for key, fields in sections.items():
-        mapping[key] = {**mapping[key], **fields}  # type: ignore[dict-item]
+        mapping[key] = {**mapping.get(key, {}), **fields}  # type: ignore[dict-item]
     return TrialSpec.from_mapping(mapping)
 
 
@@ -80,7 +80,23 @@ def fake_result(spec: TrialSpec, diverged_at: int | None = None) -> TrialResult:
         diverged_at=diverged_at,
         wall_seconds=0.1,
         cpu_seconds=0.1,
+        assessments=_assessments(spec, rng) if spec.task else (),
     )
+
+
+def _assessments(spec: TrialSpec, rng: np.random.Generator) -> tuple[Assessment, ...]:
+    """Return costs that fall to the true model's, and successes that follow them."""
+    rate = RATES.get(spec.policy.name, 2.0)
+    rows = [Assessment(0, "true_model_success", 1.0), Assessment(0, "true_model_cost", 100.0)]
+    for t in spec.assessed_steps:
+        relative = 1.0 + 2.0 * np.exp(-rate * t / spec.system.horizon) * rng.uniform(0.8, 1.2)
+        rows += [
+            Assessment(t, "control_success", float(relative < 1.5)),
+            Assessment(t, "control_cost", 100.0 * relative),
+            Assessment(t, "free_run_error", relative - 1.0),
+            Assessment(t, "coverage", t / spec.system.horizon),
+        ]
+    return tuple(rows)
 
 
 def _size(spec: TrialSpec) -> float:

@@ -36,8 +36,6 @@ ALL = (
     "FROM step s JOIN trial r ON r.trial_id = s.trial_id",
     "SELECT r.trial_key, p.dtype, p.states_shape, p.states, p.inputs_shape, p.inputs, "
     "p.parameters_shape, p.parameters FROM trajectory p JOIN trial r ON r.trial_id = p.trial_id",
-    "SELECT r.trial_key, b.t, b.measure, b.value FROM assessment b "
-    "JOIN trial r ON r.trial_id = b.trial_id",
     "SELECT r.trial_key, a.attempt, a.outcome, a.cause, a.node, a.pid, a.claimed, a.started, "
     "a.ended, a.wall_seconds, l.token, e.hash FROM attempt a "
     "JOIN trial r ON r.trial_id = a.trial_id JOIN launch l ON l.launch_id = a.launch_id "
@@ -47,6 +45,8 @@ ALL = (
     "SELECT config_key, env, policy, model, learner, width, depth, horizon, dt, gamma, config_json "
     "FROM config",
     "SELECT hash, type, message, traceback FROM error",
+    "SELECT r.trial_key, b.t, b.measure, b.value FROM assessment b "
+    "JOIN trial r ON r.trial_id = b.trial_id",
 )
 
 
