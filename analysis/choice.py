@@ -144,9 +144,10 @@ def _first(
 
 
 def departures(cell: Cell) -> int:
-    """Return how many values of a configuration are not their defaults."""
+    """Return how many values of a configuration are not their defaults, a task being none."""
     sections = {key: value for key, value in cell.config.items() if isinstance(value, Mapping)}
     names = {key: {"name": section.get("name")} for key, section in sections.items()}
+    names.pop("task", None)
     try:
         usual = flatten(TrialSpec.from_mapping(names).to_mapping())
     except SpecificationError:

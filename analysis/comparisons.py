@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.choice import REFERENCE
+from analysis.control import relative_costs, scores_at
 from analysis.divergence import DivergenceRule
 from analysis.errors import AnalysisError
 from analysis.measures import Measure, Scores, final_losses, mean_losses, steps_to
@@ -87,6 +88,36 @@ def compare_steps(
             f"would be, but neither is given: add --epsilon, or select {YARDSTICK} too."
         )
     return _adjusted(rows, selection)
+
+
+def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
+    """Return the ratio of the costs of control, one row for each environment, step and baseline.
+
+    The cost of a trial is that of the episode which its model planned, by the true model's.
+    """
+    rows = []
+    for env in selection.environments:
+        entries = selection.of(env)
+        steps = sorted({int(t) for entry in entries for t in relative_costs(reader, entry).t})
+        for t in steps:
+            if t == 0:  # the same untrained model for all
+                continue
+            successes = {entry.cell.policy: _successes(reader, entry, t) for entry in entries}
+            scores = [scores_at(reader, entry, t) for entry in entries]
+            for baseline, ours, theirs, diverged in _pairs(scores):
+                stream = _stream(env, baseline, "control_cost", str(t))
+                row = {"env": env, "t": t, "baseline": baseline}
+                row |= {"success": successes[REFERENCE], "success_baseline": successes[baseline]}
+                rows.append(row | asdict(compare(ours, theirs, stream)) | {"n_diverged": diverged})
+    return _adjusted(rows, selection)
+
+
+def _successes(reader: Reader, entry: Entry, t: int) -> float:
+    """Return the share of successful episodes after t explored steps, NaN for none."""
+    found = reader.assessments(entry.cell.config_key, "control_success")
+    known = found.values[:, found.t == t]
+    known = known[np.isfinite(known)]
+    return float(np.mean(known)) if len(known) else math.nan
 
 
 def _threshold(

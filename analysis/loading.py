@@ -6,6 +6,7 @@ results = analysis.load(env="pendulum")
 results.trials()                       # one row for each trial
 results.curves("loss")                 # one row for each trial and step
 results.matrix("pendulum", "random")   # losses (seed, t)
+results.assessments("control_cost")    # one row for each trial and assessed step
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from orchestrate.store import Cell, Curves, Reader
 DEFAULT_URL = "sqlite:///results/results.db"
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
+_MEASURED = ("seed", "t", "measure", "value", "diverged")
 _OF_CELL = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
 
 
@@ -139,6 +141,33 @@ class Results:
             }
         )
         return _labelled(frame, cell)
+
+    def assessments(self, *measures: str) -> pd.DataFrame:
+        """Return one row for each finished trial, measure and number of explored steps ``t``.
+
+        By default of all measures; empty where no trial was assessed. A value that overflowed, or
+        lies past a divergence, is NaN.
+        """
+        parts = [
+            self._measured(cell, measure)
+            for cell in self._cells()
+            for measure in (measures or self.reader.measures(cell.config_key))
+        ]
+        if not parts:
+            return pd.DataFrame(columns=[*_OF_CELL, "config_key", *_MEASURED])
+        return pd.concat(parts, ignore_index=True)
+
+    def _measured(self, cell: Cell, measure: str) -> pd.DataFrame:
+        found = self.reader.assessments(cell.config_key, measure)
+        n, steps = found.values.shape
+        columns = (
+            np.repeat(found.seeds, steps),
+            np.tile(found.t, n),
+            measure,
+            found.values.ravel(),
+            np.repeat(found.diverged, steps),
+        )
+        return _labelled(pd.DataFrame(dict(zip(_MEASURED, columns, strict=True))), cell)
 
     def matrix(self, env: str, policy: str, column: str = "loss") -> Curves:
         """Return one column of the steps of a policy in an environment as a matrix (seed, t).

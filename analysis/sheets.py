@@ -100,6 +100,38 @@ def comparison_sheet(table: pd.DataFrame, rule: str, measure: Measure = Measure.
     return Sheet(headers, rows, note)
 
 
+def control_sheet(table: pd.DataFrame) -> Sheet:
+    """Return the paired comparison of the costs of control, with the shares of successes."""
+    rows = [
+        [
+            row["env"],
+            row["t"],
+            row["baseline"],
+            share(row["success"]),
+            share(row["success_baseline"]),
+            within(row["ratio"], row["low"], row["high"]),
+            share(row["improvement"]),
+            p_text(row["p_value"]),
+            p_text(row["p_adjusted"]),
+            _pairs(row),
+        ]
+        for row in table.to_dict("records")
+    ]
+    headers = [
+        "env", "explored steps", "baseline", "success", "success of baseline",
+        "cost ratio [95 %]", "P(improvement)", "Wilcoxon p", "BH-adjusted p", "pairs",
+    ]  # fmt: skip
+    note = (
+        "Success: share of the episodes of D-optimal and of the baseline that succeed, planned by "
+        "the model learned so far. Ratio: geometric mean over seeds of the episode's cost of "
+        "D-optimal by that of the baseline, below 1 D-optimal is better; interval: paired BCa "
+        f"bootstrap of the log ratio, Student's below {FEW} pairs. P(improvement): share of seeds "
+        "with the lower cost, ties half. p: two-sided Wilcoxon signed-rank test of the log ratio, "
+        f"{_TESTED}. Trials that diverged before a step are left out."
+    )
+    return Sheet(headers, rows, note)
+
+
 def race_sheet(table: pd.DataFrame, rule: str) -> Sheet:
     """Return the paired comparison of the steps to a loss."""
     rows = [

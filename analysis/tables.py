@@ -9,11 +9,12 @@ from typing import Protocol
 
 import pandas as pd
 
-from analysis.comparisons import YARDSTICK, compare_policies, compare_steps
+from analysis.comparisons import YARDSTICK, compare_control, compare_policies, compare_steps
+from analysis.control import control_part
 from analysis.measures import Measure
 from analysis.request import Request
 from analysis.selection import Selection
-from analysis.sheets import Sheet, comparison_sheet, race_sheet, summary_sheet
+from analysis.sheets import Sheet, comparison_sheet, control_sheet, race_sheet, summary_sheet
 from analysis.summary import summarise
 from orchestrate.store import Reader
 
@@ -74,6 +75,12 @@ def _raced(selection: Selection, request: Request = _DEFAULT) -> Selection:
     )
 
 
+def _controlled(selection: Selection, _: Request = _DEFAULT) -> Selection:
+    """Return the environments with a task in which the reference has a baseline."""
+    controlled = control_part(selection).compared()
+    return controlled if len(controlled.policies) > 1 else Selection(())
+
+
 def _measure_ratios(
     reader: Reader, selection: Selection, request: Request, column: str, measure: Measure
 ) -> pd.DataFrame:
@@ -105,4 +112,10 @@ TABLES = {
     "comparison_auc": comparison("loss", Measure.AUC),
     "comparison_steps": comparison("loss", Measure.STEPS),
     "comparison_reachable": comparison("reachable_loss", Measure.FINAL),
+    "comparison_control": TableKind(
+        "Cost of control against every baseline",
+        _controlled,
+        lambda reader, selection, _: compare_control(reader, selection),
+        lambda table, _: control_sheet(table),
+    ),
 }

@@ -9,6 +9,7 @@ from typing import Any
 
 from analysis import provenance
 from analysis.figures import publish
+from analysis.figures.control import control_plot
 from analysis.figures.input_spectrum import spectrum_plot
 from analysis.figures.loss_curves import loss_plot
 from analysis.figures.page import NAME as PAGE
@@ -32,6 +33,7 @@ PLOTS: dict[str, Plot[Any]] = {
         spectrum_plot("cartpole", "figure2_spectrum"),
         cost_plot("figure4_width"),
         loss_against_width_plot("figure4_width_loss"),
+        control_plot("figure5_control"),
     )
 }
 NAMES = (*PLOTS, *TABLES)

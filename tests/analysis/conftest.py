@@ -20,16 +20,25 @@ def wide(width: int, seeds: Iterable[int], **sections: Mapping[str, object]) -> 
     return make_grid(("cartpole",), ("d_optimal",), seeds, **{**SHORT, **model, **sections})
 
 
+def controlled(seeds: Iterable[int]) -> list[TrialSpec]:
+    """Return trials that are assessed after 20, 40 and all steps."""
+    task = {"task": {"name": "control", "checkpoints": [20, 40]}}
+    policies = ("d_optimal", "uniform", "random")
+    return make_grid(("pendulum", "quadrotor"), policies, seeds, **SHORT, **task)
+
+
 @pytest.fixture(scope="session")
 def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return a complete grid of three systems and five policies, one trial of which diverged.
 
-    Beside it there are other widths of the D-optimal policy in the cartpole.
+    Beside it there are other widths of the D-optimal policy in the cartpole, and trials with a task
+    in the pendulum and the quadrotor.
     """
     address = f"sqlite:///{tmp_path_factory.mktemp('complete')}/results.db"
     specs = make_grid(("pendulum", "cartpole", "quadrotor"), seeds=range(5), **SHORT)
     specs += [spec for width in WIDTHS for spec in wide(width, range(5))]
     lost = [s for s in specs if (s.system.name, s.policy.name, s.seed) == ("cartpole", "random", 2)]
+    specs += controlled(range(5))
     fill(address, specs, diverged={lost[0].trial_key: 20})
     return address
 

@@ -24,9 +24,9 @@ def test_curves_are_tidy_and_exact(results: analysis.Results) -> None:
     table = results.curves()
     assert table.columns[-len(STEP_COLUMNS) :].tolist() == list(STEP_COLUMNS)
     chosen = table[
-        (table.env == "quadrotor") & (table.policy == "uniform") & (table.seed == 3)
+        (table.env == "cartpole") & (table.policy == "uniform") & (table.seed == 3)
     ].reset_index()
-    expected = fake_result(make_spec("quadrotor", "uniform", 3, env={"horizon": 60}))
+    expected = fake_result(make_spec("cartpole", "uniform", 3, env={"horizon": 60}))
     for name in STEP_COLUMNS:
         np.testing.assert_array_equal(chosen[name], getattr(expected, name))
     np.testing.assert_allclose(chosen.time, chosen.dt * chosen.t)

@@ -206,7 +206,7 @@ class TestOpening:
                 side.open(url)
 
     def test_shows_the_version(self, reader: Reader) -> None:
-        assert reader.schema_version() == "2"
+        assert reader.schema_version() == "3"
 
     @pytest.mark.parametrize("side", [Store, Reader])
     @pytest.mark.parametrize(

@@ -1,0 +1,107 @@
+"""Figure 5: what exploration is for, control with the learned model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from analysis.control import ControlCurve, control_part, measure_control, tabulate_control
+from analysis.counts import count_text
+from analysis.figures.axes import log_limits, log_ticks
+from analysis.figures.plot import Plot
+from analysis.figures.style import TEXT_WIDTH, environment_title, policy_style
+from analysis.selection import policy_rank
+
+ROW_HEIGHT = 1.9
+LEGEND_HEIGHT = 0.5
+SHARE = 0.012
+"""Distance of neighbouring policies' bars, as a part of the axis."""
+
+Curves = tuple[ControlCurve, ...]
+
+
+def control_plot(name: str) -> Plot[Curves]:
+    """Return success and cost of control against explored steps, a column for each task."""
+    return Plot(
+        name=name,
+        title="Control with the learned model",
+        statistic="share of successful episodes; geometric mean of the cost by the true model's",
+        band="95 % Wilson interval of the share; 95 % t-interval of the mean logarithm",
+        part=control_part,
+        measure=lambda reader, selection, _: measure_control(reader, selection),
+        tabulate=tabulate_control,
+        draw=draw_control,
+        caption=caption_control,
+    )
+
+
+def draw_control(curves: Curves) -> Figure:
+    """Draw the share of successes above the relative cost, one column for each environment."""
+    environments = list(dict.fromkeys(curve.env for curve in curves))
+    size = (TEXT_WIDTH, 2 * ROW_HEIGHT + LEGEND_HEIGHT)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(2, len(environments), sharex="col", squeeze=False)
+    for column, env in enumerate(environments):
+        own = [curve for curve in curves if curve.env == env]
+        _panel(grid[0, column], grid[1, column], own)
+    grid[0, 0].set_ylabel("success rate")
+    grid[1, 0].set_ylabel("cost / cost with\nthe true model")
+    policies = sorted({curve.policy for curve in curves}, key=policy_rank)
+    styles = [policy_style(policy) for policy in policies]
+    handles = [
+        Line2D([], [], color=s.colour, ls=s.line, lw=s.width, marker="o", ms=3, label=s.label)
+        for s in styles
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)))
+    return figure
+
+
+def _panel(rates: Axes, costs: Axes, curves: Sequence[ControlCurve]) -> None:
+    last = max(int(curve.t[-1]) for curve in curves)
+    for place, curve in reversed(list(enumerate(curves))):
+        x = curve.t + SHARE * last * (place - (len(curves) - 1) / 2)
+        _line(rates, x, curve, "success")
+        _line(costs, x, curve, "cost")
+    counts = {policy_style(curve.policy).label: curve.described for curve in curves}
+    rates.set_title(f"{environment_title(curves[0].env)}\n({count_text(counts)})", fontsize=7)
+    rates.set_ylim(-0.04, 1.04)
+    drawn = [np.r_[c.cost, c.cost_low, c.cost_high, 1.0] for c in curves]
+    low, high = log_limits(np.concatenate(drawn))
+    costs.set_yscale("log")
+    costs.set_ylim(low, high)
+    log_ticks(costs.yaxis, low, high)
+    costs.axhline(1.0, color="black", lw=0.8, ls=(0, (5, 2)))
+    costs.set_xlabel("explored steps")
+
+
+def _line(axes: Axes, x: np.ndarray, curve: ControlCurve, name: str) -> None:
+    style = policy_style(curve.policy)
+    y, low, high = (getattr(curve, f"{name}{end}") for end in ("", "_low", "_high"))
+    half = np.nan_to_num(np.maximum(0.0, np.array([y - low, high - y])))
+    axes.errorbar(
+        x, y, half, color=style.colour, ls=style.line, lw=style.width, marker="o", ms=2.5,
+        elinewidth=0.7, capsize=1.5,
+    )  # fmt: skip
+
+
+def caption_control(curves: Curves) -> str:
+    """Return the caption, with what an episode is and n by environment."""
+    environments = dict.fromkeys(curve.env for curve in curves)
+    counts = "; ".join(
+        f"{environment_title(env)}: "
+        + count_text({policy_style(c.policy).label: c.described for c in curves if c.env == env})
+        for env in environments
+    )
+    return (
+        "Control with the model learned after some explored steps, by model-predictive control "
+        "(cross-entropy method) on the true system with its noise: swing-up of the pendulum and "
+        "the cartpole, a set-point of the arm and the quadrotor. Above: share of successful "
+        "episodes with 95 % Wilson intervals. Below: cost of the episode by that of the true "
+        "model under the same planner, noise and draws (dashed: equal), geometric mean over "
+        "trials with 95 % t-intervals of the mean logarithm. At 0 steps the model is untrained. "
+        f"Points of a number of steps are drawn side by side. {counts}."
+    )

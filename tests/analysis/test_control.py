@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import analysis
+from analysis.choice import Filter
+from analysis.comparisons import compare_control
+from analysis.control import (
+    ControlCurve,
+    control_part,
+    measure_control,
+    relative_costs,
+    scores_at,
+    tabulate_control,
+)
+from analysis.figures.control import caption_control, draw_control
+from analysis.figures.registry import build
+from analysis.request import Request
+from analysis.selection import Selection, select
+from analysis.sheets import control_sheet
+from dopt.result import Assessment
+from orchestrate.store import Reader
+from tests.analysis.conftest import SHORT
+from tests.analysis.synthetic import fake_result, fill, make_grid
+
+
+@pytest.fixture
+def part(reader: Reader) -> Selection:
+    return control_part(select(reader, Filter()))
+
+
+def curve_of(curves: tuple[ControlCurve, ...], env: str, policy: str) -> ControlCurve:
+    return next(one for one in curves if (one.env, one.policy) == (env, policy))
+
+
+def test_only_trials_with_a_task_are_taken(reader: Reader, part: Selection) -> None:
+    assert part.environments == ("pendulum", "quadrotor")
+    assert part.policies == ("d_optimal", "uniform", "random")
+    assert all(entry.cell.config["task"] for entry in part.entries)
+    whole = select(reader, Filter())
+    assert not any("task" in entry.cell.config for entry in whole.entries)
+
+
+def test_the_numbers_are_those_of_the_trials(reader: Reader, part: Selection) -> None:
+    curves = measure_control(reader, part)
+    curve = curve_of(curves, "pendulum", "uniform")
+    entry = next(e for e in part.of("pendulum") if e.cell.policy == "uniform")
+    task = entry.cell.config["task"]
+    specs = make_grid(("pendulum",), ("uniform",), range(5), **SHORT, task=task)
+    rows = [fake_result(spec).assessments for spec in specs]
+    assert curve.t.tolist() == [0, 20, 40, 60]
+    assert curve.n.tolist() == [5] * 4
+    for j, t in enumerate(curve.t):
+        costs = [_value(of, t, "control_cost") / 100.0 for of in rows]
+        assert curve.cost[j] == pytest.approx(np.exp(np.mean(np.log(costs))))
+        assert curve.cost_low[j] < curve.cost[j] < curve.cost_high[j]
+        assert curve.success[j] == np.mean([_value(of, t, "control_success") for of in rows])
+
+
+def _value(rows: tuple[Assessment, ...], t: int, measure: str) -> float:
+    return next(row.value for row in rows if (row.t, row.measure) == (t, measure))
+
+
+def test_wilson_intervals_are_those_of_the_textbook(reader: Reader, part: Selection) -> None:
+    curve = curve_of(measure_control(reader, part), "pendulum", "d_optimal")
+    first, last = 0, -1
+    assert (curve.success[first], curve.success[last]) == (0.0, 1.0)
+    z = 1.959963985
+    edge = z**2 / (5 + z**2)  # no success in five
+    assert (curve.success_low[first], curve.success_high[first]) == pytest.approx((0, edge))
+    assert (curve.success_low[last], curve.success_high[last]) == pytest.approx((1 - edge, 1))
+
+
+def test_the_comparison_pairs_seeds(reader: Reader, part: Selection) -> None:
+    table = compare_control(reader, part)
+    assert sorted(set(table.t)) == [20, 40, 60]
+    row = table[(table.env == "quadrotor") & (table.t == 40) & (table.baseline == "random")]
+    entries = {entry.cell.policy: entry for entry in part.of("quadrotor")}
+    ours, theirs = (
+        scores_at(reader, entries[name], 40).by_seed for name in ("d_optimal", "random")
+    )
+    ratios = [np.log(ours[seed] / theirs[seed]) for seed in range(5)]
+    assert row.ratio.item() == pytest.approx(np.exp(np.mean(ratios)))
+    assert row.n_pairs.item() == 5
+    assert row.improvement.item() == 1.0
+    sheet = control_sheet(table)
+    assert len(sheet.rows) == len(table) == 2 * 3 * 2
+    assert "| quadrotor |" in sheet.markdown()
+
+
+def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("random",), range(3), **SHORT, **task)
+    fill(url, specs)
+    with Reader.open(url) as reader:
+        part = control_part(select(reader, Filter()))
+        (entry,) = part.entries
+        costs = relative_costs(reader, entry)
+        assert costs.values.shape == (3, 3)
+        assert scores_at(reader, entry, 19).by_seed == {}
+        assert sorted(scores_at(reader, entry, 20).by_seed) == [0, 1, 2]
+        assert tabulate_control(measure_control(reader, part)).n.tolist() == [3, 3, 3]
+
+
+def test_the_picture_has_a_column_for_each_task(reader: Reader, part: Selection) -> None:
+    curves = measure_control(reader, part)
+    figure = draw_control(curves)
+    titles = [axes.get_title() for axes in figure.axes]
+    assert [title.split("\n")[0] for title in titles[:2]] == ["pendulum", "quadrotor"]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["D-optimal", "uniform", "random"]
+    caption = caption_control(curves)
+    assert "Wilson" in caption
+    assert "pendulum: n = 5" in caption
+    odd = dataclasses.replace(curves[0], cost=np.full(4, np.nan), cost_low=np.full(4, np.nan))
+    draw_control((odd,))
+
+
+def test_a_grid_without_a_task_has_no_such_figure(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    fill(url, make_grid(("pendulum",), ("d_optimal", "random"), range(2), **SHORT))
+    names = ("figure5_control", "comparison_control")
+    with Reader.open(url) as reader:
+        outcomes = build(reader, select(reader, Filter()), Request(), tmp_path / "figures", names)
+        states = {outcome.name: outcome.state for outcome in outcomes}
+    assert all(states[name] == "not drawn, nothing is stored for it" for name in names)
+
+
+def test_assessments_as_a_frame(url: str) -> None:
+    with analysis.load(url, env="pendulum") as results:
+        frame = results.assessments("control_cost", "coverage")
+        assert set(frame.measure) == {"control_cost", "coverage"}
+        assert len(frame) == 3 * 5 * 4 * 2
+        assert frame[frame.measure == "coverage"].groupby("t").value.first().tolist() == [
+            0.0,
+            pytest.approx(1 / 3),
+            pytest.approx(2 / 3),
+            1.0,
+        ]
+        assert set(results.assessments().measure) > set(frame.measure)
+    with analysis.load(url, env="cartpole") as results:
+        assert results.assessments().empty
