@@ -14,12 +14,15 @@ from functools import singledispatch
 import numpy as np
 import numpy.typing as npt
 
-from dopt.systems import Arm, Cartpole, Pendulum, Quadrotor, System
+from dopt.systems import Arm, Cartpole, MassSpring, Pendulum, Quadrotor, System
 
 Array = npt.NDArray[np.float64]
 
 CART = (0.3, 0.12)
 """Half the length and half the height of the cart that is drawn, by the rod's length."""
+
+BLOCK = 0.3
+"""Half the side of a mass between springs that is drawn [m]; at rest they are 2 m apart."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,14 @@ def _(system: Quadrotor, states: Array) -> Body:
     centre, tilt = states[:, [0, 2]], states[:, 4]
     arm = system.half_span * np.stack([np.cos(tilt), np.sin(tilt)], axis=1)
     return Body((_polyline(centre - arm, centre + arm),), centre[:, None])
+
+
+@body.register
+def _(system: MassSpring, states: Array) -> Body:  # noqa: ARG001  # chosen by its class
+    level = np.zeros(len(states))
+    masses = [np.stack([rest + states[:, i], level], axis=1) for rest, i in ((-1, 0), (1, 2))]
+    corners = BLOCK * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    return Body(tuple(mass[:, None] + corners for mass in masses), np.stack(masses, axis=1))
 
 
 def _hanging(angle: Array, length: float) -> Array:

@@ -9,11 +9,12 @@ from dopt.systems.arm import Arm
 from dopt.systems.base import System
 from dopt.systems.cartpole import Cartpole
 from dopt.systems.features import Feature
+from dopt.systems.mass_spring import MassSpring
 from dopt.systems.pendulum import Pendulum
 from dopt.systems.quadrotor import Quadrotor
 
 SYSTEMS: dict[str, type[System]] = {
-    system.name: system for system in (Pendulum, Cartpole, Arm, Quadrotor)
+    system.name: system for system in (Pendulum, Cartpole, Arm, Quadrotor, MassSpring)
 }
 
 
@@ -27,6 +28,7 @@ __all__ = [
     "Arm",
     "Cartpole",
     "Feature",
+    "MassSpring",
     "Pendulum",
     "Quadrotor",
     "System",

@@ -15,6 +15,7 @@ from tests.dopt.trials import PAIRS, trial
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us", "states", "inputs")
 POLICIES = ["random", "uniform", "d_optimal", "oracle"]
+DAMPING = {"cartpole": "pivot_friction", "mass_spring": "damping"}
 ABSURD = {"learning_rate": 1e300}
 
 
@@ -81,7 +82,7 @@ def test_any_learning_rate_gives_a_result(policy: str, rate: float) -> None:
 def test_a_step_too_long_for_the_system_ends_a_trial(env: str, policy: str) -> None:
     fields: dict[str, Any] = {"dt": 40.0, "state_limit": 50.0}
     if policy == "periodic":
-        fields["friction" if env != "cartpole" else "pivot_friction"] = 0.0
+        fields[DAMPING.get(env, "friction")] = 0.0
     result = run_trial(trial(env, policy, env=fields), "kernel")
     check_rows(result)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dopt.geometry import Body, body
-from dopt.systems import SYSTEMS, Arm, Cartpole, Pendulum, Quadrotor, System
+from dopt.systems import SYSTEMS, Arm, Cartpole, MassSpring, Pendulum, Quadrotor, System
 
 
 def states(system: System, n: int = 50) -> np.ndarray:
@@ -60,3 +60,8 @@ def test_a_quadrotor_tilts_its_right_side_up() -> None:
     (bar,) = body_of(Quadrotor(), np.array([[3.0, 0, 4.0, 0, 0.1, 0]])).lines
     assert bar[0, 1, 1] > 4.0 > bar[0, 0, 1]
     np.testing.assert_allclose(bar[0].mean(axis=0), [3, 4])
+
+
+def test_masses_between_springs_move_along_a_level_line() -> None:
+    found = body_of(MassSpring(), np.array([[0.0, 1.0, 0.0, 2.0], [0.5, 0.0, -0.5, 0.0]])).masses
+    np.testing.assert_allclose(found, [[[-1, 0], [1, 0]], [[-0.5, 0], [0.5, 0]]])

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp
 
-from dopt.systems import Arm, Cartpole, Pendulum, Quadrotor, System
+from dopt.systems import Arm, Cartpole, MassSpring, Pendulum, Quadrotor, System
 
 
 def _tensor(values: list[float]) -> Tensor:
@@ -161,11 +161,42 @@ class QuadrotorMechanics(Mechanics):
         return drag * _tensor([1.0, 1.0, 0.0])
 
 
+class MassSpringMechanics(Mechanics):
+    """Three springs, each with a damper, between two walls and two masses on a level line."""
+
+    coordinates = (0, 2)
+
+    def masses(self) -> list[float]:
+        return [self.system.mass, self.system.mass]
+
+    def positions(self, q: Tensor) -> Tensor:
+        return torch.stack([q, torch.zeros_like(q)], dim=-1)
+
+    def extensions(self, q: Tensor) -> Tensor:
+        """Return by how much each spring is longer than at rest."""
+        return torch.stack([q[0], q[1] - q[0], -q[1]])
+
+    def potential(self, q: Tensor) -> Tensor:
+        return 0.5 * self.system.stiffness * self.extensions(q).square().sum()
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        return u
+
+    def friction(self, rates: Tensor) -> Tensor:
+        """Return the slope of Rayleigh's dissipation, half of each damper's power."""
+
+        def dissipation(v: Tensor) -> Tensor:
+            return 0.5 * self.system.damping * self.extensions(v).square().sum()
+
+        return -grad(dissipation)(rates)
+
+
 MECHANICS: dict[type[System], type[Mechanics]] = {
     Pendulum: PendulumMechanics,
     Cartpole: CartpoleMechanics,
     Arm: ArmMechanics,
     Quadrotor: QuadrotorMechanics,
+    MassSpring: MassSpringMechanics,
 }
 
 FRICTION = {
@@ -173,4 +204,5 @@ FRICTION = {
     "cartpole": ("pivot_friction", "cart_friction"),
     "arm": ("friction",),
     "quadrotor": ("drag",),
+    "mass_spring": ("damping",),
 }

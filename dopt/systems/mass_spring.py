@@ -1,0 +1,62 @@
+"""Two masses between three springs with dampers: a system that is linear in state and input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from dopt.fields import quantity
+from dopt.systems.base import System
+from dopt.systems.features import Feature
+
+
+@dataclass(frozen=True, kw_only=True)
+class MassSpring(System):
+    """Chain wall - mass - mass - wall of equal springs and dampers, with a force on each mass.
+
+    State: displacements q₁, q₂ from rest [m], each with its velocity [m/s]. Inputs: u₁, u₂ [N].
+
+    m q̈₁ = -k (2 q₁ - q₂) - c (2 q̇₁ - q̇₂) + u₁ and the same with 1 and 2 exchanged. Learned: both
+    accelerations at u = 0. Known: u / m. Modes: in phase, ω² = k/m, and opposed, ω² = 3 k/m.
+
+    Parameters
+    ----------
+    mass : float
+        Each of both masses m [kg].
+    stiffness : float
+        Of each spring, k [N/m].
+    damping : float
+        Of each damper, c [N s/m].
+    """
+
+    name: ClassVar[str] = "mass_spring"
+    physical: ClassVar[tuple[str, ...]] = ("mass", "stiffness", "damping")
+    linear_parameters: ClassVar[tuple[str, ...]] = ("stiffness", "damping")
+    state_labels: ClassVar[tuple[str, ...]] = ("q₁ [m]", "q̇₁ [m/s]", "q₂ [m]", "q̇₂ [m/s]")
+    input_labels: ClassVar[tuple[str, ...]] = ("u₁ [N]", "u₂ [N]")
+    learned_rows: ClassVar[tuple[int, ...]] = (1, 3)
+    features: ClassVar[tuple[Feature, ...]] = tuple(Feature("identity", i) for i in range(4))
+    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
+    grid_indices: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
+    equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0, 0.0, 0.0)
+
+    mass: float = quantity(1.0, "kg", "positive")
+    stiffness: float = quantity(10.0, "N/m", "nonnegative")
+    damping: float = quantity(0.5, "N s/m", "nonnegative")
+    gamma: float = quantity(5.0, "N", "positive")
+    initial_state: tuple[float, ...] = quantity((0.0, 0.0, 0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = quantity((1.9, 6.0, 1.9, 6.0), bound="positive")
+    grid_points: tuple[int, ...] = quantity((6, 6, 6, 6), bound="positive")
+
+    @staticmethod
+    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+        mass, _, _ = parameters
+        return state[1], inputs[0] / mass, state[3], inputs[1] / mass
+
+    @staticmethod
+    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+        mass, stiffness, damping = parameters
+        position_1, rate_1, position_2, rate_2 = state
+        force_1 = stiffness * (2.0 * position_1 - position_2) + damping * (2.0 * rate_1 - rate_2)
+        force_2 = stiffness * (2.0 * position_2 - position_1) + damping * (2.0 * rate_2 - rate_1)
+        return -force_1 / mass, -force_2 / mass
