@@ -15,12 +15,13 @@ from orchestrate.store import Cell, Reader, TrialRow
 
 FINISHED = ("done", "diverged")
 
-ENVIRONMENTS = ("pendulum", "cartpole", "arm", "quadrotor")
+ENVIRONMENTS = ("pendulum", "cartpole", "arm", "quadrotor", "mass_spring")
 """The paper's order; other environments follow by name."""
 
 POLICIES = (
     *(REFERENCE, "oracle", "uniform", "periodic", "random", "random_held", "random_sphere"),
     *("prbs", "multisine", "chirp"),
+    *("max", "gaussian_process", "gradient", "linear"),
 )
 """Order of legends and tables; other policies follow by name."""
 

@@ -10,8 +10,18 @@ import math
 
 from dopt.learning import Learner
 from dopt.learning.adam import Adam
-from dopt.models import MLP, Model
-from dopt.policies import DOptimal, EOptimal, Informed, Lookahead, Policy, Search, TaskOptimal
+from dopt.models import MLP, GaussianProcess, Model
+from dopt.policies import (
+    Disagreement,
+    DOptimal,
+    EOptimal,
+    GradientDOptimal,
+    Informed,
+    Lookahead,
+    Policy,
+    Search,
+    TaskOptimal,
+)
 from dopt.systems import System
 
 NUMBER = 8
@@ -46,7 +56,7 @@ def memory_by_setting(
         information = _information(policy, q, r * T, T * (p + L * w * (1 + r)))
     else:
         information = _information_of_module(policy, q, r * T)
-    for part in (information, _search(policy, system, model)):
+    for part in (information, _search(policy, system, model), _beyond(policy, system, model)):
         for setting, count in part.items():
             numbers[setting] = numbers.get(setting, 0) + count
     return {setting: NUMBER * count for setting, count in numbers.items()}
@@ -95,3 +105,22 @@ def _search(policy: Policy, system: System, model: Model) -> dict[str, int]:
         "policy.count": count * (r * q + system.n_states),
         "policy.subspace": subspace * (2 * q + 2 * subspace) + (r + 1) * q,
     }
+
+
+def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
+    """Return the numbers of an ensemble, of a covariance and of a Gaussian process, by setting."""
+    T, r, q = system.horizon, system.n_learned, model.n_parameters(system)
+    N = math.prod(system.grid_points)
+    if isinstance(policy, Disagreement):
+        per_network = 6 * q + T * (system.n_states + r)
+        return {
+            "policy.ensemble": policy.ensemble * per_network,
+            "policy.candidates": policy.candidates * policy.ensemble * (r + q),
+        }
+    if isinstance(policy, GradientDOptimal):
+        width = "model.width" if isinstance(model, MLP) else "model"
+        return {"policy.candidates": policy.candidates * 2 * r * q, width: 3 * q**2}
+    if isinstance(model, GaussianProcess):
+        # the factor, and the kernel between all samples and all evaluation points
+        return {"env.horizon": 2 * T**2, "env.grid_points": 2 * N * T}
+    return {}

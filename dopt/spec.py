@@ -9,16 +9,16 @@ import json
 from collections.abc import Collection, Mapping
 from typing import ClassVar
 
+from dopt.compatibility import check_together, mismatch
 from dopt.control import Control, task_from
-from dopt.errors import IncompatibleError, SpecificationError, unknown_name
+from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Checked, quantity
 from dopt.learning import LEARNERS, Learner
 from dopt.learning.base import Updated
-from dopt.learning.recursive_least_squares import RecursiveLeastSquares
 from dopt.memory import memory_by_setting
-from dopt.models import MODELS, Linear, Model
+from dopt.models import MODELS, Model
 from dopt.models.mlp import MLP
-from dopt.policies import POLICIES, Informed, Oracle, Policy, Search
+from dopt.policies import POLICIES, Policy, Search
 from dopt.policies.base import OpenLoop, Planned
 from dopt.registry import TARGET, build, section_of
 from dopt.systems import SYSTEMS, System
@@ -64,29 +64,14 @@ class Cell:
             raise unknown_name("path", self.path, PATHS)
         if self.task is not None:
             if isinstance(self.system, BlackBox):
-                raise _mismatch("a task", "a system with equations", f"env '{self.system.name}'")
+                raise mismatch("a task", "a system with equations", f"env '{self.system.name}'")
             object.__setattr__(self, "task", self.task.resolved(self.system))
         self._check_runnable()
         self.policy.check(self.system)
         self._check_size()
         if isinstance(self.policy, Search) and self.policy.budget_us and self.path != "kernel":
-            raise _mismatch("policy.budget_us", "path 'kernel'", f"path '{self.path}'")
-        linear = isinstance(self.model, Linear)
-        if isinstance(self.policy, Oracle) and not linear:
-            raise _mismatch("policy 'oracle'", "model 'linear'", f"model '{self.model.name}'")
-        if linear and not isinstance(self.policy, Informed):
-            raise _mismatch("model 'linear'", "policy 'oracle'", f"policy '{self.policy.name}'")
-        if linear and getattr(self.policy, "form", "auto") not in ("auto", "primal"):
-            form = f"policy.form '{getattr(self.policy, 'form', '')}'"
-            raise _mismatch("model 'linear'", "policy.form 'primal' or 'auto'", form)
-        if linear and not self.system.linear_parameters:
-            raise _mismatch("model 'linear'", "linear parameters", f"env '{self.system.name}'")
-        if isinstance(self.learner, RecursiveLeastSquares) != linear:
-            raise _mismatch(
-                "learner 'recursive_least_squares'",
-                "model 'linear' and the other way round",
-                f"learner '{self.learner.name}' with model '{self.model.name}'",
-            )
+            raise mismatch("policy.budget_us", "path 'kernel'", f"path '{self.path}'")
+        check_together(self.system, self.policy, self.model, self.learner)
 
     def _check_runnable(self) -> None:
         """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""
@@ -302,9 +287,3 @@ def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:
 
 
 _EXAMPLES = {"env": "pendulum", "policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
-
-
-def _mismatch(what: str, expected: str, given: str) -> IncompatibleError:
-    return IncompatibleError(
-        f"{what} goes with {expected}, but {given} was given: change one of them."
-    )

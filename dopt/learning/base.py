@@ -21,10 +21,12 @@ class Learner(Checked):
     """An online update of the model's parameters from the samples seen so far.
 
     ``compiled`` says whether the kernel runs it; what it does not runs on the reference path.
+    ``structure`` is that of the models which it teaches (:class:`dopt.models.Model`).
     """
 
     section: ClassVar[str] = "learner"
     name: ClassVar[str]
+    structure: ClassVar[str] = "gradient"
     compiled: ClassVar[bool] = True
 
 

@@ -17,3 +17,4 @@ class RecursiveLeastSquares(Learner):
     """
 
     name: ClassVar[str] = "recursive_least_squares"
+    structure: ClassVar[str] = "least_squares"

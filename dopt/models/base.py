@@ -19,16 +19,23 @@ Array = npt.NDArray[np.float64]
 class Model(Checked):
     """A parametric model of the r learned accelerations of a system.
 
+    ``structure`` says how its parameters can be learned: by gradient, by least squares because the
+    model is linear in them, or by conditioning on all samples. A learner names the one it teaches.
     ``compiled`` says whether the kernel runs it; what it does not runs on the reference path.
     """
 
     section: ClassVar[str] = "model"
     name: ClassVar[str]
+    structure: ClassVar[str] = "gradient"
     compiled: ClassVar[bool] = True
 
     @abstractmethod
     def n_parameters(self, system: System) -> int:
         """Return the number q of parameters for a system."""
+
+    def n_fixed_parameters(self, system: System) -> int:  # noqa: ARG002  # of most models, none
+        """Return how many of them, the last ones, stay as they were drawn."""
+        return 0
 
     @abstractmethod
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:

@@ -20,6 +20,7 @@ class Linear(Model):
     """
 
     name: ClassVar[str] = "linear"
+    structure: ClassVar[str] = "least_squares"
 
     def n_parameters(self, system: System) -> int:
         return len(system.linear_parameters)

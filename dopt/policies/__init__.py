@@ -6,8 +6,12 @@ from dopt.policies.a_optimal import AOptimal
 from dopt.policies.base import Informed, Policy
 from dopt.policies.chirp import Chirp
 from dopt.policies.d_optimal import DOptimal
+from dopt.policies.disagreement import Disagreement
 from dopt.policies.e_optimal import EOptimal
 from dopt.policies.exact import Exact
+from dopt.policies.gaussian_process import GaussianProcessEntropy
+from dopt.policies.gradient import GradientDOptimal
+from dopt.policies.greedy_linear import GreedyLinear
 from dopt.policies.lookahead import Lookahead
 from dopt.policies.multisine import Multisine
 from dopt.policies.oracle import Oracle
@@ -40,6 +44,10 @@ POLICIES: dict[str, type[Policy]] = {
         EOptimal,
         TaskOptimal,
         Lookahead,
+        Disagreement,
+        GaussianProcessEntropy,
+        GradientDOptimal,
+        GreedyLinear,
     )
 }
 
@@ -49,8 +57,12 @@ __all__ = [
     "AOptimal",
     "Chirp",
     "DOptimal",
+    "Disagreement",
     "EOptimal",
     "Exact",
+    "GaussianProcessEntropy",
+    "GradientDOptimal",
+    "GreedyLinear",
     "Informed",
     "Lookahead",
     "Multisine",

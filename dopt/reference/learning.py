@@ -48,30 +48,45 @@ class AdamLearner:
 class LeastSquaresLearner:
     """Least squares over all samples with the ridge λ, solved afresh from the normal equations.
 
-    The plain twin of the recursion: θ = (λI + Σ JᵀJ)⁻¹ Σ Jᵀ(y - offset).
+    The plain twin of the recursion: θ = (λI + Σ JᵀJ)⁻¹ Σ Jᵀ(y - offset). The first ``n_learned``
+    parameters are learned, the others stay.
     """
 
-    def __init__(self, model: Accelerations, theta: Tensor, regularization: float) -> None:
-        self._theta = theta
-        n, q = theta.shape
-        self._normal = regularization * torch.eye(q).to(theta).repeat(n, 1, 1)
-        self._moment = torch.zeros_like(theta)
-        self._rows = vmap(jacrev(model))
-        self._offset = vmap(lambda x: model(torch.zeros(q).to(theta), x))
+    def __init__(
+        self, model: Accelerations, theta: Tensor, regularization: float, n_learned: int
+    ) -> None:
+        self._theta = theta[:, :n_learned]
+        self._fixed = theta[:, n_learned:]
+        self._normal = regularization * torch.eye(n_learned).to(theta).repeat(len(theta), 1, 1)
+        self._moment = torch.zeros_like(self._theta)
+
+        def whole(learned: Tensor, fixed: Tensor, x: Tensor) -> Tensor:
+            return model(torch.cat([learned, fixed]), x)
+
+        self._model = vmap(whole)
+        self._rows = vmap(jacrev(whole))
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Absorb the newest of the states (n, t + 1, d) and targets (n, t + 1, r)."""
         x, y = states[:, -1], targets[:, -1]
-        J = self._rows(self._theta, x)
+        J = self._rows(self._theta, self._fixed, x)
+        offset = self._model(torch.zeros_like(self._theta), self._fixed, x)
         self._normal = self._normal + J.mT @ J
-        self._moment = self._moment + (J.mT @ (y - self._offset(x)).unsqueeze(-1)).squeeze(-1)
+        self._moment = self._moment + (J.mT @ (y - offset).unsqueeze(-1)).squeeze(-1)
         self._theta.copy_(torch.linalg.solve(self._normal, self._moment))
 
 
 def learner_for(
-    learner: Learner, model: Accelerations, theta: Tensor, regularization: float
+    learner: Learner,
+    model: Accelerations,
+    theta: Tensor,
+    regularization: float,
+    n_learned: int,
 ) -> BatchLearner:
-    """Return the batch learner of a specification; it writes into ``theta`` (n, q)."""
+    """Return the batch learner of a specification; it writes into ``theta`` (n, q).
+
+    Of the parameters the first ``n_learned`` are learned.
+    """
     if isinstance(learner, Adam):
         return AdamLearner(learner, model, theta)
-    return LeastSquaresLearner(model, theta, regularization)
+    return LeastSquaresLearner(model, theta, regularization, n_learned)

@@ -14,16 +14,19 @@ from torch.func import jacrev, vmap
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.learning.base import Updated
+from dopt.models import GaussianProcess
 from dopt.policies import DOptimal, Informed, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
+from dopt.reference.gaussian_process import Posterior
 from dopt.reference.learning import BatchLearner, learner_for
 from dopt.reference.models import model_function, network_function
 from dopt.reference.own import OwnLearner, observe, planned_inputs, planners_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
+from dopt.reference.plans import plan_for
 from dopt.reference.search import searched_inputs
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
@@ -73,14 +76,12 @@ class Lockstep:
             self.model = network_function(self.system, module)
             flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
             self.theta = flat.to(device).repeat(len(specs), 1)
+        self.n_learned = self.theta.shape[1] - self.cell.model.n_fixed_parameters(self.system)
         self._allocate()
         self.planners = planners_for(self.specs)
-        if isinstance(self.cell.learner, Updated):
-            self.learner: BatchLearner = OwnLearner(self.cell.learner, self)
-        else:
-            regularization = self._regularization()
-            self.learner = learner_for(self.cell.learner, self.model, self.theta, regularization)
+        self.learner = self._learner()
         self._rows = vmap(jacrev(self.model))
+        self.own_plan = plan_for(self)
 
     def _tensor(self, values: npt.NDArray[np.float64]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -89,8 +90,18 @@ class Lockstep:
         return torch.full(shape, torch.nan, dtype=torch.float64, device=self.device)
 
     def _regularization(self) -> float:
-        policy = self.cell.policy
-        return policy.regularization if isinstance(policy, Informed) else 1.0
+        return float(getattr(self.cell.policy, "regularization", 1.0))
+
+    def _learner(self) -> BatchLearner:
+        system, model = self.system, self.cell.model
+        if isinstance(model, GaussianProcess):
+            return Posterior(system, model, self.theta, self.points)
+        if isinstance(self.cell.learner, Updated):
+            return OwnLearner(self.cell.learner, self)
+        regularization = self._regularization()
+        return learner_for(
+            self.cell.learner, self.model, self.theta, regularization, self.n_learned
+        )
 
     def _allocate(self) -> None:
         n, T = len(self.specs), self.system.horizon
@@ -103,7 +114,7 @@ class Lockstep:
         self.diverged = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
         self.inputs = self._unset(n, T, self.system.n_inputs)
         self.targets = self._unset(n, T, self.system.n_learned)
-        self.project: Callable[[Tensor], Tensor] = lambda rows: rows
+        self.project: Callable[[Tensor], Tensor] = lambda rows: rows[..., : self.n_learned]
         self.columns = {name: np.full((n, T), np.nan) for name in COLUMNS}
         self.information: Tensor | None = None
         if isinstance(self.cell.policy, Informed):
@@ -122,6 +133,8 @@ class Lockstep:
         The dual form is an algorithm of the kernel for the same M; the reference builds M.
         """
         q, n_rows = self.theta.shape[1], self.system.n_learned * self.system.horizon
+        if self.cell.model.structure == "least_squares":
+            return
         if policy.chosen_form(q, n_rows) == "sketch":
             assert isinstance(policy, DOptimal)
             buckets, signs = count_sketch(q, policy.sketch_size)
@@ -136,6 +149,8 @@ class Lockstep:
             return self.open_loop[:, t]
         if self.planners:
             return planned_inputs(self, t)
+        if self.own_plan is not None:
+            return self.own_plan.plan(t)
         if isinstance(policy, Uniform):
             seen = self.states[:, : t + 1]
             return uniform_inputs(self.system, self.model, self.theta, seen, policy.iterations)
@@ -168,20 +183,32 @@ class Lockstep:
         self.learner.learn(self.states[:, : t + 1], self.targets[:, : t + 1])
         self.theta.copy_(torch.where(self.diverged, before, self.theta))
 
+    def rows(self, t: int) -> Tensor:
+        """Return J at x_t and the current parameters, (n, r, s), in the space of M."""
+        return self.project(self._rows(self.theta, self.states[:, t]))
+
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
         observe(self, t)
         if self.information is not None:
-            J = self.project(self._rows(self.theta, self.states[:, t]))
+            J = self.rows(t)
             self.information = self.information + J.mT @ J
+        if self.own_plan is not None:
+            self.own_plan.inform(t)
 
     def evaluate(self) -> tuple[Tensor, Tensor]:
         """Return the L2 errors over the grid and over the reachable set, (n,) each."""
-        over_points = vmap(self.model, in_dims=(None, 0))
-        errors = vmap(over_points, in_dims=(0, None))(self.theta, self.points) - self.truth
-        squares = errors.square().sum(dim=-1)
+        squares = (self._predicted() - self.truth).square().sum(dim=-1)
         grid, reachable = squares[:, : self.n_grid], squares[:, self.n_grid :]
         return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
+
+    def _predicted(self) -> Tensor:
+        """Return the modelled accelerations at the evaluation points, (n, N, r)."""
+        if isinstance(self.learner, Posterior):
+            return self.learner.predict_points()
+        over_points = vmap(self.model, in_dims=(None, 0))
+        predicted: Tensor = vmap(over_points, in_dims=(0, None))(self.theta, self.points)
+        return predicted
 
     def step(self, t: int) -> None:
         """Take step t of every trial and record it."""

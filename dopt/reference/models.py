@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from dopt.models import MLP, Linear, Model
+from dopt.models import MLP, RFF, GaussianProcess, Linear, LinearState, Model
 from dopt.systems.base import System
 from dopt.systems.features import feature_values
 
@@ -31,9 +31,21 @@ def model_function(system: System, model: Model) -> Accelerations:
         return network_function(system, tanh_network(model.layer_sizes(system)))
     if isinstance(model, Linear):
         return linear_function(system)
+    if isinstance(model, LinearState):
+        return linear_state_function(system)
+    if isinstance(model, RFF):
+        return rff_function(system, model)
+    if isinstance(model, GaussianProcess):
+        return process_function(system, model)
     if isinstance(model, Networked):
         return network_function(system, model.module(system))
-    raise TypeError(f"model {model!r} is no MLP, Linear or Module: give its module instead.")
+    raise TypeError(f"model {model!r} is no Module and none of this package: give its module.")
+
+
+def features(system: System, x: Tensor) -> Tensor:
+    """Return the features, (..., p), of states (..., d)."""
+    values = feature_values(system.features, system.feature_scales, x.unbind(-1))
+    return torch.stack(values, dim=-1)
 
 
 def tanh_network(sizes: tuple[int, ...]) -> nn.Module:
@@ -60,8 +72,7 @@ def network_function(system: System, module: nn.Module) -> Accelerations:
             for (name, shape), part in zip(shapes.items(), parts, strict=True)
         }
         weights |= {name: buffer.to(x.device) for name, buffer in buffers.items()}
-        phi = feature_values(system.features, system.feature_scales, x.unbind(-1))
-        out: Tensor = functional_call(module, weights, (torch.stack(phi, dim=-1),))
+        out: Tensor = functional_call(module, weights, (features(system, x),))
         return out
 
     return accelerations
@@ -76,6 +87,48 @@ def linear_function(system: System) -> Accelerations:
         return offset + psi @ theta
 
     return accelerations
+
+
+def linear_state_function(system: System) -> Accelerations:
+    """Return Θ φ(x), with θ the entries of Θ row by row."""
+
+    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
+        out: Tensor = features(system, x) @ theta.view(system.n_learned, -1).mT
+        return out
+
+    return accelerations
+
+
+def rff_function(system: System, model: RFF) -> Accelerations:
+    """Return W ψ(x) of random Fourier features, with θ holding W, Ω and b."""
+    p, r, D = len(system.features), system.n_learned, model.n_features
+
+    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
+        weights, frequencies, phases = theta.split([r * D, D * p, D])
+        waves = torch.cos(features(system, x) @ frequencies.view(D, p).mT + phases)
+        out: Tensor = model.scale * waves @ weights.view(r, D).mT
+        return out
+
+    return accelerations
+
+
+def process_function(system: System, model: GaussianProcess) -> Accelerations:
+    """Return the posterior mean of a Gaussian process, with θ holding the samples and α."""
+    T, p, r = system.horizon, len(system.features), system.n_learned
+
+    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
+        centers, alpha = theta.split([T * p, T * r])
+        values = kernel(model, features(system, x).unsqueeze(-2), centers.view(T, p))
+        out: Tensor = (values @ alpha.view(T, r)).squeeze(-2)
+        return out
+
+    return accelerations
+
+
+def kernel(model: GaussianProcess, phi: Tensor, other: Tensor) -> Tensor:
+    """Return k, (..., N, N'), between features (..., N, p) and (..., N', p)."""
+    squares = (phi.unsqueeze(-2) - other.unsqueeze(-3)).square().sum(dim=-1)
+    return model.amplitude**2 * torch.exp(-0.5 / model.lengthscale**2 * squares)
 
 
 def stack(values: tuple[Any, ...]) -> Tensor:

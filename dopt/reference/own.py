@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,11 +11,10 @@ from torch import Tensor
 
 from dopt.errors import SpecificationError
 from dopt.learning.base import Updated
-from dopt.policies.base import Array, Planned, Planner, Policy
+from dopt.policies.base import Array, Planned, Planner
 from dopt.randomness import stream
 from dopt.reference.view import TrialView
 from dopt.spec import TrialSpec
-from dopt.systems.base import System
 
 if TYPE_CHECKING:
     from dopt.reference.lockstep import Lockstep
@@ -23,19 +22,13 @@ if TYPE_CHECKING:
 ROUNDING = 1e-9
 """Share of γ by which an input may exceed it."""
 
-TORCH_PLANNERS: dict[type[Policy], Callable[[Any, System, np.random.Generator], Planner]] = {}
-"""Plans of shipped policies that are written in torch; those in numpy make their own."""
-
 
 def planners_for(specs: Sequence[TrialSpec]) -> list[Planner]:
     """Return the plan of each trial; none for a policy that this package plans in lockstep."""
     policy = specs[0].policy
-    make = TORCH_PLANNERS.get(type(policy))
-    if isinstance(policy, Planned):
-        make = type(policy).planner
-    if make is None:
+    if not isinstance(policy, Planned):
         return []
-    return [make(policy, spec.system, stream(spec.seed, "planner")) for spec in specs]
+    return [policy.planner(spec.system, stream(spec.seed, "planner")) for spec in specs]
 
 
 def planned_inputs(batch: Lockstep, t: int) -> Tensor:

@@ -18,7 +18,7 @@ from dopt.systems import SYSTEMS, System, system_from_mapping
 from dopt.systems.equilibrium import euler_spectral_radius
 
 CONF = Path(__file__).parents[2] / "conf"
-ENVS = sorted((CONF / "env").glob("*.yaml"))
+ENVS = sorted((CONF / "env").rglob("*.yaml"))
 GROUPS: list[tuple[str, dict[str, Any]]] = [
     ("policy", POLICIES),
     ("model", MODELS),

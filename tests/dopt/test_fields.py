@@ -27,11 +27,12 @@ POSITIVE = {
     *("gamma", "dt", "horizon", "grid_half_widths", "grid_points", "state_limit"),
     *("mass", "length", "cart_mass", "pole_mass", "mass_1", "mass_2", "length_1", "length_2"),
     *("inertia", "half_span", "width", "depth", "learning_rate", "window", "epsilon"),
+    *("ensemble", "lookahead", "candidates", "starts", "n_features", "lengthscale", "amplitude"),
     *("regularization", "sketch_size", "hold", "iterations", "frequency", "band"),
 }
 NONNEGATIVE = {
     *("noise", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
-    *("beta_1", "beta_2"),
+    *("beta_1", "beta_2", "stiffness", "damping"),
 }
 FRACTIONS = {"beta_1", "beta_2"}
 TEXTS = {"form"}

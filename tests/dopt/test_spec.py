@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.spec import TrialSpec
-from tests.dopt.trials import PAIRS, trial
+from tests.dopt.trials import ALL_PAIRS, trial
 
 SECTIONS = {"env": "system", "policy": "policy", "model": "model", "learner": "learner"}
 
@@ -42,7 +42,7 @@ def with_value(spec: TrialSpec, section: str, field: str, value: Any) -> TrialSp
     return TrialSpec.from_mapping(mapping | {section: mapping[section] | {field: value}})
 
 
-@pytest.mark.parametrize(("env", "policy"), PAIRS)
+@pytest.mark.parametrize(("env", "policy"), ALL_PAIRS)
 def test_a_trial_comes_back_from_its_mapping_and_its_json(env: str, policy: str) -> None:
     spec = trial(env, policy, 7)
     again = TrialSpec.from_mapping(json.loads(json.dumps(spec.to_mapping())))
@@ -51,7 +51,7 @@ def test_a_trial_comes_back_from_its_mapping_and_its_json(env: str, policy: str)
     assert again.canonical_json() == spec.canonical_json()
 
 
-@pytest.mark.parametrize(("env", "policy"), PAIRS)
+@pytest.mark.parametrize(("env", "policy"), ALL_PAIRS)
 def test_every_field_is_part_of_the_key(env: str, policy: str) -> None:
     spec = trial(env, policy)
     variants = [with_value(spec, *change) for change in every_field(spec)]
@@ -62,9 +62,9 @@ def test_every_field_is_part_of_the_key(env: str, policy: str) -> None:
 
 
 def test_pairs_have_keys_of_their_own() -> None:
-    specs = [trial(env, policy, seed) for env, policy in PAIRS for seed in range(3)]
+    specs = [trial(env, policy, seed) for env, policy in ALL_PAIRS for seed in range(3)]
     assert len({spec.trial_key for spec in specs}) == len(specs)
-    assert len({spec.config_key for spec in specs}) == len(PAIRS)
+    assert len({spec.config_key for spec in specs}) == len(ALL_PAIRS)
 
 
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))

@@ -12,9 +12,9 @@ from dopt.policies import POLICIES
 from dopt.policies.base import OpenLoop
 from dopt.randomness import draw
 from dopt.systems.equilibrium import eigenmode
-from tests.dopt.trials import PAIRS, trial
+from tests.dopt.trials import ALL_PAIRS, trial
 
-BOUNDED = [(env, policy) for env, policy in PAIRS if policy != "random"]
+BOUNDED = [(env, policy) for env, policy in ALL_PAIRS if policy != "random"]
 
 
 def open_loop(env: str, policy: str, horizon: int, **fields: Any) -> np.ndarray:
@@ -137,7 +137,7 @@ def test_the_seed_gives_the_phase(policy: str) -> None:
 
 
 def test_every_policy_is_either_open_loop_or_starts_at_random_on_the_sphere() -> None:
-    for env, policy in PAIRS:
+    for env, policy in ALL_PAIRS:
         if not issubclass(POLICIES[policy], OpenLoop):
             spec = trial(env, policy, 4, env={"horizon": 2})
             first = run_trial(spec).inputs[0]

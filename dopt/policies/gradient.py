@@ -1,0 +1,40 @@
+"""D-optimal exploration without linearisation: Definition 1 as it stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dopt.fields import quantity
+from dopt.policies.base import ClosedLoop
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradientDOptimal(ClosedLoop):
+    """Maximise G_D(u) = log det(M + J(x(u))ᵀ J(x(u))) on the sphere ‖u‖ = γ (Definition 1).
+
+    All learned components count, and x(u) = x_t + dt f_θ(x_t, u) is exact. The value of each
+    candidate is computed first; from the best of them, projected gradient ascent by automatic
+    differentiation follows, along the great circle of the slope. With one input the candidates ±γ
+    are the whole sphere, and nothing is left to ascend. Proposition 1 approximates this optimum in
+    closed form; how far it falls short is measured by :mod:`dopt.reference.shortfall`.
+
+    Parameters
+    ----------
+    regularization : float
+        λ of M₀ = λI.
+    candidates : int
+        Inputs on the sphere that are compared first.
+    starts : int
+        How many of them the ascent starts from.
+    iterations : int
+        Ascent steps from each start.
+    """
+
+    name: ClassVar[str] = "gradient"
+    compiled: ClassVar[bool] = False
+
+    regularization: float = quantity(1e-3, bound="positive")
+    candidates: int = quantity(16, "inputs", "positive")
+    starts: int = quantity(2, "inputs", "positive")
+    iterations: int = quantity(4, "steps", "positive")

@@ -1,0 +1,169 @@
+"""Definition 1 as it stands: the exact one-step information gain, and its largest value.
+
+By the determinant lemma log det(M + JᵀJ) = log det M + log det(I + J M⁻¹ Jᵀ), with r × r matrices.
+
+======  =======================================================  =========
+symbol  meaning                                                  shape
+======  =======================================================  =========
+M       information matrix, of the s dimensions that J has       s × s
+J       Jacobian of the learned accelerations at x(u)            r × s
+u       input, here on the sphere ‖u‖ = γ                        m
+======  =======================================================  =========
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.func import grad_and_value, jacrev, vmap
+
+from dopt.planning.candidates import sphere_candidates
+from dopt.policies.gradient import GradientDOptimal
+from dopt.reference.dynamics import flow
+
+if TYPE_CHECKING:
+    from dopt.reference.lockstep import Lockstep
+
+WIDENING = 4.0
+"""Largest factor from the angle of one ascent step to where the next one aims."""
+
+LEAST_ANGLE = 1e-9
+"""Of an ascent step [rad]."""
+
+
+class Situation(NamedTuple):
+    """What a gain depends on beside the input, for n trials."""
+
+    theta: Tensor  # (n, q)
+    covariance: Tensor  # (n, s, s), M⁻¹
+    x: Tensor  # (n, d)
+    component: Tensor  # (n,), which one counts where a single one does
+
+
+def log_det_gain(rows: Tensor, covariance: Tensor) -> Tensor:
+    """Return log det(I + J M⁻¹ Jᵀ) for J (r, s) and M⁻¹ (s, s)."""
+    S = rows @ covariance @ rows.mT
+    if len(S) == 1:
+        alone: Tensor = S[0, 0].log1p()
+        return alone
+    factor, _ = torch.linalg.cholesky_ex(S + torch.eye(len(S)).to(S))
+    total: Tensor = torch.diagonal(factor).square().log().sum()
+    return total
+
+
+def updated_covariance(covariance: Tensor, rows: Tensor) -> Tensor:
+    """Return (M + JᵀJ)⁻¹, (n, s, s), from M⁻¹ and J (n, r, s)."""
+    solved = rows @ covariance
+    gram = solved @ rows.mT + torch.eye(rows.shape[1]).to(rows)
+    factor, _ = torch.linalg.cholesky_ex(gram)
+    root = torch.linalg.solve_triangular(factor, solved, upper=False)
+    updated: Tensor = covariance - root.mT @ root
+    return updated
+
+
+class ExactGain:
+    """G_D(u) - log det M of Definition 1 for a batch: of all learned components, or of one."""
+
+    def __init__(self, batch: Lockstep, *, single: bool = False) -> None:
+        system, model, project = batch.system, batch.model, batch.project
+
+        def gain(u: Tensor, theta: Tensor, covariance: Tensor, x: Tensor, k: Tensor) -> Tensor:
+            following = x + system.dt * flow(system, x, u, model(theta, x))
+            rows = project(jacrev(model)(theta, following))
+            return log_det_gain(rows.index_select(0, k.view(1)) if single else rows, covariance)
+
+        over_inputs = (0, None, None, None, None)
+        self._values = vmap(vmap(gain, in_dims=over_inputs))
+        self._slopes = vmap(vmap(grad_and_value(gain), in_dims=over_inputs))
+
+    def values(self, u: Tensor, now: Situation) -> Tensor:
+        """Return the gains, (n, C), of inputs (n, C, m)."""
+        gains: Tensor = self._values(u, *now)
+        return gains
+
+    def optimum(self, starts: Tensor, now: Situation, search: GradientDOptimal) -> Tensor:
+        """Return the best inputs, (n, m), found from inputs (n, C, m) on the sphere."""
+        values = self.values(starts, now)
+        count = min(search.starts, starts.shape[1])
+        chosen = values.topk(count, dim=1).indices
+        u = starts.gather(1, chosen.unsqueeze(-1).expand(-1, -1, starts.shape[2]))
+        values = values.gather(1, chosen)
+        if starts.shape[2] > 1:
+            angle = math.pi / starts.shape[1]
+            u, values = ascend(lambda v: self._slopes(v, *now), u, angle, search.iterations)
+        return u[torch.arange(len(u)), values.argmax(dim=1)]
+
+
+def ascend(
+    gain: Callable[[Tensor], tuple[Tensor, Tensor]],
+    starts: Tensor,
+    angle: float,
+    iterations: int,
+) -> tuple[Tensor, Tensor]:
+    """Ascend on the sphere from starts (..., m); return where it ends, and the values there.
+
+    Each step goes along the great circle of the projected gradient. Its angle is where the secant
+    of the slopes along the last circle is zero, and at most half of one that gained nothing.
+
+    Parameters
+    ----------
+    gain : callable
+        From inputs (..., m) to slopes (..., m) and values (...).
+    angle : float
+        First step [rad].
+    """
+    u, (slope, value) = starts, gain(starts)
+    radius = torch.linalg.vector_norm(starts, dim=-1, keepdim=True)
+    angles = torch.full_like(radius, angle)
+    for _ in range(iterations):
+        tangent = slope - (slope * u).sum(dim=-1, keepdim=True) / radius.square() * u
+        length = torch.linalg.vector_norm(tangent, dim=-1, keepdim=True)
+        along = radius * tangent / length.clamp_min(1e-300)
+        tried = angles.cos() * u + angles.sin() * along
+        # At an optimum the tangent is rounding, which may point off the sphere.
+        tried = tried * (radius / torch.linalg.vector_norm(tried, dim=-1, keepdim=True))
+        new_slope, new_value = gain(tried)
+        onwards = angles.cos() * along - angles.sin() * u
+        fall = (radius * length - (new_slope * onwards).sum(dim=-1, keepdim=True)) / angles
+        flat = torch.where(fall > 0.0, radius * length / fall, WIDENING * angles)
+        root = torch.minimum(flat, WIDENING * angles)
+        better = (new_value > value).unsqueeze(-1)
+        u, slope = torch.where(better, tried, u), torch.where(better, new_slope, slope)
+        value = torch.where(better.squeeze(-1), new_value, value)
+        angles = torch.where(better, (root - angles).abs(), torch.minimum(root, angles / 2))
+        angles = angles.clamp_min(LEAST_ANGLE)
+    return u, value
+
+
+class GradientPlan:
+    """The exact optimum of each trial: candidates first, then ascent from the best."""
+
+    def __init__(self, batch: Lockstep, policy: GradientDOptimal) -> None:
+        self._batch, self._policy = batch, policy
+        self._gain = ExactGain(batch)
+        self._candidates = candidates(batch, policy)
+        size = batch.project(batch.theta).shape[1]
+        prior = torch.eye(size).to(batch.theta) / policy.regularization
+        self.covariance = prior.repeat(len(batch.theta), 1, 1)
+
+    def plan(self, t: int) -> Tensor:
+        """Return the inputs u_t, (n, m)."""
+        batch = self._batch
+        components = batch.components[:, t]
+        now = Situation(batch.theta, self.covariance, batch.states[:, t], components)
+        return self._gain.optimum(self._candidates, now, self._policy)
+
+    def inform(self, t: int) -> None:
+        """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
+        self.covariance = updated_covariance(self.covariance, self._batch.rows(t))
+
+
+def candidates(batch: Lockstep, policy: GradientDOptimal) -> Tensor:
+    """Return the candidates of a policy for every trial of a batch, (n, C, m)."""
+    system = batch.system
+    inputs = sphere_candidates(system.n_inputs, policy.candidates, system.gamma)
+    return torch.tensor(inputs).to(batch.theta).expand(len(batch.theta), -1, -1)

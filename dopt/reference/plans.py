@@ -1,0 +1,45 @@
+"""Plans of closed-loop policies that only the reference knows, by the class of the policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from torch import Tensor
+
+from dopt.policies.disagreement import Disagreement
+from dopt.policies.gaussian_process import GaussianProcessEntropy
+from dopt.policies.gradient import GradientDOptimal
+from dopt.policies.greedy_linear import GreedyLinear
+from dopt.reference.ensemble import EnsemblePlan
+from dopt.reference.exact_gain import GradientPlan
+from dopt.reference.gaussian_process import EntropyPlan
+from dopt.reference.greedy_linear import GreedyLinearPlan
+
+if TYPE_CHECKING:
+    from dopt.reference.lockstep import Lockstep
+
+
+class Plan(Protocol):
+    """What chooses the inputs of a batch of n trials."""
+
+    def plan(self, t: int) -> Tensor:
+        """Return the inputs u_t, (n, m), for t ≥ 1."""
+
+    def inform(self, t: int) -> None:
+        """Take in step t, which was just done and learned from."""
+
+
+PLANS: dict[type, Callable[[Lockstep, Any], Plan]] = {
+    Disagreement: EnsemblePlan,
+    GaussianProcessEntropy: EntropyPlan,
+    GradientDOptimal: GradientPlan,
+    GreedyLinear: GreedyLinearPlan,
+}
+
+
+def plan_for(batch: Lockstep) -> Plan | None:
+    """Return the plan of a batch; None for a policy that has none of its own here."""
+    policy = batch.cell.policy
+    make = PLANS.get(type(policy))
+    return make(batch, policy) if make else None
