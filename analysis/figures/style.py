@@ -92,7 +92,7 @@ _STYLES = {
     "a_optimal": PolicyStyle("A-optimal", PURPLE, (0, (7, 1.5))),
     "e_optimal": PolicyStyle("E-optimal", OLIVE, (0, (1, 2))),
     "task": PolicyStyle("task-optimal", GREEN, (0, (5, 1, 1, 1, 1, 1))),
-    "max": PolicyStyle("ensemble disagreement", "#44aa99", (0, (3, 1, 1, 1))),
+    "max": PolicyStyle("ensemble disagreement", "#44aa99", (0, (4, 1, 1, 1))),
     "gaussian_process": PolicyStyle("Gaussian process", "#aa4499", (0, (5, 1, 2, 1))),
     "gradient": PolicyStyle("D-optimal, by gradient", INDIGO, (0, (7, 1))),
     "linear": PolicyStyle("D-optimal, linear", "#661100", (0, (2, 1, 5, 1))),
