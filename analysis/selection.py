@@ -22,6 +22,7 @@ POLICIES = (
     *(REFERENCE, "oracle", "uniform", "periodic", "random", "random_held", "random_sphere"),
     *("prbs", "multisine", "chirp"),
     *("max", "gaussian_process", "gradient", "linear"),
+    *("lookahead", "exact", "trace", "trace_linearized", "a_optimal", "e_optimal", "task"),
 )
 """Order of legends and tables; other policies follow by name."""
 

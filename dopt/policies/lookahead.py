@@ -27,26 +27,26 @@ class Lookahead(Search):
 
     Parameters
     ----------
-    horizon : int
-        H; 0 takes 0.6 periods of the least damped oscillation about the stable equilibrium, and 10
-        steps where there is none.
+    horizon : int or None
+        H; None takes 0.6 periods of the least damped oscillation about the stable equilibrium, and
+        10 steps where there is none.
     criterion : {"joint", "sum"}
         ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` that of each state's
         rows alone, summed over the path.
-    stride : int
-        Every how many steps a state's rows are taken; each then counts so many times. 0 takes a
+    stride : int or None
+        Every how many steps a state's rows are taken; each then counts so many times. None takes a
         fifth of the plan's steps: neighbouring rows are nearly the same.
     """
 
     name: ClassVar[str] = "lookahead"
 
     directions: int = quantity(8, "directions", "positive")
-    horizon: int = quantity(0, "steps", "nonnegative")
+    horizon: int | None = quantity(None, "steps", "positive")
     criterion: str = quantity("sum", choices=("joint", "sum"))
-    stride: int = quantity(0, "steps", "nonnegative")
+    stride: int | None = quantity(None, "steps", "positive")
 
     def check(self, system: System) -> None:
-        if self.stride > self.steps(system):
+        if self.stride is not None and self.stride > self.steps(system):
             raise IncompatibleError(
                 f"policy.stride is {self.stride} steps, but the plans have {self.steps(system)}: "
                 f"make it smaller, or policy.horizon larger."
@@ -57,7 +57,7 @@ class Lookahead(Search):
         return self.criterion
 
     def steps(self, system: System) -> int:
-        if self.horizon:
+        if self.horizon is not None:
             return self.horizon
         mode = eigenmode(system)
         if mode is None:
@@ -66,4 +66,6 @@ class Lookahead(Search):
 
     def stride_of(self, system: System) -> int:
         """Return every how many steps of a plan a state's rows are taken."""
-        return self.stride or max(1, self.steps(system) // STATES_OF_A_PATH)
+        if self.stride is not None:
+            return self.stride
+        return max(1, self.steps(system) // STATES_OF_A_PATH)

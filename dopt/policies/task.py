@@ -37,7 +37,7 @@ class TaskOptimal(Search):
 
     states: str = quantity("grid", choices=("grid", "reachable"))
     count: int = quantity(32, "states", "positive")
-    goal: tuple[float, ...] = ()
+    goal: tuple[float, ...] = quantity(())
     radius: float = quantity(0.5, "half-widths", "positive")
 
     @property

@@ -27,7 +27,7 @@ def every_field(spec: TrialSpec) -> list[tuple[str, str, Any]]:
 
 def other(value: Any, field: dataclasses.Field[Any], spec: TrialSpec) -> Any:
     if value is None:
-        return 1.5
+        return 1 if "int" in str(field.type) else 1.5
     if isinstance(value, str):
         return next(choice for choice in field.metadata["choices"] if choice != value)
     if value == ():

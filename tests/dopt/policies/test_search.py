@@ -107,7 +107,7 @@ def test_a_task_without_a_goal_draws_from_the_set_that_it_names() -> None:
         ("exact", {"budget_us": -1.0}, r"policy\.budget_us is -1\.0 µs, .* 0 or above"),
         ("exact", {"form": "dual"}, r"form"),
         ("lookahead", {"criterion": "jont"}, r"policy\.criterion .* did you mean 'joint'"),
-        ("lookahead", {"horizon": -3}, r"policy\.horizon is -3 steps, .* 0 or above"),
+        ("lookahead", {"horizon": 0}, r"policy\.horizon is 0 steps, .* above 0"),
         ("task", {"states": "gird"}, r"policy\.states .* did you mean 'grid'"),
     ],
 )
