@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+from dopt.control.task import GOAL_FIELDS
 from dopt.spec import TrialSpec
 from orchestrate.grid import Grid
 from orchestrate.store import NoDatabaseError, Reader
 
-SECTIONS = ("env", "policy", "model", "learner")
+SECTIONS = ("env", "policy", "model", "learner", "task")
+NO_TASK = {"name": "none"}
 ALWAYS = ("env", "policy")
 COUNTS = ("trials", "done", "failed", "to run")
 
@@ -68,9 +70,11 @@ def _values(trial: TrialSpec) -> Values:
     content = trial.to_mapping()
     values: Values = {}
     for section in SECTIONS:
-        fields = content[section]
+        fields = content.get(section, NO_TASK)
         assert isinstance(fields, dict)
-        values |= {f"{section}.{key}": value for key, value in fields.items()}
+        # Every system has a goal of its own, which is no news.
+        told = {key: value for key, value in fields.items() if key not in GOAL_FIELDS}
+        values |= {f"{section}.{key}": value for key, value in told.items()}
         values[section] = values.pop(f"{section}.name")
     return values
 

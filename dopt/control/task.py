@@ -89,7 +89,7 @@ class Control(Checked):
         SpecificationError
             If a value does not fit the system.
         """
-        chosen = {name: getattr(self, name) for name in _GOAL_FIELDS}
+        chosen = {name: getattr(self, name) for name in GOAL_FIELDS}
         missing = [name for name, value in chosen.items() if value is None]
         own = GOALS.get(system.name)
         if own is None and missing:
@@ -151,7 +151,8 @@ class Goal:
     lookahead: int
 
 
-_GOAL_FIELDS = tuple(field.name for field in dataclasses.fields(Goal))
+GOAL_FIELDS = tuple(field.name for field in dataclasses.fields(Goal))
+"""Fields of a task that differ from system to system."""
 
 
 def _given(fields: dict[str, Any]) -> dict[str, Any]:
