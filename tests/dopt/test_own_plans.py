@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,7 @@ from dopt.exploration import run_trial
 from dopt.reference.lockstep import run_trials
 from dopt.spec import Cell, TrialSpec
 
+ROOT = Path(__file__).resolve().parents[2]
 HERE = "tests.dopt.own_parts"
 
 
@@ -99,3 +103,15 @@ def test_a_cell_of_own_parts_is_a_value() -> None:
     assert isinstance(first, Cell)
     assert first == second
     assert hash(first) == hash(second)
+
+
+def test_torch_is_loaded_where_a_trial_runs_and_no_sooner() -> None:
+    """The driver of a grid only makes the specification, and sends it to its workers."""
+    mapping = specification(policy=own("Coin"), learner=own("Descent")).to_mapping()
+    program = (
+        "import pickle, sys; from dopt.spec import TrialSpec; "
+        f"spec = TrialSpec.from_mapping({mapping!r}); pickle.dumps(spec); spec.trial_key; "
+        "assert 'torch' not in sys.modules; "
+        "from dopt.exploration import run_trial; run_trial(spec); assert 'torch' in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from dopt.errors import SpecificationError
+from dopt.spec import TrialSpec
+from orchestrate.campaign import Work, launch_grid
 from orchestrate.errors import ExitCode
+from orchestrate.grid import Grid
+from orchestrate.settings import LaunchSettings
 from orchestrate.store import NoDatabaseError, Reader, Store
 from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.standins import (
@@ -150,3 +156,21 @@ def test_nothing_is_made_for_a_wrong_grid(launches: Launches) -> None:
         specification(0, mass=-1)
     with pytest.raises(NoDatabaseError):
         Reader.open(launches.url)
+
+
+@pytest.mark.parametrize(("policies", "prepared"), [(("coin",), 0), (("coin", "random"), 1)])
+def test_the_kernel_is_made_ready_where_a_trial_needs_it(
+    tmp_path: Path, policies: tuple[str, ...], prepared: int
+) -> None:
+    calls: list[None] = []
+    sections = {"coin": {"_target_": "tests.dopt.own_parts.Coin"}, "random": {"name": "random"}}
+    usual = specification().to_mapping()
+    trials = [
+        TrialSpec.from_mapping({k: v for k, v in usual.items() if k != "path"} | {"policy": chosen})
+        for chosen in (sections[name] for name in policies)
+    ]
+    grid = Grid(trials, asked=len(trials), left_out={})
+    settings = LaunchSettings("inprocess", f"sqlite:///{tmp_path / 'results.db'}")
+    work = Work(quick, prepare=lambda: calls.append(None))
+    assert launch_grid(grid, settings, RECORD, work, lambda _: None, stream=None) == ExitCode.DONE
+    assert len(calls) == prepared

@@ -64,3 +64,16 @@ def test_alone_such_a_pair_is_an_error_and_so_is_a_grid_of_nothing_else() -> Non
 def test_a_seed_is_a_whole_number_of_at_least_zero(seeds: Any) -> None:
     with pytest.raises(SpecificationError, match="seed"):
         build_grid([combination(seeds)])
+
+
+OWN = {"_target_": "tests.dopt.own_parts.Coin"}
+
+
+def test_a_grid_holds_trials_of_both_paths() -> None:
+    grid = build_grid([combination(), combination(policy=OWN)])
+    paths = {(trial.policy.name, trial.cell.path) for trial in grid.trials}
+    assert paths == {("random", "kernel"), ("coin", "reference")}
+    together = grid.on_path("reference")
+    assert {trial.cell.path for trial in together.trials} == {"reference"}
+    same = [trial.trial_key for trial in together.trials if trial.policy.name == "coin"]
+    assert same == [trial.trial_key for trial in grid.trials if trial.policy.name == "coin"]

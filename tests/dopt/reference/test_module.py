@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.exploration import run_trial
 from dopt.models import MLP
+from dopt.policies import POLICIES
 from dopt.reference.lockstep import Lockstep, run_trials
 from dopt.replay import replay
 from dopt.spec import TrialSpec
@@ -60,6 +61,19 @@ def test_a_trial_with_it_is_that_of_the_shipped_network(policy: str) -> None:
     np.testing.assert_allclose(own.states, batch.states[0].numpy(), rtol=1e-9)
     np.testing.assert_allclose(own.loss, batch.columns["loss"][0], rtol=1e-9)
     assert own.loss[-1] < own.loss[0]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_policy_runs_with_it_or_says_why_not(policy: str) -> None:
+    mapping = specification(policy="random", width=4).to_mapping()
+    mapping["env"] = {"name": "pendulum", "horizon": 6, "grid_points": [4, 4]}
+    try:
+        spec = TrialSpec.from_mapping(mapping | {"policy": {"name": policy}})
+    except IncompatibleError as error:
+        assert str(error).startswith(f"policy '{policy}' ")  # noqa: PT017  # the rest runs
+        return
+    result = run_trial(spec)
+    assert np.isfinite(result.loss).all()
 
 
 def test_the_seed_alone_gives_the_initial_parameters() -> None:
