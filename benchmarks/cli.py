@@ -17,6 +17,7 @@ QUESTIONS = (
     "step",
     "jax_scan",
     "reference",
+    "shortfall",
     "evaluation",
     "trial",
     "width",
