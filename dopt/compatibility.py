@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dopt.errors import IncompatibleError
-from dopt.learning import Learner
-from dopt.learning.base import Updated
+from dopt.learning import Adam, ExtendedKalman, Learner
 from dopt.models import MODELS, GaussianProcess, Linear, LinearState, Model
 from dopt.policies import Informed, Oracle, Policy
 from dopt.policies.disagreement import Disagreement
@@ -21,10 +20,13 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
             raise mismatch(f"policy '{policy.name}'", f"model '{fitting.name}'", given)
     if isinstance(policy, Disagreement) and model.structure != "gradient":
         raise mismatch(f"policy '{policy.name}'", _models("gradient"), given)
-    if isinstance(policy, Disagreement) and isinstance(learner, Updated):
-        expected = "a learner of this package, which can learn for many networks"
+    if isinstance(policy, Disagreement) and not isinstance(learner, Adam):
+        expected = "learner 'adam' or 'adam_window', which can learn for many networks"
         raise mismatch(f"policy '{policy.name}'", expected, f"learner '{learner.name}'")
-    _check_model(system, policy, model)
+    kalman = isinstance(learner, ExtendedKalman)
+    _check_model(system, policy, model, kalman)
+    if kalman and isinstance(model, Linear):
+        return
     if learner.structure != model.structure:
         raise mismatch(
             f"learner '{learner.name}'",
@@ -40,16 +42,21 @@ _MODELS_OF: dict[type[Policy], type[Model]] = {
 }
 
 
-def _check_model(system: System, policy: Policy, model: Model) -> None:
+def _check_model(system: System, policy: Policy, model: Model, kalman: bool) -> None:
+    """Check a model with a policy, and whether the learner is a Kalman filter.
+
+    A filter that holds M itself teaches the linear model without a policy that plans by M. It needs
+    a variance of each parameter, hence M in the primal form, as least squares do.
+    """
     given = f"policy '{policy.name}'"
-    if isinstance(model, Linear) and not isinstance(policy, Informed):
+    if isinstance(model, Linear) and not (kalman or isinstance(policy, Informed)):
         raise mismatch("model 'linear'", "policy 'oracle'", given)
     if isinstance(model, Linear) and not system.linear_parameters:
         raise mismatch("model 'linear'", "linear parameters", f"env '{system.name}'")
     form = getattr(policy, "form", "auto")
-    if model.structure == "least_squares" and form not in ("auto", "primal"):
-        expected = "policy.form 'primal' or 'auto'"
-        raise mismatch(f"model '{model.name}'", expected, f"policy.form '{form}'")
+    if (kalman or model.structure == "least_squares") and form not in ("auto", "primal"):
+        what = "learner 'ekf'" if kalman else f"model '{model.name}'"
+        raise mismatch(what, "policy.form 'primal' or 'auto'", f"policy.form '{form}'")
     if model.structure == "conditioning" and hasattr(policy, "regularization"):
         expected = "a policy that needs no information matrix of parameters"
         raise mismatch(f"model '{model.name}'", expected, given)

@@ -25,7 +25,7 @@ _SEED = 20_230_131
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """States and the true accelerations there, the grid's first.
+    """States and the true accelerations there at the first step, the grid's first.
 
     Attributes
     ----------
@@ -101,15 +101,15 @@ def simulate(system: System, inputs: Array) -> Array:
     states[0] = system.initial_state
     with np.errstate(over="ignore", invalid="ignore"):
         for t in range(steps):
-            states[t + 1] = states[t] + system.dt * _flows(system, states[t], inputs[t])
+            states[t + 1] = states[t] + system.dt * _flows(system, states[t], inputs[t], t)
     return states
 
 
-def _flows(system: System, states: Array, inputs: Array) -> Array:
-    """Return f(x, u), (n, d), for states (n, d) and inputs (n, m)."""
+def _flows(system: System, states: Array, inputs: Array, step: int) -> Array:
+    """Return f(x, u) at a step, (n, d), for states (n, d) and inputs (n, m)."""
     known = system.known(tuple(states.T), tuple(inputs.T), system.parameters)
     flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-    flow[:, list(system.learned_rows)] += system.learned(states)
+    flow[:, list(system.learned_rows)] += system.learned(states, step)
     return flow
 
 

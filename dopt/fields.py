@@ -13,7 +13,7 @@ from dopt.errors import SpecificationError, unknown_name
 LARGEST_WHOLE = 2**31 - 1
 """Whole numbers of a specification fit into the columns of every database."""
 
-Bound = Literal["any", "positive", "nonnegative", "fraction"]
+Bound = Literal["any", "positive", "nonnegative", "fraction", "share"]
 
 _LARGEST_REAL = sys.float_info.max
 
@@ -22,6 +22,7 @@ _BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
     "positive": (lambda value: value > 0, " and above 0"),
     "nonnegative": (lambda value: value >= 0, " and 0 or above"),
     "fraction": (lambda value: 0 <= value < 1, " and 0 or above, below 1"),
+    "share": (lambda value: 0 < value <= 1, " and above 0, 1 or below"),
 }
 
 
@@ -41,7 +42,7 @@ def quantity(
         Default value. Its type is the type that the field accepts.
     unit : str
         Unit in the SI, ``"1"`` when dimensionless.
-    bound : {"any", "positive", "nonnegative", "fraction"}
+    bound : {"any", "positive", "nonnegative", "fraction", "share"}
         What every number of the field has to satisfy.
     size : int, optional
         Number of entries that a tuple has to have.

@@ -14,7 +14,7 @@ from functools import singledispatch
 import numpy as np
 import numpy.typing as npt
 
-from dopt.systems import Arm, Cartpole, MassSpring, Pendulum, Quadrotor, System
+from dopt.systems import Arm, Cartpole, Chain, MassSpring, Pendulum, Quadrotor, System
 
 Array = npt.NDArray[np.float64]
 
@@ -66,6 +66,13 @@ def _(system: Arm, states: Array) -> Body:
     elbow = _hanging(states[:, 0], system.length_1)
     hand = elbow + _hanging(states[:, 2], system.length_2)
     return Body((_polyline(np.zeros_like(elbow), elbow, hand),), np.stack([elbow, hand], axis=1))
+
+
+@body.register
+def _(system: Chain, states: Array) -> Body:
+    links = [_hanging(states[:, i], system.length) for i in system.angle_indices]
+    masses = np.cumsum(links, axis=0)
+    return Body((_polyline(np.zeros_like(masses[0]), *masses),), np.moveaxis(masses, 0, 1))
 
 
 @body.register

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 
-from dopt.learning import Learner
-from dopt.learning.adam import Adam
+from dopt.information import held_information
+from dopt.learning import Adam, AdamReplay, Learner
 from dopt.models import MLP, GaussianProcess, Model
 from dopt.policies import (
     Disagreement,
     DOptimal,
     EOptimal,
     GradientDOptimal,
-    Informed,
     Lookahead,
     Policy,
     Search,
@@ -43,33 +42,40 @@ def memory_by_setting(
     N = math.prod(system.grid_points)
     w, L = (model.width, model.depth) if isinstance(model, MLP) else (1, 1)
     window = learner.window if isinstance(learner, Adam) else 0
+    changing = T * len(system.physical) + N * (d + r) if len(system.history) > 1 else 0
     numbers = {
         # states, noise, inputs as drawn and applied, ties, five columns, components
-        "env.horizon": T * (2 * d + 3 * m + 6 + STRONG_INPUTS * (d + m)),
+        "env.horizon": T * (2 * d + 3 * m + 6 + STRONG_INPUTS * (d + m)) + changing,
         # states and their mesh, targets, and features in both precisions
         "env.grid_points": N * (2 * d + 2 * r + 2 * p),
         # parameters, two moments, gradient, and the copies for the evaluation
         "model.width" if isinstance(model, MLP) else "model": 6 * q,
         "learner.window": window * (p + r + (L + 3) * max(w, r)),
     }
+    if isinstance(learner, AdamReplay):
+        # the samples kept, the places drawn, and the passes of the network over a minibatch
+        numbers["env.horizon"] += min(learner.capacity, T) * (p + r)
+        drawn = T * learner.steps * learner.batch
+        numbers["learner.batch"] = drawn + learner.batch * (p + r + (L + 3) * max(w, r))
+    held = held_information(policy, learner, q, r * T)
+    form = held.form if held else "none"
     if model.compiled:
-        information = _information(policy, q, r * T, T * (p + L * w * (1 + r)))
+        information = _information(policy, form, q, r * T, T * (p + L * w * (1 + r)))
     else:
-        information = _information_of_module(policy, q, r * T)
+        information = _information_of_module(policy, form, q)
     for part in (information, _search(policy, system, model), _beyond(policy, system, model)):
         for setting, count in part.items():
             numbers[setting] = numbers.get(setting, 0) + count
     return {setting: NUMBER * count for setting, count in numbers.items()}
 
 
-def _information(policy: Policy, q: int, n_rows: int, n_factors: int) -> dict[str, int]:
+def _information(policy: Policy, form: str, q: int, n_rows: int, n_factors: int) -> dict[str, int]:
     """Return the numbers of the information matrix, in the form in which it is held.
 
     The inverse is made from an identity matrix, which makes two of them for a moment.
     """
-    if not isinstance(policy, Informed):
+    if form == "none":
         return {}
-    form = policy.chosen_form(q, n_rows)
     if form == "primal":
         return {"model.width": 2 * q**2 + 16 * q}
     if form == "dual":
@@ -78,11 +84,11 @@ def _information(policy: Policy, q: int, n_rows: int, n_factors: int) -> dict[st
     return {"policy.sketch_size": 2 * size**2, "model.width": 2 * q}
 
 
-def _information_of_module(policy: Policy, q: int, n_rows: int) -> dict[str, int]:
+def _information_of_module(policy: Policy, form: str, q: int) -> dict[str, int]:
     """Return the numbers of M, its factor and its update, which the reference holds as they are."""
-    if not isinstance(policy, Informed):
+    if form == "none":
         return {}
-    if isinstance(policy, DOptimal) and policy.chosen_form(q, n_rows) == "sketch":
+    if isinstance(policy, DOptimal) and form == "sketch":
         return {"policy.sketch_size": 3 * policy.sketch_size**2}
     return {"model": 3 * q**2}
 

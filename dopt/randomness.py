@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from dopt.learning import AdamReplay, Learner
 from dopt.policies.base import OpenLoop, on_sphere
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ _STREAMS = {
     "environment": 7,
     "control_noise": 7,
     "control_plans": 8,
+    "replay": 9,
 }
 
 
@@ -56,6 +58,8 @@ class Draws:
         Index among the r learned accelerations of the component k of Algorithm 2.
     ties : (T, m)
         Unit vectors that decide between inputs of equal value.
+    replay : (T, steps, batch)
+        Places of the buffer that make the minibatches of a learner with replay; otherwise empty.
     """
 
     noise: Array
@@ -63,6 +67,7 @@ class Draws:
     inputs: Array
     components: npt.NDArray[np.int64]
     ties: Array
+    replay: npt.NDArray[np.int64]
 
 
 def draw(spec: TrialSpec) -> Draws:
@@ -80,4 +85,11 @@ def draw(spec: TrialSpec) -> Draws:
         inputs=np.ascontiguousarray(inputs),
         components=stream(seed, "components").integers(system.n_learned, size=system.horizon),
         ties=on_sphere(stream(seed, "ties").standard_normal(sphere), 1.0),
+        replay=_replay(spec.learner, system.horizon, seed),
     )
+
+
+def _replay(learner: Learner, horizon: int, seed: int) -> npt.NDArray[np.int64]:
+    if isinstance(learner, AdamReplay):
+        return learner.places(horizon, stream(seed, "replay"))
+    return np.zeros((0, 0, 0), dtype=np.int64)

@@ -83,7 +83,7 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
         loss[:end],
         body(spec.system, states),
         DrawnPlane.of(spec.system),
-        spec.system.learned(states),
+        spec.system.learned(states, np.arange(len(states))),
         np.array(learned),
     )
 

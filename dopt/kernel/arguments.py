@@ -16,7 +16,7 @@ Integers = npt.NDArray[np.int64]
 
 MLP_MODEL, LINEAR_MODEL = 0, 1
 OPEN_LOOP, UNIFORM, D_OPTIMAL, SEARCH = 0, 1, 2, 3
-ADAM, LEAST_SQUARES = 0, 1
+ADAM, LEAST_SQUARES, REPLAY, KALMAN = 0, 1, 2, 3
 PRIMAL, DUAL, SKETCH = 0, 1, 2
 JOINT, SUM, TRACE, A_OPTIMAL, E_OPTIMAL, TASK = 0, 1, 2, 3, 4, 5
 
@@ -24,7 +24,8 @@ JOINT, SUM, TRACE, A_OPTIMAL, E_OPTIMAL, TASK = 0, 1, 2, 3, 4, 5
 class World(NamedTuple):
     """The system's constants."""
 
-    parameters: Floats  # physical parameters
+    parameters: Floats  # physical parameters, at the start
+    history: Floats  # (T, number of them) at each step; one row where they stay
     linear_form: Floats  # (1 + n_linear, number of physical parameters)
     learned_rows: Integers  # (r,)
     n_inputs: int  # m
@@ -65,12 +66,18 @@ class Rules(NamedTuple):
     all_components: bool  # whether D_OPTIMAL sums over the components
     search: Search
     ascent_steps: int  # of the uniform policy
-    learner: int  # ADAM or LEAST_SQUARES
+    learner: int  # ADAM, LEAST_SQUARES, REPLAY or KALMAN
     learning_rate: float
     beta_1: float
     beta_2: float
     epsilon: float
-    window: int
+    window: int  # newest samples that are kept
+    batch: int  # samples in a step's loss: the window, or a minibatch
+    steps: int  # minibatches at each time step
+    noise_variance: float  # ρ of the Kalman filter
+    forgetting: float  # f
+    renewed: int  # diagonal entries of M that get back their share of the prior at each step
+    renewal: float  # what is added to each
     informed: bool  # whether the policy plans with M
     form: int  # of the information matrix: PRIMAL, DUAL or SKETCH
     regularization: float  # λ of M₀ = λI
@@ -83,6 +90,7 @@ class Randomness(NamedTuple):
     inputs: Floats  # (T, m)
     components: Integers  # (T,)
     ties: Floats  # (T, m)
+    replay: Integers  # (T, steps, batch), empty without replay
 
 
 class Evaluation(NamedTuple):
@@ -98,6 +106,7 @@ class Evaluation(NamedTuple):
     block_sizes: Integers  # (blocks,) points that count
     regressors: Floats  # (N, r, q) of the linear model
     targets: Floats  # (N, r) less the offset, of the linear model
+    states: Floats  # (N, d) where the truth changes; otherwise empty
     n_grid: int  # blocks of the grid, or its points for the linear model
     n_all: int  # all blocks or points
     target_size: float  # root mean square of the targets

@@ -82,7 +82,7 @@ def _compiled_functions(
     n_inputs: int,
     n_parameters: int,
 ) -> Equations:
-    name = f"{known.__module__}.{known.__qualname__}"
+    name = f"{known.__module__}.{known.__qualname__}.{n_states}"
     known, accelerations = compilable(known), compilable(accelerations)
     with one_compiler_at_a_time(name):
         return Equations(
@@ -104,7 +104,7 @@ def _known_into(
         for i in range(len(values)):
             out[i] = values[i]
 
-    return _compiled_for(function, into, KNOWN)
+    return _compiled_for(function, into, KNOWN, n_states)
 
 
 def _accelerations_into(
@@ -115,18 +115,20 @@ def _accelerations_into(
         for i in range(len(values)):
             out[i] = values[i]
 
-    return _compiled_for(function, into, signature)
+    return _compiled_for(function, into, signature, n_states)
 
 
-def _compiled_for(function: Callable[..., Any], into: Callable[..., None], signature: Any) -> Any:
+def _compiled_for(
+    function: Callable[..., Any], into: Callable[..., None], signature: Any, n_states: int
+) -> Any:
     """Compile ``into`` under a name of its own.
 
     Numba tells functions of one name apart by a number that starts anew in each process. Two of
     them that were cached by different processes, or one cached and one compiled here, would share a
-    symbol, and a call of one could run the other.
+    symbol, and a call of one could run the other. One equation may serve several numbers of states.
     """
     own = function.__module__.startswith("dopt.systems.")
-    name = f"{function.__module__}.{function.__qualname__}"
+    name = f"{function.__module__}.{function.__qualname__}.{n_states}"
     into.__qualname__ = name if own else f"{name}.{next(_foreign)}"
     into.__name__ = into.__qualname__.replace(".", "_").replace("<", "_").replace(">", "_")
     # The cache's folder is named after the package's sources: only they may be found in it.

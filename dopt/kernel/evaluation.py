@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dopt.kernel.arguments import LINEAR_MODEL, Evaluation, Network
+from dopt.kernel.arguments import LINEAR_MODEL, Evaluation, Network, World
 from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.network import forward
 
@@ -100,3 +100,26 @@ def evaluation_buffers(network: Network, q: int, r: int) -> Any:
         np.empty((r, BLOCK)),
         np.empty(q, np.float32),
     )
+
+
+@compiled
+def follow_truth(
+    accelerations: Any, world: World, network: Network, points: Evaluation, t: int
+) -> None:
+    """Write the accelerations that are true at step t into the targets of all points."""
+    r = world.learned_rows.shape[0]
+    value, offset = np.empty(r), np.empty(r)
+    if network.kind == LINEAR_MODEL:
+        for i in range(points.states.shape[0]):
+            accelerations(points.states[i], world.history[t], value)
+            accelerations(points.states[i], world.linear_form[0], offset)
+            for k in range(r):
+                points.targets[i, k] = value[k] - offset[k]
+        return
+    i = 0
+    for block in range(points.n_all):
+        for j in range(points.block_sizes[block]):
+            accelerations(points.states[i], world.history[t], value)
+            i += 1
+            for k in range(r):
+                points.block_targets[block, k, j] = value[k]

@@ -202,7 +202,7 @@ def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> N
         residuals[k] /= L[k, k]
         for j in range(row.shape[0]):
             row[j] /= L[k, k]
-        _append(covariance, row)
+        append_row(covariance, row)
 
 
 @vectorized
@@ -246,7 +246,7 @@ def _factorize(L: Any) -> None:
 
 
 @vectorized
-def _append(covariance: Covariance, row: Any) -> None:
+def append_row(covariance: Covariance, row: Any) -> None:
     """Add a row to V, and subtract VᵀV from A when that fills it."""
     n = covariance.n_pending[0]
     pending = covariance.pending

@@ -1,4 +1,4 @@
-"""Learning steps in compiled code: Adam on a window of samples."""
+"""Learning steps in compiled code: Adam on a window of samples, or on some drawn from a buffer."""
 
 from __future__ import annotations
 
@@ -35,6 +35,26 @@ def adam_step(
         targets = targets[:, : t + 1].copy()
     loss_gradient(network, state.theta, features, targets, hidden, deltas, gradient)
     adam_update(rules, t, state.theta, state.moment_1, state.moment_2, gradient)
+
+
+@compiled
+def replay_steps(
+    network: Network, rules: Rules, state: State, t: int, places: Any, buffers: Any, gradient: Any
+) -> None:
+    """Take Adam's steps of time t, one for each row of places in the buffer, (steps, batch)."""
+    hidden, deltas = buffers
+    features = np.empty((state.window_features.shape[0], rules.batch))
+    targets = np.empty((state.window_targets.shape[0], rules.batch))
+    for s in range(rules.steps):
+        for j in range(rules.batch):
+            place = places[s, j]
+            for i in range(features.shape[0]):
+                features[i, j] = state.window_features[i, place]
+            for k in range(targets.shape[0]):
+                targets[k, j] = state.window_targets[k, place]
+        loss_gradient(network, state.theta, features, targets, hidden, deltas, gradient)
+        step = t * rules.steps + s
+        adam_update(rules, step, state.theta, state.moment_1, state.moment_2, gradient)
 
 
 @contracted

@@ -11,7 +11,7 @@ from dopt.errors import SpecificationError
 from dopt.kernel import arguments as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.loop import compiled_loop, compiled_search
-from dopt.kernel.setup import constants, empty_record, initial_state
+from dopt.kernel.setup import constants, empty_record, initial_state, own_targets
 from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
@@ -38,7 +38,8 @@ class KernelTrial:
 
     def __init__(self, spec: TrialSpec) -> None:
         self.spec = spec
-        self.constants = constants(spec.cell)
+        *shared, points = constants(spec.cell)
+        self.constants = (*shared, own_targets(points))
         draws = draw(spec)
         self.randomness = args.Randomness(*_fields(draws, args.Randomness))
         self.state = initial_state(spec, draws.weights)

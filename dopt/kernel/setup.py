@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from dopt.evaluation import EvaluationSet, evaluation_set
+from dopt.information import Information, held_information
 from dopt.kernel import arguments as args
 from dopt.kernel.evaluation import BLOCK
 from dopt.kernel.information import PENDING_ROWS, SMALL
-from dopt.learning import Adam
+from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, Learner
 from dopt.models import MLP
 from dopt.planning.task_states import task_states
 from dopt.policies import (
@@ -41,6 +42,7 @@ def constants(
     system = cell.system
     world = args.World(
         np.array(system.parameters),
+        np.ascontiguousarray(system.history),
         np.array(system.linear_form),
         np.array(system.learned_rows),
         system.n_inputs,
@@ -69,6 +71,39 @@ def _network(cell: Cell) -> args.Network:
     )
 
 
+def _learner(cell: Cell) -> dict[str, Any]:
+    """Return the fields of the rules that describe the learner."""
+    learner = cell.learner
+    kinds = {Adam: args.ADAM, AdamReplay: args.REPLAY, ExtendedKalman: args.KALMAN}
+    kind = next((k for cls, k in kinds.items() if isinstance(learner, cls)), args.LEAST_SQUARES)
+    adam = learner if isinstance(learner, AdamRule) else Adam()
+    kalman = learner if isinstance(learner, ExtendedKalman) else ExtendedKalman()
+    replay = learner if isinstance(learner, AdamReplay) else None
+    window = _window(learner, cell.system.horizon)
+    renewed, renewal = kalman.renewal(cell.model.n_parameters(cell.system), _regularization(cell))
+    return {
+        "learner": kind,
+        "learning_rate": adam.learning_rate,
+        "beta_1": adam.beta_1,
+        "beta_2": adam.beta_2,
+        "epsilon": adam.epsilon,
+        "window": max(1, window),
+        "batch": replay.batch if replay else max(1, window),
+        "steps": replay.steps if replay else 1,
+        "noise_variance": kalman.noise_variance,
+        "forgetting": kalman.forgetting,
+        "renewed": renewed,
+        "renewal": renewal,
+    }
+
+
+def _window(learner: Learner, horizon: int) -> int:
+    """Return the number of samples that are kept."""
+    if isinstance(learner, AdamReplay):
+        return min(learner.capacity, horizon)
+    return learner.window if isinstance(learner, Adam) else 0
+
+
 def _rules(cell: Cell) -> args.Rules:
     policies = {
         OpenLoop: args.OPEN_LOOP,
@@ -78,21 +113,15 @@ def _rules(cell: Cell) -> args.Rules:
     }
     policy = next(code for kind, code in policies.items() if isinstance(cell.policy, kind))
     steps = cell.policy.iterations if isinstance(cell.policy, Uniform) else 0
-    adam = cell.learner if isinstance(cell.learner, Adam) else Adam()
     return args.Rules(
         policy,
         isinstance(cell.policy, TraceLinearized),
         _search(cell),
         steps,
-        args.ADAM if isinstance(cell.learner, Adam) else args.LEAST_SQUARES,
-        adam.learning_rate,
-        adam.beta_1,
-        adam.beta_2,
-        adam.epsilon,
-        adam.window,
-        isinstance(cell.policy, Informed),
-        _form(cell),
-        _regularization(cell),
+        **_learner(cell),
+        informed=isinstance(cell.policy, Informed),
+        form=_form(cell),
+        regularization=_regularization(cell),
     )
 
 
@@ -122,7 +151,13 @@ def _search(cell: Cell) -> args.Search:
 
 def _regularization(cell: Cell) -> float:
     """Return λ of M₀ = λI, 1 where there is no M."""
-    return cell.policy.regularization if isinstance(cell.policy, Informed) else 1.0
+    held = _held(cell)
+    return held.regularization if held else 1.0
+
+
+def _held(cell: Cell) -> Information | None:
+    q, n_rows = cell.model.n_parameters(cell.system), cell.system.n_learned * cell.system.horizon
+    return held_information(cell.policy, cell.learner, q, n_rows)
 
 
 def _evaluation(system: System, network: args.Network, points: EvaluationSet) -> args.Evaluation:
@@ -141,10 +176,23 @@ def _evaluation(system: System, network: args.Network, points: EvaluationSet) ->
         np.concatenate(sizes),
         np.zeros((0, 0, 0)),
         np.zeros((0, 0)),
+        _followed(system, points),
         len(sizes[0]),
         len(sizes[0]) + len(sizes[1]),
-        _size(points.accelerations),
+        _size(system, points),
     )
+
+
+def _followed(system: System, points: EvaluationSet) -> args.Floats:
+    """Return the states at which the truth is evaluated anew at each step."""
+    return points.states if len(system.history) > 1 else points.states[:0]
+
+
+def own_targets(points: args.Evaluation) -> args.Evaluation:
+    """Return points whose targets a trial may write into, if the truth changes with time."""
+    if not len(points.states):
+        return points
+    return points._replace(block_targets=points.block_targets.copy(), targets=points.targets.copy())
 
 
 def _blocks(features: args.Floats, targets: args.Floats) -> tuple[Any, Any, Any]:
@@ -174,20 +222,22 @@ def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation
         np.zeros(0, dtype=np.int64),
         np.ascontiguousarray(regressors),
         np.ascontiguousarray(points.accelerations - offset),
+        _followed(system, points),
         points.n_grid,
         len(points.states),
-        _size(points.accelerations),
+        _size(system, points),
     )
 
 
-def _size(targets: args.Floats) -> float:
-    """Return the root mean square norm of targets, (N, r)."""
-    return float(np.sqrt(np.mean(np.sum(targets**2, axis=1))))
+def _size(system: System, points: EvaluationSet) -> float:
+    """Return the root mean square norm of the targets, at the first or the last step."""
+    ends = (points.accelerations, system.learned(points.states, system.horizon - 1))
+    return max(float(np.sqrt(np.mean(np.sum(targets**2, axis=1)))) for targets in ends)
 
 
 def initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:
-    system, learner = spec.system, spec.learner
-    window = learner.window if isinstance(learner, Adam) else 0
+    system = spec.system
+    window = _window(spec.learner, system.horizon)
     return args.State(
         weights.copy(),
         np.zeros(len(weights)),
@@ -203,7 +253,7 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, a
     policy = spec.policy
     form = _form(spec.cell)
     size, dual, sketch = 0, _empty_dual(spec, 0), count_sketch(0, 1)
-    if form == args.PRIMAL and isinstance(policy, Informed):
+    if form == args.PRIMAL and _held(spec.cell):
         size = q
     elif form == args.DUAL:
         dual = _empty_dual(spec, spec.system.horizon)
@@ -233,11 +283,9 @@ def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
 
 def _form(cell: Cell) -> int:
     """Return the form of the information matrix, PRIMAL where there is none."""
-    if not isinstance(cell.policy, Informed):
-        return args.PRIMAL
-    n_rows = cell.system.n_learned * cell.system.horizon
+    held = _held(cell)
     names = {"primal": args.PRIMAL, "dual": args.DUAL, "sketch": args.SKETCH}
-    return names[cell.policy.chosen_form(cell.model.n_parameters(cell.system), n_rows)]
+    return names[held.form] if held else args.PRIMAL
 
 
 def empty_record(system: System) -> args.Record:

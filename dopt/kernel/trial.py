@@ -10,9 +10,11 @@ from dopt.kernel.arguments import (
     ADAM,
     D_OPTIMAL,
     DUAL,
+    KALMAN,
     LEAST_SQUARES,
     LINEAR_MODEL,
     OPEN_LOOP,
+    REPLAY,
     SEARCH,
     SKETCH,
     Evaluation,
@@ -26,9 +28,10 @@ from dopt.kernel.arguments import (
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
 from dopt.kernel.dual import dual_absorb
-from dopt.kernel.evaluation import evaluation_buffers, model_error
+from dopt.kernel.evaluation import evaluation_buffers, follow_truth, model_error
+from dopt.kernel.forgetting import fade
 from dopt.kernel.information import absorb
-from dopt.kernel.learning import adam_step, remember
+from dopt.kernel.learning import adam_step, remember, replay_steps
 from dopt.kernel.model import add_linear, all_components, network_rows, regressors
 from dopt.kernel.policies import d_optimal_input, uniform_input
 from dopt.kernel.sketch import sketched
@@ -85,13 +88,14 @@ def observe(
     x: Any,
     u: Any,
     noise: Any,
+    t: int,
     following: Any,
     target: Any,
 ) -> None:
     """Write x_{t+1} (equation 2) and the observed accelerations, (r,)."""
     flow = np.empty(x.shape[0])
     known(x, u, world.parameters, flow)
-    accelerations(x, world.parameters, target)
+    accelerations(x, world.history[min(t, world.history.shape[0] - 1)], target)
     for i in range(x.shape[0]):
         following[i] = flow[i]
     for k in range(target.shape[0]):
@@ -110,10 +114,11 @@ def inform(
     network: Network,
     rules: Rules,
     state: State,
+    t: int,
     x: Any,
     target: Any,
 ) -> None:
-    """Add JᵀJ at a state to M, and take the least-squares step that goes with it."""
+    """Add JᵀJ at a state to M, and take the least-squares or Kalman step that goes with it."""
     q, r = state.theta.shape[0], target.shape[0]
     residuals = np.empty(r)
     if network.kind == LINEAR_MODEL:
@@ -130,11 +135,26 @@ def inform(
             rows = sketched(state.sketch, rows)
     for k in range(r):
         residuals[k] = target[k] - residuals[k]
+    if rules.learner == KALMAN:
+        _weigh(rules, state, t, rows, residuals)
     scratch = np.empty(rows.shape)
     absorb(state.covariance, rows, residuals, scratch)
-    for k in range(r if rules.learner == LEAST_SQUARES else 0):
+    learns = rules.learner == LEAST_SQUARES or rules.learner == KALMAN
+    for k in range(r if learns else 0):
         for i in range(q):
             state.theta[i] += residuals[k] * scratch[k, i]
+
+
+@compiled
+def _weigh(rules: Rules, state: State, t: int, rows: Any, residuals: Any) -> None:
+    """Let M fade, and divide J, (r, q), and the residuals, (r,), by √ρ."""
+    if rules.forgetting < 1.0:
+        fade(state.covariance, rules.forgetting, t, rules.renewed, rules.renewal)
+    scale = 1.0 / np.sqrt(rules.noise_variance)
+    for k in range(rows.shape[0]):
+        residuals[k] *= scale
+        for i in range(rows.shape[1]):
+            rows[k, i] *= scale
 
 
 @called_from_python
@@ -160,7 +180,7 @@ def advance(
     """
     q, r = state.theta.shape[0], world.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    room = max(width, r) * rules.window
+    room = max(width, r) * rules.batch
     learning = (np.empty((depth, room)), np.empty((3, room)))
     evaluating = evaluation_buffers(network, q, r)
     gradient, target = np.empty(q), np.empty(r)
@@ -182,19 +202,26 @@ def advance(
             u,
         )
         clock_1 = monotonic_microseconds()
-        observe(known, accelerations, world, x, u, randomness.noise[t], following, target)
+        observe(known, accelerations, world, x, u, randomness.noise[t], t, following, target)
         if not within(following, world.state_limit):
             return t
         clock_2 = monotonic_microseconds()
         if rules.learner == ADAM:
             remember(network, rules, state, t, x, target)
             adam_step(network, rules, state, t, learning, gradient)
+        elif rules.learner == REPLAY:
+            remember(network, rules, state, t, x, target)
+            replay_steps(network, rules, state, t, randomness.replay[t], learning, gradient)
+        elif rules.learner == KALMAN:
+            inform(accelerations, world, network, rules, state, t, x, target)
         clock_3 = monotonic_microseconds()
         if not within(state.theta, np.inf):
             return t
-        if rules.informed:
-            inform(accelerations, world, network, rules, state, x, target)
+        if rules.informed and rules.learner != KALMAN:
+            inform(accelerations, world, network, rules, state, t, x, target)
         clock_4 = monotonic_microseconds()
+        if world.history.shape[0] > 1:
+            follow_truth(accelerations, world, network, points, t)
         loss = model_error(network, state.theta, points, 0, points.n_grid, evaluating)
         record.loss[t] = loss
         record.reachable_loss[t] = model_error(

@@ -1,14 +1,34 @@
-"""How the model learns online: by Adam, by recursive least squares, or by conditioning."""
+"""How the model learns online: Adam, least squares, the extended Kalman filter, conditioning."""
 
 from __future__ import annotations
 
-from dopt.learning.adam import Adam, AdamWindow
+from dopt.learning.adam import Adam, AdamRule, AdamWindow
+from dopt.learning.adam_replay import AdamReplay
 from dopt.learning.base import Learner
 from dopt.learning.conditioning import Conditioning
+from dopt.learning.extended_kalman import ExtendedKalman
 from dopt.learning.recursive_least_squares import RecursiveLeastSquares
 
 LEARNERS: dict[str, type[Learner]] = {
-    learner.name: learner for learner in (Adam, AdamWindow, RecursiveLeastSquares, Conditioning)
+    learner.name: learner
+    for learner in (
+        Adam,
+        AdamWindow,
+        AdamReplay,
+        RecursiveLeastSquares,
+        ExtendedKalman,
+        Conditioning,
+    )
 }
 
-__all__ = ["LEARNERS", "Adam", "AdamWindow", "Conditioning", "Learner", "RecursiveLeastSquares"]
+__all__ = [
+    "LEARNERS",
+    "Adam",
+    "AdamReplay",
+    "AdamRule",
+    "AdamWindow",
+    "Conditioning",
+    "ExtendedKalman",
+    "Learner",
+    "RecursiveLeastSquares",
+]

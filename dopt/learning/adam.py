@@ -15,8 +15,8 @@ from dopt.learning.base import Learner
 
 
 @dataclass(frozen=True, kw_only=True)
-class Adam(Learner):
-    """One Adam step on the newest sample at each time step.
+class AdamRule(Learner):
+    """What all learners share that take Adam's steps.
 
     Parameters
     ----------
@@ -26,16 +26,26 @@ class Adam(Learner):
         Decay rates of the first and the second moment.
     epsilon : float
         Regulariser of the denominator.
+    """
+
+    learning_rate: float = quantity(2e-3, bound="positive")
+    beta_1: float = quantity(0.9, bound="fraction")
+    beta_2: float = quantity(0.999, bound="fraction")
+    epsilon: float = quantity(1e-8, bound="positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adam(AdamRule):
+    """One Adam step on the newest sample at each time step.
+
+    Parameters
+    ----------
     window : int
         Number of newest samples in the loss; while fewer have been seen, those.
     """
 
     name: ClassVar[str] = "adam"
 
-    learning_rate: float = quantity(2e-3, bound="positive")
-    beta_1: float = quantity(0.9, bound="fraction")
-    beta_2: float = quantity(0.999, bound="fraction")
-    epsilon: float = quantity(1e-8, bound="positive")
     window: int = quantity(1, "samples", "positive")
 
 

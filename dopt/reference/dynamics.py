@@ -14,9 +14,10 @@ def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:
     return stack(system.known(x.unbind(-1), u.unbind(-1), system.parameters))
 
 
-def true_accelerations(system: System, x: Tensor) -> Tensor:
-    """Return a(x), (..., r)."""
-    return stack(system.accelerations(x.unbind(-1), system.parameters))
+def true_accelerations(system: System, x: Tensor, step: int) -> Tensor:
+    """Return a(x) at a step, (..., r), for states (..., d)."""
+    parameters = system.history[min(step, len(system.history) - 1)].tolist()
+    return stack(system.accelerations(x.unbind(-1), parameters))
 
 
 def flow(system: System, x: Tensor, u: Tensor, accelerations: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
-from dopt.learning import Adam, Learner
+from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, Learner
 from dopt.reference.models import Accelerations
 
 
@@ -22,8 +22,10 @@ class BatchLearner(Protocol):
 class AdamLearner:
     """Adam on the newest samples; one optimiser for the whole batch, as Adam is elementwise."""
 
-    def __init__(self, learner: Adam, model: Accelerations, theta: Tensor) -> None:
-        self.window = learner.window
+    def __init__(
+        self, learner: AdamRule, model: Accelerations, theta: Tensor, window: int = 1
+    ) -> None:
+        self.window = window
         self.optimizer = torch.optim.Adam(
             [theta],
             lr=learner.learning_rate,
@@ -41,8 +43,30 @@ class AdamLearner:
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Take one step on states (n, t + 1, d) and observed accelerations (n, t + 1, r)."""
         newest = slice(-self.window, None)
-        self._theta.grad = self._gradient(self._theta, states[:, newest], targets[:, newest])
+        self._step(states[:, newest], targets[:, newest])
+
+    def _step(self, states: Tensor, targets: Tensor) -> None:
+        self._theta.grad = self._gradient(self._theta, states, targets)
         self.optimizer.step()
+
+
+class ReplayLearner(AdamLearner):
+    """Adam on the samples that were last put into the drawn places of a buffer, (n, T, S, B)."""
+
+    def __init__(
+        self, learner: AdamReplay, model: Accelerations, theta: Tensor, places: Tensor
+    ) -> None:
+        super().__init__(learner, model, theta)
+        self._capacity, self._places = learner.capacity, places
+
+    def learn(self, states: Tensor, targets: Tensor) -> None:
+        """Take the steps of time t on states (n, t + 1, d) and accelerations (n, t + 1, r)."""
+        t = states.shape[1] - 1
+        for place in self._places[:, t].unbind(1):
+            times = (t - (t - place) % self._capacity).unsqueeze(-1)
+            self._step(
+                torch.take_along_dim(states, times, 1), torch.take_along_dim(targets, times, 1)
+            )
 
 
 class LeastSquaresLearner:
@@ -76,17 +100,54 @@ class LeastSquaresLearner:
         self._theta.copy_(torch.linalg.solve(self._normal, self._moment))
 
 
+class KalmanLearner:
+    """The extended Kalman filter in information form: M is summed, and solved afresh.
+
+    M_{t+1} = f M_t + D_t + JᵀJ/ρ and θ += M_{t+1}⁻¹ Jᵀ e/ρ.
+    """
+
+    def __init__(
+        self, learner: ExtendedKalman, model: Accelerations, theta: Tensor, regularization: float
+    ) -> None:
+        self._learner, self._theta = learner, theta
+        self._model, self._rows = vmap(model), vmap(jacrev(model))
+        self._renewal = learner.renewal(theta.shape[1], regularization)
+
+    def filtered(self, states: Tensor, targets: Tensor, information: Tensor) -> Tensor:
+        """Absorb the newest of the states (n, t + 1, d) and targets (n, t + 1, r); return M."""
+        x, y = states[:, -1], targets[:, -1]
+        J, noise = self._rows(self._theta, x), self._learner.noise_variance
+        given_back = torch.diag(self._given_back(states.shape[1] - 1))
+        information = self._learner.forgetting * information + given_back + J.mT @ J / noise
+        slope = J.mT @ (y - self._model(self._theta, x)).unsqueeze(-1) / noise
+        factor, _ = torch.linalg.cholesky_ex(information)
+        self._theta.add_(torch.cholesky_solve(slope, factor).squeeze(-1))
+        return information
+
+    def _given_back(self, t: int) -> Tensor:
+        """Return the diagonal of D_t, (q,)."""
+        diagonal = torch.zeros_like(self._theta[0])
+        k, weight = self._renewal
+        turn = torch.arange(t * k, (t + 1) * k, device=diagonal.device)
+        diagonal[turn % len(diagonal)] = weight
+        return diagonal
+
+
 def learner_for(
     learner: Learner,
     model: Accelerations,
     theta: Tensor,
     regularization: float,
     n_learned: int,
+    replay: Tensor | None = None,
 ) -> BatchLearner:
     """Return the batch learner of a specification; it writes into ``theta`` (n, q).
 
     Of the parameters the first ``n_learned`` are learned.
     """
     if isinstance(learner, Adam):
-        return AdamLearner(learner, model, theta)
+        return AdamLearner(learner, model, theta, learner.window)
+    if isinstance(learner, AdamReplay):
+        assert replay is not None
+        return ReplayLearner(learner, model, theta, replay)
     return LeastSquaresLearner(model, theta, regularization, n_learned)

@@ -13,16 +13,18 @@ from torch.func import jacrev, vmap
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
+from dopt.information import held_information
+from dopt.learning import ExtendedKalman
 from dopt.learning.base import Updated
 from dopt.models import GaussianProcess
-from dopt.policies import DOptimal, Informed, Search, TraceLinearized, Uniform
+from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.gaussian_process import Posterior
-from dopt.reference.learning import BatchLearner, learner_for
+from dopt.reference.learning import BatchLearner, KalmanLearner, learner_for
 from dopt.reference.models import model_function, network_function
 from dopt.reference.own import OwnLearner, observe, planned_inputs, planners_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
@@ -77,8 +79,11 @@ class Lockstep:
             flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
             self.theta = flat.to(device).repeat(len(specs), 1)
         self.n_learned = self.theta.shape[1] - self.cell.model.n_fixed_parameters(self.system)
+        q, n_rows = self.theta.shape[1], self.system.n_learned * self.system.horizon
+        self.held = held_information(self.cell.policy, self.cell.learner, q, n_rows)
         self._allocate()
         self.planners = planners_for(self.specs)
+        self.replay = torch.tensor(np.stack([d.replay for d in draws]), device=device)
         self.learner = self._learner()
         self._rows = vmap(jacrev(self.model))
         self.own_plan = plan_for(self)
@@ -89,19 +94,17 @@ class Lockstep:
     def _unset(self, *shape: int) -> Tensor:
         return torch.full(shape, torch.nan, dtype=torch.float64, device=self.device)
 
-    def _regularization(self) -> float:
-        return float(getattr(self.cell.policy, "regularization", 1.0))
-
-    def _learner(self) -> BatchLearner:
-        system, model = self.system, self.cell.model
+    def _learner(self) -> BatchLearner | KalmanLearner:
+        system, model, learner = self.system, self.cell.model, self.cell.learner
         if isinstance(model, GaussianProcess):
             return Posterior(system, model, self.theta, self.points)
-        if isinstance(self.cell.learner, Updated):
-            return OwnLearner(self.cell.learner, self)
-        regularization = self._regularization()
-        return learner_for(
-            self.cell.learner, self.model, self.theta, regularization, self.n_learned
-        )
+        if isinstance(learner, Updated):
+            return OwnLearner(learner, self)
+        if isinstance(learner, ExtendedKalman):
+            assert self.held is not None
+            return KalmanLearner(learner, self.model, self.theta, self.held.regularization)
+        ridge = float(getattr(self.cell.policy, "regularization", 1.0))
+        return learner_for(learner, self.model, self.theta, ridge, self.n_learned, self.replay)
 
     def _allocate(self) -> None:
         n, T = len(self.specs), self.system.horizon
@@ -117,25 +120,25 @@ class Lockstep:
         self.project: Callable[[Tensor], Tensor] = lambda rows: rows[..., : self.n_learned]
         self.columns = {name: np.full((n, T), np.nan) for name in COLUMNS}
         self.information: Tensor | None = None
-        if isinstance(self.cell.policy, Informed):
-            self._choose_form(self.cell.policy)
+        if self.held:
+            self._choose_form(self.held.form)
             size = self.project(self.theta).shape[1]
-            prior = self._regularization() * torch.eye(size).to(self.theta)
+            prior = self.held.regularization * torch.eye(size).to(self.theta)
             self.information = prior.repeat(n, 1, 1)
         points = evaluation_set(self.system)
         self.points = self._tensor(points.states)
         self.truth = self._tensor(points.accelerations)
         self.n_grid = points.n_grid
 
-    def _choose_form(self, policy: Informed) -> None:
+    def _choose_form(self, form: str) -> None:
         """Plan in the space of a sketch where the specification says so.
 
         The dual form is an algorithm of the kernel for the same M; the reference builds M.
         """
-        q, n_rows = self.theta.shape[1], self.system.n_learned * self.system.horizon
+        q, policy = self.theta.shape[1], self.cell.policy
         if self.cell.model.structure == "least_squares":
             return
-        if policy.chosen_form(q, n_rows) == "sketch":
+        if form == "sketch":
             assert isinstance(policy, DOptimal)
             buckets, signs = count_sketch(q, policy.sketch_size)
             matrix = torch.zeros(q, policy.sketch_size).to(self.theta)
@@ -170,7 +173,7 @@ class Lockstep:
         if self.episodes:
             u, following = stepped(self.episodes, u)
         else:
-            step = flow(self.system, x, u, true_accelerations(self.system, x))
+            step = flow(self.system, x, u, true_accelerations(self.system, x, t))
             following = x + self.system.dt * step + self.noise[:, t]
         observed = (following - x) / self.system.dt - known_flow(self.system, x, u)
         self.inputs[:, t] = u
@@ -180,7 +183,12 @@ class Lockstep:
     def learn(self, t: int) -> None:
         """Update the parameters with the samples up to time t; diverged trials keep theirs."""
         before = self.theta.clone()
-        self.learner.learn(self.states[:, : t + 1], self.targets[:, : t + 1])
+        seen = (self.states[:, : t + 1], self.targets[:, : t + 1])
+        if isinstance(self.learner, KalmanLearner):
+            assert self.information is not None
+            self.information = self.learner.filtered(*seen, self.information)
+        else:
+            self.learner.learn(*seen)
         self.theta.copy_(torch.where(self.diverged, before, self.theta))
 
     def rows(self, t: int) -> Tensor:
@@ -188,16 +196,21 @@ class Lockstep:
         return self.project(self._rows(self.theta, self.states[:, t]))
 
     def inform(self, t: int) -> None:
-        """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
+        """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t.
+
+        A Kalman filter has done so in its learning step.
+        """
         observe(self, t)
-        if self.information is not None:
+        if self.information is not None and not isinstance(self.learner, KalmanLearner):
             J = self.rows(t)
             self.information = self.information + J.mT @ J
         if self.own_plan is not None:
             self.own_plan.inform(t)
 
-    def evaluate(self) -> tuple[Tensor, Tensor]:
-        """Return the L2 errors over the grid and over the reachable set, (n,) each."""
+    def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
+        """Return the L2 errors at step t over the grid and over the reachable set, (n,) each."""
+        if len(self.system.history) > 1:
+            self.truth = true_accelerations(self.system, self.points, t)
         squares = (self._predicted() - self.truth).square().sum(dim=-1)
         grid, reachable = squares[:, : self.n_grid], squares[:, self.n_grid :]
         return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
@@ -223,7 +236,7 @@ class Lockstep:
         clocks.append(self._clock())
         self.inform(t)
         clocks.append(self._clock())
-        loss, reachable = self.evaluate()
+        loss, reachable = self.evaluate(t)
         self.diverged |= ~loss.isfinite().unsqueeze(1)
         clocks.append(self._clock())
         planned, _, learned, informed, evaluated = np.diff(clocks) * 1e6 / len(self.specs)

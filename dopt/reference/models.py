@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -131,7 +131,7 @@ def kernel(model: GaussianProcess, phi: Tensor, other: Tensor) -> Tensor:
     return model.amplitude**2 * torch.exp(-0.5 / model.lengthscale**2 * squares)
 
 
-def stack(values: tuple[Any, ...]) -> Tensor:
+def stack(values: Sequence[Any]) -> Tensor:
     """Stack scalars, some of which may be plain numbers, along a new last axis."""
     like = next(value for value in values if isinstance(value, Tensor))
     tensors = [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]

@@ -8,13 +8,16 @@ from dopt.registry import build
 from dopt.systems.arm import Arm
 from dopt.systems.base import System
 from dopt.systems.cartpole import Cartpole
+from dopt.systems.chain import Chain
+from dopt.systems.drifting_pendulum import DriftingPendulum
 from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
 from dopt.systems.pendulum import Pendulum
 from dopt.systems.quadrotor import Quadrotor
 
 SYSTEMS: dict[str, type[System]] = {
-    system.name: system for system in (Pendulum, Cartpole, Arm, Quadrotor, MassSpring)
+    system.name: system
+    for system in (Pendulum, Cartpole, Arm, Quadrotor, MassSpring, DriftingPendulum, Chain)
 }
 
 
@@ -27,6 +30,8 @@ __all__ = [
     "SYSTEMS",
     "Arm",
     "Cartpole",
+    "Chain",
+    "DriftingPendulum",
     "Feature",
     "MassSpring",
     "Pendulum",

@@ -23,6 +23,7 @@ import dataclasses
 import functools
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,6 +32,7 @@ import numpy.typing as npt
 from dopt.errors import SpecificationError
 from dopt.fields import Checked, quantity
 from dopt.systems.features import Feature, feature_values
+from dopt.systems.points import sobol_midpoints
 
 Array = npt.NDArray[np.float64]
 
@@ -56,6 +58,7 @@ class System(Checked):
     angle_indices: ClassVar[tuple[int, ...]] = ()
     phase_plane: ClassVar[tuple[int, int]]
     grid_indices: ClassVar[tuple[int, ...]]
+    low_discrepancy: ClassVar[bool] = False
     equilibrium: ClassVar[tuple[float, ...] | None] = None
 
     gamma: float = quantity(1.0, bound="positive")
@@ -72,7 +75,7 @@ class System(Checked):
         axes = len(self.grid_indices)
         self._check_size("initial_state", self.n_states)
         self._check_size("grid_half_widths", axes)
-        self._check_size("grid_points", axes)
+        self._check_size("grid_points", 1 if self.low_discrepancy else axes)
 
     def _check_size(self, field: str, size: int) -> None:
         given = getattr(self, field)
@@ -84,12 +87,12 @@ class System(Checked):
 
     @staticmethod
     @abstractmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+    def known(state: Any, inputs: Any, parameters: Any) -> Sequence[Any]:
         """Return the known part of dx/dt: d scalars."""
 
     @staticmethod
     @abstractmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+    def accelerations(state: Any, parameters: Any) -> Sequence[Any]:
         """Return the learned accelerations at zero input: r scalars."""
 
     @property
@@ -112,6 +115,15 @@ class System(Checked):
         """Physical parameters in the order of ``physical``."""
         return tuple(getattr(self, name) for name in self.physical)
 
+    @functools.cached_property
+    def history(self) -> Array:
+        """Physical parameters of each step, (T, number of them); one row for one that stays.
+
+        They are those of the learned accelerations. The known part, which a policy and a model are
+        given, is that of :attr:`parameters` at all times.
+        """
+        return np.array([self.parameters])
+
     @property
     def feature_scales(self) -> tuple[float, ...]:
         """Divisor of each feature: the grid's half-width for an identity, 1 otherwise."""
@@ -132,13 +144,19 @@ class System(Checked):
         """Return the evaluation states, (N, d): midpoints of a regular partition of the box.
 
         The mean over them is the midpoint rule for the mean over the box. Components that the
-        learned accelerations do not depend on are zero.
+        learned accelerations do not depend on are zero. A system with too many axes for that
+        (``low_discrepancy``) is judged on the first N points of a Sobol sequence.
         """
+        states = np.zeros((math.prod(self.grid_points), self.n_states))
+        if self.low_discrepancy:
+            low, high = np.array(list(self.grid_box().values())).T
+            unit = sobol_midpoints(len(self.grid_indices), len(states))
+            states[:, list(self.grid_indices)] = low + (high - low) * unit
+            return states
         axes = [
             (low + (high - low) * (np.arange(n) + 0.5) / n)
             for (low, high), n in zip(self.grid_box().values(), self.grid_points, strict=True)
         ]
-        states = np.zeros((math.prod(self.grid_points), self.n_states))
         mesh = np.meshgrid(*axes, indexing="ij")
         states[:, list(self.grid_indices)] = np.stack([axis.ravel() for axis in mesh], axis=1)
         return states
@@ -148,9 +166,15 @@ class System(Checked):
         values = feature_values(self.features, self.feature_scales, np.moveaxis(states, -1, 0))
         return np.stack(values, axis=-1)
 
-    def learned(self, states: Array) -> Array:
-        """Return the true accelerations, (N, r), of states, (N, d)."""
-        values = self.accelerations(tuple(states.T), self.parameters)
+    def learned(self, states: Array, steps: npt.ArrayLike = 0) -> Array:
+        """Return the true accelerations, (N, r), of states, (N, d), at a step or at (N,) steps.
+
+        A system that has changed stays as it is at the horizon.
+        """
+        parameters: Sequence[Any] = self.parameters
+        if len(self.history) > 1:
+            parameters = tuple(self.history[np.minimum(steps, len(self.history) - 1)].T)
+        values = self.accelerations(tuple(states.T), parameters)
         return np.stack(np.broadcast_arrays(*values), axis=-1)
 
     def derivative(self, state: npt.ArrayLike, inputs: npt.ArrayLike) -> npt.NDArray[Any]:

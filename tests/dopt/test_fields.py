@@ -30,12 +30,14 @@ POSITIVE = {
     *("ensemble", "lookahead", "candidates", "starts", "n_features", "lengthscale", "amplitude"),
     *("regularization", "sketch_size", "hold", "iterations", "frequency", "band"),
     *("directions", "subspace", "count", "radius", "stride"),
+    *("n_links", "time_constant", "capacity", "batch", "steps", "noise_variance", "forgetting"),
 }
 NONNEGATIVE = {
     *("noise", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
-    *("beta_1", "beta_2", "stiffness", "damping", "budget_us"),
+    *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction"),
 }
 FRACTIONS = {"beta_1", "beta_2"}
+SHARES = {"forgetting"}
 TEXTS = {"form", "criterion", "states"}
 OF_ANY_SIZE = {"goal"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)
@@ -59,6 +61,7 @@ def bad_values(field: dataclasses.Field[Any]) -> Iterator[tuple[Any, Any]]:
     numbers += [-1] if field.name in POSITIVE | NONNEGATIVE else []
     numbers += [0] if field.name in POSITIVE else []
     numbers += [1] if field.name in FRACTIONS else []
+    numbers += [1.5] if field.name in SHARES else []
     numbers += [0.5, "3"] if "int" in str(field.type) else []
     if not str(field.type).startswith("tuple"):
         yield from ((number, number) for number in numbers)

@@ -10,7 +10,14 @@ from dopt.policies import POLICIES
 from dopt.spec import TrialSpec
 from dopt.systems import SYSTEMS
 
-SMALL_GRIDS = {"pendulum": (4, 4), "cartpole": (3, 4, 3), "arm": (2, 2, 2, 2), "quadrotor": (4, 4)}
+SMALL_GRIDS = {
+    "pendulum": (4, 4),
+    "cartpole": (3, 4, 3),
+    "arm": (2, 2, 2, 2),
+    "quadrotor": (4, 4),
+    "drifting_pendulum": (4, 4),
+    "chain": (16,),
+}
 SMALL_SEARCHES = {"lookahead": {"horizon": 6, "directions": 4}, "task": {"count": 8}}
 SMALL_GRIDS |= {"mass_spring": (2, 2, 2, 2)}
 MODELS = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}

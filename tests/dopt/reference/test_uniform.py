@@ -6,7 +6,7 @@ from torch import Tensor
 
 from dopt.reference.planning import uniform_inputs
 from dopt.systems import SYSTEMS
-from tests.dopt.reference.batch import circle, situation, step_from
+from tests.dopt.reference.batch import situation, sphere, step_from
 from tests.dopt.trials import trial
 
 
@@ -27,8 +27,7 @@ def test_no_input_on_the_sphere_leads_farther(env: str, seed: int) -> None:
         torch.cat([torch.zeros(1, system.n_states), steps.cumsum(0)]), [0]
     )
     chosen = uniform_inputs(system, now.model, now.theta[None], path[None], 8)[0]
-    two = torch.tensor([[system.gamma], [-system.gamma]], dtype=torch.float64)
-    scan = circle(system.gamma, 360) if system.n_inputs == 2 else two
+    scan = sphere(system.gamma, system.n_inputs)
     best = max(spread(path, step_from(spec, now, u)) for u in scan)
     found = spread(path, step_from(spec, now, chosen))
     assert chosen.norm().item() == pytest.approx(system.gamma, rel=1e-12)

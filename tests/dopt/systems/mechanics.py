@@ -15,7 +15,16 @@ import torch
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp
 
-from dopt.systems import Arm, Cartpole, MassSpring, Pendulum, Quadrotor, System
+from dopt.systems import (
+    Arm,
+    Cartpole,
+    Chain,
+    DriftingPendulum,
+    MassSpring,
+    Pendulum,
+    Quadrotor,
+    System,
+)
 
 
 def _tensor(values: list[float]) -> Tensor:
@@ -134,6 +143,30 @@ class ArmMechanics(Mechanics):
         return -self.system.friction * rates
 
 
+class ChainMechanics(Mechanics):
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        self.coordinates = system.angle_indices
+
+    def masses(self) -> list[float]:
+        return [self.system.mass] * self.system.n_links
+
+    def positions(self, q: Tensor) -> Tensor:
+        links = self.system.length * torch.stack([q.sin(), -q.cos()], dim=-1)
+        return links.cumsum(0)
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
+        """Return the torques of motors that feel the joints' relative angles, by virtual work."""
+
+        def joints(angles: Tensor) -> Tensor:
+            return torch.diff(angles, prepend=torch.zeros_like(angles[:1]))
+
+        return jacrev(joints)(q).mT @ u + 0.0 * rates
+
+    def friction(self, rates: Tensor) -> Tensor:
+        return -self.system.friction * rates
+
+
 class QuadrotorMechanics(Mechanics):
     coordinates = (0, 2, 4)
 
@@ -197,6 +230,8 @@ MECHANICS: dict[type[System], type[Mechanics]] = {
     Arm: ArmMechanics,
     Quadrotor: QuadrotorMechanics,
     MassSpring: MassSpringMechanics,
+    DriftingPendulum: PendulumMechanics,
+    Chain: ChainMechanics,
 }
 
 FRICTION = {
@@ -205,4 +240,6 @@ FRICTION = {
     "arm": ("friction",),
     "quadrotor": ("drag",),
     "mass_spring": ("damping",),
+    "drifting_pendulum": ("friction", "final_friction"),
+    "chain": ("friction",),
 }

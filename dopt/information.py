@@ -1,0 +1,38 @@
+"""Which information matrix a trial holds: the planner's, or that of the learner."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from dopt.learning import ExtendedKalman, Learner
+from dopt.policies import Informed, Policy
+
+
+class Information(NamedTuple):
+    """The one information matrix M of a trial.
+
+    Attributes
+    ----------
+    form : {"primal", "dual", "sketch"}
+        How it is held (:class:`dopt.policies.DOptimal`).
+    regularization : float
+        λ of M₀ = λI.
+    """
+
+    form: str
+    regularization: float
+
+
+def held_information(
+    policy: Policy, learner: Learner, n_parameters: int, n_rows: int
+) -> Information | None:
+    """Return what M a trial holds for q parameters and N rows; None where nothing needs one.
+
+    A policy that plans by M shares it with a Kalman filter, which needs the gain in the space of
+    the parameters and hence the primal form.
+    """
+    kalman = learner if isinstance(learner, ExtendedKalman) else None
+    if isinstance(policy, Informed):
+        form = "primal" if kalman else policy.chosen_form(n_parameters, n_rows)
+        return Information(form, policy.regularization)
+    return Information("primal", kalman.regularization) if kalman else None

@@ -1,0 +1,46 @@
+"""Forgetting in compiled code: M fades, and gets back what the prior loses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dopt.kernel.arguments import Covariance
+from dopt.kernel.compiler import vectorized
+from dopt.kernel.information import add_multiple, append_row
+
+
+@vectorized
+def fade(covariance: Covariance, forgetting: float, t: int, renewed: int, renewal: float) -> None:
+    """Turn M⁻¹ into (f M + D)⁻¹ at step t (:class:`dopt.learning.ExtendedKalman`).
+
+    D has the entry ``renewal`` at the ``renewed`` diagonal places whose turn it is.
+    """
+    upper, pending = covariance.upper, covariance.pending
+    q = upper.shape[0]
+    for i in range(q):
+        row = upper[i, i:]
+        for j in range(row.shape[0]):
+            row[j] /= forgetting
+    for k in range(covariance.n_pending[0]):
+        for j in range(q):
+            pending[k, j] /= np.sqrt(forgetting)
+    column = np.empty(q)
+    for n in range(renewed):
+        i = (t * renewed + n) % q
+        _read_column(covariance, i, column)
+        factor = np.sqrt(renewal / (1.0 + renewal * column[i]))
+        for j in range(q):
+            column[j] *= factor
+        append_row(covariance, column)
+
+
+@vectorized
+def _read_column(covariance: Covariance, i: int, out: Any) -> None:
+    """Write column i of M⁻¹, (q,)."""
+    upper, pending = covariance.upper, covariance.pending
+    for j in range(out.shape[0]):
+        out[j] = upper[min(i, j), max(i, j)]
+    for k in range(covariance.n_pending[0]):
+        add_multiple(out, -pending[k, i], pending[k])

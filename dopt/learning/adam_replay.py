@@ -1,0 +1,48 @@
+"""Adam on minibatches of all that has been seen: experience replay.
+
+Reference: L.-J. Lin, "Self-improving reactive agents based on reinforcement learning, planning and
+teaching", Machine Learning 8 (1992).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.fields import quantity
+from dopt.learning.adam import AdamRule
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdamReplay(AdamRule):
+    """Some Adam steps at each time step, each on samples drawn from the buffer with replacement.
+
+    The sample of time t takes place t mod ``capacity`` of the buffer, in which the oldest one was.
+
+    Parameters
+    ----------
+    capacity : int
+        Number of newest samples that the buffer holds.
+    batch : int
+        Samples of a minibatch.
+    steps : int
+        Minibatches, and Adam steps, at each time step.
+    """
+
+    name: ClassVar[str] = "adam_replay"
+
+    learning_rate: float = quantity(1e-2, bound="positive")
+    capacity: int = quantity(10_000, "samples", "positive")
+    batch: int = quantity(100, "samples", "positive")
+    steps: int = quantity(1, "steps", "positive")
+
+    def places(self, horizon: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
+        """Draw the places of the buffer that the minibatches are made of, (T, steps, batch).
+
+        At time t they are uniform over the min(t + 1, capacity) places that hold a sample.
+        """
+        filled = np.minimum(np.arange(1, horizon + 1), self.capacity)
+        return rng.integers(filled[:, None, None], size=(horizon, self.steps, self.batch))

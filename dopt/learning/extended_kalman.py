@@ -1,0 +1,91 @@
+"""The extended Kalman filter as a learner: online Gauss-Newton steps on the newest sample.
+
+======  ======================================================  =========
+symbol  meaning                                                 shape
+======  ======================================================  =========
+θ       parameters of the model                                 q
+J       ∂a_θ/∂θ at the newest state, before the learning step   r × q
+e       y - a_θ(x), observed less modelled accelerations        r
+M       information matrix, M₀ = λI                             q × q
+ρ       variance of the observations
+f       forgetting factor
+======  ======================================================  =========
+
+References: S. Singhal and L. Wu, "Training multilayer perceptrons with the extended Kalman
+algorithm" (1989); L. Ljung and T. Söderström, "Theory and practice of recursive identification"
+(1983), for forgetting; L. Ngia and J. Sjöberg, "Efficient training of neural nets for nonlinear
+adaptive filtering using a recursive Levenberg-Marquardt algorithm", IEEE Transactions on Signal
+Processing 48 (2000), for the renewal of the prior, some diagonal entries of M at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+from dopt.fields import quantity
+from dopt.learning.base import Learner
+
+
+class Renewal(NamedTuple):
+    """What is given back of the prior at each step while M fades.
+
+    Attributes
+    ----------
+    entries : int
+        Diagonal entries of M that are renewed at a step, k of them in turn: at step t those at
+        (k t, ..., k t + k - 1) mod q.
+    weight : float
+        What is added to each of them.
+    """
+
+    entries: int
+    weight: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExtendedKalman(Learner):
+    """θ += K e with K = M⁻¹Jᵀ (ρI + J M⁻¹ Jᵀ)⁻¹, and M += JᵀJ/ρ.
+
+    There is one information matrix. With a policy that plans by M the filter takes that of the
+    policy, with its λ; with any other it holds one of its own. In both cases a sample enters M with
+    the J that its learning step was taken with, hence at the parameters before that step, so that θ
+    and M⁻¹ stay the mean and the covariance of one filter; for a model that is linear in θ this is
+    recursive least squares. (With other learners the planner adds J at the parameters after the
+    step, as the paper does.)
+
+    With f < 1 the past fades, M_{t+1} = f M_t + D_t + JᵀJ/ρ. The diagonal D_t gives back what the
+    prior loses, so that M never falls below λ/2 I: directions that nothing excites do not wind up,
+    and the variance of no parameter exceeds 2/λ.
+
+    Parameters
+    ----------
+    regularization : float
+        λ of a filter with a matrix of its own; with ρ = 1 it is the ratio of the variance of the
+        observations to that of the initial parameters.
+    noise_variance : float
+        ρ, in the units in which the parameters have the variance 1/λ.
+    forgetting : float
+        f, above 0 and at most 1: samples of 1/(1 - f) steps ago count 1/e. 1 forgets nothing.
+    """
+
+    name: ClassVar[str] = "ekf"
+
+    regularization: float = quantity(1e-3, bound="positive")
+    noise_variance: float = quantity(1.0, bound="positive")
+    forgetting: float = quantity(1.0, bound="share")
+
+    def renewal(self, n_parameters: int, regularization: float) -> Renewal:
+        """Return what is given back of λI for q parameters.
+
+        All entries have their turn within a period P with fᴾ ≥ 1/2, or at each step if f is less.
+        With an entry at λ or above after its turn it is at fᴾλ or above before the next, to which
+        λ(1 - fᴾ) is added.
+        """
+        if self.forgetting == 1.0:
+            return Renewal(0, 0.0)
+        longest = max(1, math.floor(math.log(0.5) / math.log(self.forgetting)))
+        entries = math.ceil(n_parameters / longest)
+        period = math.ceil(n_parameters / entries)
+        return Renewal(entries, regularization * (1.0 - self.forgetting**period))
