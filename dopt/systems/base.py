@@ -171,17 +171,22 @@ class System(Checked):
 
         A system that has changed stays as it is at the horizon.
         """
-        parameters: Sequence[Any] = self.parameters
-        if len(self.history) > 1:
-            parameters = tuple(self.history[np.minimum(steps, len(self.history) - 1)].T)
-        values = self.accelerations(tuple(states.T), parameters)
+        values = self.accelerations(tuple(states.T), self._parameters_at(steps))
         return np.stack(np.broadcast_arrays(*values), axis=-1)
 
-    def derivative(self, state: npt.ArrayLike, inputs: npt.ArrayLike) -> npt.NDArray[Any]:
-        """Return dx/dt = f(x, u), equation 1, of one state (d,) and input (m,)."""
+    def _parameters_at(self, steps: npt.ArrayLike) -> Sequence[Any]:
+        """Return the physical parameters at a step, or arrays of them at (N,) steps."""
+        if len(self.history) == 1:
+            return self.parameters
+        return tuple(self.history[np.minimum(steps, len(self.history) - 1)].T)
+
+    def derivative(
+        self, state: npt.ArrayLike, inputs: npt.ArrayLike, step: int = 0
+    ) -> npt.NDArray[Any]:
+        """Return dx/dt = f(x, u), equation 1, of one state (d,) and input (m,) at a step."""
         x, u = tuple(np.asarray(state)), tuple(np.asarray(inputs))
         flow = np.array(self.known(x, u, self.parameters))
-        rows = np.array(self.accelerations(x, self.parameters))
+        rows = np.array(self.accelerations(x, self._parameters_at(step)))
         kind = np.result_type(flow, rows)
         flow = flow.astype(kind)
         flow[list(self.learned_rows)] += rows

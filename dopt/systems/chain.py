@@ -87,7 +87,7 @@ class Chain(System):
     friction : float
         Viscous friction coefficient b of each link's rotation [N m s].
     initial_state, grid_half_widths : tuple of float
-        Of all 2n components, or an angle and a rate for every link.
+        Of all 2n components, or an angle and a rate, which then hold for every link.
     """
 
     name: ClassVar[str] = "chain"
@@ -138,8 +138,8 @@ class Chain(System):
         }
         for field in ("initial_state", "grid_half_widths"):
             given = getattr(self, field)
-            if len(given) == 2:
-                shape[field] = given * n
+            if len(given) % 2 == 0 and given == given[:2] * (len(given) // 2):
+                shape[field] = given[:2] * n
         for attribute, value in shape.items():
             object.__setattr__(self, attribute, value)
 

@@ -57,7 +57,7 @@ def test_a_simulated_step_is_the_euler_map(name: str) -> None:
     path = simulate(system, inputs)
     for t in range(5):
         for i in range(3):
-            step = system.dt * system.derivative(path[t, i], inputs[t, i])
+            step = system.dt * system.derivative(path[t, i], inputs[t, i], t)
             assert path[t + 1, i] == pytest.approx(path[t, i] + step, rel=1e-13, abs=1e-15)
 
 

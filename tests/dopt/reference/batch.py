@@ -56,3 +56,14 @@ def circle(radius: float, points: int) -> Tensor:
     """Return points on a circle, (points, 2)."""
     angles = torch.arange(points, dtype=torch.float64) * (2 * torch.pi / points)
     return radius * torch.stack([angles.cos(), angles.sin()], dim=-1)
+
+
+def sphere(radius: float, dimensions: int) -> Tensor:
+    """Return points on a sphere, (points, dimensions): both, evenly spread, or random ones."""
+    if dimensions == 1:
+        return torch.tensor([[radius], [-radius]], dtype=torch.float64)
+    if dimensions == 2:
+        return circle(radius, 3_600)
+    rng = torch.Generator().manual_seed(0)
+    points = torch.randn(20_000, dimensions, generator=rng, dtype=torch.float64)
+    return radius * points / points.norm(dim=1, keepdim=True)

@@ -12,7 +12,7 @@ from torch.func import jacrev
 from dopt.planning.sphere import maximize_on_sphere
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem
 from dopt.spec import Cell, TrialSpec
-from tests.dopt.reference.batch import Situation, circle, situation, step_from
+from tests.dopt.reference.batch import Situation, situation, sphere, step_from
 from tests.dopt.trials import PAIRS, trial
 
 CASES = [(env, policy) for env, policy in PAIRS if policy in ("d_optimal", "oracle")]
@@ -101,8 +101,7 @@ def test_no_input_on_the_sphere_has_a_larger_linearised_gain(
             return (rows * torch.linalg.solve(now.information, rows.mT).mT).sum(-1)
 
         u = solve(spec, now, component)[2]
-        two = torch.tensor([[gamma], [-gamma]], dtype=torch.float64)
-        scan = circle(gamma, 3_600) if spec.system.n_inputs == 2 else two
+        scan = sphere(gamma, spec.system.n_inputs)
         assert u.norm().item() == pytest.approx(gamma, rel=1e-12)
         assert gain(u[None]) >= gain(scan).max() - 1e-7 * gain(u[None]).abs()
 
