@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from analysis.selection import ENVIRONMENTS
 from benchmarks.launches import RECORD, claims_for, run_record
 from benchmarks.processes import database, run
 from benchmarks.rows import Row, Target
@@ -15,7 +16,6 @@ from dopt.errors import IncompatibleError
 from dopt.exploration import run_trial
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
-from dopt.systems import SYSTEMS
 from orchestrate.store import Store
 
 PAPER = ("random", "uniform", "periodic", "d_optimal", "oracle")
@@ -50,7 +50,7 @@ def fill(url: str, seeds: int) -> int:
 
 
 def _cells() -> Iterator[TrialSpec]:
-    for env in SYSTEMS:
+    for env in ENVIRONMENTS:
         for policy in PAPER:
             linear = policy == "oracle"
             learner = "recursive_least_squares" if linear else "adam_window"

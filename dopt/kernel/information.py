@@ -178,7 +178,8 @@ def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> N
     rows : (r, q)
         J.
     residuals : (r,)
-        e, overwritten: then ``scratch.T @ residuals`` is the least-squares correction of θ.
+        e, overwritten: then ``scratch.T @ residuals`` is the least-squares correction of θ. NaN
+        where the variance J M⁻¹ Jᵀ overflows: θ must not seem to rest.
     scratch : (r, q)
         Overwritten by L⁻¹V.
     """
@@ -199,7 +200,7 @@ def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> N
         for i in range(k):
             residuals[k] -= L[k, i] * residuals[i]
             add_multiple(row, -L[k, i], scratch[i])
-        residuals[k] /= L[k, k]
+        residuals[k] /= L[k, k] if np.isfinite(L[k, k]) else np.nan
         for j in range(row.shape[0]):
             row[j] /= L[k, k]
         append_row(covariance, row)

@@ -40,7 +40,7 @@ class DriftingPendulum(Pendulum):
     def history(self) -> Array:
         """Physical parameters of each step, (T, number of them)."""
         rows = np.tile(np.array(self.parameters), (self.horizon, 1))
-        passed = np.exp(-self.dt * np.arange(self.horizon) / self.time_constant)
-        worn = self.final_friction + (self.friction - self.final_friction) * passed
-        rows[:, self.physical.index("friction")] = worn
+        worn = -np.expm1(-self.dt * np.arange(self.horizon) / self.time_constant)
+        growth = (self.final_friction - self.friction) * worn
+        rows[:, self.physical.index("friction")] += growth
         return rows
