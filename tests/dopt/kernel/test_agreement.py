@@ -33,8 +33,10 @@ def check_agreement(spec: TrialSpec) -> tuple[TrialResult, TrialResult]:
     assert np.isfinite(plain.loss).all()
     assert relative_gap(fast.inputs, plain.inputs) < 1e-8
     assert relative_gap(fast.states, plain.states) < 1e-8
-    assert fast.loss == pytest.approx(plain.loss, rel=LOSS)
-    assert fast.reachable_loss == pytest.approx(plain.reachable_loss, rel=LOSS)
+    # Least squares of the reference squares the condition, which shows once the loss is tiny.
+    rounding = 1e-8 * plain.loss.max()
+    assert fast.loss == pytest.approx(plain.loss, rel=LOSS, abs=rounding)
+    assert fast.reachable_loss == pytest.approx(plain.reachable_loss, rel=LOSS, abs=rounding)
     assert fast.diverged_at is None
     assert plain.diverged_at is None
     return fast, plain
