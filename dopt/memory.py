@@ -119,9 +119,10 @@ def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
     N = math.prod(system.grid_points)
     if isinstance(policy, Disagreement):
         per_network = 6 * q + T * (system.n_states + r)
+        units = model.depth * model.width if isinstance(model, MLP) else q
         return {
             "policy.ensemble": policy.ensemble * per_network,
-            "policy.candidates": policy.candidates * policy.ensemble * (r + q),
+            "policy.candidates": policy.candidates * policy.ensemble * (r + units),
         }
     if isinstance(policy, GradientDOptimal):
         width = "model.width" if isinstance(model, MLP) else "model"

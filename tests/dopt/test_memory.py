@@ -69,6 +69,23 @@ def test_what_no_machine_can_hold_is_refused_by_name(changes: dict[str, Any], se
         trial("cartpole", "d_optimal", **changes)
 
 
+@pytest.mark.parametrize(
+    ("policy", "changes", "setting"),
+    [
+        ("max", {"policy": {"ensemble": 2**31 - 1}}, "policy.ensemble"),
+        ("max", {"policy": {"candidates": 2**31 - 1}}, "policy.candidates"),
+        ("gaussian_process", {"env": {"horizon": 10**6}}, "env.horizon"),
+        ("gradient", {"model": {"width": 1_000}}, "model.width"),
+        ("gradient", {"policy": {"candidates": 2**31 - 1}}, "policy.candidates"),
+    ],
+)
+def test_what_the_reference_cannot_hold_is_refused_by_name(
+    policy: str, changes: dict[str, Any], setting: str
+) -> None:
+    with pytest.raises(SpecificationError, match=rf"GiB .* because of {setting}, .* smaller\.$"):
+        trial("cartpole", policy, **changes)
+
+
 def test_a_horizon_has_a_bound() -> None:
     assert trial("pendulum", "random", env={"horizon": LARGEST_HORIZON}).system.horizon
     with pytest.raises(SpecificationError, match=r"env\.horizon is 10,000,001 steps, .* at most"):
