@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DB ?= sqlite:///results/results.db
+STUDY_DB ?= sqlite:///results/study.db
 SMOKE_DB := sqlite:///results/smoke.db
 
 # One thread to a process: the grid runs one worker on each core.
@@ -12,7 +13,7 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-machines soak image lint format grid figures smoke bench clean
+.PHONY: help setup test test-machines soak image lint format grid figures study smoke bench clean
 
 help:  ## show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -55,6 +56,10 @@ grid: setup  ## run the paper's grid, or what is left of it
 
 figures: grid  ## run the paper's grid and draw its figures
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures
+
+study: setup  ## run everything beyond the paper and compare it on one page, report/README.md
+	$(BIN)/python orchestrate/launch.py -m experiment=beyond store.url='$(STUDY_DB)'
+	$(BIN)/python -m analysis report --db '$(STUDY_DB)' --out report
 
 smoke: setup  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'

@@ -13,7 +13,7 @@ from analysis.errors import IncompleteError
 from analysis.figures import publish
 from analysis.figures.style import styled
 from analysis.gaps import Gap
-from analysis.report import numbers, page, picture
+from analysis.report import control, numbers, page, picture
 from analysis.report.variants import Field, fields
 from analysis.selection import Selection
 from analysis.sheets import gaps_sheet
@@ -37,6 +37,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         if gaps and not options.allow_partial:
             raise IncompleteError(_refusal(gaps))
         table = numbers.adjust([numbers.tabulate_field(moment, field) for field in found])
+        controlled = control.section(moment, found)
         selection = Selection(tuple(one.entry for field in found for one in field.variants))
         facts = provenance.describe(moment, selection)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -48,7 +49,9 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
     notes = [f"{field.env}: {note}" for field in found for note in field.notes]
     if gaps:
         notes.insert(0, f"PARTIAL: {sum(len(gap.seeds) for gap in gaps)} trials are missing")
-    text = page.write(table, notes, _origin(facts), f"{NAME}.png")
+    text = page.write(
+        table, notes, _origin(facts), f"{NAME}.png", [controlled] if controlled else []
+    )
     publish.write_text(text, options.out / PAGE)
     publish.write_provenance(facts, options.out, NAME)
     sys.stdout.write(f"{options.out / PAGE}: {len(table)} variants\n")

@@ -10,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from analysis.control import scores_at
 from analysis.divergence import DivergenceRule
 from analysis.measures import final_losses, mean_losses
 from analysis.paired import benjamini_hochberg, compare
 from analysis.reading import read_curves
+from analysis.report.control import has_task
 from analysis.report.variants import Field, Variant
 from analysis.statistics import mean, standard_error
 from dopt.coverage import Plane
@@ -23,8 +25,12 @@ from orchestrate.store import Reader
 Array = npt.NDArray[np.float64]
 Scores = Mapping[int, float]
 
-MEASURES = ("loss", "reachable_loss", "auc", "coverage")
-"""What variants are compared by; of coverage more is better, of the others less."""
+MEASURES = ("loss", "reachable_loss", "auc", "coverage", "control")
+"""What variants are compared by; of coverage more is better, of the others less.
+
+``control`` is the cost of an episode with the model learned so far by that with the true model, at
+the first number of steps that the task names; only trials with a task have it.
+"""
 
 LEVEL = 0.05
 """Adjusted p below which a report says that a variant is better or worse."""
@@ -66,7 +72,15 @@ def _scores(reader: Reader, variant: Variant, plane: Plane) -> dict[str, Scores]
         "reachable_loss": final_losses(reader, entry, "reachable_loss", rule).by_seed,
         "auc": mean_losses(reader, entry, "loss", rule).by_seed,
         "coverage": _coverages(reader, variant, plane),
+        "control": _control_costs(reader, variant),
     }
+
+
+def _control_costs(reader: Reader, variant: Variant) -> Scores:
+    if not has_task(variant):
+        return {}
+    steps = reader.assessments(variant.entry.cell.config_key, "control_cost").t
+    return scores_at(reader, variant.entry, int(min(t for t in steps.tolist() if t > 0))).by_seed
 
 
 def _coverages(reader: Reader, variant: Variant, plane: Plane) -> Scores:

@@ -14,7 +14,7 @@ from analysis.sheets import Sheet
 
 HEADERS = (
     "variant", "final loss", "ratio [95 %]", "adjusted p", "reachable set, ratio", "curve, ratio",
-    "coverage", "plan [µs]", "learn [µs]", "n",
+    "coverage", "control cost, ratio", "plan [µs]", "learn [µs]", "n",
 )  # fmt: skip
 
 EXPLAINED = (
@@ -23,9 +23,10 @@ EXPLAINED = (
     "the log ratio, Student's for few pairs. Adjusted p: two-sided Wilcoxon signed-rank test of "
     "the final losses, adjusted over all rows of the report (Benjamini-Hochberg). Curve: the loss "
     "over all steps (geometric mean). Coverage: share of the cells of the phase plane's box that "
-    "a trial visits, mean ± 2 standard errors. Microseconds: median over all steps and trials, on "
-    "the machine that ran them, the update of the information matrix with the plan. n: trials "
-    "that did not diverge; diverged ones are in no mean and in no ratio."
+    "a trial visits, mean ± 2 standard errors. Control cost: of an episode with the model learned "
+    "until the first assessment of the task, as a ratio too. Microseconds: median over all steps "
+    "and trials, on the machine that ran them, the update of the information matrix with the "
+    "plan. n: trials that did not diverge; diverged ones are in no mean and in no ratio."
 )
 
 Row = Mapping[str, object]
@@ -87,6 +88,7 @@ def _cells(row: Row) -> list[object]:
         ratio("reachable_loss"),
         ratio("auc"),
         plus_minus(_number(row, "coverage"), _number(row, "coverage_2se")),
+        ratio("control"),
         number(_number(row, "plan_us")),
         number(_number(row, "learn_us")),
         f"{row['n']}{diverged}",
