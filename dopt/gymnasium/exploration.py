@@ -60,7 +60,7 @@ class Exploration(gymnasium.Env):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         super().reset(seed=seed, options=options)
-        self._state = np.array(self.system.initial_state)
+        self._state, self._steps = np.array(self.system.initial_state), 0
         self._covariance = np.eye(UNITS + 1) / REGULARIZATION
         self._gain(self._state)
         return self._state.copy(), {}
@@ -69,11 +69,19 @@ class Exploration(gymnasium.Env):
         system, u = self.system, np.asarray(action, dtype=np.float64)
         u = u * min(1.0, system.gamma / max(float(np.linalg.norm(u)), 1e-300))
         noise = system.noise * np.sqrt(system.dt) * self.np_random.standard_normal(system.n_states)
-        self._state = self._state + system.dt * system.derivative(self._state, u) + noise
+        self._state = self._state + system.dt * self._flow(u) + noise
+        self._steps += 1
         limit = system.state_limit
         terminated = not bool(np.all(np.abs(self._state) <= limit))
         observed = np.clip(np.nan_to_num(self._state, nan=limit), -limit, limit)
         return observed, self._gain(observed), terminated, False, {"input": u}
+
+    def _flow(self, u: Array) -> Array:
+        """Return f(x_t, u), (d,), of the system as it is at step t."""
+        system = self.system
+        flow = np.array(system.known(tuple(self._state), tuple(u), system.parameters), dtype=float)
+        flow[list(system.learned_rows)] += system.learned(self._state[None], self._steps)[0]
+        return flow
 
     def _gain(self, state: Array) -> float:
         """Return the information gained at a state, and take it in (Sherman and Morrison)."""

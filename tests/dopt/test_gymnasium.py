@@ -61,6 +61,18 @@ def test_an_environment_steps_the_system_with_bounded_energy() -> None:
     np.testing.assert_allclose(reached, expected, rtol=1e-12)
 
 
+def test_an_environment_changes_as_its_system_does() -> None:
+    environment = dopt.gymnasium.Exploration({"name": "drifting_pendulum", "noise": 0.0})
+    system = environment.system
+    state, _ = environment.reset(seed=0)
+    for row in system.history[:100]:
+        worn = SYSTEMS["pendulum"](friction=row[system.physical.index("friction")])
+        expected = state + system.dt * worn.derivative(state, [system.gamma])
+        state, *_ = environment.step(np.array([system.gamma]))
+        np.testing.assert_allclose(state, expected, rtol=1e-9)
+    assert system.history[99, 3] > 1.2 * system.history[0, 3], "the pivot wears out"
+
+
 def test_the_reward_is_the_information_about_random_features() -> None:
     """Its sum is half the log determinant of the whole information matrix over the first one."""
     environment = dopt.gymnasium.Exploration(SYSTEMS["pendulum"]())
