@@ -128,7 +128,7 @@ def relative_costs(reader: Reader, entry: Entry) -> Assessments:
     key = entry.cell.config_key
     costs = reader.assessments(key, "control_cost")
     truth = reader.assessments(key, "true_model_cost")
-    of_seed = dict(zip(truth.seeds.tolist(), truth.values[:, 0].tolist(), strict=True))
+    of_seed = dict(zip(truth.seeds.tolist(), truth.values[:, :1].ravel().tolist(), strict=True))
     divisors = np.array([of_seed.get(seed, np.nan) for seed in costs.seeds.tolist()])
     return Assessments(costs.seeds, costs.t, costs.values / divisors[:, None], costs.diverged)
 

@@ -15,14 +15,14 @@ from analysis.selection import select
 from analysis.statistics import Statistic
 from analysis.tables import TABLES
 from orchestrate.store import Reader
-from tests.analysis.conftest import SHORT
+from tests.analysis.conftest import SHORT, controlled
 from tests.analysis.synthetic import fill, make_grid
 
 
 @pytest.fixture
 def twins(sqlite_url: str, postgresql_url: str) -> tuple[Reader, Reader]:
     """Return one grid in both databases, with a diverged trial, filled in different orders."""
-    specs = make_grid(("pendulum", "cartpole"), seeds=range(6), **SHORT)
+    specs = make_grid(("pendulum", "cartpole"), seeds=range(6), **SHORT) + controlled(range(6))
     lost = next(s for s in specs if (s.system.name, s.policy.name) == ("cartpole", "random"))
     for url, order in ((sqlite_url, specs), (postgresql_url, specs[::-1])):
         fill(url, order, diverged={lost.trial_key: 20})
@@ -38,7 +38,8 @@ def test_every_number_is_the_same(twins: tuple[Reader, Reader]) -> None:
 
 def _numbers(reader: Reader) -> list[pd.DataFrame]:
     selection, rule = select(reader, Filter()), DivergenceRule.EXCLUDE
-    tables = [kind.measure(reader, selection, Request()) for kind in TABLES.values()]
+    asked = Request()
+    tables = [kind.measure(reader, kind.part(selection, asked), asked) for kind in TABLES.values()]
     curves = [
         tabulate_curves(measure_curves(reader, selection, "loss", rule, statistic=statistic))
         for statistic in Statistic

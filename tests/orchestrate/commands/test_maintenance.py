@@ -47,7 +47,7 @@ class TestUpgrade:
         assert f"run 'python -m orchestrate upgrade --db {url}'" in refused.err
         answer = command("upgrade")
         assert answer.code == 0
-        assert f"went from schema 1 to 2; a backup is in the file {_path(url)}.v1-b" in answer.out
+        assert f"went from schema 1 to 3; a backup is in the file {_path(url)}.v1-b" in answer.out
         assert command("status").code == 0
         assert "there is nothing to do" in command("upgrade").out
 
@@ -55,7 +55,7 @@ class TestUpgrade:
         restore(1, url)
         document = command("upgrade", "--no-backup", "--json").document
         assert document == {
-            "safe_url": url, "before": 1, "after": 2, "backup": None, "changed": True
+            "safe_url": url, "before": 1, "after": 3, "backup": None, "changed": True
         }  # fmt: skip
         assert not list(_path(url).parent.glob("*backup*"))
 
@@ -67,7 +67,7 @@ class TestUpgrade:
     def test_of_an_empty_file(self, command: Run, url: str) -> None:
         _path(url).parent.mkdir()
         _path(url).touch()
-        assert "was empty and has schema 2 now" in command("upgrade").out
+        assert "was empty and has schema 3 now" in command("upgrade").out
 
 
 def _path(url: str) -> Path:
