@@ -84,6 +84,9 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["-m", "policy=random,uniform", "policy.regularization=1"], "'regularization' is unknown"),
         (["-m", "env=glob(*)", "env.gravty=1,2"], "did you mean 'gravity'"),
         (["policy=random_held"], "did you mean 'baseline/random_held'"),
+        (["policy=lookahead"], "did you mean 'beyond/lookahead'"),
+        (["policy=beyond/exact", "policy.form=dual"], "setting of policy 'form' is unknown"),
+        (["policy=beyond/lookahead", "policy.stride=99"], "policy.stride is 99 steps, but"),
         (["-m", "hydra/sweeper=basic", "seed=1,2"], "another hydra/sweeper was given"),
         (["width=1000000"], "would need .* GiB of memory, .* make model.width smaller"),
         (["env.grid_points=[1000000,1000000]"], "make env.grid_points smaller"),
@@ -112,6 +115,14 @@ def test_a_trial_prints_its_result_and_is_stored(command_line: Command, tmp_path
     )
     assert output == command_line(*arguments)[1]
     assert [path.name for path in tmp_path.iterdir()] == ["results"]
+
+
+def test_the_policies_that_search_run_by_name(command_line: Command) -> None:
+    names = ("exact", "trace", "trace_linearized", "a_optimal", "e_optimal", "task", "lookahead")
+    policies = ",".join(f"beyond/{name}" for name in names)
+    code, output, errors = command_line("-m", f"policy={policies}", "seed=0", *SHORT)
+    assert code == 0, output + errors
+    assert "7 of 7 done, 0 failed" in output
 
 
 def test_a_grid_runs_once_and_the_default_is_a_hundred_seeds(command_line: Command) -> None:
