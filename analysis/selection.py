@@ -15,7 +15,10 @@ from orchestrate.store import Cell, Reader, TrialRow
 
 FINISHED = ("done", "diverged")
 
-ENVIRONMENTS = ("pendulum", "cartpole", "arm", "quadrotor", "mass_spring")
+ENVIRONMENTS = (
+    *("pendulum", "cartpole", "arm", "quadrotor"),
+    *("drifting_pendulum", "chain", "mass_spring"),
+)
 """The paper's order; other environments follow by name."""
 
 POLICIES = (
