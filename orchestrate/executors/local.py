@@ -177,7 +177,7 @@ class LocalExecutor(Executor):
 
 def _start(*descriptors: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-m", "orchestrate.executors.worker", *map(str, descriptors)],
+        [sys.executable, "-P", "-m", "orchestrate.executors.worker", *map(str, descriptors)],
         pass_fds=descriptors,
         stdin=subprocess.DEVNULL,
         stdout=sys.stderr.fileno() if _has_descriptor() else subprocess.DEVNULL,
