@@ -74,6 +74,7 @@ TUTORIAL = [
 SNIPPETS = re.findall(r"```python\n(.*?)```", PAGES["tutorial.md"], flags=re.DOTALL)
 
 
+@pytest.mark.long
 @pytest.mark.timeout(1200)
 def test_the_tutorial_runs_from_its_first_command_to_its_last(tmp_path: Path) -> None:
     """In a folder that looks like the repository, so that nothing is left in the real one."""

@@ -32,8 +32,11 @@ TRAIL = 40
 
 PALE = "#e4e4e4"
 
-SIZE = (8.0, 4.5)
-"""Width and height [inches]: 16 to 9."""
+WIDTH, HEIGHT = 8.0, 4.5
+"""Of a film [inches], 16 to 9, unless the system has more accelerations than fit side by side."""
+
+FITTING = 3
+"""Panels of accelerations that fit."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +53,9 @@ class Stage:
 
 def build(story: Story) -> Stage:
     """Draw everything that does not move and return how the rest does."""
-    figure = Figure(figsize=SIZE, layout="constrained")
     rows = story.truth.shape[1]
+    width = WIDTH * (1 + max(FITTING, rows)) / (1 + FITTING)
+    figure = Figure(figsize=(width, HEIGHT), layout="constrained")
     grid = figure.add_gridspec(2, 1 + max(2, rows), height_ratios=(1.25, 1))
     places = [grid[1, 1 + row] if rows > 1 else grid[1, 1:] for row in range(rows)]
     moves = [

@@ -46,7 +46,7 @@ def test_without_a_plan_worth_the_name_the_pendulum_hangs() -> None:
     assert episode.cost == pytest.approx(4.0 * task.on(pendulum).steps, rel=1e-3)
 
 
-@pytest.mark.parametrize("name", sorted(SYSTEMS))
+@pytest.mark.parametrize("name", sorted(set(SYSTEMS) - {"drifting_pendulum"}))  # has no one truth
 def test_predictions_are_the_simulation_of_the_evaluation(name: str) -> None:
     system = system_of(name)
     inputs = np.random.default_rng(0).standard_normal((5, 12, system.n_inputs))

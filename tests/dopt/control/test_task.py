@@ -6,6 +6,7 @@ import json
 import pytest
 
 from dopt.control import Control
+from dopt.control.task import GOALS
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.spec import TrialSpec
 from dopt.systems import SYSTEMS, Pendulum
@@ -59,8 +60,8 @@ def test_the_steps_to_assess_hold_the_first_and_the_last() -> None:
     assert unsorted.assessed_steps == (0, 10, 20, 30)
 
 
-@pytest.mark.parametrize("name", sorted(SYSTEMS))
-def test_every_shipped_system_has_a_task_that_fits(name: str) -> None:
+@pytest.mark.parametrize("name", sorted(GOALS))
+def test_the_task_of_a_shipped_system_fits_it(name: str) -> None:
     system = SYSTEMS[name]()
     goal = Control().on(system)
     assert len(goal.goal) == len(goal.initial_state) == system.n_states
