@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import signal
 import sys
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+IMPATIENT = 3
+"""Signals during one undisturbed block after which it is left all the same."""
 
 
 class Interrupt:
@@ -40,3 +45,35 @@ class Interrupt:
         self.draining = True
         with suppress(RuntimeError):  # the signal came while this very stream was written to
             sys.stderr.write("\nending the trials that run; once more stops at once\n")
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Hold signals back until the block is over.
+
+    An interrupt in the middle of a transaction could leave the connection open, and its locks to a
+    process that nobody can ask any more: this very one.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        In the block, at the third signal: it hangs.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+
+    def hold(number: int, _: FrameType | None) -> None:
+        held.append(number)
+        if len(held) == IMPATIENT:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, hold) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for one in held:
+            signal.raise_signal(one)

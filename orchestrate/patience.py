@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from orchestrate.interrupt import undisturbed
 from orchestrate.store import (
     Claim,
     Failure,
@@ -105,7 +106,7 @@ class PatientStore:
 
     def _persist(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
         try:
-            return operation()
+            return _whole(operation)
         except StoreUnavailableError as error:
             if not error.transient:
                 raise
@@ -119,10 +120,15 @@ class PatientStore:
             time.sleep(max(0.0, min(pause, left)))
             pause = min(2 * pause, LONGEST_PAUSE)
             try:
-                result = operation()
+                result = _whole(operation)
             except StoreUnavailableError as error:
                 if not error.transient or time.monotonic() - start >= self._seconds:
                     raise
             else:
                 self._say(f"the database is back after {time.monotonic() - start:.1f} s")
                 return result
+
+
+def _whole(operation: Callable[[], T]) -> T:
+    with undisturbed():
+        return operation()

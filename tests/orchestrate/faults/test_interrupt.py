@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import random
 import signal
 import time
+from collections.abc import Callable
 
 import pytest
 
+from orchestrate.interrupt import Interrupt, undisturbed
 from tests.orchestrate.faults.laboratory import Laboratory, alive
 
 
@@ -41,3 +45,45 @@ def test_two_interrupts_stop_at_once_and_lose_nothing_committed(laboratory: Labo
     assert laboratory.count("status = 'running'") == 0
     laboratory.check_whole()
     laboratory.complete()
+
+
+@pytest.mark.parametrize("moment", range(12))
+def test_two_interrupts_at_any_moment_leave_no_lock(
+    sqlite_url: str, laboratory_at: Callable[..., Laboratory], moment: int
+) -> None:
+    """One of ten of them came in the middle of a transaction, whose lock then stayed."""
+    laboratory = laboratory_at(sqlite_url, 4000, seconds=0.005, settings={"patience": 1})
+    chance = random.Random(moment)
+    with laboratory.launched() as launched:
+        launched.until(lambda: laboratory.count() >= 20)
+        time.sleep(chance.uniform(0, 1))
+        launched.send(signal.SIGINT)
+        time.sleep(chance.uniform(0.02, 0.15))
+        launched.send(signal.SIGINT)
+        assert launched.end() == 130, launched.errors
+    assert laboratory.count("status = 'running'") == 0
+
+
+def interrupted(times: int, rest: float = 0.0) -> None:
+    """Be interrupted so many times in the middle of a transaction, then go on for some seconds."""
+    with undisturbed():
+        for _ in range(times):
+            os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(rest)
+
+
+def test_an_interrupt_waits_for_the_end_of_a_transaction() -> None:
+    with Interrupt() as stop:
+        interrupted(1)
+        assert stop.draining
+        start = time.monotonic()
+        with pytest.raises(KeyboardInterrupt):
+            interrupted(1, rest=0.3)
+        assert time.monotonic() - start >= 0.3
+
+
+def test_a_third_interrupt_leaves_a_transaction_that_hangs() -> None:
+    start = time.monotonic()
+    with Interrupt(), pytest.raises(KeyboardInterrupt):
+        interrupted(3, rest=60)
+    assert time.monotonic() - start < 30
