@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.choice import REFERENCE, Filter, departures, flatten
@@ -17,6 +17,12 @@ from analysis.selection import Entry, environment_rank, newest, policy_rank
 from orchestrate.store import Reader
 
 _SETTING = ("model", "learner")
+
+Flat = Mapping[str, object]
+Word = tuple[str, str]
+"""Key of a configuration, and what is added to its label."""
+
+Tell = Callable[[Sequence[Flat], Flat, Sequence[Entry]], Iterator[Word]]
 
 
 @dataclass(frozen=True)
@@ -113,41 +119,56 @@ def _weight(entry: Entry) -> tuple[bool, int]:
 
 
 def _labels(entries: Sequence[Entry], reference: Entry) -> dict[str, str]:
-    labels: dict[str, str] = {}
-    for policy in {entry.cell.policy for entry in entries}:
-        own = [entry for entry in entries if entry.cell.policy == policy]
-        labels |= {one.cell.config_key: _label(one, own, reference) for one in own}
-    return labels
+    """Return a label for each configuration: its policy, and what else it takes to tell it apart.
+
+    Names come before values: the model, the learner, then the values in which those differ that are
+    still called alike.
+    """
+    usual = flatten(reference.cell.config)
+    words = {one.cell.config_key: [one.cell.policy.replace("_", " ")] for one in entries}
+    for tell in (*map(_by_name, _SETTING), *map(_by_values, (*_SETTING, "policy")), _by_path):
+        for group in _alike(entries, words):
+            for key, word in tell([flatten(one.cell.config) for one in group], usual, group):
+                words[key] += [word] if word else []
+    return {key: ", ".join(parts) for key, parts in words.items()}
 
 
-def _label(entry: Entry, own: Iterable[Entry], reference: Entry) -> str:
-    """Return the policy and, where it was run in several ways, how this one differs."""
-    flat = [flatten(one.cell.config) for one in own]
-    differing = {
-        path for path in set().union(*flat) if len({repr(config.get(path)) for config in flat}) > 1
-    }
-    mine, usual = flatten(entry.cell.config), flatten(reference.cell.config)
-    parts = [
-        _part(section, mine, usual, differing)
-        for section in (*_SETTING, "policy", "path")
-        if any(path == section or path.startswith(f"{section}.") for path in differing)
-    ]
-    name = entry.cell.policy.replace("_", " ")
-    return ", ".join([name, *(part for part in parts if part)])
+def _alike(entries: Sequence[Entry], words: Mapping[str, list[str]]) -> list[list[Entry]]:
+    """Return the groups of entries that have the same label so far."""
+    groups: dict[tuple[str, ...], list[Entry]] = {}
+    for one in entries:
+        groups.setdefault(tuple(words[one.cell.config_key]), []).append(one)
+    return [group for group in groups.values() if len(group) > 1]
 
 
-def _part(
-    section: str, mine: Mapping[str, object], usual: Mapping[str, object], differing: set[str]
-) -> str:
-    """Return how a section differs from the usual one: by its name or by its values."""
-    if section == "path":
-        return f"path {mine['path']}" if mine["path"] != usual["path"] else ""
-    name = f"{section}.name"
-    if section in _SETTING and mine.get(name) != usual.get(name):
-        return str(mine.get(name)).replace("_", " ")
-    paths = sorted(path for path in differing if path.startswith(f"{section}."))
-    return " ".join(
-        f"{path.partition('.')[2]}={mine[path]}"
-        for path in paths
-        if path in mine and mine[path] != usual.get(path)
-    )
+def _by_name(section: str) -> Tell:
+    def tell(flat: Sequence[Flat], usual: Flat, group: Sequence[Entry]) -> Iterator[Word]:
+        path = f"{section}.name"
+        for one, config in zip(group, flat, strict=True):
+            differs = config.get(path) != usual.get(path)
+            yield one.cell.config_key, str(config.get(path)).replace("_", " ") if differs else ""
+
+    return tell
+
+
+def _by_values(section: str) -> Tell:
+    def tell(flat: Sequence[Flat], usual: Flat, group: Sequence[Entry]) -> Iterator[Word]:
+        paths = [
+            path
+            for path in sorted(set().union(*flat))
+            if path.startswith(f"{section}.") and len({repr(one.get(path)) for one in flat}) > 1
+        ]
+        for one, config in zip(group, flat, strict=True):
+            values = [
+                f"{path.partition('.')[2]}={config[path]}"
+                for path in paths
+                if path in config and config[path] != usual.get(path)
+            ]
+            yield one.cell.config_key, " ".join(values)
+
+    return tell
+
+
+def _by_path(flat: Sequence[Flat], usual: Flat, group: Sequence[Entry]) -> Iterator[Word]:  # noqa: ARG001
+    for one, config in zip(group, flat, strict=True):
+        yield one.cell.config_key, f"path={config.get('path')}"

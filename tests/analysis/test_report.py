@@ -62,6 +62,23 @@ def test_every_variant_has_a_label_of_its_own(pendulum: Field) -> None:
     ]
 
 
+def test_variants_of_one_name_are_told_apart_by_their_values(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/values.db"
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(2), **SHORT)
+    for rate in (1e-3, 1e-4):
+        learner = {"learner": {"name": "adam", "window": 1, "learning_rate": rate}}
+        specs += make_grid(("pendulum",), ("d_optimal",), range(2), **SHORT, **learner)
+    fill(url, specs)
+    with Reader.open(url) as opened:
+        labels = [one.label for one in fields(opened, Filter())[0].variants]
+    assert labels == [
+        "d optimal",
+        "d optimal, adam, learning_rate=0.0001",
+        "d optimal, adam, learning_rate=0.001",
+        "random",
+    ]
+
+
 def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Field) -> None:
     table = numbers.adjust([numbers.tabulate_field(reader, pendulum)]).set_index("variant")
     finals = {
