@@ -16,8 +16,8 @@ _INCHES_PER_PANEL = 0.62
 CAPTION = (
     "Final loss of every variant by that of D-optimal inputs (geometric mean over shared seeds) "
     "with its 95 % interval, the best at the top. Circles: better, squares: worse, diamonds: not "
-    f"told apart at an adjusted p of {LEVEL}. The oracle, which knows the form of the physics and is "
-    "orders of magnitude below, is in the tables alone."
+    f"told apart at an adjusted p of {LEVEL}. The oracle, which knows the form of the physics and "
+    "is orders of magnitude below, is in the tables alone."
 )
 APART = "oracle"
 """The policy that would leave no room for the others."""
