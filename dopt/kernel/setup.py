@@ -42,7 +42,7 @@ def constants(
     system = cell.system
     world = args.World(
         np.array(system.parameters),
-        np.ascontiguousarray(system.history),
+        np.array(system.history),  # a copy: what came through Ray's memory cannot be written to
         np.array(system.linear_form),
         np.array(system.learned_rows),
         system.n_inputs,

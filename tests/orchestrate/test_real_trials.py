@@ -1,0 +1,42 @@
+"""The trials themselves, not stand-ins, through every executor: the same rows."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from orchestrate.store import Reader
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def losses(executor: str, folder: Path) -> list[float]:
+    """Launch two short trials of two systems, one of which changes with time."""
+    url = f"sqlite:///{folder}/{executor}.db"
+    grid = ("-m", "env=pendulum,beyond/drifting_pendulum", "policy=d_optimal", "seed=range(2)")
+    words = (*grid, "env.horizon=12", f"executor={executor}", f"store.url={url}")
+    done = subprocess.run(
+        [sys.executable, "orchestrate/launch.py", *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    with Reader.open(url) as reader:
+        cells = sorted(reader.cells(), key=lambda cell: cell.config_key)
+        return [
+            float(loss)
+            for cell in cells
+            for loss in reader.curves(cell.config_key).values.ravel().tolist()
+        ]
+
+
+@pytest.mark.parametrize("executor", ["local", "ray"])
+def test_every_executor_stores_the_same_losses(executor: str, tmp_path: Path) -> None:
+    alone = losses("inprocess", tmp_path)
+    assert len(alone) == 48
+    assert losses(executor, tmp_path) == alone
