@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.choice import REFERENCE, Filter, departures, flatten
@@ -17,12 +17,6 @@ from analysis.selection import Entry, environment_rank, newest, policy_rank
 from orchestrate.store import Reader
 
 _SETTING = ("model", "learner")
-
-Flat = Mapping[str, object]
-Word = tuple[str, str]
-"""Key of a configuration, and what is added to its label."""
-
-Tell = Callable[[Sequence[Flat], Flat, Sequence[Entry]], Iterator[Word]]
 
 
 @dataclass(frozen=True)
@@ -119,56 +113,35 @@ def _weight(entry: Entry) -> tuple[bool, int]:
 
 
 def _labels(entries: Sequence[Entry], reference: Entry) -> dict[str, str]:
-    """Return a label for each configuration: its policy, and what else it takes to tell it apart.
-
-    Names come before values: the model, the learner, then the values in which those differ that are
-    still called alike.
-    """
+    """Return a label for each configuration: its policy, and what it takes to tell it apart."""
+    flat = {one.cell.config_key: flatten(one.cell.config) for one in entries}
     usual = flatten(reference.cell.config)
     words = {one.cell.config_key: [one.cell.policy.replace("_", " ")] for one in entries}
-    for tell in (*map(_by_name, _SETTING), *map(_by_values, (*_SETTING, "policy")), _by_path):
-        for group in _alike(entries, words):
-            for key, word in tell([flatten(one.cell.config) for one in group], usual, group):
-                words[key] += [word] if word else []
+    for path in sorted(set().union(*flat.values()), key=_rank):
+        for group in _alike(words):
+            if len({repr(flat[key].get(path)) for key in group}) > 1:
+                for key in group:
+                    words[key] += _word(path, flat[key], usual)
     return {key: ", ".join(parts) for key, parts in words.items()}
 
 
-def _alike(entries: Sequence[Entry], words: Mapping[str, list[str]]) -> list[list[Entry]]:
-    """Return the groups of entries that have the same label so far."""
-    groups: dict[tuple[str, ...], list[Entry]] = {}
-    for one in entries:
-        groups.setdefault(tuple(words[one.cell.config_key]), []).append(one)
+def _rank(path: str) -> tuple[int, str]:
+    """Let the names of the model and of the learner come before their values."""
+    names = [f"{section}.name" for section in _SETTING]
+    return names.index(path) if path in names else len(names), path
+
+
+def _alike(words: Mapping[str, Sequence[str]]) -> list[list[str]]:
+    """Return the groups of keys that have the same label so far."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for key, parts in words.items():
+        groups.setdefault(tuple(parts), []).append(key)
     return [group for group in groups.values() if len(group) > 1]
 
 
-def _by_name(section: str) -> Tell:
-    def tell(flat: Sequence[Flat], usual: Flat, group: Sequence[Entry]) -> Iterator[Word]:
-        path = f"{section}.name"
-        for one, config in zip(group, flat, strict=True):
-            differs = config.get(path) != usual.get(path)
-            yield one.cell.config_key, str(config.get(path)).replace("_", " ") if differs else ""
-
-    return tell
-
-
-def _by_values(section: str) -> Tell:
-    def tell(flat: Sequence[Flat], usual: Flat, group: Sequence[Entry]) -> Iterator[Word]:
-        paths = [
-            path
-            for path in sorted(set().union(*flat))
-            if path.startswith(f"{section}.") and len({repr(one.get(path)) for one in flat}) > 1
-        ]
-        for one, config in zip(group, flat, strict=True):
-            values = [
-                f"{path.partition('.')[2]}={config[path]}"
-                for path in paths
-                if path in config and config[path] != usual.get(path)
-            ]
-            yield one.cell.config_key, " ".join(values)
-
-    return tell
-
-
-def _by_path(flat: Sequence[Flat], usual: Flat, group: Sequence[Entry]) -> Iterator[Word]:  # noqa: ARG001
-    for one, config in zip(group, flat, strict=True):
-        yield one.cell.config_key, f"path={config.get('path')}"
+def _word(path: str, config: Mapping[str, object], usual: Mapping[str, object]) -> list[str]:
+    """Return what one value adds to a label: nothing where it is the reference's, or is not set."""
+    if path not in config or config[path] == usual.get(path):
+        return []
+    name = path.rpartition(".")[2]
+    return [str(config[path]).replace("_", " ") if name == "name" else f"{name}={config[path]}"]
