@@ -41,7 +41,7 @@ class Swing(Environment):
     grid_points: tuple[int, ...] = quantity((32, 32), bound="positive")
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG004
+    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG004  # no constants
         return state[1], 3.0 * inputs[0]
 
     @staticmethod

@@ -230,48 +230,6 @@ def test_every_experiment_is_a_grid(command_line: Command) -> None:
         assert re.search(r"[1-9][\d,]* trials, 0 done", output)
 
 
-SEVERAL = """
-# @package _global_
-hydra:
-  sweeper:
-    params: {env: arm, seed: "range(0,3)"}
-    grids:
-      - {policy: "random,uniform"}
-      - {policy: uniform, env: "arm,pendulum"}
-"""
-
-
-@pytest.fixture
-def several(tmp_path: Path) -> tuple[str, ...]:
-    """Return the words that choose an experiment of two grids, which share the uniform arm."""
-    folder = tmp_path / "settings/experiment"
-    folder.mkdir(parents=True)
-    (folder / "several.yaml").write_text(SEVERAL)
-    return "--config-dir", str(folder.parent), "experiment=several"
-
-
-def test_an_experiment_can_be_several_grids(
-    command_line: Command, several: tuple[str, ...]
-) -> None:
-    code, output, errors = command_line("-m", *several, "launch.dry_run=true")
-    assert (code, errors) == (0, "")
-    assert "9 trials, 0 done, 9 to run" in output  # 2 × 3 and 2 × 3, of which 3 are the same
-
-
-def test_a_word_of_the_command_line_holds_for_every_grid(
-    command_line: Command, several: tuple[str, ...]
-) -> None:
-    code, output, _ = command_line("-m", *several, "seed=5", "env=pendulum", "launch.dry_run=true")
-    assert code == 0
-    assert "2 trials, 0 done, 2 to run" in output
-
-
-def test_several_grids_are_no_single_trial(command_line: Command, several: tuple[str, ...]) -> None:
-    code, _, errors = command_line(*several, "seed=5", "env=pendulum", "launch.dry_run=true")
-    assert code == 2
-    assert "experiment=several is a grid (policy=uniform): add -m" in errors
-
-
 def test_provenance_is_written_without_passwords(command_line: Command, tmp_path: Path) -> None:
     command_line("-m", "seed=1,2", "+model.note=1", *SHORT)  # refused, and not written down
     command_line("-m", "seed=1,2", "~launch.ray", "+launch.ray={address: 'ray://u:pw@h'}", *SHORT)
