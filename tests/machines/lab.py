@@ -9,9 +9,12 @@ from pathlib import Path
 from tests.machines import servers
 from tests.machines.hosts import Host, Network, Process, until
 from tests.machines.outcome import Outcome
+from tests.machines.witness import PAUSE
 
 GRID = ("env=pendulum", "policy=d_optimal", "width=32")
 SEEDS = 24
+SECONDS_PER_TRIAL = 0.5
+"""What a witness adds to a trial at least, so that a fault meets a grid that is not done."""
 
 
 class Lab:
@@ -48,7 +51,10 @@ class Lab:
         self, *words: str, seeds: int = SEEDS, on: str = "desk", witness: bool = False,
         **environment: str,
     ) -> Process:  # fmt: skip
-        """Start a launch of the grid, on the cluster if there is one, else in a pool."""
+        """Start a launch of the grid, on the cluster if there is one, else in a pool.
+
+        A launch into which a fault is to fall has a witness, which gives its trials a length.
+        """
         where = ["executor=local", "launch.workers=1"]
         if self.address:
             where = ["executor=ray", f"launch.ray.address={self.address}"]
@@ -103,4 +109,5 @@ def environment() -> dict[str, str]:
         "DOPT_CACHE": str(Path(cache).expanduser()),  # nobody compiles again
         "OMP_NUM_THREADS": "1",
         "RAY_USAGE_STATS_ENABLED": "0",
+        PAUSE: str(SECONDS_PER_TRIAL),
     }

@@ -19,7 +19,7 @@ def test_a_launch_waits_for_a_server_that_restarts(
     lab: Lab, undisturbed: Outcome, measured: Measured, mode: str
 ) -> None:
     lab.start_cluster("w1", "w2")
-    launched = lab.launch()
+    launched = lab.launch(witness=True)
     lab.until_done(launched, 4)
     start = time.monotonic()
     lab.database.restart(mode)

@@ -18,7 +18,7 @@ def test_without_its_head_a_launch_ends_and_a_new_cluster_completes_it(
     lab: Lab, undisturbed: Outcome, measured: Callable[[str, float], None], fault: str
 ) -> None:
     lab.start_cluster("w1", "w2")
-    launched = lab.launch()
+    launched = lab.launch(witness=True)
     lab.until_done(launched, 4)
     start = time.monotonic()
     if fault == "power off":

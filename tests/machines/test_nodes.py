@@ -30,10 +30,10 @@ def test_all_hosts_work(lab: Lab, undisturbed: Outcome) -> None:
 def test_a_host_that_joins_in_mid_run_is_used(
     lab: Lab, undisturbed: Outcome, measured: Measured
 ) -> None:
-    lab.start_cluster("w1")
-    launched = lab.launch()
+    lab.start_cluster("w1", **{PAUSE: "1.5"})
+    launched = lab.launch(witness=True)
     lab.until_done(launched, 2)
-    lab.add_worker("w2")
+    lab.add_worker("w2", **{PAUSE: "1.5"})
     seconds = until(
         lambda: lab.count("trial", "node = 'w2'") > 0 or not launched.running, 120.0,
         lambda: f"trial on w2:\n{launched.output}",
@@ -50,7 +50,7 @@ def test_a_host_that_is_lost_costs_nothing(
     lab: Lab, undisturbed: Outcome, measured: Measured, fault: str
 ) -> None:
     lab.start_cluster("w1", "w2")
-    launched = lab.launch()
+    launched = lab.launch(witness=True)
     lab.until_done(launched, 4)
     if fault == "power off":
         lab.network.power_off(lab.host("w1"))
@@ -67,7 +67,7 @@ def test_a_host_that_is_lost_costs_nothing(
 
 def test_a_short_cut_is_not_even_noticed(lab: Lab, undisturbed: Outcome) -> None:
     lab.start_cluster("w1", "w2")
-    launched = lab.launch()
+    launched = lab.launch(witness=True)
     lab.until_done(launched, 4)
     with lab.network.link_cut(lab.host("w1")):
         time.sleep(1.0)
