@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dopt.errors import IncompatibleError
-from dopt.learning import Adam, ExtendedKalman, Learner
+from dopt.learning import LEARNERS, Adam, ExtendedKalman, Learner
 from dopt.models import MODELS, GaussianProcess, Linear, LinearState, Model
 from dopt.policies import Informed, Oracle, Policy
 from dopt.policies.disagreement import Disagreement
@@ -25,14 +25,34 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
         raise mismatch(f"policy '{policy.name}'", expected, f"learner '{learner.name}'")
     kalman = isinstance(learner, ExtendedKalman)
     _check_model(system, policy, model, kalman)
-    if kalman and isinstance(model, Linear):
-        return
-    if learner.structure != model.structure:
+    if not _teaches(type(learner), type(model)):
         raise mismatch(
             f"learner '{learner.name}'",
-            f"{_models(learner.structure)} and the other way round",
-            f"learner '{learner.name}' with {given}",
+            f"{_taught(learner)} and {given} with {_teachers(model)}",
+            "the two together",
+            "were",
         )
+
+
+def _teaches(learner: type[Learner], model: type[Model]) -> bool:
+    """Tell whether a learner can learn a model's parameters; a filter also those of physics."""
+    filtered = issubclass(learner, ExtendedKalman) and issubclass(model, Linear)
+    return filtered or learner.structure == model.structure
+
+
+def _taught(learner: Learner) -> str:
+    return _choice("model", [name for name, one in MODELS.items() if _teaches(type(learner), one)])
+
+
+def _teachers(model: Model) -> str:
+    return _choice(
+        "learner", [name for name, one in LEARNERS.items() if _teaches(one, type(model))]
+    )
+
+
+def _choice(kind: str, names: list[str]) -> str:
+    *others, last = map(repr, names)
+    return f"{kind} {', '.join(others)} or {last}" if others else f"{kind} {last}"
 
 
 _MODELS_OF: dict[type[Policy], type[Model]] = {
@@ -63,12 +83,11 @@ def _check_model(system: System, policy: Policy, model: Model, kalman: bool) -> 
 
 
 def _models(structure: str) -> str:
-    names = [name for name, model in MODELS.items() if model.structure == structure]
-    return f"model {' or '.join(repr(name) for name in names)}"
+    return _choice("model", [name for name, one in MODELS.items() if one.structure == structure])
 
 
-def mismatch(what: str, expected: str, given: str) -> IncompatibleError:
+def mismatch(what: str, expected: str, given: str, verb: str = "was") -> IncompatibleError:
     """Return the error for two choices that do not go together."""
     return IncompatibleError(
-        f"{what} goes with {expected}, but {given} was given: change one of them."
+        f"{what} goes with {expected}, but {given} {verb} given: change one of them."
     )

@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from dopt.evaluation import evaluation_set
 from dopt.systems.base import System
 
 Array = npt.NDArray[np.float64]
@@ -38,6 +39,8 @@ class Plane:
 
     Angles are centred on the stable equilibrium, so that small oscillations about it are in one
     piece, wherever the angle is measured from. A box that covers the whole turn moves with them.
+    Where the evaluation grid has no such axis, the box is the whole turn of an angle, and otherwise
+    what the reachable set spans.
     """
 
     axes: tuple[int, int]
@@ -56,10 +59,10 @@ class Plane:
             rest[axes[0]] if angles[0] else 0.0,
             rest[axes[1]] if angles[1] else 0.0,
         )
-        given = system.grid_box()
+        given = [_given_side(system, axis) for axis in axes]
         sides = [
-            _side(given[axis], centre) if turning else given[axis]
-            for axis, centre, turning in zip(axes, centres, angles, strict=True)
+            _side(side, centre) if turning else side
+            for side, centre, turning in zip(given, centres, angles, strict=True)
         ]
         labels = (system.state_labels[axes[0]], system.state_labels[axes[1]])
         return cls(axes, labels, angles, centres, (sides[0], sides[1]))
@@ -79,6 +82,18 @@ class Plane:
     def coverage(self, states: Array) -> float:
         """Return the share of the box that states (n, d) visit."""
         return coverage(self.wrapped(self.project(states)), self.box)
+
+
+def _given_side(system: System, axis: int) -> tuple[float, float]:
+    """Return the ends of the box along a component of the state."""
+    given = system.grid_box()
+    if axis in given:
+        return given[axis]
+    if axis in system.angle_indices:
+        return -math.pi, math.pi
+    points = evaluation_set(system)
+    reached = points.states[points.n_grid :, axis]
+    return float(reached.min()), float(reached.max())
 
 
 def _side(side: tuple[float, float], centre: float) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from dopt.control.assessment import assessed
+from dopt.assessment import assessed
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec
 

@@ -18,11 +18,19 @@ Bound = Literal["any", "positive", "nonnegative", "fraction", "share"]
 _LARGEST_REAL = sys.float_info.max
 
 _BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
-    "any": (lambda _: True, ""),
-    "positive": (lambda value: value > 0, " and above 0"),
-    "nonnegative": (lambda value: value >= 0, " and 0 or above"),
-    "fraction": (lambda value: 0 <= value < 1, " and 0 or above, below 1"),
-    "share": (lambda value: 0 < value <= 1, " and above 0, 1 or below"),
+    "any": (lambda _: True, "finite"),
+    "positive": (lambda value: value > 0, "finite and above 0"),
+    "nonnegative": (lambda value: value >= 0, "finite and at least 0"),
+    "fraction": (lambda value: 0 <= value < 1, "at least 0 and below 1"),
+    "share": (lambda value: 0 < value <= 1, "above 0 and at most 1"),
+}
+
+_SMALLEST_WHOLE = {
+    "any": -LARGEST_WHOLE,
+    "positive": 1,
+    "nonnegative": 0,
+    "fraction": 0,
+    "share": 1,
 }
 
 
@@ -111,13 +119,15 @@ def _converted_number(
     if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
         raise _wrong_type(path, value, expected)
     number = value if whole else _real(value)
-    holds, words = _BOUNDS[field.metadata.get("bound", "any")]
-    largest, limit = (LARGEST_WHOLE, "at most 2^31 - 1") if whole else (_LARGEST_REAL, "finite")
-    if not abs(number) <= largest or not holds(number):
+    bound = field.metadata.get("bound", "any")
+    holds, words = _BOUNDS[bound]
+    if whole:
+        words = f"from {_SMALLEST_WHOLE[bound]} to {LARGEST_WHOLE}"
+    if not abs(number) <= (LARGEST_WHOLE if whole else _LARGEST_REAL) or not holds(number):
         unit = field.metadata.get("unit", "1")
         suffix = "" if unit == "1" else f" {unit}"
         raise SpecificationError(
-            f"{path} is {number}{suffix}, but it has to be {limit}{words}: set it so."
+            f"{path} is {number}{suffix}, but it has to be {words}: set it so."
         )
     return number
 

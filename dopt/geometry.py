@@ -42,7 +42,7 @@ class Body:
 
 
 @singledispatch
-def body(system: System, states: Array) -> Body | None:  # noqa: ARG001  # what others take
+def body(system: System, states: Array) -> Body | None:  # noqa: ARG001  # its variants need them
     """Return the body of a system at states (n, d); None for a system that has none."""
     return None
 
@@ -83,7 +83,7 @@ def _(system: Quadrotor, states: Array) -> Body:
 
 
 @body.register
-def _(system: MassSpring, states: Array) -> Body:  # noqa: ARG001  # chosen by its class
+def _(system: MassSpring, states: Array) -> Body:  # noqa: ARG001  # its class decides
     level = np.zeros(len(states))
     masses = [np.stack([rest + states[:, i], level], axis=1) for rest, i in ((-1, 0), (1, 2))]
     corners = BLOCK * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+from dopt.control import Control
+from dopt.control.free_run import STARTS
 from dopt.information import held_information
 from dopt.learning import Adam, AdamReplay, Learner
 from dopt.models import MLP, GaussianProcess, Model
@@ -31,11 +33,11 @@ STRONG_INPUTS = 8
 
 
 def memory_by_setting(
-    system: System, policy: Policy, model: Model, learner: Learner
+    system: System, policy: Policy, model: Model, learner: Learner, task: Control | None = None
 ) -> dict[str, int]:
     """Return the bytes that a trial holds at once, by the setting that decides about them.
 
-    The interpreter and its libraries, some 0.2 GiB, come on top.
+    A ``task`` has every field set. The interpreter and its libraries, some 0.2 GiB, come on top.
     """
     T, d, m, r = system.horizon, system.n_states, system.n_inputs, system.n_learned
     p, q = len(system.features), model.n_parameters(system)
@@ -63,7 +65,8 @@ def memory_by_setting(
         information = _information(policy, form, q, r * T, T * (p + L * w * (1 + r)))
     else:
         information = _information_of_module(policy, form, q)
-    for part in (information, _search(policy, system, model), _beyond(policy, system, model)):
+    parts = (information, _search(policy, system, model), _beyond(policy, system, model))
+    for part in (*parts, _task(task, system, q) if task else {}):
         for setting, count in part.items():
             numbers[setting] = numbers.get(setting, 0) + count
     return {setting: NUMBER * count for setting, count in numbers.items()}
@@ -131,3 +134,20 @@ def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
         # the factor, and the kernel between all samples and all evaluation points
         return {"env.horizon": 2 * T**2, "env.grid_points": 2 * N * T}
     return {}
+
+
+def _task(task: Control, system: System, q: int) -> dict[str, int]:
+    """Return the numbers of an assessment: its planner, episode, free run and checkpoints."""
+    goal, d, m = task.on(system), system.n_states, system.n_inputs
+    # a planned step of each sample: state, error, square, two costs, input in two orders
+    sizes = {"task.samples": task.samples, "task.hold": goal.hold, "task.lookahead": goal.lookahead}
+    planned = (
+        math.prod(sizes.values()) * (3 * d + 2 * m + 2) + task.samples * goal.lookahead * 4 * m
+    )
+    return {
+        max(sizes, key=lambda key: sizes[key]): planned,
+        "task.steps": goal.steps * (4 * d + m),
+        # the true states and the predicted ones, two squares, and the inputs in three orders
+        "task.free_run_steps": STARTS * task.free_run_steps * (5 * d + 3 * m),
+        "task.checkpoints": len(task.assessed_steps(system.horizon)) * q,
+    }

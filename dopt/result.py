@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 class Assessment(NamedTuple):
     """A number that says what a trial was worth after t explored steps.
 
-    The measures and their meanings are :data:`dopt.control.assessment.MEASURES`; a value that is
+    The measures and their meanings are :data:`dopt.assessment.MEASURES`; a value that is
     not finite stands for an overflow.
     """
 

@@ -124,7 +124,7 @@ class Cell:
 
     @functools.cached_property
     def _memory_by_setting(self) -> dict[str, int]:
-        return memory_by_setting(self.system, self.policy, self.model, self.learner)
+        return memory_by_setting(*self._parts, self.task)
 
     @functools.cached_property
     def canonical_json(self) -> str:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from dopt.kernel.cache import COMPILED_SOURCES
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("dopt", "orchestrate", "analysis")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
@@ -78,6 +80,16 @@ def test_the_analysis_reads_through_the_store_alone() -> None:
         assert not {name.split(".")[0] for name in names} & {"torch", "ray", "hydra", "numba"}, path
         own = {name for name in names if name.split(".")[0] == "orchestrate"}
         assert all(name.startswith(shared) for name in own), path
+
+
+def test_what_is_compiled_is_made_of_sources_that_name_its_cache() -> None:
+    """A change anywhere else would leave stale machine code where the launcher finds it."""
+    folders = tuple(f"dopt.{folder}" for folder in COMPILED_SOURCES)
+    for path in sources("dopt/kernel"):
+        names = imports(path)
+        if names & {"dopt.kernel.compiler"} and path.name != "equations.py":
+            own = {name for name in names if name.startswith("dopt.")}
+            assert all(name.startswith(folders) for name in own), path
 
 
 def test_nothing_imports_the_analysis_but_itself() -> None:

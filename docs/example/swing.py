@@ -41,7 +41,11 @@ class Swing(Environment):
     grid_points: tuple[int, ...] = quantity((32, 32), bound="positive")
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG004  # no constants
+    def known(
+        state: Any,
+        inputs: Any,
+        parameters: Any,  # noqa: ARG004  # there are none
+    ) -> tuple[Any, ...]:
         return state[1], 3.0 * inputs[0]
 
     @staticmethod

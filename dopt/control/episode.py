@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.control.planner import CrossEntropy, Objective
-from dopt.control.prediction import Accelerations, predict
+from dopt.control.prediction import Forecast
 from dopt.control.task import Control, Goal
 from dopt.systems.base import System
 
@@ -39,19 +39,22 @@ class Episode:
 def run_episode(
     system: System,
     task: Control,
-    accelerations: Accelerations,
+    plant: Forecast,
+    forecast: Forecast,
     noise: Array,
     rng: np.random.Generator,
 ) -> Episode:
-    """Control the true system by model-predictive control with a model of its accelerations.
+    """Control the true system by model-predictive control with a model.
 
     Every ``hold`` steps the planner looks ``hold * lookahead`` steps ahead from the state that it
     observes; the first input of the plan is held, the others start the next plan.
 
     Parameters
     ----------
-    accelerations
-        The model, or the true accelerations for the oracle.
+    plant
+        Of the true system.
+    forecast
+        What the planner goes by: of a model, or of the true system too.
     noise : (steps, d)
         w_t of the plant.
     rng
@@ -67,22 +70,19 @@ def run_episode(
         if t % goal.hold == 0:
             if t:
                 plan = np.concatenate([plan[1:], np.zeros_like(plan[:1])])
-            plan = planner.plan(_objective(system, goal, accelerations, states[t]), plan, rng)
+            plan = planner.plan(_objective(system, goal, forecast, states[t]), plan, rng)
         inputs[t] = plan[0]
-        step = predict(system, system.learned, states[t : t + 1], plan[None, :1])
-        states[t + 1] = step[0, 0] + noise[t]
+        states[t + 1] = plant(states[t : t + 1], plan[None, :1])[0, 0] + noise[t]
     cost = float(np.sum(costs(system, goal, states[1:], inputs)))
     if not np.all(np.abs(states) <= system.state_limit):
         return Episode(states, inputs, math.inf, success=False)
     return Episode(states, inputs, cost, succeeds(system, goal, states))
 
 
-def _objective(system: System, goal: Goal, accelerations: Accelerations, state: Array) -> Objective:
+def _objective(system: System, goal: Goal, forecast: Forecast, state: Array) -> Objective:
     def objective(plans: Array) -> Array:
         inputs = np.repeat(plans, goal.hold, axis=1)
-        states = predict(
-            system, accelerations, np.broadcast_to(state, (len(plans), len(state))), inputs
-        )
+        states = forecast(np.tile(state, (len(plans), 1)), inputs)
         with np.errstate(over="ignore", invalid="ignore"):
             total: Array = costs(system, goal, states, inputs.swapaxes(0, 1)).sum(axis=0)
         return total

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.prediction import Accelerations, predict
+from dopt.control.prediction import Forecast, forecast_by
 from dopt.evaluation import evaluation_set
 from dopt.policies.base import on_sphere
 from dopt.systems.base import System
@@ -51,10 +51,10 @@ def held_out(system: System, steps: int) -> HeldOut:
     rng = np.random.default_rng(_SEED)
     draws = rng.standard_normal((len(starts), -(-steps // HOLD_STEPS), system.n_inputs))
     inputs = np.repeat(on_sphere(draws, system.gamma), HOLD_STEPS, axis=1)[:, :steps]
-    return HeldOut(starts, inputs, predict(system, system.learned, starts, inputs))
+    return HeldOut(starts, inputs, forecast_by(system, system.learned)(starts, inputs))
 
 
-def free_run_error(system: System, accelerations: Accelerations, steps: int) -> float:
+def free_run_error(system: System, forecast: Forecast, steps: int) -> float:
     """Return the relative root mean square error of predictions over 1 ... n steps.
 
     The squared error of each state component is divided by the mean square of its true change
@@ -63,7 +63,7 @@ def free_run_error(system: System, accelerations: Accelerations, steps: int) -> 
     prediction overflows.
     """
     truth = held_out(system, steps)
-    predicted = predict(system, accelerations, truth.starts, truth.inputs)
+    predicted = forecast(truth.starts, truth.inputs)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.mean((predicted - truth.states) ** 2, axis=(0, 1))
     changes = np.mean((truth.states - truth.starts) ** 2, axis=(0, 1))

@@ -1,4 +1,4 @@
-"""Many states one step or many steps on, under the true accelerations or modelled ones."""
+"""Many states many steps on, under the true accelerations or modelled ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from dopt.models.base import Model
 from dopt.systems.base import System
 
 Array = npt.NDArray[np.float64]
@@ -15,10 +14,13 @@ Array = npt.NDArray[np.float64]
 Accelerations = Callable[[Array], Array]
 """Accelerations (N, r) of states (N, d)."""
 
+Forecast = Callable[[Array, Array], Array]
+"""States (H, N, d) after each step, from states (N, d) under inputs (N, H, m)."""
 
-def modelled(system: System, model: Model, parameters: Array) -> Accelerations:
-    """Return the accelerations of a model with parameters (q,)."""
-    return lambda states: model.predict(system, parameters, states)
+
+def forecast_by(system: System, accelerations: Accelerations) -> Forecast:
+    """Return the forecast of a system by accelerations that any function gives."""
+    return lambda states, inputs: predict(system, accelerations, states, inputs)
 
 
 def predict(system: System, accelerations: Accelerations, states: Array, inputs: Array) -> Array:

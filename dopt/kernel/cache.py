@@ -19,7 +19,7 @@ import llvmlite.binding
 
 CACHE_VARIABLE = "DOPT_CACHE"
 _PACKAGE = Path(__file__).resolve().parent.parent
-_COMPILED_SOURCES = ("kernel", "systems", "planning")
+COMPILED_SOURCES = ("kernel", "systems", "planning")
 
 
 def _source_digest() -> str:
@@ -35,7 +35,7 @@ def _source_digest() -> str:
     digest.update(llvmlite.binding.get_host_cpu_features().flatten().encode())
     # Numba files what it keeps under the path of its source: another checkout would not find it.
     digest.update(str(_PACKAGE).encode())
-    for folder in _COMPILED_SOURCES:
+    for folder in COMPILED_SOURCES:
         for path in sorted((_PACKAGE / folder).rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

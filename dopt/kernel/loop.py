@@ -21,18 +21,18 @@ from dopt.kernel.trial import advance
 
 def compiled_loop(call: tuple[Any, ...]) -> Any:
     """Return the loop for the arguments of a trial from World to Record."""
-    equations = (_pointer(KNOWN), _pointer(ACCELERATIONS), _pointer(COMPLEX_ACCELERATIONS))
+    equations = (pointer(KNOWN), pointer(ACCELERATIONS), pointer(COMPLEX_ACCELERATIONS))
     kinds = tuple(numba.typeof(argument) for argument in call)
-    search = _pointer(types.void(*_search_kinds(call)))
-    return _compiled("loop", advance, (*equations, search, *kinds, int64, int64))
+    search = pointer(types.void(*_search_kinds(call)))
+    return compiled_for("loop", advance, (*equations, search, *kinds, int64, int64))
 
 
 def compiled_search(call: tuple[Any, ...]) -> Any:
     """Return the search for the same arguments; one that finds nothing if none is needed."""
     rules = call[2]
     if rules.policy == SEARCH:
-        return _compiled("search", search_input, _search_kinds(call))
-    return _compiled("no-search", no_search, _search_kinds(call))
+        return compiled_for("search", search_input, _search_kinds(call))
+    return compiled_for("no-search", no_search, _search_kinds(call))
 
 
 def _search_kinds(call: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -40,14 +40,15 @@ def _search_kinds(call: tuple[Any, ...]) -> tuple[Any, ...]:
     world, network, rules, _, _, state, _ = call
     given = (world, network, rules.search, state.theta, state.covariance)
     kinds = (numba.typeof(argument) for argument in given)
-    return (_pointer(KNOWN), _pointer(ACCELERATIONS), *kinds, *(float64[::1],) * 3)
+    return (pointer(KNOWN), pointer(ACCELERATIONS), *kinds, *(float64[::1],) * 3)
 
 
-def _pointer(signature: Any) -> Any:
+def pointer(signature: Any) -> Any:
+    """Return the type of a pointer to functions of a signature."""
     return types.FunctionType(signature)
 
 
-def _compiled(name: str, function: Any, kinds: tuple[Any, ...]) -> Any:
+def compiled_for(name: str, function: Any, kinds: tuple[Any, ...]) -> Any:
     """Compile a function for types of arguments, unless it is."""
     if (name, kinds) not in _done:
         with one_compiler_at_a_time(

@@ -75,6 +75,18 @@ def model_accelerations(
 
 
 @compiled
+def euler_step(
+    known: Any, world: World, x: Any, u: Any, accelerations: Any, flow: Any, following: Any
+) -> None:
+    """Write x + dt f(x, u), (d,), given the accelerations, (r,)."""
+    known(x, u, world.parameters, flow)
+    for k in range(accelerations.shape[0]):
+        flow[world.learned_rows[k]] += accelerations[k]
+    for j in range(x.shape[0]):
+        following[j] = x[j] + world.dt * flow[j]
+
+
+@compiled
 def point_at(
     network: Network, theta: Any, x: Any, directions: Any, component: int, out: Any
 ) -> Point:

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dopt.kernel import network as nn
-from dopt.kernel.arguments import LINEAR_MODEL, Covariance, Floats, Network, Search, World
+from dopt.kernel.arguments import JOINT, LINEAR_MODEL, Covariance, Floats, Network, Search, World
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.information import add_multiple, inner, multiply_rows
-from dopt.kernel.model import add_linear, regressors
+from dopt.kernel.model import add_linear, euler_step, regressors
 
 FEW_ROWS = 24
 """Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
@@ -95,18 +95,14 @@ def roll(
 ) -> bool:
     """Hold u from state ``first`` of the path to state ``last``; tell whether it stays in bounds.
 
-    x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written, times the
-    root of the stride.
+    x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written, for the
+    determinant of all of them together times the root of the stride.
     """
     r, stride = world.learned_rows.shape[0], search.stride
     spare = path.products.shape[0]
     for i in range(first, last):
         x, following = path.states[i], path.states[i + 1]
-        known(x, u, world.parameters, path.flow)
-        for k in range(r):
-            path.flow[world.learned_rows[k]] += path.outputs[i, k]
-        for j in range(x.shape[0]):
-            following[j] = x[j] + world.dt * path.flow[j]
+        euler_step(known, world, x, u, path.outputs[i], path.flow, following)
         if not within(following, world.state_limit):
             return False
         wanted = (i + 1) % stride == 0
@@ -115,7 +111,7 @@ def roll(
         count = r if wanted or network.kind == LINEAR_MODEL else 0
         rows = path.rows[block : block + count]
         look(accelerations, world, network, theta, path, i + 1, rows)
-        if stride > 1:
+        if stride > 1 and search.score == JOINT:
             scale(rows, np.sqrt(stride))
     return True
 

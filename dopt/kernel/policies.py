@@ -11,6 +11,7 @@ from dopt.kernel.compiler import compilable, compiled
 from dopt.kernel.dual import dual_forms
 from dopt.kernel.information import quadratic_forms
 from dopt.kernel.model import (
+    euler_step,
     linear_gradients,
     model_accelerations,
     network_gradients,
@@ -18,11 +19,9 @@ from dopt.kernel.model import (
 )
 from dopt.kernel.sketch import sketched
 from dopt.planning.sphere import sphere_maximizer
+from dopt.planning.ties import TIE_MARGIN
 
 compilable(sphere_maximizer)
-
-TIE_MARGIN = 1e-9
-"""A second optimum has to be better by this relative margin: rounding must not choose."""
 
 
 @compiled
@@ -30,15 +29,11 @@ def predicted_state(
     known: Any, accelerations: Any, world: World, network: Network, theta: Any, x: Any
 ) -> Any:
     """Return x̄ = x + dt f_θ(x, 0), (d,)."""
-    flow = np.empty(x.shape[0])
+    flow, following = np.empty(x.shape[0]), np.empty(x.shape[0])
     a = np.empty(world.learned_rows.shape[0])
-    known(x, np.zeros(world.n_inputs), world.parameters, flow)
     model_accelerations(accelerations, world, network, theta, x, a)
-    for k in range(a.shape[0]):
-        flow[world.learned_rows[k]] += a[k]
-    for i in range(flow.shape[0]):
-        flow[i] = x[i] + world.dt * flow[i]
-    return flow
+    euler_step(known, world, x, np.zeros(world.n_inputs), a, flow, following)
+    return following
 
 
 @compiled

@@ -11,7 +11,8 @@ from dopt.errors import SpecificationError
 from dopt.kernel import arguments as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.loop import compiled_loop, compiled_search
-from dopt.kernel.setup import constants, empty_record, initial_state, own_targets
+from dopt.kernel.points import own_targets
+from dopt.kernel.setup import constants, empty_record, initial_state
 from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.spec import TrialSpec

@@ -23,7 +23,7 @@ from dopt.kernel.compiler import compiled, monotonic_microseconds, vectorized
 from dopt.kernel.information import inner
 from dopt.kernel.krylov import krylov_space, largest_eigenvalue
 from dopt.kernel.path import Path, log_determinant, look, new_path, roll, weigh, whiten
-from dopt.policies.search import TIE_MARGIN
+from dopt.planning.ties import TIE_MARGIN
 
 
 class Yardstick(NamedTuple):
@@ -67,7 +67,8 @@ def search_input(
         path.states[0, i] = x[i]
     look(accelerations, world, network, theta, path, 0, path.rows[path.products.shape[0] :])
     problem = Problem(world, network, search, theta, covariance, path, yardstick, end)
-    _choose(_values(known, accelerations, problem), search.candidates, tie, u)
+    order = _order(search.candidates, tie)
+    _choose(_values(known, accelerations, problem, order), search.candidates, tie, u)
 
 
 @compiled
@@ -88,7 +89,20 @@ def no_search(
 
 
 @compiled
-def _values(known: Any, accelerations: Any, problem: Problem) -> Any:
+def _order(candidates: Any, tie: Any) -> Any:
+    """Return the candidates, (C,), in the order in which they are tried: opposite ones in turn.
+
+    The first is that nearest to a random direction, so that haste prefers no input to another.
+    """
+    C = candidates.shape[0]
+    ranks = np.argsort(-np.dot(candidates, tie), kind="mergesort")
+    order = np.empty_like(ranks)
+    order[::2], order[1::2] = ranks[: C - C // 2], ranks[::-1][: C // 2]
+    return order
+
+
+@compiled
+def _values(known: Any, accelerations: Any, problem: Problem, order: Any) -> Any:
     """Return the scores of the plans by their two candidates, (C, C); -∞ where there is none.
 
     In a hurry the plans without a switch come first, then the switches from the best of these.
@@ -97,13 +111,14 @@ def _values(known: Any, accelerations: Any, problem: Problem) -> Any:
     unhurried, switching = search.budget_us == 0.0, search.switch < search.steps
     C = search.candidates.shape[0]
     values = np.full((C, C), -np.inf)
-    for c in range(C):
-        if c > 0 and _late(problem):
+    for k in range(C):
+        if k > 0 and _late(problem):
             break
+        c = order[k]
         begun = _begin(known, accelerations, problem, c)
         values[c, c] = _finish(known, accelerations, problem, c, begun)
         if unhurried and switching:
-            _switches(known, accelerations, problem, c, begun, values[c])
+            _switches(known, accelerations, problem, order, c, begun, values[c])
     if switching and not unhurried:
         begun_from = np.zeros(C, np.bool_)
         for _ in range(C):
@@ -112,7 +127,7 @@ def _values(known: Any, accelerations: Any, problem: Problem) -> Any:
             c = _best_hold(values, begun_from)
             begun_from[c] = True
             begun = _begin(known, accelerations, problem, c)
-            _switches(known, accelerations, problem, c, begun, values[c])
+            _switches(known, accelerations, problem, order, c, begun, values[c])
     return values
 
 
@@ -135,10 +150,10 @@ def _late(problem: Problem) -> bool:
 
 @compiled
 def _switches(
-    known: Any, accelerations: Any, problem: Problem, c: int, begun: float, values: Any
+    known: Any, accelerations: Any, problem: Problem, order: Any, c: int, begun: float, values: Any
 ) -> None:
     """Score the plans that begin with candidate c, as the path does, and switch to another."""
-    for other in range(values.shape[0]):
+    for other in order:
         if other != c:
             if _late(problem):
                 break

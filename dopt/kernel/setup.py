@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.information import Information, held_information
 from dopt.kernel import arguments as args
-from dopt.kernel.evaluation import BLOCK
 from dopt.kernel.information import PENDING_ROWS, SMALL
+from dopt.kernel.points import evaluation_points
 from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, Learner
 from dopt.models import MLP
+from dopt.models.base import Model
 from dopt.planning.task_states import task_states
 from dopt.policies import (
     DOptimal,
@@ -39,8 +39,14 @@ def constants(
     cell: Cell,
 ) -> tuple[args.World, args.Network, args.Rules, args.Evaluation]:
     """Return everything that the trials of a cell share."""
-    system = cell.system
-    world = args.World(
+    system, network = cell.system, network_of(cell.system, cell.model)
+    points = evaluation_points(system, network)
+    return world_of(system), network, _rules(cell), points
+
+
+def world_of(system: System) -> args.World:
+    """Return the constants of a system."""
+    return args.World(
         np.array(system.parameters),
         np.array(system.history),  # a copy: what came through Ray's memory cannot be written to
         np.array(system.linear_form),
@@ -50,14 +56,12 @@ def constants(
         system.gamma,
         system.state_limit,
     )
-    network = _network(cell)
-    return world, network, _rules(cell), _evaluation(system, network, evaluation_set(system))
 
 
-def _network(cell: Cell) -> args.Network:
-    system = cell.system
-    if isinstance(cell.model, MLP):
-        kind, sizes = args.MLP_MODEL, cell.model.layer_sizes(system)
+def network_of(system: System, model: Model) -> args.Network:
+    """Return the architecture of a model on a system."""
+    if isinstance(model, MLP):
+        kind, sizes = args.MLP_MODEL, model.layer_sizes(system)
     else:
         kind, sizes = args.LINEAR_MODEL, (len(system.features), 1, system.n_learned)
     lengths = [(n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes)]
@@ -158,81 +162,6 @@ def _regularization(cell: Cell) -> float:
 def _held(cell: Cell) -> Information | None:
     q, n_rows = cell.model.n_parameters(cell.system), cell.system.n_learned * cell.system.horizon
     return held_information(cell.policy, cell.learner, q, n_rows)
-
-
-def _evaluation(system: System, network: args.Network, points: EvaluationSet) -> args.Evaluation:
-    if network.kind == args.LINEAR_MODEL:
-        return _linear_evaluation(system, points)
-    columns = [system.featurize(points.states).T, points.accelerations.T]
-    parts = [slice(0, points.n_grid), slice(points.n_grid, None)]
-    features, targets, sizes = zip(
-        *(_blocks(columns[0][:, part], columns[1][:, part]) for part in parts), strict=True
-    )
-    blocks = np.concatenate(features)
-    return args.Evaluation(
-        blocks.astype(np.float32),
-        blocks,
-        np.concatenate(targets),
-        np.concatenate(sizes),
-        np.zeros((0, 0, 0)),
-        np.zeros((0, 0)),
-        _followed(system, points),
-        len(sizes[0]),
-        len(sizes[0]) + len(sizes[1]),
-        _size(system, points),
-    )
-
-
-def _followed(system: System, points: EvaluationSet) -> args.Floats:
-    """Return the states at which the truth is evaluated anew at each step."""
-    return points.states if len(system.history) > 1 else points.states[:0]
-
-
-def own_targets(points: args.Evaluation) -> args.Evaluation:
-    """Return points whose targets a trial may write into, if the truth changes with time."""
-    if not len(points.states):
-        return points
-    return points._replace(block_targets=points.block_targets.copy(), targets=points.targets.copy())
-
-
-def _blocks(features: args.Floats, targets: args.Floats) -> tuple[Any, Any, Any]:
-    """Cut columns of points, (·, N), into padded blocks, (blocks, ·, BLOCK), and their sizes."""
-    n = features.shape[1]
-    starts = range(0, n, BLOCK)
-    sizes = np.array([min(BLOCK, n - start) for start in starts], dtype=np.int64)
-
-    def cut(columns: args.Floats) -> args.Floats:
-        padded = np.zeros((len(columns), BLOCK * len(starts)))
-        padded[:, :n] = columns
-        return np.ascontiguousarray(padded.reshape(len(columns), -1, BLOCK).swapaxes(0, 1))
-
-    return cut(features), cut(targets), sizes
-
-
-def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation:
-    offset, *units = (
-        np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.states.T), form)), axis=-1)
-        for form in system.linear_form
-    )
-    regressors = np.stack([unit - offset for unit in units], axis=-1)
-    return args.Evaluation(
-        np.zeros((0, 0, 0), dtype=np.float32),
-        np.zeros((0, 0, 0)),
-        np.zeros((0, 0, 0)),
-        np.zeros(0, dtype=np.int64),
-        np.ascontiguousarray(regressors),
-        np.ascontiguousarray(points.accelerations - offset),
-        _followed(system, points),
-        points.n_grid,
-        len(points.states),
-        _size(system, points),
-    )
-
-
-def _size(system: System, points: EvaluationSet) -> float:
-    """Return the root mean square norm of the targets, at the first or the last step."""
-    ends = (points.accelerations, system.learned(points.states, system.horizon - 1))
-    return max(float(np.sqrt(np.mean(np.sum(targets**2, axis=1)))) for targets in ends)
 
 
 def initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:

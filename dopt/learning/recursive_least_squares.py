@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from dopt.fields import quantity
 from dopt.learning.base import Learner
 
 
@@ -13,8 +14,15 @@ class RecursiveLeastSquares(Learner):
     """θ += K (y - a_θ(x)), K = M⁻¹Jᵀ (I + J M⁻¹ Jᵀ)⁻¹, with the planner's own M.
 
     Started from M₀ = λI it is at every t the minimiser of λ‖θ‖² + Σ ‖J θ + offset - y‖² over all
-    samples seen: ordinary least squares with a vanishing ridge λ (``policy.regularization``).
+    samples seen: ordinary least squares with a vanishing ridge λ.
+
+    Parameters
+    ----------
+    regularization : float
+        λ, unless the policy has one: a policy that plans by M shares it with the learner.
     """
 
     name: ClassVar[str] = "recursive_least_squares"
     structure: ClassVar[str] = "least_squares"
+
+    regularization: float = quantity(1e-3, bound="positive")

@@ -6,10 +6,13 @@ import functools
 
 import numpy as np
 
-from dopt.evaluation import evaluation_set
+from dopt.evaluation import reachable_states
 from dopt.policies.base import Array
 from dopt.policies.task import TaskOptimal
 from dopt.systems.base import System
+
+DRAWN = 4096
+"""States of the box among which a task's are chosen."""
 
 _SEED = 20_260_101
 
@@ -17,14 +20,20 @@ _SEED = 20_260_101
 @functools.lru_cache(maxsize=64)
 def task_states(system: System, task: TaskOptimal) -> Array:
     """Return states, (≤ count, d), drawn without replacement by their weights; always the same."""
-    points = evaluation_set(system)
-    part = slice(points.n_grid, None) if task.states == "reachable" else slice(points.n_grid)
-    states = points.states[part]
-    weights = goal_weights(system, task, states)
     rng = np.random.default_rng(_SEED)
+    states = reachable_states(system) if task.states == "reachable" else _box(system, rng)
+    weights = goal_weights(system, task, states)
     count = min(task.count, int(np.count_nonzero(weights)))
     chosen = rng.choice(len(states), count, replace=False, p=weights / weights.sum())
     return np.ascontiguousarray(states[np.sort(chosen)])
+
+
+def _box(system: System, rng: np.random.Generator) -> Array:
+    """Return states, (4096, d), uniform in the evaluation box; the other components are zero."""
+    low, high = np.array(list(system.grid_box().values())).T
+    states = np.zeros((DRAWN, system.n_states))
+    states[:, list(system.grid_indices)] = rng.uniform(low, high, (DRAWN, len(low)))
+    return states
 
 
 def goal_weights(system: System, task: TaskOptimal, states: Array) -> Array:
@@ -40,6 +49,7 @@ def goal_weights(system: System, task: TaskOptimal, states: Array) -> Array:
         gap = states[:, index] - task.goal[index]
         if index in system.angle_indices:
             gap = (gap + np.pi) % (2 * np.pi) - np.pi
-        squares += (gap / (task.radius * half_width)) ** 2
-    weights: Array = np.exp(-0.5 * (squares - squares.min()))
+        squares += (gap / half_width) ** 2
+    with np.errstate(over="ignore"):
+        weights: Array = np.exp(-0.5 * ((squares - squares.min()) / task.radius / task.radius))
     return weights

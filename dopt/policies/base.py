@@ -14,11 +14,21 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from dopt.errors import IncompatibleError
 from dopt.fields import Checked, quantity
 from dopt.systems.base import System
 from dopt.view import View
 
 Array = npt.NDArray[np.float64]
+
+
+def check_length(key: str, steps: int, system: System) -> None:
+    """Raise IncompatibleError if a plan is longer than a trial of the system."""
+    if steps > system.horizon:
+        raise IncompatibleError(
+            f"{key} is {steps} steps, but a trial of env '{system.name}' has {system.horizon}: "
+            f"lower it, or raise env.horizon."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

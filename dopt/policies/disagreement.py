@@ -7,11 +7,11 @@ from typing import ClassVar
 
 from dopt.errors import SpecificationError
 from dopt.fields import quantity
-from dopt.policies.base import ClosedLoop
+from dopt.policies.held_candidates import HeldCandidates
 
 
 @dataclass(frozen=True, kw_only=True)
-class Disagreement(ClosedLoop):
+class Disagreement(HeldCandidates):
     """Maximise how much networks with other initial weights disagree about where the input leads.
 
     K networks learn from the same samples by the same learner. The trial's own network is the first
@@ -32,18 +32,14 @@ class Disagreement(ClosedLoop):
     ----------
     ensemble : int
         K, networks in all, at least 2.
-    lookahead : int
-        Steps for which a candidate is held in prediction.
-    candidates : int
-        Inputs on the sphere that are compared (two if there is but one input).
+    lookahead, candidates
+        As of :class:`dopt.policies.held_candidates.HeldCandidates`.
     """
 
     name: ClassVar[str] = "max"
     compiled: ClassVar[bool] = False
 
     ensemble: int = quantity(5, "networks", "positive")
-    lookahead: int = quantity(1, "steps", "positive")
-    candidates: int = quantity(16, "inputs", "positive")
 
     def __post_init__(self) -> None:
         super().__post_init__()

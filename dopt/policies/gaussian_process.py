@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.fields import quantity
-from dopt.policies.base import ClosedLoop
+from dopt.policies.held_candidates import HeldCandidates
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussianProcessEntropy(ClosedLoop):
+class GaussianProcessEntropy(HeldCandidates):
     """Maximise the predictive entropy of a Gaussian process at the states that an input leads to.
 
     Each candidate input is held for ``lookahead`` steps of the mean prediction; its value is the
@@ -18,17 +17,7 @@ class GaussianProcessEntropy(ClosedLoop):
     step is the predictive variance at the next state. It goes with ``model=gaussian_process`` and
     ``learner=conditioning``. Reference: M. Buisson-Fenet, F. Solowjow and S. Trimpe, "Actively
     learning Gaussian process dynamics" (L4DC 2020).
-
-    Parameters
-    ----------
-    lookahead : int
-        Steps for which a candidate is held in prediction.
-    candidates : int
-        Inputs on the sphere that are compared (two if there is but one input).
     """
 
     name: ClassVar[str] = "gaussian_process"
     compiled: ClassVar[bool] = False
-
-    lookahead: int = quantity(1, "steps", "positive")
-    candidates: int = quantity(16, "inputs", "positive")

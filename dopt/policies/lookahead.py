@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from dopt.errors import IncompatibleError
 from dopt.fields import quantity
+from dopt.policies.base import check_length
 from dopt.policies.search import Search
 from dopt.systems.base import System
 from dopt.systems.equilibrium import eigenmode
@@ -29,13 +30,14 @@ class Lookahead(Search):
     ----------
     horizon : int or None
         H; None takes 0.6 periods of the least damped oscillation about the stable equilibrium, and
-        10 steps where there is none.
+        10 steps where there is none. The period is the true system's, as that of the periodic
+        policy is: give H where it is unknown.
     criterion : {"joint", "sum"}
         ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` that of each state's
         rows alone, summed over the path.
     stride : int or None
-        Every how many steps a state's rows are taken; each then counts so many times. None takes a
-        fifth of the plan's steps: neighbouring rows are nearly the same.
+        Every how many steps a state's rows are taken; in ``joint`` each counts so many times. None
+        takes a fifth of the plan's steps: neighbouring rows are nearly the same.
     """
 
     name: ClassVar[str] = "lookahead"
@@ -46,6 +48,8 @@ class Lookahead(Search):
     stride: int | None = quantity(None, "steps", "positive")
 
     def check(self, system: System) -> None:
+        if self.horizon is not None:
+            check_length("policy.horizon", self.horizon, system)
         if self.stride is not None and self.stride > self.steps(system):
             raise IncompatibleError(
                 f"policy.stride is {self.stride} steps, but the plans have {self.steps(system)}: "

@@ -17,14 +17,15 @@ class TaskOptimal(Search):
 
     With G the rows of the Jacobian at these states and V = J M⁻¹, the decrease by the rows J at
     x_t + dt f_θ(x_t, u) is tr((I + V Jᵀ)⁻¹ V GᵀG Vᵀ): V-optimal design. The states are drawn once
-    for all from the evaluation grid or the reachable set, with weights exp(-δ²/2) that fall with
+    for all from the evaluation box or the reachable set, with weights exp(-δ²/2) that fall with
     the distance δ to the goal (:func:`dopt.planning.task_states.task_states`). Reference:
     A. Atkinson, A. Donev and R. Tobias, "Optimum experimental designs" (2007), chapter 10.
 
     Parameters
     ----------
     states : {"grid", "reachable"}
-        Where the states are drawn from.
+        Where the states are drawn from: the box of the evaluation grid, or the states that the true
+        system visits under strong inputs, which takes the true system to know.
     count : int
         How many states.
     goal : tuple of float

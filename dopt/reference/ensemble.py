@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 from torch.func import vmap
 
-from dopt.planning.candidates import sphere_candidates
 from dopt.policies.disagreement import Disagreement
 from dopt.randomness import stream
 from dopt.reference.dynamics import flow
@@ -26,12 +25,9 @@ class EnsemblePlan:
 
     def __init__(self, batch: Lockstep, policy: Disagreement) -> None:
         self._batch, self._lookahead = batch, policy.lookahead
-        system = batch.system
-        inputs = sphere_candidates(system.n_inputs, policy.candidates, system.gamma)
-        self._inputs = torch.tensor(inputs).to(batch.theta)
+        self._inputs = torch.tensor(policy.compared_inputs(batch.system)).to(batch.theta)
         self._others = torch.tensor(_initial(batch, policy.ensemble - 1)).to(batch.theta)
-        n_learned = self._others.shape[1]
-        self._learner = learner_for(batch.cell.learner, batch.model, self._others, 1.0, n_learned)
+        self._learner = learner_for(batch.cell.learner, batch.model, self._others)
 
     @property
     def members(self) -> Tensor:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.func import grad_and_value, jacrev, vmap
 
-from dopt.planning.candidates import sphere_candidates
+from dopt.policies.directions import sphere_inputs
 from dopt.policies.gradient import GradientDOptimal
 from dopt.reference.dynamics import flow
 
@@ -165,5 +165,5 @@ class GradientPlan:
 def candidates(batch: Lockstep, policy: GradientDOptimal) -> Tensor:
     """Return the candidates of a policy for every trial of a batch, (n, C, m)."""
     system = batch.system
-    inputs = sphere_candidates(system.n_inputs, policy.candidates, system.gamma)
+    inputs = sphere_inputs(system, policy.candidates)
     return torch.tensor(inputs).to(batch.theta).expand(len(batch.theta), -1, -1)

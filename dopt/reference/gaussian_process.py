@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from dopt.models.gaussian_process import GaussianProcess
-from dopt.planning.candidates import sphere_candidates
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.reference.dynamics import flow
 from dopt.reference.models import features, kernel
@@ -110,9 +109,7 @@ class EntropyPlan:
 
     def __init__(self, batch: Lockstep, policy: GaussianProcessEntropy) -> None:
         self._batch, self._lookahead = batch, policy.lookahead
-        system = batch.system
-        inputs = sphere_candidates(system.n_inputs, policy.candidates, system.gamma)
-        self._inputs = torch.tensor(inputs).to(batch.theta)
+        self._inputs = torch.tensor(policy.compared_inputs(batch.system)).to(batch.theta)
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m)."""

@@ -137,17 +137,11 @@ def learner_for(
     learner: Learner,
     model: Accelerations,
     theta: Tensor,
-    regularization: float,
-    n_learned: int,
     replay: Tensor | None = None,
 ) -> BatchLearner:
-    """Return the batch learner of a specification; it writes into ``theta`` (n, q).
-
-    Of the parameters the first ``n_learned`` are learned.
-    """
+    """Return the batch learner by gradients of a specification; it writes into ``theta`` (n, q)."""
     if isinstance(learner, Adam):
         return AdamLearner(learner, model, theta, learner.window)
-    if isinstance(learner, AdamReplay):
-        assert replay is not None
-        return ReplayLearner(learner, model, theta, replay)
-    return LeastSquaresLearner(model, theta, regularization, n_learned)
+    assert isinstance(learner, AdamReplay)
+    assert replay is not None
+    return ReplayLearner(learner, model, theta, replay)

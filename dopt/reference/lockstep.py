@@ -14,9 +14,6 @@ from torch.func import jacrev, vmap
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.information import held_information
-from dopt.learning import ExtendedKalman
-from dopt.learning.base import Updated
-from dopt.models import GaussianProcess
 from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
@@ -24,9 +21,10 @@ from dopt.randomness import draw
 from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.gaussian_process import Posterior
-from dopt.reference.learning import BatchLearner, KalmanLearner, learner_for
+from dopt.reference.learners import batch_learner
+from dopt.reference.learning import KalmanLearner
 from dopt.reference.models import model_function, network_function
-from dopt.reference.own import OwnLearner, observe, planned_inputs, planners_for
+from dopt.reference.own import observe, planned_inputs, planners_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
 from dopt.reference.plans import plan_for
 from dopt.reference.search import searched_inputs
@@ -84,7 +82,7 @@ class Lockstep:
         self._allocate()
         self.planners = planners_for(self.specs)
         self.replay = torch.tensor(np.stack([d.replay for d in draws]), device=device)
-        self.learner = self._learner()
+        self.learner = batch_learner(self)
         self._rows = vmap(jacrev(self.model))
         self.own_plan = plan_for(self)
 
@@ -93,18 +91,6 @@ class Lockstep:
 
     def _unset(self, *shape: int) -> Tensor:
         return torch.full(shape, torch.nan, dtype=torch.float64, device=self.device)
-
-    def _learner(self) -> BatchLearner | KalmanLearner:
-        system, model, learner = self.system, self.cell.model, self.cell.learner
-        if isinstance(model, GaussianProcess):
-            return Posterior(system, model, self.theta, self.points)
-        if isinstance(learner, Updated):
-            return OwnLearner(learner, self)
-        if isinstance(learner, ExtendedKalman):
-            assert self.held is not None
-            return KalmanLearner(learner, self.model, self.theta, self.held.regularization)
-        ridge = float(getattr(self.cell.policy, "regularization", 1.0))
-        return learner_for(learner, self.model, self.theta, ridge, self.n_learned, self.replay)
 
     def _allocate(self) -> None:
         n, T = len(self.specs), self.system.horizon

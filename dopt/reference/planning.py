@@ -20,12 +20,11 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp, vmap
 
+from dopt.planning.ties import TIE_MARGIN
 from dopt.reference.dynamics import flow, input_matrix
 from dopt.reference.models import Accelerations
 from dopt.reference.sphere import maximize_on_spheres
 from dopt.systems.base import System
-
-TIE_MARGIN = 1e-9
 
 
 class QuadraticProblem(NamedTuple):

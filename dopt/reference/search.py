@@ -3,7 +3,7 @@
 ======  ==================================================  =============
 symbol  meaning                                             shape
 ======  ==================================================  =============
-J       rows along a path, times the root of the stride     (..., N, q)
+J       rows along a path                                   (..., N, q)
 V       J M⁻¹                                               (..., N, q)
 S       J M⁻¹ Jᵀ                                            (..., N, N)
 ======  ==================================================  =============
@@ -19,8 +19,8 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from dopt.planning.task_states import task_states
+from dopt.planning.ties import TIE_MARGIN
 from dopt.policies import EOptimal, Lookahead, Search, TaskOptimal
-from dopt.policies.search import TIE_MARGIN
 from dopt.reference.dynamics import flow
 from dopt.reference.models import Accelerations
 from dopt.systems.base import System
@@ -45,7 +45,10 @@ def searched_inputs(
     states = vmap(lambda p, z: paths(policy, system, model, p, z, inputs))(theta, x)
     stride = policy.stride_of(system) if isinstance(policy, Lookahead) else 1
     seen = states[:, :, stride - 1 :: stride]
-    rows = vmap(vmap(vmap(jacrev(model), (None, 0)), (None, 0)))(theta, seen) * stride**0.5
+    rows = vmap(vmap(vmap(jacrev(model), (None, 0)), (None, 0)))(theta, seen)
+    rows = rows[..., : information.shape[1]]
+    if policy.score == "joint":
+        rows = rows * stride**0.5
     score = score_function(policy, system, model)
     values = vmap(vmap(score, (0, None, None)))(rows, theta, torch.linalg.inv_ex(information)[0])
     inside = (states.abs() <= system.state_limit).flatten(2).all(dim=2)
@@ -97,7 +100,7 @@ def score_function(policy: Search, system: System, model: Accelerations) -> Scor
 
     def eigenvalue(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
         assert isinstance(policy, EOptimal)
-        starts = torch.tensor(policy.starts(len(theta), system.n_learned)).to(theta)
+        starts = torch.tensor(policy.starts(len(inverse), system.n_learned)).to(theta)
         Q = krylov_basis(inverse, starts, policy.subspace)
         values: Tensor = torch.linalg.eigvalsh(Q @ (inverse - decrease(rows, inverse)) @ Q.mT)
         return -values[-1]
@@ -105,7 +108,7 @@ def score_function(policy: Search, system: System, model: Accelerations) -> Scor
     def task(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
         assert isinstance(policy, TaskOptimal)
         states = torch.tensor(task_states(system, policy)).to(theta)
-        G = vmap(jacrev(model), (None, 0))(theta, states).flatten(0, 1)
+        G = vmap(jacrev(model), (None, 0))(theta, states).flatten(0, 1)[:, : len(inverse)]
         total: Tensor = ((G @ decrease(rows, inverse)) * G).sum()
         return total
 

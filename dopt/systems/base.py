@@ -32,7 +32,7 @@ import numpy.typing as npt
 from dopt.errors import SpecificationError
 from dopt.fields import Checked, quantity
 from dopt.systems.features import Feature, feature_values
-from dopt.systems.points import sobol_midpoints
+from dopt.systems.points import check_number, sobol_midpoints
 
 Array = npt.NDArray[np.float64]
 
@@ -76,6 +76,8 @@ class System(Checked):
         self._check_size("initial_state", self.n_states)
         self._check_size("grid_half_widths", axes)
         self._check_size("grid_points", 1 if self.low_discrepancy else axes)
+        if self.low_discrepancy:
+            check_number(self.grid_points[0])
 
     def _check_size(self, field: str, size: int) -> None:
         given = getattr(self, field)

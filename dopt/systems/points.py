@@ -8,6 +8,21 @@ import numpy.typing as npt
 from dopt.errors import SpecificationError
 
 
+def check_number(n: int) -> None:
+    """Refuse a number of points of a low-discrepancy set.
+
+    Raises
+    ------
+    SpecificationError
+        If n is not a power of two: other numbers of points are spread less evenly.
+    """
+    if n & (n - 1):
+        raise SpecificationError(
+            f"env.grid_points is [{n}], but a power of two is expected for a low-discrepancy set: "
+            f"set it to {2 ** (n.bit_length() - 1)} or {2 ** n.bit_length()}."
+        )
+
+
 def sobol_midpoints(dimensions: int, n: int) -> npt.NDArray[np.float64]:
     """Return the first n points of a Sobol sequence in the unit cube, (n, dimensions).
 
@@ -19,14 +34,10 @@ def sobol_midpoints(dimensions: int, n: int) -> npt.NDArray[np.float64]:
     Raises
     ------
     SpecificationError
-        If n is not a power of two: other numbers of points are spread less evenly.
+        If :func:`check_number` refuses n.
     """
     from scipy.stats import qmc  # its import takes longer than a short trial
 
-    if n & (n - 1):
-        raise SpecificationError(
-            f"env.grid_points is [{n}], but a power of two is expected for a low-discrepancy set: "
-            f"set it to {2 ** (n.bit_length() - 1)} or {2 ** n.bit_length()}."
-        )
+    check_number(n)
     points: npt.NDArray[np.float64] = qmc.Sobol(dimensions, scramble=False).random(n)
     return points + 0.5 / n

@@ -122,6 +122,23 @@ def test_a_negative_mass_is_a_sentence() -> None:
 
 
 @pytest.mark.parametrize(
+    ("section", "name", "field", "value", "words"),
+    [
+        ("learner", "ekf", "forgetting", 1.5, "above 0 and at most 1"),
+        ("learner", "adam", "beta_1", 1.0, "at least 0 and below 1"),
+        ("env", "pendulum", "noise", -1.0, "finite and at least 0"),
+        ("env", "pendulum", "horizon", 0, "from 1 to 2147483647"),
+        ("env", "pendulum", "horizon", 2**31, "from 1 to 2147483647"),
+    ],
+)
+def test_a_bound_is_said_in_words(
+    section: str, name: str, field: str, value: float, words: str
+) -> None:
+    with pytest.raises(SpecificationError, match=f", but it has to be {words}: set it so"):
+        build(section, REGISTRIES[section], {"name": name, field: value})
+
+
+@pytest.mark.parametrize(
     ("section", "given_name", "nearest"),
     [
         ("env", "pendulun", "pendulum"),

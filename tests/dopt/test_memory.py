@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
 import pytest
 
+from dopt.control.episode import run_episode
+from dopt.control.free_run import free_run_error
+from dopt.control.prediction import forecast_by
 from dopt.errors import SpecificationError
 from dopt.kernel import setup
 from dopt.randomness import draw
@@ -84,6 +88,56 @@ def test_what_the_reference_cannot_hold_is_refused_by_name(
 ) -> None:
     with pytest.raises(SpecificationError, match=rf"GiB .* because of {setting}, .* smaller\.$"):
         trial("cartpole", policy, **changes)
+
+
+TASK = {"name": "control", "checkpoints": []}
+
+
+def with_task(env: str, **fields: Any) -> TrialSpec:
+    mapping = trial(env, "random").to_mapping()
+    return TrialSpec.from_mapping(mapping | {"task": TASK | fields})
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "quadrotor"])
+@pytest.mark.parametrize(
+    ("sizes", "setting"),
+    [
+        ({"samples": 5_000}, "task.samples"),
+        ({"samples": 500, "lookahead": 600}, "task.lookahead"),
+        ({"samples": 100, "hold": 200}, "task.hold"),
+    ],
+)
+def test_the_planner_of_a_task_is_reckoned(env: str, sizes: dict[str, Any], setting: str) -> None:
+    spec = with_task(env, steps=1, settle_steps=1, iterations=1, **sizes)
+    assert spec.cell.largest_setting == setting
+    assert spec.task is not None
+    system, task, rng = spec.system, spec.task, np.random.default_rng(0)
+    truth = forecast_by(system, system.learned)
+    tracemalloc.start()
+    run_episode(system, task, truth, truth, np.zeros((1, system.n_states)), rng)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak <= spec.cell.memory <= 2 * peak
+
+
+@pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
+def test_the_free_run_of_a_task_is_reckoned(env: str) -> None:
+    spec = with_task(env, free_run_steps=500)
+    assert spec.cell.largest_setting == "task.free_run_steps"
+    truth = forecast_by(spec.system, spec.system.learned)
+    tracemalloc.start()
+    free_run_error(spec.system, truth, 500)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak <= spec.cell.memory <= 2 * peak
+
+
+@pytest.mark.parametrize("field", ["samples", "lookahead", "hold", "free_run_steps"])
+def test_a_task_that_no_machine_can_hold_is_refused_by_name(field: str) -> None:
+    with pytest.raises(
+        SpecificationError, match=rf"GiB .* because of task\.{field}, .* smaller\.$"
+    ):
+        with_task("quadrotor", **{field: 2**31 - 1})
 
 
 def test_a_horizon_has_a_bound() -> None:

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
+from dopt.control.task import GOAL_FIELDS
 from dopt.errors import SpecificationError
 from dopt.exploration import run_trial
 from dopt.policies.base import ClosedLoop
@@ -38,7 +40,8 @@ class Thief(ClosedLoop):
 def on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(EXAMPLE))
     yield
-    sys.modules.pop("vehicle", None)
+    for name in ("vehicle", "gauss_newton"):
+        sys.modules.pop(name, None)
 
 
 def specification(
@@ -138,3 +141,34 @@ def test_a_name_that_is_not_the_classs_is_refused() -> None:
 def test_unknown_fields_are_named() -> None:
     with pytest.raises(SpecificationError, match=r"env\.boat field"):
         specification({"_target_": "vehicle.Boat", "mas": 3.0})
+
+
+def option(group: str, name: str) -> dict[str, object]:
+    """Return what an option of the tutorial sets."""
+    content = OmegaConf.to_container(OmegaConf.load(EXAMPLE / f"conf/{group}/{name}.yaml"))
+    assert isinstance(content, dict)
+    return {str(key): value for key, value in content.items()}
+
+
+def test_a_learner_of_ones_own_learns() -> None:
+    mapping = specification(policy={"name": "random"}).to_mapping()
+    del mapping["path"]
+    env = {**option("env", "boat"), "horizon": 100}
+    learner = option("learner", "gauss_newton")
+    spec = TrialSpec.from_mapping({**mapping, "env": env, "learner": learner})
+    assert spec.columns()["learner"] == "gauss_newton"
+    loss = run_trial(spec).loss
+    assert loss[-1] < 0.7 * loss[0]
+    np.testing.assert_array_equal(run_trial(spec).loss, loss)
+
+
+def test_a_control_task_for_a_system_of_ones_own_can_be_solved() -> None:
+    """Its nine keys are those that a system without a task of its own has to be given."""
+    mapping = specification(option("env", "boat"), {"name": "random"}).to_mapping()
+    task = option("task", "harbour")
+    spec = TrialSpec.from_mapping({**mapping, "task": task})
+    assert set(GOAL_FIELDS) < set(task)
+    rows = {(row.t, row.measure): row.value for row in run_trial(spec).assessments}
+    assert rows[0, "true_model_success"] == 1
+    assert rows[200, "free_run_error"] < 0.5 * rows[0, "free_run_error"]
+    assert rows[200, "coverage"] > rows[50, "coverage"] > 0

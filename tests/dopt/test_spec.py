@@ -32,6 +32,8 @@ def other(value: Any, field: dataclasses.Field[Any], spec: TrialSpec) -> Any:
         return next(choice for choice in field.metadata["choices"] if choice != value)
     if value == ():
         return spec.system.initial_state
+    if field.name == "grid_points":
+        return [2 * value[0], *value[1:]]  # some have to be powers of two
     if isinstance(value, tuple):
         return [other(value[0], field, spec), *value[1:]]
     return 0.5 * value if 0 < value < 1 else value + 1
@@ -190,6 +192,34 @@ def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
         TrialSpec.from_mapping(mapping)
     assert isinstance(caught.value, SpecificationError)
     assert str(caught.value).endswith((": change one of them.", ": choose another policy."))
+
+
+@pytest.mark.parametrize(
+    ("model", "learner", "sentence"),
+    [
+        (
+            "rff",
+            "ekf",
+            "learner 'ekf' goes with model 'mlp' or 'linear' and model 'rff' with learner "
+            "'recursive_least_squares', but the two together were given",
+        ),
+        (
+            "mlp",
+            "recursive_least_squares",
+            "learner 'recursive_least_squares' goes with model 'linear', 'linear_state' or 'rff' "
+            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay' or 'ekf', but",
+        ),
+    ],
+)
+def test_which_learners_a_model_takes_and_which_models_a_learner_is_said(
+    model: str, learner: str, sentence: str
+) -> None:
+    mapping = trial("arm", "random").to_mapping()
+    del mapping["path"]
+    mapping |= {"model": {"name": model}, "learner": {"name": learner}}
+    with pytest.raises(IncompatibleError) as caught:
+        TrialSpec.from_mapping(mapping)
+    assert str(caught.value).startswith(sentence)
 
 
 def test_the_linear_model_also_goes_with_d_optimal_inputs() -> None:

@@ -8,9 +8,9 @@ import pytest
 
 from dopt.control import Control
 from dopt.control.episode import costs, run_episode, succeeds
-from dopt.control.prediction import predict
+from dopt.control.prediction import Forecast
 from dopt.control.task import GOALS
-from dopt.evaluation import simulate
+from dopt.forecasts import true_forecast
 from dopt.systems import SYSTEMS, Pendulum, Quadrotor
 from dopt.systems.base import System
 
@@ -22,6 +22,11 @@ def system_of(name: str) -> System:
     return SYSTEMS[name](**EXPLORED.get(name, {}))  # type: ignore[arg-type]
 
 
+def by_the_truth(system: System) -> tuple[Forecast, Forecast]:
+    """Return the plant and the forecast of a planner that knows it."""
+    return true_forecast(system), true_forecast(system)
+
+
 def quiet(task: Control, system: System) -> np.ndarray:
     return np.zeros((task.on(system).steps, system.n_states))
 
@@ -31,7 +36,7 @@ def test_the_true_model_succeeds(name: str) -> None:
     system, task = system_of(name), Control()
     noise = np.random.default_rng(1).standard_normal((task.on(system).steps, system.n_states))
     noise *= system.noise * math.sqrt(system.dt)
-    episode = run_episode(system, task, system.learned, noise, np.random.default_rng(2))
+    episode = run_episode(system, task, *by_the_truth(system), noise, np.random.default_rng(2))
     assert episode.success
     assert np.all(np.linalg.norm(episode.inputs, axis=1) <= system.gamma * (1 + 1e-12))
 
@@ -39,27 +44,17 @@ def test_the_true_model_succeeds(name: str) -> None:
 def test_without_a_plan_worth_the_name_the_pendulum_hangs() -> None:
     pendulum, task = Pendulum(), Control(samples=1, elites=1, iterations=1)
     episode = run_episode(
-        pendulum, task, pendulum.learned, quiet(task, pendulum), np.random.default_rng(0)
+        pendulum, task, *by_the_truth(pendulum), quiet(task, pendulum), np.random.default_rng(0)
     )
     assert not episode.success
     assert np.all(episode.inputs == 0.0)
     assert episode.cost == pytest.approx(4.0 * task.on(pendulum).steps, rel=1e-3)
 
 
-@pytest.mark.parametrize("name", sorted(set(SYSTEMS) - {"drifting_pendulum"}))  # has no one truth
-def test_predictions_are_the_simulation_of_the_evaluation(name: str) -> None:
-    system = system_of(name)
-    inputs = np.random.default_rng(0).standard_normal((5, 12, system.n_inputs))
-    starts = np.tile(system.initial_state, (5, 1))
-    expected = simulate(system, inputs.swapaxes(0, 1))
-    found = predict(system, system.learned, starts, inputs)
-    np.testing.assert_allclose(found, expected[1:], rtol=1e-13, atol=1e-15)
-
-
 def test_the_plant_is_the_true_system_with_its_noise() -> None:
     pendulum, task = Pendulum(), Control(steps=20, settle_steps=1)
     noise = np.random.default_rng(3).standard_normal((20, 2))
-    episode = run_episode(pendulum, task, pendulum.learned, noise, np.random.default_rng(0))
+    episode = run_episode(pendulum, task, *by_the_truth(pendulum), noise, np.random.default_rng(0))
     for t in range(20):
         x, u = episode.states[t], episode.inputs[t]
         expected = x + pendulum.dt * pendulum.derivative(x, u) + noise[t]
@@ -92,6 +87,6 @@ def test_success_is_what_the_last_states_say() -> None:
 def test_a_plant_beyond_its_limit_fails_at_infinite_cost() -> None:
     quadrotor, task = Quadrotor(state_limit=1.0), Control(steps=60, settle_steps=1)
     episode = run_episode(
-        quadrotor, task, quadrotor.learned, quiet(task, quadrotor), np.random.default_rng(0)
+        quadrotor, task, *by_the_truth(quadrotor), quiet(task, quadrotor), np.random.default_rng(0)
     )
     assert (episode.cost, episode.success) == (math.inf, False)

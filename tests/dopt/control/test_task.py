@@ -80,6 +80,11 @@ def test_a_system_of_ones_own_is_told_what_to_give() -> None:
     assert own.on(Swing()) == Control().on(Pendulum())
 
 
+def test_a_system_that_changes_has_no_one_truth_to_be_judged_by() -> None:
+    with pytest.raises(IncompatibleError, match=r"'drifting_pendulum' changes .* task=none"):
+        with_task(trial("drifting_pendulum", "random"), TASK)
+
+
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [

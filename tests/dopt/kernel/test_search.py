@@ -176,25 +176,27 @@ class TestBudget:
         assert np.median(limited.plan_us[1:]) < 1_000.0 + 20 * plan
         assert np.median(limited.plan_us[1:]) < np.median(unlimited.plan_us[1:])
 
-    def test_without_time_the_first_plan_is_taken(self) -> None:
+    def test_without_time_the_input_nearest_to_a_random_direction_is_taken(self) -> None:
         spec = self.spec(1e-9)
         assert isinstance(spec.policy, Search)
-        first = spec.policy.candidates(spec.system)[0]
-        assert np.array_equal(run_trial(spec).inputs[1:], np.tile(first, (29, 1)))
+        candidates = spec.policy.candidates(spec.system)
+        nearest = np.argmax(draw(spec).ties @ candidates.T, axis=1)
+        assert np.array_equal(run_trial(spec).inputs[1:], candidates[nearest][1:])
 
     def test_with_time_enough_all_plans_are_scored(self) -> None:
         assert np.array_equal(run_trial(self.spec(1e9)).inputs, run_trial(self.spec(0.0)).inputs)
 
     def test_what_is_taken_is_no_worse_than_the_first_plan(self) -> None:
         spec = self.spec(500.0)
-        fast = before_planning(spec, 12)
+        fast, ties = before_planning(spec, 12), draw(spec).ties
         for t in range(12, 20):
             pairs, values = self.scores(fast)
             fast.advance(t + 1)
             candidates = spec.policy.candidates(spec.system)  # type: ignore[attr-defined]  # a Search
             taken = int(np.flatnonzero((candidates == fast.record.inputs[t]).all(axis=1))[0])
             best = max(v for (c, _), v in zip(pairs, values, strict=True) if c == taken)
-            assert best >= values[pairs.index((0, 0))] * (1 - 1e-9)
+            first = int(np.argmax(candidates @ ties[t]))
+            assert best >= values[pairs.index((first, first))] * (1 - 1e-9)
 
     def scores(self, fast: KernelTrial) -> tuple[list[tuple[int, int]], list[float]]:
         """Return all plans of the next step and their scores by the reference."""

@@ -139,6 +139,6 @@ def test_the_seed_gives_the_phase(policy: str) -> None:
 def test_every_policy_is_either_open_loop_or_starts_at_random_on_the_sphere() -> None:
     for env, policy in ALL_PAIRS:
         if not issubclass(POLICIES[policy], OpenLoop):
-            spec = trial(env, policy, 4, env={"horizon": 2})
+            spec = trial(env, policy, 4, env={"horizon": 6})
             first = run_trial(spec).inputs[0]
             assert np.array_equal(first, draw(spec).inputs[0])

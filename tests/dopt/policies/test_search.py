@@ -3,55 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from torch.func import jacrev, vmap
 
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.evaluation import evaluation_set, reachable_states
 from dopt.exploration import run_trial
 from dopt.planning.task_states import goal_weights, task_states
 from dopt.policies import Exact, Lookahead, TaskOptimal
 from dopt.policies.lookahead import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
-from dopt.policies.search import sphere_directions
+from dopt.randomness import draw
+from dopt.reference import search
+from dopt.reference.models import model_function
 from dopt.spec import Cell
 from dopt.systems import SYSTEMS
 from dopt.systems.equilibrium import eigenmode
 from tests.dopt.trials import trial
-
-
-@pytest.mark.parametrize("m", [1, 2, 3, 4, 7])
-@pytest.mark.parametrize("count", [1, 2, 8, 33])
-def test_directions_are_unit_vectors_and_always_the_same(m: int, count: int) -> None:
-    found = sphere_directions(m, count)
-    assert found.shape == (2 if m == 1 else count, m)
-    assert np.linalg.norm(found, axis=1) == pytest.approx(1.0, rel=1e-12)
-    assert np.array_equal(found, sphere_directions.__wrapped__(m, count))
-
-
-def test_two_inputs_have_directions_at_equal_angles() -> None:
-    found = sphere_directions(2, 16)
-    cos, sin = np.cos(np.pi / 8), np.sin(np.pi / 8)
-    turned = found @ np.array([[cos, sin], [-sin, cos]])
-    assert turned == pytest.approx(np.roll(found, -1, axis=0), abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("m", "count", "best"),
-    [
-        (3, 4, np.arccos(-1 / 3)),
-        (3, 6, np.pi / 2),
-        (3, 12, np.arccos(1 / 5**0.5)),
-        (4, 8, np.pi / 2),
-    ],
-)
-def test_more_inputs_have_directions_nearly_as_far_apart_as_can_be(
-    m: int, count: int, best: float
-) -> None:
-    """Tetrahedron, octahedron, icosahedron and 16-cell are the optimal codes of their size."""
-    found = sphere_directions(m, count)
-    angles = np.arccos(np.clip(found @ found.T - 2 * np.eye(count), -1, 1))
-    assert angles.min() > 0.9 * best
 
 
 @pytest.mark.parametrize("env", SYSTEMS)
@@ -93,21 +65,42 @@ def test_the_states_of_a_task_are_those_that_its_goal_weighs() -> None:
 
 def test_a_task_without_a_goal_draws_from_the_set_that_it_names() -> None:
     system = SYSTEMS["pendulum"]()
-    grid = {tuple(state) for state in system.grid()}
-    assert all(tuple(state) in grid for state in task_states(system, TaskOptimal()))
-    reachable = task_states(system, TaskOptimal(states="reachable"))
-    assert not any(tuple(state) in grid for state in reachable)
-    assert len(task_states(system, TaskOptimal(count=10**6))) == len(grid)
+    reachable = {tuple(state) for state in reachable_states(system)}
+    box = task_states(system, TaskOptimal(count=10**6))
+    assert not any(tuple(state) in reachable for state in box)
+    half_widths = np.array(system.grid_half_widths)
+    assert np.all(np.abs(box) <= half_widths)
+    assert np.all(np.abs(box).max(axis=0) > 0.99 * half_widths)
+    named = task_states(system, TaskOptimal(states="reachable"))
+    assert all(tuple(state) in reachable for state in named)
+
+
+def test_a_task_is_not_told_where_the_model_is_judged() -> None:
+    system = SYSTEMS["pendulum"]()
+    judged = {tuple(state) for state in evaluation_set(system).states}
+    assert not any(tuple(state) in judged for state in task_states(system, TaskOptimal()))
+
+
+def test_of_a_tiny_task_the_nearest_state_is_left() -> None:
+    tiny = TaskOptimal(goal=(1.0, 0.0), radius=1e-300)
+    system = SYSTEMS["pendulum"]()
+    nearest = task_states(system, TaskOptimal(goal=(1.0, 0.0), radius=1e-3, count=1))
+    np.testing.assert_allclose(task_states(system, tiny), nearest, atol=0.2)
+    assert len(task_states(system, tiny)) == 1
 
 
 @pytest.mark.parametrize(
     ("policy", "fields", "message"),
     [
-        ("exact", {"directions": 0}, r"policy\.directions is 0 directions, .* above 0: set it so"),
-        ("exact", {"budget_us": -1.0}, r"policy\.budget_us is -1\.0 µs, .* 0 or above"),
+        (
+            "exact",
+            {"directions": 0},
+            r"policy\.directions is 0 .* from 1 to 2147483647: set it so",
+        ),
+        ("exact", {"budget_us": -1.0}, r"policy\.budget_us is -1\.0 µs, .* at least 0"),
         ("exact", {"form": "dual"}, r"form"),
         ("lookahead", {"criterion": "jont"}, r"policy\.criterion .* did you mean 'joint'"),
-        ("lookahead", {"horizon": 0}, r"policy\.horizon is 0 steps, .* above 0"),
+        ("lookahead", {"horizon": 0}, r"policy\.horizon is 0 steps, .* from 1 to 2147483647: set"),
         ("task", {"states": "gird"}, r"policy\.states .* did you mean 'grid'"),
     ],
 )
@@ -123,6 +116,12 @@ def test_a_wrong_field_is_answered_by_one_sentence(
     [
         ("task", {"goal": (1.0,)}, r"policy\.goal has 1 entries, .* has 2: give one for each"),
         ("lookahead", {"horizon": 4, "stride": 5}, r"policy\.stride is 5 steps, .* have 4: make"),
+        (
+            "lookahead",
+            {"horizon": 31},
+            r"policy\.horizon is 31 steps, but a trial .* has 30: lower",
+        ),
+        ("max", {"lookahead": 31}, r"policy\.lookahead is 31 steps, but a trial .* has 30: lower"),
     ],
 )
 def test_a_field_that_does_not_fit_the_system_is_answered_by_one_sentence(
@@ -146,3 +145,37 @@ def test_plans_along_a_model_in_the_physical_parametrisation() -> None:
     result = run_trial(dataclasses.replace(oracle, cell=cell))
     assert np.isfinite(result.loss).all()
     assert result.loss[-1] < 0.05 * result.loss[0]
+
+
+@pytest.mark.parametrize("policy", ["exact", "trace", "a_optimal", "e_optimal", "task"])
+def test_random_features_are_searched_by_their_weights_alone(policy: str) -> None:
+    sections = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+    result = run_trial(trial("pendulum", policy, **sections))
+    assert np.isfinite(result.loss).all()
+    assert np.abs(result.inputs) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("criterion", "weight"), [("sum", 1.0), ("joint", 3.0)])
+def test_a_state_counts_stride_times_in_the_joint_determinant_alone(
+    criterion: str, weight: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = trial("pendulum", "lookahead", policy={"criterion": criterion, "stride": 3})
+    assert isinstance(spec.policy, Lookahead)
+    model = model_function(spec.system, spec.model)
+    theta = torch.tensor(draw(spec).weights)[None]
+    x = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
+    seen: list[torch.Tensor] = []
+
+    def scored(*_: object) -> Callable[..., torch.Tensor]:
+        return lambda rows, *_: seen.append(rows) or (rows**2).sum()  # type: ignore[func-returns-value]
+
+    monkeypatch.setattr(search, "score_function", scored)
+    information = torch.eye(theta.shape[1], dtype=torch.float64)[None]
+    ties = torch.ones(1, 1, dtype=torch.float64)
+    values: list[torch.Tensor] = []
+    monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
+    search.searched_inputs(spec.policy, spec.system, model, theta, information, x, ties)
+    inputs = torch.tensor(spec.policy.candidates(spec.system))[[0, 0]][None]
+    path = search.paths(spec.policy, spec.system, model, theta[0], x[0], inputs)[0, 2::3]
+    rows = vmap(jacrev(model), (None, 0))(theta[0], path)
+    assert float(values[0][0, 0]) == pytest.approx(weight * float((rows**2).sum()))

@@ -74,4 +74,4 @@ def test_the_number_of_points_of_a_low_discrepancy_set_is_a_power_of_two() -> No
     with pytest.raises(
         SpecificationError, match=r"grid_points is \[1000\], .* set it to 512 or 1024"
     ):
-        Chain(grid_points=(1000,)).grid()
+        Chain(grid_points=(1000,))

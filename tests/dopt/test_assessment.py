@@ -8,8 +8,8 @@ import itertools
 import numpy as np
 import pytest
 
-from dopt.control import assessment
-from dopt.control.assessment import MEASURES, assess
+from dopt import assessment
+from dopt.assessment import MEASURES, assess
 from dopt.exploration import run_trial
 from dopt.kernel import run
 from dopt.replay import replay
@@ -96,6 +96,23 @@ def test_policies_of_one_seed_share_what_is_not_theirs(done: TrialResult) -> Non
     assert [row for row in other if row.t == 0] == shared
     assert [row for row in other if row.t] != [row for row in done.assessments if row.t]
     assert run_trial(short("pendulum", "random", 2)).assessments[1] != other[1]
+
+
+def test_what_policies_share_is_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = run_trial(short("pendulum", "random", 7))
+    episodes = []
+    whole = assessment.run_episode
+
+    def counted(*arguments: object) -> object:
+        episodes.append(arguments)
+        return whole(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(assessment, "run_episode", counted)
+    second = run_trial(short("pendulum", "d_optimal", 7))
+    assert len(episodes) == 2  # of those after 0, 10 and 30 steps and with the true model
+    assert [row for row in second.assessments if row.t == 0] == [
+        row for row in first.assessments if row.t == 0
+    ]
 
 
 def test_with_the_true_model_learned_both_costs_are_one() -> None:

@@ -1,0 +1,111 @@
+"""What a trial is worth at some of its steps: the rows of its assessment."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.control.episode import run_episode
+from dopt.control.free_run import free_run_error
+from dopt.control.prediction import Forecast
+from dopt.control.task import Control
+from dopt.coverage import Plane
+from dopt.forecasts import model_forecast, true_forecast
+from dopt.models.base import Model
+from dopt.randomness import stream
+from dopt.result import Assessment, TrialResult
+from dopt.spec import TrialSpec
+from dopt.systems.base import System
+
+Array = npt.NDArray[np.float64]
+
+KEPT_OUTCOMES = 4096
+"""Outcomes that trials of one seed share and that are kept: the true and the untrained model's."""
+
+MEASURES = {
+    "control_success": "1 if the episode that the learned model plans succeeds, otherwise 0",
+    "control_cost": "its cost",
+    "true_model_success": "the same with the true model under the same planner, at t = 0",
+    "true_model_cost": "its cost, at t = 0",
+    "free_run_error": "relative root mean square error of predictions over n steps",
+    "coverage": "share of the phase plane's box that the states up to t have visited",
+}
+"""Every measure with its meaning; t is the number of steps explored, 0 the untrained model."""
+
+
+def assess(
+    spec: TrialSpec, task: Control, parameters: Mapping[int, Array], states: Array
+) -> tuple[Assessment, ...]:
+    """Return the measures of a trial.
+
+    Parameters
+    ----------
+    parameters
+        Parameters (q,) of the model after each number of steps that is to be assessed.
+    states : (T + 1, d)
+        States of the trial.
+    """
+    rows: list[Assessment] = []
+    if parameters:
+        rows += _measured(0, "true_model", _with_the_truth(spec.system, task, spec.seed))
+    plane = Plane.of(spec.system)
+    for t, theta in sorted(parameters.items()):
+        forecast = model_forecast(spec.system, spec.model, theta)
+        if t == 0:
+            outcome = _untrained(spec.system, spec.model, task, spec.seed, theta.tobytes())
+        else:
+            outcome = _controlled(spec.system, task, spec.seed, forecast)
+        rows += _measured(t, "control", outcome)
+        error = free_run_error(spec.system, forecast, task.free_run_steps)
+        rows.append(Assessment(t, "free_run_error", error))
+        rows.append(Assessment(t, "coverage", plane.coverage(states[: t + 1])))
+    return tuple(rows)
+
+
+class Outcome(NamedTuple):
+    """What a controller achieved in an episode."""
+
+    success: bool
+    cost: float
+
+
+def _controlled(system: System, task: Control, seed: int, forecast: Forecast) -> Outcome:
+    """Run an episode; all of a seed share the noise and the planner's draws."""
+    steps = task.on(system).steps
+    noise = stream(seed, "control_noise").standard_normal((steps, system.n_states))
+    noise *= np.sqrt(system.dt) * system.noise
+    plans = stream(seed, "control_plans")
+    episode = run_episode(system, task, true_forecast(system), forecast, noise, plans)
+    return Outcome(episode.success, episode.cost)
+
+
+@functools.lru_cache(maxsize=KEPT_OUTCOMES)
+def _with_the_truth(system: System, task: Control, seed: int) -> Outcome:
+    return _controlled(system, task, seed, true_forecast(system))
+
+
+@functools.lru_cache(maxsize=KEPT_OUTCOMES)
+def _untrained(
+    system: System, model: Model, task: Control, seed: int, parameters: bytes
+) -> Outcome:
+    forecast = model_forecast(system, model, np.frombuffer(parameters).copy())
+    return _controlled(system, task, seed, forecast)
+
+
+def _measured(t: int, name: str, outcome: Outcome) -> Iterator[Assessment]:
+    yield Assessment(t, f"{name}_success", float(outcome.success))
+    yield Assessment(t, f"{name}_cost", outcome.cost)
+
+
+def assessed(spec: TrialSpec, result: TrialResult) -> TrialResult:
+    """Return the result with its assessments, where the trial asks for them."""
+    task = spec.task
+    if task is None:
+        return result
+    rows = assess(spec, task, result.checkpoints, result.states)
+    return dataclasses.replace(result, assessments=rows)

@@ -1,0 +1,25 @@
+"""Forecasts of a system by the truth or a model, in compiled code where there is some for them."""
+
+from __future__ import annotations
+
+from dopt.control.prediction import Array, Forecast, forecast_by
+from dopt.models.base import Model
+from dopt.systems.base import System
+
+
+def true_forecast(system: System) -> Forecast:
+    """Return the forecast by the system itself as it is at the first step, without noise."""
+    if not system.compiled:
+        return forecast_by(system, system.learned)
+    from dopt.kernel import forecast
+
+    return forecast.true_forecast(system)
+
+
+def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
+    """Return the forecast by a model with parameters (q,) in place of the true accelerations."""
+    if not (system.compiled and model.compiled):
+        return forecast_by(system, lambda states: model.predict(system, parameters, states))
+    from dopt.kernel import forecast
+
+    return forecast.model_forecast(system, model, parameters)

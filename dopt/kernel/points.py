@@ -1,0 +1,89 @@
+"""The evaluation points of a system as the compiled loop wants them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dopt.evaluation import EvaluationSet, evaluation_set
+from dopt.kernel import arguments as args
+from dopt.kernel.evaluation import BLOCK
+from dopt.systems.base import System
+
+
+def evaluation_points(system: System, network: args.Network) -> args.Evaluation:
+    """Return the points of a system in the form that its model takes."""
+    points = evaluation_set(system)
+    if network.kind == args.LINEAR_MODEL:
+        return _linear_evaluation(system, points)
+    columns = [system.featurize(points.states).T, points.accelerations.T]
+    parts = [slice(0, points.n_grid), slice(points.n_grid, None)]
+    features, targets, sizes = zip(
+        *(_blocks(columns[0][:, part], columns[1][:, part]) for part in parts), strict=True
+    )
+    blocks = np.concatenate(features)
+    return args.Evaluation(
+        blocks.astype(np.float32),
+        blocks,
+        np.concatenate(targets),
+        np.concatenate(sizes),
+        np.zeros((0, 0, 0)),
+        np.zeros((0, 0)),
+        _followed(system, points),
+        len(sizes[0]),
+        len(sizes[0]) + len(sizes[1]),
+        _size(system, points),
+    )
+
+
+def _followed(system: System, points: EvaluationSet) -> args.Floats:
+    """Return the states at which the truth is evaluated anew at each step."""
+    return points.states if len(system.history) > 1 else points.states[:0]
+
+
+def own_targets(points: args.Evaluation) -> args.Evaluation:
+    """Return points whose targets a trial may write into, if the truth changes with time."""
+    if not len(points.states):
+        return points
+    return points._replace(block_targets=points.block_targets.copy(), targets=points.targets.copy())
+
+
+def _blocks(features: args.Floats, targets: args.Floats) -> tuple[Any, Any, Any]:
+    """Cut columns of points, (·, N), into padded blocks, (blocks, ·, BLOCK), and their sizes."""
+    n = features.shape[1]
+    starts = range(0, n, BLOCK)
+    sizes = np.array([min(BLOCK, n - start) for start in starts], dtype=np.int64)
+
+    def cut(columns: args.Floats) -> args.Floats:
+        padded = np.zeros((len(columns), BLOCK * len(starts)))
+        padded[:, :n] = columns
+        return np.ascontiguousarray(padded.reshape(len(columns), -1, BLOCK).swapaxes(0, 1))
+
+    return cut(features), cut(targets), sizes
+
+
+def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation:
+    offset, *units = (
+        np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.states.T), form)), axis=-1)
+        for form in system.linear_form
+    )
+    regressors = np.stack([unit - offset for unit in units], axis=-1)
+    return args.Evaluation(
+        np.zeros((0, 0, 0), dtype=np.float32),
+        np.zeros((0, 0, 0)),
+        np.zeros((0, 0, 0)),
+        np.zeros(0, dtype=np.int64),
+        np.ascontiguousarray(regressors),
+        np.ascontiguousarray(points.accelerations - offset),
+        _followed(system, points),
+        points.n_grid,
+        len(points.states),
+        _size(system, points),
+    )
+
+
+def _size(system: System, points: EvaluationSet) -> float:
+    """Return the root mean square norm of the targets, at the first or the last step."""
+    ends = (points.accelerations, system.learned(points.states, system.horizon - 1))
+    return max(float(np.sqrt(np.mean(np.sum(targets**2, axis=1)))) for targets in ends)
