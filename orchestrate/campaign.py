@@ -15,7 +15,7 @@ from dopt.spec import TrialSpec
 from orchestrate.chunks import Chunks
 from orchestrate.driver import Driver
 from orchestrate.errors import ExitCode, InfrastructureError
-from orchestrate.executors import make_executor
+from orchestrate.executors import check_executor, make_executor
 from orchestrate.executors.base import Run
 from orchestrate.grid import Grid
 from orchestrate.heartbeat import Heartbeat
@@ -71,9 +71,12 @@ def launch_grid(
 
     Raises
     ------
+    LaunchError
+        If nothing can run as the settings ask; then nothing is written.
     StoreError, InfrastructureError
         If the database or the workers fail; nothing that was committed is lost.
     """
+    check_executor(settings)
     with Store.open(settings.store_url, lease_seconds=settings.lease) as store:
         launch = store.begin_launch(record)
         try:

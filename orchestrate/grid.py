@@ -26,13 +26,14 @@ class Combination:
         Seeds of the cell, or None for the one in ``settings``.
     words
         The swept overrides that made it, as they would be typed.
-    unused
-        Keys that the command line sets and these choices lack.
+    used, unused
+        Keys that its grid sets: those that these choices have, and those that they lack.
     """
 
     settings: Mapping[str, Any]
     inner: Sequence[Any] | None = None
     words: tuple[str, ...] = ()
+    used: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
 
 
@@ -108,7 +109,7 @@ def _notes(combinations: Sequence[Combination]) -> Iterator[str]:
     """Yield for each key that some choices lack, which of them have it."""
     for key in dict.fromkeys(key for one in combinations for key in one.unused):
         group = key.split(".")[0]
-        having = (one.settings.get(group) for one in combinations if key not in one.unused)
+        having = (one.settings.get(group) for one in combinations if key in one.used)
         names = dict.fromkeys(name_of(part) for part in having if isinstance(part, Mapping))
         yield f"{key} applies to {group}={','.join(names)} only"
 

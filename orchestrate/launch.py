@@ -41,6 +41,7 @@ from orchestrate.capacity import check_memory  # noqa: E402
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError  # noqa: E402
 from orchestrate.grid import TRIAL_SECTIONS, Combination, Grid, build_grid  # noqa: E402
 from orchestrate.hydra_plugins.dopt_grid._alone import check_alone  # noqa: E402
+from orchestrate.hydra_plugins.dopt_grid._first import apply_known, waiting  # noqa: E402
 from orchestrate.hydra_plugins.dopt_grid._sentences import sentence_for  # noqa: E402
 from orchestrate.hydra_plugins.dopt_grid._unread import check_keys, check_launch  # noqa: E402
 from orchestrate.hydra_plugins.dopt_grid._words import OWN_SWEEPER, ordered  # noqa: E402
@@ -54,6 +55,9 @@ from orchestrate.usage import UsageError  # noqa: E402
 
 WORK = Work(run_trial, warm_up)
 LAUNCH_SECTIONS = ("launch", "store", "executor")
+
+Expand = Callable[[Sequence[str]], list[Combination]]
+"""Returns the combinations of the grid that overrides of the command line ask for."""
 
 
 @dataclass(frozen=True)
@@ -74,18 +78,19 @@ def read_command_line() -> Request | None:
     Exception
         Hydra's own errors, and those of the grid.
     """
-    requests: list[Callable[[], Request]] = []
+    requests: list[Callable[[tuple[str, ...]], Request]] = []
 
     @hydra.main(config_path=str(CONFIGURATION), config_name="config", version_base="1.3")
-    def capture(task: DictConfig | tuple[DictConfig, list[Combination]]) -> None:
+    def capture(task: DictConfig | tuple[DictConfig, Expand]) -> None:
         # Read it later: to an error in here Hydra would add a line of its own.
         if isinstance(task, tuple):
             requests.append(partial(_grid_request, *task))
         else:
             requests.append(partial(_single_request, task, cast(DictConfig, HydraConfig.get())))
 
-    capture()
-    return requests[0]() if requests else None
+    with waiting() as words:
+        capture()
+    return requests[0](words) if requests else None
 
 
 @contextmanager
@@ -102,25 +107,21 @@ def _errors_let_through() -> Iterator[None]:
             os.environ["HYDRA_FULL_ERROR"] = before
 
 
-def _grid_request(config: DictConfig, combinations: list[Combination]) -> Request:
-    launch = _plain(config, LAUNCH_SECTIONS)
-    return Request(combinations, launch, _words(config.hydra.overrides.task), single=False)
+def _grid_request(config: DictConfig, expand: Expand, words: tuple[str, ...]) -> Request:
+    combinations = expand(words)
+    apply_known(config, words)
+    return Request(combinations, _plain(config, LAUNCH_SECTIONS), words, single=False)
 
 
-def _single_request(config: DictConfig, hydra_config: DictConfig) -> Request:
+def _single_request(
+    config: DictConfig, hydra_config: DictConfig, words: tuple[str, ...]
+) -> Request:
     if hydra_config.mode == RunMode.MULTIRUN:
         raise UsageError(OWN_SWEEPER)
-    words = _words(hydra_config.overrides.task)
     check_alone(words, hydra_config, CONFIGURATION)
     check_keys(config)
     combination = Combination(_plain(config, TRIAL_SECTIONS))
     return Request([combination], _plain(config, LAUNCH_SECTIONS), words, single=True)
-
-
-def _words(overrides: object) -> tuple[str, ...]:
-    """Return the overrides as they were typed, references in them included."""
-    words = OmegaConf.to_container(overrides, resolve=False)
-    return tuple(map(str, words)) if isinstance(words, list) else ()
 
 
 def _plain(config: DictConfig, sections: Sequence[str]) -> dict[str, Any]:

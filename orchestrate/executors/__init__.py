@@ -8,8 +8,14 @@ from orchestrate.executors.base import Executor, Run
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.local import LocalExecutor
-from orchestrate.executors.lockstep import LockstepExecutor
+from orchestrate.executors.lockstep import LockstepExecutor, check_device
 from orchestrate.settings import LaunchSettings
+
+
+def check_executor(settings: LaunchSettings) -> None:
+    """Raise LaunchError for what can be seen to be missing before any trial is registered."""
+    if settings.executor == "lockstep":
+        check_device(settings.device)
 
 
 def make_executor(

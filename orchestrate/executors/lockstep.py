@@ -41,18 +41,8 @@ class LockstepExecutor(Executor):
         self._chunks: deque[list[Task]] = deque()
 
     def start(self) -> None:
+        check_device(self._device)
         self.slots = 1
-        import torch
-
-        kind, _, number = self._device.partition(":")
-        there = torch.cuda.device_count() if kind == "cuda" else 0
-        if self._device != "cpu" and not (
-            kind == "cuda" and (number or "0") in map(str, range(there))
-        ):
-            raise LaunchError(
-                f"executor.device is '{self._device}', but torch can run here on cpu and on "
-                f"{there} CUDA devices: set executor.device=cpu."
-            )
 
     def submit(self, chunk: Sequence[Task]) -> None:
         if chunk:
@@ -69,9 +59,22 @@ class LockstepExecutor(Executor):
         self._chunks.clear()
 
 
+def check_device(device: str) -> None:
+    """Raise LaunchError if torch cannot run on a device here."""
+    import torch
+
+    kind, _, number = device.partition(":")
+    there = torch.cuda.device_count() if kind == "cuda" else 0
+    if device != "cpu" and not (kind == "cuda" and (number or "0") in map(str, range(there))):
+        raise LaunchError(
+            f"executor.device is '{device}', but torch can run here on cpu and on "
+            f"{there} CUDA devices: set executor.device=cpu."
+        )
+
+
 def run_batch(tasks: Sequence[Task], device: str) -> list[Finished]:
     """Run tasks of one configuration in lockstep; an exception is every task's."""
-    from dopt.control.assessment import assessed
+    from dopt.assessment import assessed
     from dopt.reference.lockstep import run_trials
 
     started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()

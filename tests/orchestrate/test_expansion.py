@@ -176,6 +176,10 @@ MIXED: list[tuple[list[str], list[list[str]]]] = [
         ["model.order=[1,2]", "env=glob(*)", "model=mlp,linear"],
         [["model.order=[1,2]", "env=glob(*)", "model=linear"], ["env=glob(*)", "model=mlp"]],
     ),
+    (
+        ["model=linear,mlp", "model.order=2", "env.masses.1=7"],
+        [["model=linear", "model.order=2", "env.masses.1=7"], ["model=mlp", "env.masses.1=7"]],
+    ),
 ]
 
 
@@ -193,8 +197,31 @@ def test_a_key_that_some_choices_lack_holds_for_the_others(
     assert len({one.unused for one in combinations}) == 2
 
 
-@pytest.mark.parametrize("override", ["model.ordr=2,3", "nothere=1", "env.dtt=[1]"])
-def test_a_key_that_every_choice_lacks_is_the_error_of_hydra(sample: Sample, override: str) -> None:
-    same(sample, ["model=linear,mlp", override])
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("model.ordr=2,3", "setting of model 'ordr' is .* half, order, .*: did you mean 'order'"),
+        ("nothere=1", "setting 'nothere' is unknown, valid names are env, "),
+        ("env.dtt=[1]", "setting of env 'dtt' is .*: did you mean 'dt'"),
+        ("env.dtt.x=1", "setting of env 'dtt' is .*: did you mean 'dt'"),
+        ("env.dt.x=1", "setting of env.dt 'x' is unknown, there is none to set"),
+    ],
+)
+def test_a_key_that_every_choice_lacks_is_answered_with_the_names_of_all(
+    sample: Sample, override: str, sentence: str
+) -> None:
     with pytest.raises(HydraException):
+        by_hydra(sample, ["model=linear,mlp", override])
+    with pytest.raises(SpecificationError, match=sentence):
         expand(sample.loader, sample.master, ["model=linear,mlp", override])
+
+
+def test_a_key_has_to_be_known_to_one_of_several_grids(sample: Sample) -> None:
+    grids = [["model=linear", "model.order=3"], ["model=mlp", "model.order=3"]]
+    together = expand(sample.loader, sample.master, *grids, sections=SECTIONS)
+    assert [(one.used, one.unused) for one in together] == [
+        (("model.order",), ()),
+        ((), ("model.order",)),
+    ]
+    with pytest.raises(SpecificationError, match="did you mean 'order'"):
+        expand(sample.loader, sample.master, *grids, ["model=linear", "model.oder=3"])

@@ -48,14 +48,16 @@ def test_a_device_that_is_not_there_is_a_sentence(device: str) -> None:
         LockstepExecutor(device, batch=2).start()
 
 
-def test_a_launch_on_a_device_that_is_not_there_is_refused(
-    command_line: Callable[..., tuple[int, str, str]],
+@pytest.mark.parametrize("grid", [["-m"], []])
+def test_a_launch_on_a_device_that_is_not_there_is_refused_and_leaves_nothing(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path, grid: list[str]
 ) -> None:
     code, _, errors = command_line(
-        "env.horizon=5", "-m", "seed=0", "executor=lockstep", "executor.device=cuda:99"
+        "env.horizon=5", *grid, "seed=0", "executor=lockstep", "executor.device=cuda:99"
     )
     assert (code, errors.count("\n")) == (2, 1)
     assert errors.startswith("error: executor.device is 'cuda:99'")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_grid_runs_in_lockstep(

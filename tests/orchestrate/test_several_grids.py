@@ -37,6 +37,18 @@ def test_an_experiment_can_be_several_grids(
     assert "9 trials, 0 done, 9 to run" in output  # 2 × 3 and 2 × 3, of which 3 are the same
 
 
+def test_values_of_a_grid_are_those_of_yaml(command_line: Command, tmp_path: Path) -> None:
+    folder = tmp_path / "settings/experiment"
+    folder.mkdir(parents=True)
+    values = "{policy: beyond/task, policy.goal: [1, 0.5], policy.count: 3, seed: 7}"
+    words = f"# @package _global_\nhydra:\n  sweeper:\n    grids: [{values}]\n"
+    (folder / "typed.yaml").write_text(words)
+    given = ("-m", "--config-dir", str(folder.parent), "experiment=typed")
+    code, output, errors = command_line(*given, "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    assert "1 trial, 0 done, 1 to run" in output
+
+
 def test_a_word_of_the_command_line_holds_for_every_grid(
     command_line: Command, several: tuple[str, ...]
 ) -> None:
@@ -49,3 +61,22 @@ def test_several_grids_are_no_single_trial(command_line: Command, several: tuple
     code, _, errors = command_line(*several, "seed=5", "env=pendulum", "launch.dry_run=true")
     assert code == 2
     assert "experiment=several is a grid (policy=uniform): add -m" in errors
+
+
+def test_a_setting_holds_for_the_grids_that_have_it(
+    command_line: Command, several: tuple[str, ...]
+) -> None:
+    """And what is said of it does not count the grids that never asked for it."""
+    more = ("-m", *several, "policy.iterations=3", "launch.dry_run=true")
+    code, output, errors = command_line(*more)
+    assert (code, errors) == (0, "")
+    assert output.startswith("policy.iterations applies to policy=uniform only\n")
+    code, _, errors = command_line("-m", *several, "policy.iteratons=3", "launch.dry_run=true")
+    assert code == 2
+    assert "valid names are iterations: did you mean 'iterations'?" in errors
+
+
+def test_a_setting_of_one_grid_is_not_said_to_hold_for_the_others(command_line: Command) -> None:
+    code, output, _ = command_line("-m", "experiment=beyond", "launch.dry_run=true")
+    assert code == 0
+    assert output.startswith("learner.forgetting applies to learner=ekf only\n")

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 from hydra.core.config_loader import ConfigLoader
-from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override, OverrideType, QuotedString
 from hydra.errors import ConfigCompositionException
 
 from dopt.errors import unknown_name
+from orchestrate.hydra_plugins.dopt_grid._globs import every_option, matches
 
 NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
 """Groups and sections that hold for a whole launch."""
@@ -78,10 +78,17 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
     key = override.get_key_element()
     texts: tuple[str, ...]
     values: tuple[object, ...]
+    value: object = override.value()
     if not override.is_sweep_override():
-        texts, values = (override.get_value_element_as_str(),), (override.value(),)
+        texts, values = (override.get_value_element_as_str(),), (value,)
+    elif isinstance(value, Glob):
+        _check_key(override)
+        texts = values = matches(loader, override.key_or_group, value)
+        if not texts:
+            raise _no_match(loader, override, value)
     else:
-        _check_sweep(loader, override)
+        _check_key(override)
+        _check_count(override)
         texts = tuple(override.sweep_string_iterator())
         values = tuple(_unquoted(value) for value in override.sweep_iterator())
     options = loader.get_group_options(override.key_or_group, results_filter=None)
@@ -93,35 +100,34 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
     return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
 
 
-def _check_sweep(loader: ConfigLoader, override: Override) -> None:
-    key, line = override.key_or_group, override.input_line
-    if key.replace("/", ".").split(".")[0] in NOT_SWEPT:
+def _check_key(override: Override) -> None:
+    if override.key_or_group.replace("/", ".").split(".")[0] in NOT_SWEPT:
         raise ConfigCompositionException(
-            f"'{line}' sweeps a setting of the whole launch, only trials can be swept: give one "
-            "value."
+            f"'{override.input_line}' sweeps a setting of the whole launch, only trials can be "
+            "swept: give one value."
         )
+
+
+def _check_count(override: Override) -> None:
+    line = override.input_line
     if not override.is_discrete_sweep():
         raise ConfigCompositionException(
             f"'{line}' has no finite list of values: use a choice a,b or range(start,stop,step)."
         )
     count = sum(1 for _ in itertools.islice(override.sweep_iterator(), MOST_VALUES + 1))
     if count == 0:
-        raise _empty(loader, override)
+        raise ConfigCompositionException(
+            f"'{line}' has no values, at least one is expected: check its bounds."
+        )
     if count > MOST_VALUES:
         raise ConfigCompositionException(
             f"'{line}' has more than {MOST_VALUES:,} values: check its bounds, or sweep in parts."
         )
 
 
-def _empty(loader: ConfigLoader, override: Override) -> Exception:
+def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception:
     key = override.key_or_group
-    glob: object = override.value()
-    options = loader.get_group_options(key, results_filter=ObjectType.CONFIG)
-    if not isinstance(glob, Glob):
-        return ConfigCompositionException(
-            f"'{override.input_line}' has no values, at least one is expected: check its bounds."
-        )
-    if options:
+    if options := every_option(loader, key):
         return unknown_name(f"glob of {key}", ",".join(glob.include), options)
     names = sorted(name for name in loader.list_groups("") if name != "hydra")
     return ConfigCompositionException(

@@ -7,7 +7,7 @@ that has one.
 
 It has none where an override sets a key that some of the choices have and others lack, such as
 ``policy.regularization=1e-2`` with every policy. Here it holds for the choices that have the key,
-and is an error only if none has.
+and is an error only if none has, in any of the grids that are asked for at once.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from omegaconf import DictConfig
 from orchestrate.grid import TRIAL_SECTIONS, Combination
 from orchestrate.hydra_plugins.dopt_grid._axes import Axis, read_axes
 from orchestrate.hydra_plugins.dopt_grid._composer import Composer
+from orchestrate.hydra_plugins.dopt_grid._keys import Keys
 from orchestrate.hydra_plugins.dopt_grid._overlay import Overlay, has_key
 
 Check = Callable[[DictConfig], None]
@@ -30,47 +31,51 @@ Check = Callable[[DictConfig], None]
 def expand(
     loader: ConfigLoader,
     config: DictConfig,
-    arguments: Sequence[str],
-    *,
+    *grids: Sequence[str],
     sections: Sequence[str] = TRIAL_SECTIONS,
     inner: str = "seed",
     check: Check = lambda _: None,
 ) -> list[Combination]:
-    """Return the combinations of the grid that ``arguments`` span.
+    """Return the combinations of one or several grids.
 
     Parameters
     ----------
     loader, config
         Hydra's loader, and the configuration of the launch as Hydra composed it without sweeps.
-    arguments
-        Overrides; a later one replaces an earlier one of the same key.
+    grids
+        Overrides that span each grid; a later one replaces an earlier one of the same key.
     sections
         Top-level keys that the settings of a combination hold.
     inner
         Scalar whose values stay together in one combination, if nothing else depends on it.
     check
         Is given each configuration that is composed, and raises where it makes no sense.
+
+    Raises
+    ------
+    SpecificationError
+        If no choice of any grid has a key that is set.
     """
-    axes = read_axes(loader, arguments)
     expansion = _Expansion(Composer(loader, config), sections, inner, check)
-    fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
     result: list[Combination] = []
-    for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
-        result.extend(expansion.of(axes, _arguments(fixed, picks)))
-    expansion.check_every_key_was_used(axes)
+    for arguments in grids:
+        axes = read_axes(loader, arguments)
+        fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
+        for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
+            result.extend(expansion.of(axes, _arguments(fixed, picks)))
+    expansion.keys.check_all_used()
     return result
 
 
 @dataclasses.dataclass
 class _Expansion:
-    """What the combinations of all choices share, and which keys some choice had."""
+    """What the combinations of all choices share."""
 
     composer: Composer
     sections: Sequence[str]
     inner: str
     check: Check
-    used: set[str] = dataclasses.field(default_factory=set)
-    refused: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    keys: Keys = dataclasses.field(default_factory=Keys)
 
     def of(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> Iterator[Combination]:
         """Yield the combinations of one choice of everything but the swept scalars."""
@@ -78,7 +83,8 @@ class _Expansion:
         self.check(first)
         unused = tuple(axis.key for axis in lacking)
         kept = [axis for axis in axes if axis not in lacking]
-        self.used |= {axis.key for axis in kept}
+        used = tuple(axis.key for axis in kept if axis.replaces)
+        self.keys.note(first, used, unused)
         scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
         words = tuple(fixed[axis.key] for axis in kept if axis.swept and axis.key in fixed)
         overlay = Overlay(first, [axis.key for axis in scalars], self.sections)
@@ -86,7 +92,7 @@ class _Expansion:
             found = _overlaid(overlay, scalars, words, self.inner)
         else:
             found = self._one_by_one(kept, fixed, scalars)
-        yield from (dataclasses.replace(one, unused=unused) for one in found)
+        yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
 
     def _compose(
         self, axes: Sequence[Axis], fixed: Mapping[str, str]
@@ -97,7 +103,6 @@ class _Expansion:
         lacking = [] if composed is not None else self._lacking(axes, fixed)
         if lacking:
             kept = [axis for axis in axes if axis not in lacking]
-            self.refused |= {axis.key: words for axis in lacking}
             composed = self.composer.compose(_in_order(kept, fixed))
         return composed or self.composer.like_hydra(words), lacking
 
@@ -106,12 +111,6 @@ class _Expansion:
         others = [axis for axis in axes if axis not in replacing]
         bare = self.composer.attempt(_in_order(others, fixed))
         return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
-
-    def check_every_key_was_used(self, axes: Sequence[Axis]) -> None:
-        """Let Hydra complain of a key that no choice had."""
-        for axis in axes:
-            if axis.key in self.refused and axis.key not in self.used:
-                self.composer.like_hydra(self.refused[axis.key])
 
     def _one_by_one(
         self, axes: Sequence[Axis], fixed: Mapping[str, str], scalars: Sequence[Axis]

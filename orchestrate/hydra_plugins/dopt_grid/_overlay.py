@@ -103,8 +103,12 @@ def _node(config: DictConfig, key: str) -> Any:
 
 
 def has_key(config: DictConfig, key: str) -> bool:
-    """Return whether a dotted key is there, whatever its value."""
+    """Return whether a dotted key is there, whatever its value; the entry of a list is one too."""
+    parent, _, last = key.rpartition(".")
     with contextlib.suppress(OmegaConfBaseException):
+        holder = OmegaConf.select(config, parent) if parent else config
+        if isinstance(holder, ListConfig):
+            return last.isdecimal() and int(last) < len(holder)
         return _node(config, key) is not None
     return False
 

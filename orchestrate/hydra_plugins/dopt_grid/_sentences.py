@@ -20,6 +20,9 @@ from dopt.errors import DoptError, unknown_name
 _SEVERAL = re.compile(r"(?:Ambiguous value for argument|Sweep parameters) ('.*?')(?: requires|\n)")
 CONFIGURATION = Path(__file__).resolve().parents[2] / "conf"
 
+_OPTION = re.compile(r"(hydra/[^/]+|[^/]+)/(.+)")
+"""A group, those of Hydra itself have two parts, and what is chosen of it."""
+
 _BARE = re.compile(r"[^=]+")
 _NOISE = re.compile(r"\s*(\^|See https?:|full_key:|object_type=|reference_type=|To append |$)")
 
@@ -29,8 +32,7 @@ def sentence_for(error: Exception) -> str:
     if isinstance(error, DoptError):
         return _one_line(str(error))
     if isinstance(error, MissingConfigException) and error.options:
-        group, _, option = str(error.missing_cfg_file).rpartition("/")
-        return _unknown(group or "configuration", option, [*error.options, *_nested(group)])
+        return _unknown_option(str(error.missing_cfg_file), error.options)
     if isinstance(error, OverrideParseException) and _BARE.fullmatch(error.override):
         return f"'{error.override}' is no setting: write key=value, such as env=pendulum or seed=3."
     if isinstance(error, OverrideParseException):
@@ -45,6 +47,16 @@ def sentence_for(error: Exception) -> str:
     if isinstance(error, HydraException | OmegaConfBaseException):
         return _one_line(str(error))
     return _one_line(f"{type(error).__name__}: {error} (HYDRA_FULL_ERROR=1 shows where it arose)")
+
+
+def _unknown_option(given: str, options: Iterable[str]) -> str:
+    """Return the sentence for a path that is no file of the configuration.
+
+    In ``policy/beyond/exact`` the group is ``policy``: folders in it are part of the option.
+    """
+    match = _OPTION.fullmatch(given)
+    group, option = match.groups() if match else ("", given)
+    return _unknown(group or "configuration", option, [*options, *_nested(group)])
 
 
 def _unknown_key(cause: OmegaConfBaseException) -> str:

@@ -4,6 +4,7 @@ Annotations are not postponed here: Hydra's scan executes a plugin before it is 
 where a dataclass would look up postponed ones.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from orchestrate.grid import Combination
 from orchestrate.hydra_plugins.dopt_grid._expansion import expand
@@ -27,8 +28,8 @@ class GridSweeperConf:
     """
 
     _target_: str = "hydra_plugins.dopt_grid.sweeper.GridSweeper"
-    params: dict[str, str] = field(default_factory=dict)
-    grids: list[dict[str, str]] = field(default_factory=list)
+    params: dict[str, Any] = field(default_factory=dict)
+    grids: list[dict[str, Any]] = field(default_factory=list)
 
 
 ConfigStore.instance().store(
@@ -37,12 +38,13 @@ ConfigStore.instance().store(
 
 
 class GridSweeper(Sweeper):
-    """Expands the whole grid and hands it, with the common settings, to the task function once.
+    """Hands the common settings, and what expands the grid, to the task function once.
 
-    The task function gets a pair: the configuration without the sweeps, and the combinations.
+    The task function gets a pair: the configuration without the sweeps, and a function that returns
+    the combinations for the overrides of the command line. Hydra has not seen all of them.
     """
 
-    def __init__(self, params: Mapping[str, str], grids: Sequence[Mapping[str, str]] = ()) -> None:
+    def __init__(self, params: Mapping[str, Any], grids: Sequence[Mapping[str, Any]] = ()) -> None:
         self.grids = [{**params, **grid} for grid in grids] or [dict(params)]
 
     def setup(
@@ -52,17 +54,17 @@ class GridSweeper(Sweeper):
         self.task_function = task_function
         self.settings = config
 
-    def sweep(self, arguments: list[str]) -> Any:
-        combinations = [
-            combination
-            for grid in self.grids
-            for combination in self._expand([*_words(grid), *arguments])
-        ]
-        return self.task_function((self.settings, combinations))
+    def sweep(self, arguments: list[str]) -> Any:  # noqa: ARG002  # only what Hydra has seen
+        return self.task_function((self.settings, self._combinations))
 
-    def _expand(self, arguments: list[str]) -> list[Combination]:
-        return expand(self.loader, self.settings, arguments, check=check_keys)
+    def _combinations(self, words: Sequence[str]) -> list[Combination]:
+        grids = [[*(_override(*item) for item in one.items()), *words] for one in self.grids]
+        return expand(self.loader, self.settings, *grids, check=check_keys)
 
 
-def _words(grid: Mapping[str, str]) -> list[str]:
-    return [f"{key}={value}" for key, value in grid.items()]
+def _override(key: str, value: Any) -> str:
+    """Return what would be typed: text as it is, such as ``range(0,5)``, YAML's values as JSON."""
+    if isinstance(value, str):
+        return f"{key}={value}"
+    plain = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+    return f"{key}={json.dumps(plain)}"

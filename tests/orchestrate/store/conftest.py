@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from sqlalchemy import Engine, text
 
 from orchestrate.store import Claim, Reader, Store
 from tests.orchestrate.store.fakes import LAUNCH, Spec
+from tests.orchestrate.store.released import VERSIONS, restore
 
 
 @pytest.fixture
@@ -71,3 +73,22 @@ def take(store: Store, launch: int) -> Callable[..., list[Claim]]:
         return store.claim(launch, store.register(launch, specs).todo)
 
     return register_and_claim
+
+
+@pytest.fixture(params=VERSIONS)
+def version(request: pytest.FixtureRequest) -> int:
+    return int(request.param)
+
+
+@pytest.fixture
+def old(version: int, url: str) -> str:
+    restore(version, url)
+    return url
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def other(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """URL of another database, of each kind for each kind of the first."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path}/other/results.db"
+    return str(request.getfixturevalue("another_postgresql_url"))

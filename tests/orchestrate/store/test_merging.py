@@ -22,50 +22,12 @@ from orchestrate.store import (
     merge,
     merge_source,
 )
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
+from tests.orchestrate.store.everything import everything
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
 from tests.orchestrate.store.processes import hear, kill, merge_and_tell, running
 
 KEY = Spec().config_key
 FAILURE = Failure("ValueError", "no", "Traceback: no")
-ALL = (
-    "SELECT c.config_key, r.trial_key, r.seed, r.status, r.attempt, r.n_steps, r.final_loss, "
-    "r.best_loss, r.diverged_at, r.wall_seconds, r.node, l.token, e.hash FROM trial r "
-    "JOIN config c ON c.config_id = r.config_id "
-    "LEFT JOIN launch l ON l.launch_id = r.launch_id LEFT JOIN error e ON e.error_id = r.error_id",
-    "SELECT r.trial_key, s.t, s.loss, s.reachable_loss, s.plan_us, s.learn_us, s.evaluate_us "
-    "FROM step s JOIN trial r ON r.trial_id = s.trial_id",
-    "SELECT r.trial_key, p.dtype, p.states_shape, p.states, p.inputs_shape, p.inputs, "
-    "p.parameters_shape, p.parameters FROM trajectory p JOIN trial r ON r.trial_id = p.trial_id",
-    "SELECT r.trial_key, a.attempt, a.outcome, a.cause, a.node, a.pid, a.claimed, a.started, "
-    "a.ended, a.wall_seconds, l.token, e.hash FROM attempt a "
-    "JOIN trial r ON r.trial_id = a.trial_id JOIN launch l ON l.launch_id = a.launch_id "
-    "LEFT JOIN error e ON e.error_id = a.error_id",
-    "SELECT token, state, started, ended, host, pid, argv, overrides, git_commit, git_dirty, "
-    "versions, exit_code FROM launch",
-    "SELECT config_key, env, policy, model, learner, width, depth, horizon, dt, gamma, config_json "
-    "FROM config",
-    "SELECT hash, type, message, traceback FROM error",
-    "SELECT r.trial_key, b.t, b.measure, b.value FROM assessment b "
-    "JOIN trial r ON r.trial_id = b.trial_id",
-)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def other(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """URL of another database, of each kind for each kind of the first."""
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path}/other/results.db"
-    return str(request.getfixturevalue("another_postgresql_url"))
-
-
-def everything(url: str) -> list[list[str]]:
-    """Return all that is in a database, without the numbers that it gave itself."""
-    with Reader.open(url) as reader:
-        return [sorted(repr(_plain(row)) for row in reader.query(sql)) for sql in ALL]
-
-
-def _plain(row: tuple[object, ...]) -> list[object]:
-    return [bytes(x) if isinstance(x, memoryview) else x for x in row]
 
 
 def fill(url: str, *specs: Spec, offset: int = 0) -> None:
@@ -245,49 +207,6 @@ def test_only_whole_trials_come(url: str, other: str, damage: str) -> None:
     assert [one.trial_key for one in found.broken] == [Spec(0).trial_key]
     with Reader.open(url) as reader:
         assert reader.query("SELECT * FROM trial") == []
-
-
-def assess(url: str, *several: Spec) -> None:
-    """Run trials that are assessed."""
-    with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        for claim, spec in zip(
-            store.claim(launch, store.register(launch, several).todo), several, strict=True
-        ):
-            store.commit(claim, assessed(spec.seed), RUN)
-        store.end_launch(launch, "done")
-
-
-def test_assessments_come_with_their_trials(url: str, other: str) -> None:
-    assess(other, Spec(0), Spec(1))
-    assert merge(url, other).added == {"done": 2}
-    assert everything(url) == everything(other)
-    again = merge(url, other)
-    assert (again.identical, again.conflicts) == (2, [])
-
-
-@pytest.mark.parametrize("damage", ["DELETE FROM assessment WHERE t = 3", "DELETE FROM assessment"])
-def test_a_trial_that_lost_assessments_does_not_come(url: str, other: str, damage: str) -> None:
-    assess(other, Spec(0), Spec(1))
-    engine = create_engine(other)
-    with engine.begin() as connection:
-        first = "(SELECT min(trial_id) FROM trial)"
-        joint = "AND" if "WHERE" in damage else "WHERE"
-        connection.execute(text(f"{damage} {joint} trial_id = {first}"))
-    engine.dispose()
-    found = merge(url, other)
-    assert [one.trial_key for one in found.broken] == [Spec(0).trial_key]
-    assert found.added == {"done": 1}
-
-
-def test_another_assessment_is_a_conflict(url: str, other: str) -> None:
-    for where in (url, other):
-        assess(where, Spec(0))
-    engine = create_engine(other)
-    with engine.begin() as connection:
-        connection.execute(text("UPDATE assessment SET value = 9 WHERE t = 3"))
-    engine.dispose()
-    assert [one.seed for one in merge(url, other).conflicts] == [0]
 
 
 def test_a_merge_that_was_killed_is_completed(

@@ -9,8 +9,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine, create_engine, text
-from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ProgrammingError
 
 from orchestrate.store import (
@@ -19,7 +17,6 @@ from orchestrate.store import (
     Reader,
     SchemaVersionError,
     Store,
-    StoreError,
     StoreUnavailableError,
     address,
     migrations,
@@ -29,8 +26,9 @@ from orchestrate.store.locks import LaunchLocks
 from orchestrate.store.opening import make_backend
 from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.store.fakes import LAUNCH, Spec
+from tests.orchestrate.store.places import backups, execute, file_of
 from tests.orchestrate.store.processes import CLEAN, hear, kill, running, upgrade_and_tell
-from tests.orchestrate.store.released import VERSIONS, restore
+from tests.orchestrate.store.released import VERSIONS
 from tests.orchestrate.store.structure import columns, contents, structure
 
 FAILING = '''
@@ -63,17 +61,6 @@ def upgrade():
         with rebuilt(table) as batch:
             batch.add_column(sqlalchemy.Column("more", sqlalchemy.Integer))
 '''
-
-
-@pytest.fixture(params=VERSIONS)
-def version(request: pytest.FixtureRequest) -> int:
-    return int(request.param)
-
-
-@pytest.fixture
-def old(version: int, url: str) -> str:
-    restore(version, url)
-    return url
 
 
 @pytest.fixture
@@ -154,49 +141,6 @@ def test_again_there_is_nothing_to_do(old: str) -> None:
     assert structure(old) == before
 
 
-def _backup_url(url: str, name: str) -> str:
-    return f"sqlite:///{name}" if url.startswith("sqlite") else _in_schema(url, name)
-
-
-def _in_schema(url: str, schema: str) -> str:
-    return f"{url.rpartition('%3D')[0]}%3D{schema}"
-
-
-def test_the_backup_is_what_was_there(old: str, drop: Callable[[str], None]) -> None:
-    before, kept = structure(old), columns(old)
-    rows = contents(old, kept)
-    name = upgrade(old).backup
-    assert name is not None
-    drop(name)
-    backup = _backup_url(old, name)
-    assert structure(backup) == before
-    assert contents(backup, kept) == rows
-    assert upgrade(backup, backup=False).changed
-
-
-def test_a_backup_replaces_no_other(old: str, version: int, drop: Callable[[str], None]) -> None:
-    if old.startswith("sqlite"):
-        taken = f"{_file(old)}.v{version}-backup"
-        Path(taken).write_text("precious")
-    else:
-        taken = f"{_schema(old)}_v{version}_backup"
-        drop(taken)
-        _execute(old, f'CREATE SCHEMA "{taken}"')
-    name = upgrade(old).backup
-    assert name is not None
-    drop(name)
-    assert name in (f"{taken}-2", f"{taken}_2")
-    if old.startswith("sqlite"):
-        assert Path(taken).read_text() == "precious"
-
-
-def test_a_backup_can_be_left_out(old: str) -> None:
-    done = upgrade(old, backup=False)
-    assert done.changed
-    assert done.backup is None
-    assert _backups(old) == []
-
-
 def test_a_failure_in_the_middle_changes_nothing(
     old: str, with_script: Callable[[str], None]
 ) -> None:
@@ -207,7 +151,7 @@ def test_a_failure_in_the_middle_changes_nothing(
         upgrade(old)
     assert structure(old) == before
     assert contents(old, kept) == rows
-    assert _backups(old) == []
+    assert backups(old) == []
 
 
 def test_tables_that_are_written_anew_keep_everything(
@@ -262,15 +206,15 @@ def test_a_living_launch_is_left_alone(old: str) -> None:
 def _revive(url: str, stack: ExitStack) -> None:
     """Let the launch that was killed count as alive."""
     if url.startswith("sqlite"):
-        ((token,),) = _execute(url, "SELECT token FROM launch WHERE state = 'running'")
-        folder = _file(url).with_name(f"{_file(url).name}-locks")
+        ((token,),) = execute(url, "SELECT token FROM launch WHERE state = 'running'")
+        folder = file_of(url).with_name(f"{file_of(url).name}-locks")
         folder.mkdir()
         locks = LaunchLocks(folder)
         locks.acquire(str(token))
         stack.callback(locks.close)
     else:
         lease = "extract(epoch FROM clock_timestamp()) + 600"
-        _execute(url, f"UPDATE launch SET lease_until = {lease} WHERE state = 'running'")
+        execute(url, f"UPDATE launch SET lease_until = {lease} WHERE state = 'running'")
 
 
 def test_of_two_at_once_one_finds_nothing_to_do(old: str) -> None:
@@ -304,8 +248,8 @@ def test_the_newest_is_left_alone_and_a_newer_refused(store: Store, url: str) ->
 
 def test_an_empty_database_is_created(url: str) -> None:
     if url.startswith("sqlite"):
-        _file(url).parent.mkdir()
-        _file(url).touch()
+        file_of(url).parent.mkdir()
+        file_of(url).touch()
     done = upgrade(url)
     assert (done.before, done.after, done.backup) == (None, SCHEMA_VERSION, None)
     Reader.open(url).close()
@@ -314,7 +258,7 @@ def test_an_empty_database_is_created(url: str) -> None:
 def test_nothing_is_made_where_there_is_no_file(sqlite_url: str) -> None:
     with pytest.raises(NoDatabaseError):
         upgrade(sqlite_url)
-    assert not _file(sqlite_url).parent.exists()
+    assert not file_of(sqlite_url).parent.exists()
 
 
 def test_a_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
@@ -328,65 +272,3 @@ def test_a_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(SchemaVersionError, match="not a results database"):
         upgrade(f"sqlite:///{path}")
     assert path.read_bytes() == before
-
-
-def test_a_full_disk_refuses_the_backup(sqlite_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    restore(1, sqlite_url)
-    before = structure(sqlite_url)
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("orchestrate.store.backup_file.os.fsync", full)
-    with pytest.raises(StoreUnavailableError, match=r"No space left.*--no-backup"):
-        upgrade(sqlite_url)
-    assert structure(sqlite_url) == before
-    assert _backups(sqlite_url) == []
-
-
-def _backups(url: str) -> list[object]:
-    if url.startswith("sqlite"):
-        return list(_file(url).parent.glob("*backup*"))
-    names = _execute(url, "SELECT nspname FROM pg_namespace")
-    return [name for (name,) in names if str(name).startswith(f"{_schema(url)}_")]
-
-
-def _file(url: str) -> Path:
-    return Path(str(make_url(url).database))
-
-
-def test_a_user_who_cannot_make_a_backup_is_told(postgresql_url: str, server: Engine) -> None:
-    restore(1, postgresql_url)
-    schema, role = _schema(postgresql_url), f"guest_{_schema(postgresql_url)[-8:]}"
-    named = (
-        "SELECT relname FROM pg_class WHERE relkind IN ('r', 'v') "
-        "AND relnamespace = to_regnamespace(current_schema())"
-    )
-    with server.begin() as connection:
-        connection.exec_driver_sql(f"CREATE ROLE {role}")
-        connection.exec_driver_sql(f"ALTER SCHEMA {schema} OWNER TO {role}")
-        for (name,) in _execute(postgresql_url, named):
-            connection.exec_driver_sql(f"ALTER TABLE {schema}.{name} OWNER TO {role}")
-    try:
-        guest = f"{postgresql_url}%20-crole%3D{role}"
-        with pytest.raises(StoreError, match=r"right to create a schema.*--no-backup"):
-            upgrade(guest)
-        assert upgrade(guest, backup=False).changed
-    finally:
-        with server.begin() as connection:
-            connection.exec_driver_sql(f"REASSIGN OWNED BY {role} TO CURRENT_USER")
-            connection.exec_driver_sql(f"DROP OWNED BY {role}")
-            connection.exec_driver_sql(f"DROP ROLE {role}")
-
-
-def _schema(url: str) -> str:
-    return url.rpartition("%3D")[2]
-
-
-def _execute(url: str, sql: str) -> list[tuple[object, ...]]:
-    engine = create_engine(url)
-    with engine.begin() as connection:
-        done = connection.execute(text(sql))
-        rows = [tuple(row) for row in done] if done.returns_rows else []
-    engine.dispose()
-    return rows
