@@ -120,7 +120,7 @@ def _reference(group: Sequence[Candidate]) -> Candidate:
     def rank(candidate: Candidate) -> tuple[int, ...]:
         setting = _setting(candidate.cell)
         alone = len(policies[setting]) < 2
-        return -alone, totals[setting], candidate.n_trials, -departures(candidate.cell)
+        return -alone, totals[setting], candidate.n_trials, *nearness(candidate.cell)
 
     best = _first(pool, rank)
     if len({_setting(candidate.cell) for candidate in best}) > 1:
@@ -129,7 +129,7 @@ def _reference(group: Sequence[Candidate]) -> Candidate:
 
 
 def _most(candidates: Sequence[Candidate]) -> Candidate:
-    best = _first(candidates, lambda one: (one.n_trials, -departures(one.cell)))
+    best = _first(candidates, lambda one: (one.n_trials, *nearness(one.cell)))
     if len(best) > 1:
         raise _tie(best)
     return best[0]
@@ -143,16 +143,32 @@ def _first(
     return [candidate for candidate in candidates if rank(candidate) == top]
 
 
-def departures(cell: Cell) -> int:
-    """Return how many values of a configuration are not their defaults, a task being none."""
-    sections = {key: value for key, value in cell.config.items() if isinstance(value, Mapping)}
-    names = {key: {"name": section.get("name")} for key, section in sections.items()}
+def nearness(cell: Cell) -> tuple[int, int]:
+    """Return a key by which the configuration that is nearest to the defaults is the largest.
+
+    Fewer values that are not defaults come first, then no task: it changes nothing of the trial.
+    """
+    usual, parts = defaults(cell), _sections(cell)
+    task = parts.pop("task", None) is not None
+    own = flatten(parts) if usual else {}
+    return -sum(usual.get(path) != value for path, value in own.items()), -task
+
+
+def defaults(cell: Cell) -> dict[str, object]:
+    """Return the defaults of what a configuration names, without a task, as dotted paths.
+
+    There are none where it holds a system or policy of a user's own, which is not registered here.
+    """
+    names = {key: {"name": section.get("name")} for key, section in _sections(cell).items()}
     names.pop("task", None)
     try:
-        usual = flatten(TrialSpec.from_mapping(names).to_mapping())
+        return flatten(TrialSpec.from_mapping(names).to_mapping())
     except SpecificationError:
-        return 0  # a system or policy of a user's own, which is not registered here
-    return sum(usual.get(path) != value for path, value in flatten(sections).items())
+        return {}
+
+
+def _sections(cell: Cell) -> dict[str, Mapping[str, Any]]:
+    return {key: value for key, value in cell.config.items() if isinstance(value, Mapping)}
 
 
 def _tie(pool: Sequence[Candidate]) -> AnalysisError:

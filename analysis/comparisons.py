@@ -16,7 +16,7 @@ from analysis.control import relative_costs, scores_at
 from analysis.divergence import DivergenceRule
 from analysis.errors import AnalysisError
 from analysis.measures import Measure, Scores, final_losses, mean_losses, steps_to
-from analysis.paired import benjamini_hochberg, compare, race
+from analysis.paired import benjamini_hochberg, compare, race, without_ratio
 from analysis.selection import Entry, Selection
 from orchestrate.store import Reader
 
@@ -75,7 +75,9 @@ def compare_steps(
     rows = []
     for env in selection.environments:
         entries = selection.of(env)
-        threshold = _threshold(reader, entries, column, rule) if epsilon is None else epsilon
+        threshold = (
+            loss_of_random_inputs(reader, entries, column, rule) if epsilon is None else epsilon
+        )
         if threshold is None:
             continue
         scores = [steps_to(reader, entry, column, rule, threshold) for entry in entries]
@@ -90,10 +92,22 @@ def compare_steps(
     return _adjusted(rows, selection)
 
 
+def loss_of_random_inputs(
+    reader: Reader, entries: tuple[Entry, ...], column: str, rule: DivergenceRule
+) -> float | None:
+    """Return the median final loss of random inputs, None where there are no trials of them."""
+    found = (entry for entry in entries if entry.cell.policy == YARDSTICK)
+    finals = next((final_losses(reader, entry, column, rule).values for entry in found), None)
+    return float(np.median(finals)) if finals is not None and len(finals) else None
+
+
 def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
     """Return the ratio of the costs of control, one row for each environment, step and baseline.
 
     The cost of a trial is that of the episode which its model planned, by the true model's.
+    ``n_lost`` pairs are in no ratio: one of the two episodes, or the true model's, has no finite
+    cost. An episode's own loss counts as the worst in the test; where the true model's was lost,
+    nothing is known.
     """
     rows = []
     for env in selection.environments:
@@ -108,7 +122,9 @@ def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
                 stream = _stream(env, baseline, "control_cost", str(t))
                 row = {"env": env, "t": t, "baseline": baseline}
                 row |= {"success": successes[REFERENCE], "success_baseline": successes[baseline]}
-                rows.append(row | asdict(compare(ours, theirs, stream)) | {"n_diverged": diverged})
+                row |= asdict(compare(ours, theirs, stream))
+                row |= {"n_lost": without_ratio(ours, theirs), "n_diverged": diverged}
+                rows.append(row)
     return _adjusted(rows, selection)
 
 
@@ -118,14 +134,6 @@ def _successes(reader: Reader, entry: Entry, t: int) -> float:
     known = found.values[:, found.t == t]
     known = known[np.isfinite(known)]
     return float(np.mean(known)) if len(known) else math.nan
-
-
-def _threshold(
-    reader: Reader, entries: tuple[Entry, ...], column: str, rule: DivergenceRule
-) -> float | None:
-    found = (entry for entry in entries if entry.cell.policy == YARDSTICK)
-    finals = next((final_losses(reader, entry, column, rule).values for entry in found), None)
-    return float(np.median(finals)) if finals is not None and len(finals) else None
 
 
 def _pairs(scores: list[Scores]) -> Iterator[tuple[str, Array, Array, int]]:

@@ -2,7 +2,8 @@
 
 Each trial that was assessed gives two numbers after some of its steps: whether the episode that its
 model planned succeeded, and what it cost beside the true model under the same planner, noise and
-draws.
+draws. An episode without a finite cost is lost: it counts in the share of successes, and in no mean
+of costs, so that it is counted beside each.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy import stats
 
 from analysis.choice import Candidate, choose
 from analysis.measures import Scores
+from analysis.numbers import but_lost
 from analysis.selection import Entry, Selection, environment_rank, policy_rank
 from analysis.statistics import LEVEL, band
 from orchestrate.store import Assessments, Reader
@@ -29,6 +31,21 @@ Interval = tuple[float, float, float]
 """Centre, low and high."""
 
 Estimate = Callable[[Array], Interval]
+
+
+@dataclass(frozen=True)
+class TrueModel:
+    """What the planner achieves in an environment with the true model: the ceiling of the others.
+
+    ``n`` seeds, the share of successes with its Wilson interval of 95 %, and how many of the
+    episodes have no finite cost. NaN where there is none.
+    """
+
+    n: int
+    success: float
+    success_low: float
+    success_high: float
+    lost: int
 
 
 @dataclass(frozen=True)
@@ -43,6 +60,11 @@ class ControlCurve:
         Share of successful episodes, with its Wilson interval of 95 %.
     cost, cost_low, cost_high : (k,)
         Geometric mean of the cost by the true model's, with Student's interval of 95 %.
+    lost : (k,)
+        Episodes of the n that are in no mean of costs: of no finite cost, their own or the true
+        model's of the same seed.
+    truth : TrueModel
+        Of the seeds of all policies in the environment.
     described : str
         Number of trials, and how many diverged.
     """
@@ -57,13 +79,19 @@ class ControlCurve:
     cost: Array
     cost_low: Array
     cost_high: Array
+    lost: npt.NDArray[np.int64]
+    truth: TrueModel
     described: str
+
+    @property
+    def counts(self) -> str:
+        """The number of trials, and of the episodes that were lost after any of the steps."""
+        return but_lost(self.described, int(np.sum(self.lost)))
 
 
 def control_part(selection: Selection) -> Selection:
     """Return the entries with a task, in each environment those of the task with most trials."""
-    asked = [entry for entry in selection.stored if entry.cell.config.get("task")]
-    asked = [entry for entry in asked if entry.final_losses()]
+    asked = [entry for entry in selection.stored if task_of(entry)]
     chosen: list[Entry] = []
     for env in dict.fromkeys(entry.cell.env for entry in asked):
         chosen += _of_one_task([entry for entry in asked if entry.cell.env == env])
@@ -72,17 +100,29 @@ def control_part(selection: Selection) -> Selection:
 
 
 def _of_one_task(entries: list[Entry]) -> list[Entry]:
-    totals: Counter[str] = Counter()
-    for entry in entries:
-        totals[_task(entry)] += len(entry.trials)
-    most = max(totals, key=lambda task: (totals[task], task))
-    same = {entry.cell.config_key: entry for entry in entries if _task(entry) == most}
+    most = common_task(entries)
+    same = {entry.cell.config_key: entry for entry in entries if task_of(entry) == most}
     cells = choose(Candidate(entry.cell, len(entry.trials)) for entry in same.values())
     return [same[cell.config_key] for cell in cells]
 
 
-def _task(entry: Entry) -> str:
-    return json.dumps(entry.cell.config["task"], sort_keys=True)
+def common_task(entries: Iterable[Entry]) -> str | None:
+    """Return the task by which most trials were assessed, None where there is none.
+
+    Costs and successes of different tasks are not compared.
+    """
+    totals: Counter[str] = Counter()
+    for entry in entries:
+        task = task_of(entry)
+        if task is not None:
+            totals[task] += len(entry.trials)
+    return max(totals, key=lambda task: (totals[task], task)) if totals else None
+
+
+def task_of(entry: Entry) -> str | None:
+    """Return the task by which trials of an entry were assessed, as JSON, None without one."""
+    task = entry.cell.config.get("task")
+    return json.dumps(task, sort_keys=True) if task and entry.final_losses() else None
 
 
 def _unfinished(entries: Iterable[Entry]) -> Iterable[str]:
@@ -94,12 +134,38 @@ def _unfinished(entries: Iterable[Entry]) -> Iterable[str]:
 
 def measure_control(reader: Reader, selection: Selection) -> tuple[ControlCurve, ...]:
     """Return a curve for each entry."""
-    return tuple(_curve(reader, entry) for entry in selection.entries)
+    truths = {env: true_model(reader, selection.of(env)) for env in selection.environments}
+    return tuple(_curve(reader, entry, truths[entry.cell.env]) for entry in selection.entries)
 
 
-def _curve(reader: Reader, entry: Entry) -> ControlCurve:
+def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
+    """Return what the true model achieved on the seeds of some entries, each seed once.
+
+    Trials of one seed, environment and task share that episode.
+    """
+    successes, costs = (
+        {
+            seed: value
+            for entry in entries
+            for seed, value in _first(reader.assessments(entry.cell.config_key, measure)).items()
+        }
+        for measure in ("true_model_success", "true_model_cost")
+    )
+    found = np.array(list(successes.values()))
+    known = [seed for seed, success in successes.items() if np.isfinite(success)]
+    finite = _usable(np.array([costs.get(seed, np.nan) for seed in known]))
+    return TrueModel(len(known), *_rate(found), int(np.sum(~finite)))
+
+
+def _first(found: Assessments) -> dict[int, float]:
+    """Return the number of each seed after the first number of steps."""
+    return dict(zip(found.seeds.tolist(), found.values[:, :1].ravel().tolist(), strict=True))
+
+
+def _curve(reader: Reader, entry: Entry, truth: TrueModel) -> ControlCurve:
     successes = reader.assessments(entry.cell.config_key, "control_success")
     ratios = relative_costs(reader, entry).values
+    reached = np.isfinite(successes.values)
     success, success_low, success_high = _by_step(_rate, successes.values)
     cost, cost_low, cost_high = _by_step(_mean_ratio, ratios)
     diverged = int(np.sum(successes.diverged))
@@ -107,13 +173,15 @@ def _curve(reader: Reader, entry: Entry) -> ControlCurve:
         entry.cell.env,
         entry.cell.policy,
         successes.t,
-        np.sum(np.isfinite(successes.values), axis=0),
+        np.sum(reached, axis=0),
         success,
         success_low,
         success_high,
         cost,
         cost_low,
         cost_high,
+        np.sum(reached & ~_usable(ratios), axis=0),
+        truth,
         f"{len(successes.seeds)}, {diverged} diverged" if diverged else f"{len(successes.seeds)}",
     )
 
@@ -124,13 +192,19 @@ def _by_step(estimate: Estimate, values: Array) -> Array:
 
 
 def relative_costs(reader: Reader, entry: Entry) -> Assessments:
-    """Return the cost of each trial and number of steps by that of its true model."""
+    """Return the cost of each trial and number of steps by that of its true model.
+
+    It is inf where the episode has no finite cost, and NaN where there was no episode or where the
+    true model's has no finite cost, so that nothing can be said.
+    """
     key = entry.cell.config_key
     costs = reader.assessments(key, "control_cost")
-    truth = reader.assessments(key, "true_model_cost")
-    of_seed = dict(zip(truth.seeds.tolist(), truth.values[:, :1].ravel().tolist(), strict=True))
+    reached = np.isfinite(reader.assessments(key, "control_success").values)
+    of_seed = _first(reader.assessments(key, "true_model_cost"))
     divisors = np.array([of_seed.get(seed, np.nan) for seed in costs.seeds.tolist()])
-    return Assessments(costs.seeds, costs.t, costs.values / divisors[:, None], costs.diverged)
+    divisors = np.where(_usable(divisors), divisors, np.nan)
+    values = np.where(reached & ~np.isfinite(costs.values), np.inf, costs.values)
+    return Assessments(costs.seeds, costs.t, values / divisors[:, None], costs.diverged)
 
 
 def _rate(successes: Array) -> Interval:
@@ -143,23 +217,30 @@ def _rate(successes: Array) -> Interval:
     return float(np.mean(known)), float(interval.low), float(interval.high)
 
 
+def _usable(values: Array) -> npt.NDArray[np.bool_]:
+    """Return which costs or ratios have a logarithm."""
+    return np.isfinite(values) & (values > 0)
+
+
 def _mean_ratio(ratios: Array) -> Interval:
-    """Return the geometric mean of (n,), NaN left out, with Student's interval."""
-    known = np.log(ratios[np.isfinite(ratios) & (ratios > 0)])
+    """Return the geometric mean of the finite ones of (n,), with Student's interval."""
+    known = np.log(ratios[_usable(ratios)])
     found = band(known[:, None])
     centre, low, high = (float(np.exp(end[0])) for end in (found.centre, found.low, found.high))
     return centre, low, high
 
 
 def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
-    """Return the relative cost of each trial after t explored steps."""
+    """Return the relative cost of each trial that reached t explored steps.
+
+    As in :func:`relative_costs` a lost episode has inf, and NaN where the true model's was lost.
+    """
     costs = relative_costs(reader, entry)
-    column = costs.values[:, np.flatnonzero(costs.t == t)].ravel()
-    by_seed = {
-        seed: value
-        for seed, value in zip(costs.seeds.tolist(), column.tolist(), strict=False)
-        if np.isfinite(value)
-    }
+    reached = np.isfinite(reader.assessments(entry.cell.config_key, "control_success").values)
+    at = costs.t == t
+    seeds = costs.seeds[reached[:, at].any(axis=1)]
+    column = costs.values[reached & at]
+    by_seed = dict(zip(seeds.tolist(), column.tolist(), strict=True))
     return Scores(
         entry.cell.env, entry.cell.policy, by_seed, len(costs.seeds), int(np.sum(costs.diverged))
     )
@@ -167,12 +248,16 @@ def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
 
 def tabulate_control(curves: Iterable[ControlCurve]) -> pd.DataFrame:
     """Return what is drawn, one row for each environment, policy and number of steps."""
-    columns = ("t", "n", "success", "success_low", "success_high", "cost", "cost_low", "cost_high")
+    columns = (
+        *("t", "n", "success", "success_low", "success_high"),
+        *("cost", "cost_low", "cost_high", "lost"),
+    )
     return pd.concat(
         [
             pd.DataFrame(
                 {"env": curve.env, "policy": curve.policy}
                 | {name: getattr(curve, name) for name in columns}
+                | {"true_model_success": curve.truth.success}
             )
             for curve in curves
         ],

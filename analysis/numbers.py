@@ -42,8 +42,20 @@ def plus_minus(value: float, error: float) -> str:
     return f"{value:.{places}f} ± {error:.{places}f}"
 
 
+def steps_text(median: float, horizon: int) -> str:
+    """Return a median number of steps, ``> horizon`` for one that is censored, a dash for NaN."""
+    if math.isnan(median):
+        return "–"
+    return f"> {horizon}" if math.isinf(median) else f"{median:.0f}"
+
+
 def within(value: float, low: float, high: float) -> str:
     """Return a number with its interval, or alone where there is none."""
     if math.isnan(low):
         return number(value)
     return f"{number(value)} [{number(low)}, {number(high)}]"
+
+
+def but_lost(text: str, lost: int) -> str:
+    """Return what is said of some episodes, and how many are not in it: ``1.3, 2 lost``."""
+    return f"{text}, {lost} lost" if lost else text

@@ -28,8 +28,9 @@ class Comparison:
     n_pairs : int
         Seeds on which neither diverged.
     ratio, low, high : float
-        Geometric mean of loss / baseline loss, and its paired interval; below 1 the policy is
-        better. NaN, as the p-value is, where a loss is 0 and has no logarithm.
+        Geometric mean of loss / baseline loss over the pairs of which both are finite, and its
+        paired interval; below 1 the policy is better. NaN, as the p-value is, where a loss is 0
+        and has no logarithm.
     improvement : float
         Probability of improvement: share of pairs with the lower loss, ties counted half.
     p_value : float
@@ -45,17 +46,35 @@ class Comparison:
 
 
 def compare(loss: Array, baseline: Array, rng: np.random.Generator) -> Comparison:
-    """Compare losses, both (n,) and paired by position; NaN where n is too small."""
+    """Compare losses, both (n,) and paired by position; NaN where n is too small.
+
+    A loss may be inf, worse than every finite one: it has no ratio, but counts in the probability
+    of improvement and as the largest difference in the test; two of a pair are equal. A pair with a
+    NaN is left out.
+    """
+    known = ~(np.isnan(loss) | np.isnan(baseline))
+    loss, baseline = loss[known], baseline[known]
     n, unknown = len(loss), float("nan")
     if not n:
         return Comparison(0, *[unknown] * 5)
     wins = float(np.mean(loss < baseline) + np.mean(loss == baseline) / 2)
     if np.min(loss) <= 0 or np.min(baseline) <= 0:
         return Comparison(n, unknown, unknown, unknown, wins, unknown)
-    difference = np.log(loss) - np.log(baseline)
-    low, high = np.exp(interval_of_mean(difference, rng))
-    ratio = float(np.exp(np.mean(difference)))
-    return Comparison(n, ratio, float(low), float(high), wins, signed_rank(difference))
+    both_lost = np.isinf(loss) & np.isinf(baseline)
+    ours, theirs = (np.log(np.where(both_lost, 1.0, one)) for one in (loss, baseline))
+    finite = np.isfinite(loss) & np.isfinite(baseline)
+    difference = ours - theirs
+    p_value = signed_rank(difference)
+    if not finite.any():
+        return Comparison(n, unknown, unknown, unknown, wins, p_value)
+    low, high = np.exp(interval_of_mean(difference[finite], rng))
+    ratio = float(np.exp(np.mean(difference[finite])))
+    return Comparison(n, ratio, float(low), float(high), wins, p_value)
+
+
+def without_ratio(loss: Array, baseline: Array) -> int:
+    """Return how many pairs of (n,) are in no ratio, as one of the two is not finite."""
+    return int(np.sum(~(np.isfinite(loss) & np.isfinite(baseline))))
 
 
 def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, float]:

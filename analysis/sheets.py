@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 from tabulate import tabulate
 
 from analysis.gaps import Gap
 from analysis.measures import Measure
-from analysis.numbers import number, p_text, plus_minus, share, within
+from analysis.numbers import but_lost, number, p_text, plus_minus, share, steps_text, within
 from analysis.paired import FEW
 
 _LATEX = {"±": r"$\pm$", "–": "--", "≤": r"$\leq$", "ε": r"$\varepsilon$"}
@@ -69,6 +69,7 @@ _JUDGED = {
     Measure.FINAL: "final loss",
     Measure.AUC: "loss over the whole curve (geometric mean over the steps)",
 }
+_DIRECTION = "below 1 D-optimal is better (a report has it the other way, variant / D-optimal)"
 _TESTED = "then adjusted over the table (Benjamini-Hochberg)"
 
 
@@ -79,10 +80,7 @@ def comparison_sheet(table: pd.DataFrame, rule: str, measure: Measure = Measure.
             row["env"],
             row["baseline"],
             within(row["ratio"], row["low"], row["high"]),
-            share(row["improvement"]),
-            p_text(row["p_value"]),
-            p_text(row["p_adjusted"]),
-            _pairs(row),
+            *_test_cells(row),
         ]
         for row in table.to_dict("records")
     ]
@@ -91,11 +89,11 @@ def comparison_sheet(table: pd.DataFrame, rule: str, measure: Measure = Measure.
         "pairs",
     ]  # fmt: skip
     note = (
-        f"Ratio: geometric mean over seeds of the {_JUDGED[measure]} of D-optimal by that of the "
-        "baseline, below 1 D-optimal is better; interval: paired BCa bootstrap, of the "
-        f"log ratio; Student's below {FEW} pairs. P(improvement): share of seeds with the lower "
-        "loss, ties half. p: two-sided Wilcoxon signed-rank test of the log ratio, "
-        f"{_TESTED}. Diverged trials: {rule}."
+        f"Ratio: D-optimal / baseline, {_DIRECTION}; geometric mean over seeds of the "
+        f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, Student's below "
+        f"{FEW} pairs. P(improvement): share of seeds with the lower loss, ties half. "
+        f"p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
+        f"Diverged trials: {rule}."
     )
     return Sheet(headers, rows, note)
 
@@ -109,11 +107,8 @@ def control_sheet(table: pd.DataFrame) -> Sheet:
             row["baseline"],
             share(row["success"]),
             share(row["success_baseline"]),
-            within(row["ratio"], row["low"], row["high"]),
-            share(row["improvement"]),
-            p_text(row["p_value"]),
-            p_text(row["p_adjusted"]),
-            _pairs(row),
+            but_lost(within(row["ratio"], row["low"], row["high"]), row["n_lost"]),
+            *_test_cells(row),
         ]
         for row in table.to_dict("records")
     ]
@@ -123,11 +118,13 @@ def control_sheet(table: pd.DataFrame) -> Sheet:
     ]  # fmt: skip
     note = (
         "Success: share of the episodes of D-optimal and of the baseline that succeed, planned by "
-        "the model learned so far. Ratio: geometric mean over seeds of the episode's cost of "
-        "D-optimal by that of the baseline, below 1 D-optimal is better; interval: paired BCa "
-        f"bootstrap of the log ratio, Student's below {FEW} pairs. P(improvement): share of seeds "
-        "with the lower cost, ties half. p: two-sided Wilcoxon signed-rank test of the log ratio, "
-        f"{_TESTED}. Trials that diverged before a step are left out."
+        f"the model learned so far. Cost ratio: D-optimal / baseline, {_DIRECTION}; geometric mean "
+        "over seeds of the episode's cost; interval: paired BCa bootstrap of the log ratio, "
+        f"Student's below {FEW} pairs. P(improvement): share of seeds with the lower cost, "
+        f"ties half. p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
+        "Lost: pairs in no ratio, as one of the two episodes or the true model's has "
+        "no finite cost; a lost episode counts as the worst in P(improvement) and p, one "
+        "whose true model's was lost in neither. Trials that diverged before a step are left out."
     )
     return Sheet(headers, rows, note)
 
@@ -139,14 +136,11 @@ def race_sheet(table: pd.DataFrame, rule: str) -> Sheet:
             row["env"],
             row["baseline"],
             number(row["epsilon"]),
-            _steps(row["median"], row["horizon"]),
-            _steps(row["median_baseline"], row["horizon"]),
+            steps_text(row["median"], row["horizon"]),
+            steps_text(row["median_baseline"], row["horizon"]),
             f"{row['reached']}/{row['n_pairs']}",
             f"{row['reached_baseline']}/{row['n_pairs']}",
-            share(row["improvement"]),
-            p_text(row["p_value"]),
-            p_text(row["p_adjusted"]),
-            _pairs(row),
+            *_test_cells(row),
         ]
         for row in table.to_dict("records")
     ]
@@ -165,16 +159,14 @@ def race_sheet(table: pd.DataFrame, rule: str) -> Sheet:
     return Sheet(headers, rows, note)
 
 
-def _pairs(row: Mapping[Hashable, object]) -> str:
-    """Return the number of pairs, and how many trials of the two policies diverged, if any."""
+def _test_cells(row: Mapping[Hashable, Any]) -> list[str]:
+    """Return the share of seeds on which the reference is better, p, adjusted p, and the pairs.
+
+    With the number of pairs comes how many trials of the two policies diverged, if any.
+    """
     diverged = f", {row['n_diverged']} diverged" if row["n_diverged"] else ""
-    return f"{row['n_pairs']}{diverged}"
-
-
-def _steps(median: float, horizon: int) -> str:
-    if math.isnan(median):
-        return "–"
-    return f"> {horizon}" if math.isinf(median) else f"{median:.0f}"
+    pairs = f"{row['n_pairs']}{diverged}"
+    return [share(row["improvement"]), p_text(row["p_value"]), p_text(row["p_adjusted"]), pairs]
 
 
 def gaps_sheet(gaps: Iterable[Gap]) -> Sheet:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.choice import REFERENCE, departures, flatten
+from analysis.choice import REFERENCE, flatten, nearness
 from analysis.divergence import DivergenceRule
 from analysis.measures import final_losses
 from analysis.reading import read_sample
@@ -107,9 +107,9 @@ def _lines(entries: Iterable[Entry]) -> list[Line]:
     return [tuple(sorted(group, key=lambda e: e.cell.width or 0)) for group in groups.values()]
 
 
-def _rank(line: Line) -> tuple[int, int, int]:
+def _rank(line: Line) -> tuple[int, ...]:
     trials = sum(len(entry.finished) for entry in line)
-    return len(line), -min(departures(entry.cell) for entry in line), trials
+    return len(line), *max(nearness(entry.cell) for entry in line), trials
 
 
 def _differ_in_form(one: Entry, other: Entry) -> bool:

@@ -1,4 +1,4 @@
-"""Helpers for axes: readable logarithmic ticks, multiples of π, panels in rows."""
+"""Helpers for axes: logarithmic ones with readable ticks, multiples of π, panels in rows."""
 
 from __future__ import annotations
 
@@ -6,8 +6,15 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFormatter
+from matplotlib.ticker import (
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    MultipleLocator,
+    NullFormatter,
+)
 
 TAU_TICKS = {0: "0", 1: "π/2", 2: "π", 3: "3π/2", 4: "2π"}
 
@@ -21,11 +28,25 @@ TICKS: dict[float, tuple[float, ...]] = {
 """Labelled multiples of a power of ten, by the decades of an axis below which they hold."""
 
 
+SHORT = 0.5
+"""Decades below which an axis has evenly spaced ticks: multiples of a power of ten would be few."""
+
+
+def log_scale(axes: Axes, low: float, high: float) -> None:
+    """Make the vertical axis a logarithmic one over [low, high], with readable ticks."""
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    log_ticks(axes.yaxis, low, high)
+
+
 def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Set ticks of a logarithmic axis over [low, high], with at least a few labels."""
     decades = math.log10(high / low)
     steps = next(steps for limit, steps in TICKS.items() if decades < limit)
-    axis.set_major_locator(LogLocator(subs=steps, numticks=12))
+    if decades < SHORT:
+        axis.set_major_locator(MaxNLocator(nbins=5, min_n_ticks=3, steps=[1, 2, 2.5, 5, 10]))
+    else:
+        axis.set_major_locator(LogLocator(subs=steps, numticks=12))
     axis.set_minor_locator(LogLocator(subs=tuple(range(2, 10)), numticks=40))
     axis.set_minor_formatter(NullFormatter())
     if decades < 4:

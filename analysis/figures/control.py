@@ -11,15 +11,19 @@ from matplotlib.lines import Line2D
 
 from analysis.control import ControlCurve, control_part, measure_control, tabulate_control
 from analysis.counts import count_text
-from analysis.figures.axes import log_limits, log_ticks
+from analysis.figures.axes import log_limits, log_scale
 from analysis.figures.plot import Plot
-from analysis.figures.style import TEXT_WIDTH, environment_title, policy_style
+from analysis.figures.style import GUIDE, TEXT_WIDTH, environment_title, policy_style
+from analysis.numbers import share
 from analysis.selection import policy_rank
 
 ROW_HEIGHT = 1.9
 LEGEND_HEIGHT = 0.5
 SHARE = 0.012
 """Distance of neighbouring policies' bars, as a part of the axis."""
+
+TRUTH = {**GUIDE, "lw": 0.6}
+"""Look of what the planner achieves with the true model."""
 
 Curves = tuple[ControlCurve, ...]
 
@@ -56,6 +60,7 @@ def draw_control(curves: Curves) -> Figure:
         Line2D([], [], color=s.colour, ls=s.line, lw=s.width, marker="o", ms=3, label=s.label)
         for s in styles
     ]
+    handles.append(Line2D([], [], **TRUTH, label="true model"))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)))
     return figure
 
@@ -66,15 +71,12 @@ def _panel(rates: Axes, costs: Axes, curves: Sequence[ControlCurve]) -> None:
         x = curve.t + SHARE * last * (place - (len(curves) - 1) / 2)
         _line(rates, x, curve, "success")
         _line(costs, x, curve, "cost")
-    counts = {policy_style(curve.policy).label: curve.described for curve in curves}
-    rates.set_title(f"{environment_title(curves[0].env)}\n({count_text(counts)})", fontsize=7)
+    rates.set_title(f"{environment_title(curves[0].env)}\n({_counts(curves)})", fontsize=7)
     rates.set_ylim(-0.04, 1.04)
+    rates.axhline(curves[0].truth.success, **TRUTH)
     drawn = [np.r_[c.cost, c.cost_low, c.cost_high, 1.0] for c in curves]
-    low, high = log_limits(np.concatenate(drawn))
-    costs.set_yscale("log")
-    costs.set_ylim(low, high)
-    log_ticks(costs.yaxis, low, high)
-    costs.axhline(1.0, color="black", lw=0.8, ls=(0, (5, 2)))
+    log_scale(costs, *log_limits(np.concatenate(drawn)))
+    costs.axhline(1.0, **TRUTH)
     costs.set_xlabel("explored steps")
 
 
@@ -88,20 +90,40 @@ def _line(axes: Axes, x: np.ndarray, curve: ControlCurve, name: str) -> None:
     )  # fmt: skip
 
 
+def _counts(curves: Sequence[ControlCurve]) -> str:
+    return count_text({policy_style(curve.policy).label: curve.counts for curve in curves})
+
+
 def caption_control(curves: Curves) -> str:
     """Return the caption, with what an episode is and n by environment."""
     environments = dict.fromkeys(curve.env for curve in curves)
     counts = "; ".join(
-        f"{environment_title(env)}: "
-        + count_text({policy_style(c.policy).label: c.described for c in curves if c.env == env})
+        f"{environment_title(env)}: {_counts([curve for curve in curves if curve.env == env])}"
         for env in environments
     )
     return (
         "Control with the model learned after some explored steps, by model-predictive control "
         "(cross-entropy method) on the true system with its noise: swing-up of the pendulum and "
         "the cartpole, a set-point of the arm and the quadrotor. Above: share of successful "
-        "episodes with 95 % Wilson intervals. Below: cost of the episode by that of the true "
+        "episodes with 95 % Wilson intervals; dashed: of the same planner with the true model, on "
+        f"the same seeds ({_truths(curves)}). Below: cost of the episode by that of the true "
         "model under the same planner, noise and draws (dashed: equal), geometric mean over "
         "trials with 95 % t-intervals of the mean logarithm. At 0 steps the model is untrained. "
-        f"Points of a number of steps are drawn side by side. {counts}."
+        f"Points of a number of steps are drawn side by side. {_lost(curves)}{counts}."
+    )
+
+
+def _truths(curves: Curves) -> str:
+    """Return the true model's share of successes, by environment."""
+    truths = {environment_title(curve.env): curve.truth for curve in curves}
+    return ", ".join(f"{env} {share(truth.success)}" for env, truth in truths.items())
+
+
+def _lost(curves: Curves) -> str:
+    """Return what a lost episode is, or nothing where none was."""
+    if not any(np.any(curve.lost) for curve in curves):
+        return ""
+    return (
+        "Lost: episodes, after any number of steps, without a finite cost of their own or of the "
+        "true model's; they are in the success rate and in no mean of costs. "
     )

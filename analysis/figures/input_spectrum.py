@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 
 from analysis.choice import REFERENCE
 from analysis.counts import count_text
-from analysis.figures.axes import log_ticks
+from analysis.figures.axes import log_scale, log_ticks
 from analysis.figures.plot import Plot
-from analysis.figures.style import COLUMN_WIDTH, environment_title, policy_style
+from analysis.figures.style import COLUMN_WIDTH, GUIDE, environment_title, policy_style
 from analysis.input_spectra import InputSpectra, PolicySpectrum, measure_spectra, tabulate_spectra
 
 HEIGHT = 3.0
@@ -41,12 +41,9 @@ def draw(spectra: InputSpectra) -> Figure:
     figure = Figure(figsize=(COLUMN_WIDTH, HEIGHT), layout="constrained")
     axes = figure.subplots()
     axes.set_xscale("log")
-    axes.set_yscale("log")
     for one in reversed(spectra.policies):
         _line(axes, one)
-    low, high = _limits(spectra)
-    axes.set_ylim(low, high)
-    log_ticks(axes.yaxis, low, high)
+    log_scale(axes, *_limits(spectra))
     frequency = spectra.policies[0].spectrum.frequency
     axes.set_xlim(frequency[1], frequency[-2])
     log_ticks(axes.xaxis, frequency[1], frequency[-2])
@@ -92,7 +89,7 @@ def _mark(axes: Axes, frequency: float | None) -> None:
     if frequency is None:
         return
     for factor, text in ((1, f"f₀ = {frequency:.3g} Hz"), (3, "3f₀")):
-        axes.axvline(factor * frequency, color="black", lw=0.8, ls=(0, (5, 2)), zorder=1.5)
+        axes.axvline(factor * frequency, **GUIDE, zorder=1.5)
         axes.annotate(
             text,
             (factor * frequency, 0.03),

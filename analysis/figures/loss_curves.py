@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 
 from analysis.counts import count_text
 from analysis.divergence import DivergenceRule
-from analysis.figures.axes import log_ticks, rows_and_columns
+from analysis.figures.axes import log_scale, rows_and_columns
 from analysis.figures.axis_break import Limits, axis_parts, mark_break
 from analysis.figures.plot import Plot
 from analysis.figures.style import GREY, TEXT_WIDTH, environment_title, policy_style
@@ -115,7 +115,6 @@ def _absent(curves: Sequence[LossCurve], env: str) -> dict[str, str]:
 
 
 def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits, spread: Spread) -> None:
-    axes.set_yscale("log")
     for place, curve in reversed(list(enumerate(curves))):
         style, band = policy_style(curve.policy), curve.band
         axes.plot(curve.x, band.centre, color=style.colour, ls=style.line, lw=style.width)
@@ -123,8 +122,7 @@ def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits, spread: Spre
             axes.fill_between(curve.x, band.low, band.high, color=style.colour, alpha=0.18, lw=0)
         else:
             _bars(axes, curve, (place + 1) / (len(curves) + 1))
-    axes.set_ylim(*limits)
-    log_ticks(axes.yaxis, *limits)
+    log_scale(axes, *limits)
     axes.set_xlim(0, max(_end(curve) for curve in curves))
 
 

@@ -25,6 +25,9 @@ TEXT_WIDTH = 6.75
 COLUMN_WIDTH = 4.2
 """Width of a figure of one panel [inches]."""
 
+GUIDE: dict[str, Any] = {"color": "black", "lw": 0.8, "ls": (0, (5, 2))}
+"""Look of a straight line that marks a value, such as a limit."""
+
 _RC: dict[Any, Any] = {
     "font.size": 8,
     "font.family": "DejaVu Sans",

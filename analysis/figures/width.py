@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from analysis.counts import count_text
-from analysis.figures.axes import log_limits, log_ticks
+from analysis.figures.axes import log_limits, log_scale
 from analysis.figures.loss_curves import NORM
 from analysis.figures.plot import Plot
 from analysis.figures.style import (
@@ -16,6 +16,7 @@ from analysis.figures.style import (
     COLUMN_WIDTH,
     GREEN,
     GREY,
+    GUIDE,
     VERMILLION,
     environment_title,
     policy_style,
@@ -72,7 +73,7 @@ def loss_against_width_plot(name: str) -> Plot[WidthLosses]:
 def draw_costs(numbers: WidthCosts) -> Figure:
     """Draw every part of a step on logarithmic axes, with the time that a step may take."""
     figure, axes = _axes(HEIGHT, numbers.costs[0].widths)
-    axes.axhline(numbers.limit_us, color="black", lw=0.8, ls=(0, (5, 2)))
+    axes.axhline(numbers.limit_us, **GUIDE)
     limit = f"real time: dt = {numbers.limit_us / 1e3:g} ms"
     axes.annotate(
         limit, (0, numbers.limit_us), xycoords=("axes fraction", "data"), xytext=(3, -3),
@@ -81,9 +82,7 @@ def draw_costs(numbers: WidthCosts) -> Figure:
     for cost in numbers.costs:
         _line(axes, cost, other=cost.form != numbers.costs[0].form)
     drawn = np.concatenate([np.r_[cost.low, cost.high] for cost in numbers.costs])
-    low, high = log_limits(np.r_[drawn, numbers.limit_us], margin=1.5)
-    axes.set_ylim(low, high)
-    log_ticks(axes.yaxis, low, high)
+    log_scale(axes, *log_limits(np.r_[drawn, numbers.limit_us], margin=1.5))
     axes.set_ylabel("time per step [µs]")
     axes.set_title(f"{policy_style(numbers.policy).label}, {environment_title(numbers.env)}")
     figure.legend(loc="outside lower center", ncols=2)
@@ -91,11 +90,10 @@ def draw_costs(numbers: WidthCosts) -> Figure:
 
 
 def _axes(height: float, widths: np.ndarray[tuple[int], np.dtype[np.int64]]) -> tuple[Figure, Axes]:
-    """Return axes whose ticks are the widths."""
+    """Return a figure of one panel whose horizontal ticks are the widths."""
     figure = Figure(figsize=(COLUMN_WIDTH, height), layout="constrained")
     axes = figure.subplots()
     axes.set_xscale("log")
-    axes.set_yscale("log")
     axes.set_xlabel("width w [units in each hidden layer]")
     axes.xaxis.set_major_locator(FixedLocator(widths.tolist()))
     axes.xaxis.set_minor_locator(NullLocator())
@@ -141,21 +139,21 @@ def draw_losses(numbers: WidthLosses) -> Figure:
         capsize=2,
     )  # fmt: skip
     edges = np.r_[numbers.mean - half, numbers.mean + half, numbers.mean]
-    low, high = log_limits(edges, margin=1.35)
-    axes.set_ylim(low, high)
-    log_ticks(axes.yaxis, low, high)
+    log_scale(axes, *log_limits(edges, margin=1.35))
     axes.set_ylabel(f"final {NORM['loss']}")
-    counts = count_text(dict(zip(map(str, numbers.widths), numbers.counts, strict=True)))
-    axes.set_title(f"{style.label}, {environment_title(numbers.env)} ({counts})")
+    axes.set_title(f"{style.label}, {environment_title(numbers.env)} ({_counts(numbers)})")
     return figure
+
+
+def _counts(numbers: WidthLosses) -> str:
+    return count_text(dict(zip(map(str, numbers.widths), numbers.counts, strict=True)))
 
 
 def caption_losses(numbers: WidthLosses) -> str:
     """Return the caption, with the statistic and n by width."""
-    counts = dict(zip(map(str, numbers.widths), numbers.counts, strict=True))
     return (
         f"L² norm of the model's error over the evaluation grid after the last step, against the "
         f"width of both hidden layers, {policy_style(numbers.policy).label} in the "
         f"{environment_title(numbers.env)}: mean over trials ± 2 standard errors. "
-        f"Trials by width: {count_text(counts)}."
+        f"Trials by width: {_counts(numbers)}."
     )

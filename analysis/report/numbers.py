@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from analysis.comparisons import loss_of_random_inputs
 from analysis.control import scores_at
 from analysis.divergence import DivergenceRule
-from analysis.measures import final_losses, mean_losses
-from analysis.paired import benjamini_hochberg, compare
+from analysis.measures import final_losses, mean_losses, steps_to
+from analysis.paired import benjamini_hochberg, censored_median, compare, without_ratio
 from analysis.reading import read_curves
-from analysis.report.control import has_task
 from analysis.report.variants import Field, Variant
 from analysis.statistics import mean, standard_error
 from dopt.coverage import Plane
@@ -29,7 +29,9 @@ MEASURES = ("loss", "reachable_loss", "auc", "coverage", "control")
 """What variants are compared by; of coverage more is better, of the others less.
 
 ``control`` is the cost of an episode with the model learned so far by that with the true model, at
-the first number of steps that the task names; only trials with a task have it.
+the first number of steps that the task names; only trials of the environment's task have it. An
+episode without a finite cost is in no mean and in no ratio (``control_lost`` pairs), and the worst
+in the test.
 """
 
 LEVEL = 0.05
@@ -39,9 +41,18 @@ LEVEL = 0.05
 def tabulate_field(reader: Reader, field: Field) -> pd.DataFrame:
     """Return one row for each variant of an environment, the reference first."""
     plane = Plane.of(system_from_mapping(field.reference.entry.cell.config["env"]))
+    entries = tuple(one.entry for one in field.variants)
+    epsilon = loss_of_random_inputs(reader, entries, "loss", DivergenceRule.EXCLUDE)
     scores = {one.label: _scores(reader, one, plane) for one in field.variants}
+    costs = _control_costs(reader, field)
+    for label, own in scores.items():
+        own["control"] = costs.get(label, {})
     return pd.DataFrame(
-        [_row(reader, field, one, scores[one.label], scores) for one in field.variants]
+        [
+            _row(reader, field, one, scores[one.label], scores)
+            | _samples(reader, one, math.nan if epsilon is None else epsilon)
+            for one in field.variants
+        ]
     )
 
 
@@ -72,15 +83,15 @@ def _scores(reader: Reader, variant: Variant, plane: Plane) -> dict[str, Scores]
         "reachable_loss": final_losses(reader, entry, "reachable_loss", rule).by_seed,
         "auc": mean_losses(reader, entry, "loss", rule).by_seed,
         "coverage": _coverages(reader, variant, plane),
-        "control": _control_costs(reader, variant),
     }
 
 
-def _control_costs(reader: Reader, variant: Variant) -> Scores:
-    if not has_task(variant):
-        return {}
-    steps = reader.assessments(variant.entry.cell.config_key, "control_cost").t
-    return scores_at(reader, variant.entry, int(min(t for t in steps.tolist() if t > 0))).by_seed
+def _control_costs(reader: Reader, field: Field) -> dict[str, Scores]:
+    """Return the relative costs of the assessed variants after the first steps of their task."""
+    keys = {one.label: one.entry.cell.config_key for one in field.assessed}
+    steps = {t for key in keys.values() for t in reader.assessments(key, "control_cost").t.tolist()}
+    first = min((t for t in steps if t > 0), default=0)
+    return {one.label: scores_at(reader, one.entry, first).by_seed for one in field.assessed}
 
 
 def _coverages(reader: Reader, variant: Variant, plane: Plane) -> Scores:
@@ -111,10 +122,27 @@ def _row(
     reference = scores[field.reference.label]
     for measure in MEASURES:
         values = np.array(list(own[measure].values()))
+        values = values[np.isfinite(values)]
         row[measure] = float(mean(values)) if len(values) else math.nan
         row[f"{measure}_2se"] = 2 * float(standard_error(values)) if len(values) else math.nan
         row |= _against(own[measure], reference[measure], field.env, variant.label, measure)
+    row["control_lost"] = without_ratio(*_paired(own["control"], reference["control"]))
     return row
+
+
+def _samples(reader: Reader, variant: Variant, epsilon: float) -> dict[str, float]:
+    """Return how many inputs it takes to the loss ε: the median over the trials, and how many do.
+
+    A trial that never gets there is censored: later than any that does.
+    """
+    steps = steps_to(reader, variant.entry, "loss", DivergenceRule.EXCLUDE, epsilon).values
+    known = not math.isnan(epsilon)
+    return {
+        "epsilon": epsilon,
+        "horizon": variant.entry.cell.horizon,
+        "steps": censored_median(steps) if known else math.nan,
+        "reached": float(np.mean(np.isfinite(steps))) if known and len(steps) else math.nan,
+    }
 
 
 def _against(own: Scores, reference: Scores, *names: str) -> dict[str, float]:
@@ -123,11 +151,16 @@ def _against(own: Scores, reference: Scores, *names: str) -> dict[str, float]:
     columns = ("ratio", "low", "high", "improvement", "p")
     if own is reference:
         return {f"{measure}_{column}": math.nan for column in columns}
-    seeds = sorted(set(own) & set(reference))
-    ours, theirs = (np.array([one[seed] for seed in seeds]) for one in (own, reference))
-    found = compare(ours, theirs, _stream(*names))
+    found = compare(*_paired(own, reference), _stream(*names))
     values = (found.ratio, found.low, found.high, found.improvement, found.p_value)
     return {f"{measure}_{column}": value for column, value in zip(columns, values, strict=True)}
+
+
+def _paired(own: Scores, reference: Scores) -> tuple[Array, Array]:
+    """Return the scores of the two on the seeds that they share."""
+    seeds = sorted(set(own) & set(reference))
+    ours, theirs = (np.array([one[seed] for seed in seeds], float) for one in (own, reference))
+    return ours, theirs
 
 
 def _typical(reader: Reader, variant: Variant, column: str) -> float:

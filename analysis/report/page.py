@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
 from analysis.figures.style import environment_title
-from analysis.numbers import number, p_text, plus_minus, within
+from analysis.numbers import but_lost, number, p_text, plus_minus, steps_text, within
 from analysis.report.numbers import LEVEL, verdict
 from analysis.report.picture import CAPTION
 from analysis.sheets import Sheet
 
 HEADERS = (
     "variant", "final loss", "ratio [95 %]", "adjusted p", "reachable set, ratio", "curve, ratio",
-    "coverage", "control cost, ratio", "plan [µs]", "learn [µs]", "n",
+    "steps to ε", "coverage", "control cost, ratio", "plan [µs]", "learn [µs]", "n",
 )  # fmt: skip
 
 EXPLAINED = (
-    "Ratio: geometric mean over shared seeds of the variant's loss by that of D-optimal inputs "
-    "(the first row of a table); below 1 the variant is better. Interval: paired BCa bootstrap of "
-    "the log ratio, Student's for few pairs. Adjusted p: two-sided Wilcoxon signed-rank test of "
-    "the final losses, adjusted over all rows of the report (Benjamini-Hochberg). Curve: the loss "
-    "over all steps (geometric mean). Coverage: share of the cells of the phase plane's box that "
-    "a trial visits, mean ± 2 standard errors. Control cost: of an episode with the model learned "
-    "until the first assessment of the task, as a ratio too. Microseconds: median over all steps "
-    "and trials, on the machine that ran them, the update of the information matrix with the "
-    "plan. n: trials that did not diverge; diverged ones are in no mean and in no ratio."
+    "Ratio: variant / D-optimal inputs (the first row of a table), below 1 the variant is better; "
+    "the comparison tables of the figures have it the other way, D-optimal / baseline. It is the "
+    "geometric mean over shared seeds, of losses and of control costs alike. Interval: paired BCa "
+    "bootstrap of the log ratio, Student's for few pairs. Adjusted p: two-sided Wilcoxon "
+    "signed-rank test of the final losses, adjusted over all rows of the report "
+    "(Benjamini-Hochberg). Curve: the loss over all steps (geometric mean). Steps to ε: median "
+    "number of inputs until the loss first is at most ε, the median final loss of random inputs; "
+    "trials that never get there count as later. Coverage: share of the cells of the phase "
+    "plane's box that a trial visits, mean ± 2 standard errors. Control cost: of an episode with "
+    "the model learned until the first assessment of the task, as a ratio too; lost: pairs "
+    "without a ratio, as one of the episodes or the true model's has no finite cost. "
+    "Microseconds: median over all steps and trials, on the machine that ran them, the update of "
+    "the information matrix with the plan. n: trials that did not diverge; diverged ones are in "
+    "no mean and in no ratio."
 )
 
 Row = Mapping[str, object]
@@ -60,18 +66,20 @@ def _rows(part: pd.DataFrame) -> list[Row]:
 
 
 def _finding(env: str, rows: Sequence[Row]) -> str:
-    """Return one sentence: what is better, what worse, and what the test does not tell apart."""
+    """Return what is better, what worse, and what the test does not tell apart, the best first."""
     judged: dict[str, list[str]] = {"better": [], "worse": [], "open": []}
-    for row in rows[1:]:
+    for row in sorted(rows[1:], key=lambda row: _number(row, "loss_ratio")):
         words = f"{row['variant']} ({number(_number(row, 'loss_ratio'))})"
         judged[verdict(row)].append(words)
     names = {"better": "better", "worse": "worse", "open": "not told apart"}
-    said = [f"{names[kind]}: {', '.join(found) or 'none'}" for kind, found in judged.items()]
-    return f"- **{environment_title(env)}** (ratio, p < {LEVEL}): {'; '.join(said)}."
+    said = [f"  - {names[kind]}: {'; '.join(found) or 'none'}" for kind, found in judged.items()]
+    return "\n".join([f"- **{environment_title(env)}** (ratio, p < {LEVEL})", *said])
 
 
 def _sheet(rows: Sequence[Row]) -> str:
-    return Sheet(HEADERS, [_cells(row) for row in rows]).markdown()
+    table = Sheet(HEADERS, [_cells(row) for row in rows]).markdown()
+    epsilon = _number(rows[0], "epsilon")
+    return table if math.isnan(epsilon) else f"ε = {number(epsilon)}\n\n{table}"
 
 
 def _cells(row: Row) -> list[object]:
@@ -87,8 +95,9 @@ def _cells(row: Row) -> list[object]:
         p_text(_number(row, "loss_p_adjusted")),
         ratio("reachable_loss"),
         ratio("auc"),
+        steps_text(_number(row, "steps"), int(_number(row, "horizon"))),
         plus_minus(_number(row, "coverage"), _number(row, "coverage_2se")),
-        ratio("control"),
+        but_lost(ratio("control"), int(_number(row, "control_lost"))),
         number(_number(row, "plan_us")),
         number(_number(row, "learn_us")),
         f"{row['n']}{diverged}",

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from analysis.choice import REFERENCE, Filter, departures, flatten
+from analysis.choice import REFERENCE, Filter, defaults, difference, flatten, nearness
+from analysis.control import common_task, task_of
 from analysis.errors import AnalysisError
 from analysis.selection import Entry, environment_rank, newest, policy_rank
 from orchestrate.store import Reader
@@ -29,11 +30,15 @@ class Variant:
 
 @dataclass(frozen=True)
 class Field:
-    """The variants of one environment, the reference first, and what was left out."""
+    """The variants of one environment, the reference first, and what was left out.
+
+    ``task`` is the one by which control is compared, as JSON, None where no trial was assessed.
+    """
 
     env: str
     variants: tuple[Variant, ...]
     notes: tuple[str, ...] = ()
+    task: str | None = None
 
     @property
     def reference(self) -> Variant:
@@ -42,6 +47,13 @@ class Field:
     @property
     def others(self) -> tuple[Variant, ...]:
         return self.variants[1:]
+
+    @property
+    def assessed(self) -> tuple[Variant, ...]:
+        """The variants whose control is compared: those that were assessed by the common task."""
+        if self.task is None:
+            return ()
+        return tuple(one for one in self.variants if task_of(one.entry) == self.task)
 
 
 def fields(reader: Reader, wanted: Filter) -> list[Field]:
@@ -66,19 +78,36 @@ def fields(reader: Reader, wanted: Filter) -> list[Field]:
 
 
 def _field(env: str, entries: Sequence[Entry]) -> Field | None:
-    kept = _one_world(entries)
+    world = _one_world(entries)
+    task = common_task(world)
+    kept = _one_each(world, task)
     references = [entry for entry in kept if entry.cell.policy == REFERENCE]
     if not references or len(kept) < 2:
         return None
-    reference = min(references, key=lambda entry: (-_company(entry, kept), departures(entry.cell)))
+    reference = max(references, key=lambda entry: (_company(entry, kept), *nearness(entry.cell)))
     labels = _labels(kept, reference)
     variants = [Variant(labels[entry.cell.config_key], entry) for entry in kept]
     first = replace(next(one for one in variants if one.entry is reference))
     rest = [one for one in variants if one.entry is not reference]
     rest.sort(key=lambda one: (policy_rank(one.entry.cell.policy), one.label))
     left = len(entries) - len(kept)
-    notes = (f"{left} configurations of another env section, task or fewer trials",) if left else ()
-    return Field(env, (first, *rest), notes)
+    notes = [f"{left} configurations of another env section, task or fewer trials"] if left else []
+    return Field(env, (first, *rest), (*notes, *_of_other_tasks([first, *rest], task)), task)
+
+
+def _of_other_tasks(variants: Sequence[Variant], task: str | None) -> Iterator[str]:
+    """Say which variants are not in the section on control, and in what their task differs."""
+    others: dict[str, list[str]] = {}
+    for one in variants:
+        own = task_of(one.entry)
+        if own is not None and own != task:
+            others.setdefault(own, []).append(one.label)
+    for other, labels in others.items():
+        path, (value, usual) = difference([json.loads(other), json.loads(task or "{}")])
+        yield (
+            f"control with {'; '.join(labels)}: assessed by another task than most trials "
+            f"({path} = {value} instead of {usual}), so these costs and successes are not compared"
+        )
 
 
 def _company(entry: Entry, entries: Sequence[Entry]) -> int:
@@ -88,17 +117,27 @@ def _company(entry: Entry, entries: Sequence[Entry]) -> int:
 
 
 def _one_world(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the entries of the env section with most trials, one for each policy and setting."""
+    """Return the entries of the env section with most trials."""
     totals: Counter[str] = Counter()
     for entry in entries:
         totals[_section(entry, "env")] += len(entry.trials)
     world = max(totals, key=lambda section: (totals[section], section))
+    return [entry for entry in entries if _section(entry, "env") == world]
+
+
+def _one_each(entries: Sequence[Entry], task: str | None) -> list[Entry]:
+    """Return one entry for each policy and setting: of the task if there is one, with most trials.
+
+    The losses of a trial are the same with any task and without one.
+    """
+
+    def weight(entry: Entry) -> tuple[bool, int]:
+        return task is not None and task_of(entry) == task, len(entry.trials)
+
     best: dict[tuple[str, ...], Entry] = {}
     for entry in entries:
-        if _section(entry, "env") != world:
-            continue
         key = tuple(_section(entry, name) for name in ("policy", *_SETTING, "path"))
-        if key not in best or _weight(entry) > _weight(best[key]):
+        if key not in best or weight(entry) > weight(best[key]):
             best[key] = entry
     return list(best.values())
 
@@ -107,28 +146,30 @@ def _section(entry: Entry, name: str) -> str:
     return json.dumps(entry.cell.config.get(name), sort_keys=True)
 
 
-def _weight(entry: Entry) -> tuple[bool, int]:
-    """Prefer a configuration whose trials also did a task, then the one with more trials."""
-    return bool(entry.cell.config.get("task")), len(entry.trials)
-
-
 def _labels(entries: Sequence[Entry], reference: Entry) -> dict[str, str]:
-    """Return a label for each configuration: its policy, and what it takes to tell it apart."""
+    """Return a label for each configuration: its policy, and what sets it apart from the others.
+
+    Names of the model and of the learner are said where it takes them and they are not those of the
+    reference; then, of the values in which configurations so called differ, all but defaults.
+    """
     flat = {one.cell.config_key: flatten(one.cell.config) for one in entries}
-    usual = flatten(reference.cell.config)
+    own = flatten(reference.cell.config)
     words = {one.cell.config_key: [one.cell.policy.replace("_", " ")] for one in entries}
-    for path in sorted(set().union(*flat.values()), key=_rank):
+    for path in (f"{section}.name" for section in _SETTING):
         for group in _alike(words):
-            if len({repr(flat[key].get(path)) for key in group}) > 1:
-                for key in group:
-                    words[key] += _word(path, flat[key], usual)
+            for key in group if _differ(flat, group, path) else ():
+                words[key] += _word(path, flat[key], own)
+    usual = {one.cell.config_key: own | defaults(one.cell) for one in entries}
+    for group in _alike(words):
+        for path in sorted(set().union(*(flat[key] for key in group))):
+            for key in group if _differ(flat, group, path) else ():
+                words[key] += _word(path, flat[key], usual[key])
     return {key: ", ".join(parts) for key, parts in words.items()}
 
 
-def _rank(path: str) -> tuple[int, str]:
-    """Let the names of the model and of the learner come before their values."""
-    names = [f"{section}.name" for section in _SETTING]
-    return names.index(path) if path in names else len(names), path
+def _differ(flat: Mapping[str, Mapping[str, object]], keys: Sequence[str], path: str) -> bool:
+    """Whether some configurations have different values at a path."""
+    return len({repr(flat[key].get(path)) for key in keys}) > 1
 
 
 def _alike(words: Mapping[str, Sequence[str]]) -> list[list[str]]:
@@ -140,8 +181,9 @@ def _alike(words: Mapping[str, Sequence[str]]) -> list[list[str]]:
 
 
 def _word(path: str, config: Mapping[str, object], usual: Mapping[str, object]) -> list[str]:
-    """Return what one value adds to a label: nothing where it is the reference's, or is not set."""
-    if path not in config or config[path] == usual.get(path):
+    """Return what one value adds to a label: nothing where it is the usual one, or is not set."""
+    if path not in config or (path in usual and config[path] == usual[path]):
         return []
-    name = path.rpartition(".")[2]
-    return [str(config[path]).replace("_", " ") if name == "name" else f"{name}={config[path]}"]
+    name, value = path.rpartition(".")[2], config[path]
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return [text.replace("_", " ") if name == "name" else f"{name}={text}"]

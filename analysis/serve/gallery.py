@@ -34,7 +34,7 @@ LONGEST_TABLE = 60
 FACTS = ("statistic", "band", "database", "schema", "selection", "fingerprint", "git", "versions")
 
 
-def gallery(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # what every page takes
+def gallery(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # the signature is that of every page
     """Return what lies in the folder, one item for each name, figures before tables."""
     groups: dict[str, dict[str, Path]] = {}
     for path in files(site.figures).values():

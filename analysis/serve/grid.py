@@ -27,7 +27,7 @@ SHADES = 9
 """Steps of the heat scale."""
 
 
-def grid(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # what every page takes
+def grid(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # the signature is that of every page
     """Return every configuration with its final loss and the state of its trials."""
     reader = site.source.reader()
     state = measure(reader)

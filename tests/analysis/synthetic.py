@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 
 import numpy as np
@@ -141,8 +141,12 @@ def fill(
     specs: list[TrialSpec],
     skipped: Iterable[TrialSpec] = (),
     diverged: Mapping[str, int] | None = None,
+    edit: Callable[[TrialSpec, TrialResult], TrialResult] = lambda _, result: result,
 ) -> None:
-    """Register all trials and run all but the skipped; ``diverged`` maps trial keys to steps."""
+    """Register all trials and run all but the skipped; ``diverged`` maps trial keys to steps.
+
+    ``edit`` may change the made-up result of a trial before it is stored.
+    """
     left = {spec.trial_key for spec in skipped}
     with Store.open(url) as store:
         launch = store.begin_launch(LaunchRecord(argv=["test"], overrides=[], host="h", pid=1))
@@ -153,8 +157,9 @@ def fill(
         }
         now = datetime(2026, 1, 1, tzinfo=UTC)
         run = RunRecord("h", 1, 0.1, 0.1, 1, now, now)
+        lost = diverged or {}
         items = [
-            (claims[spec.trial_key], fake_result(spec, (diverged or {}).get(spec.trial_key)), run)
+            (claims[spec.trial_key], edit(spec, fake_result(spec, lost.get(spec.trial_key))), run)
             for spec in todo
             if spec.trial_key in claims
         ]

@@ -55,6 +55,15 @@ def test_a_tie_names_the_difference_and_the_way_out() -> None:
         choose([Candidate(wide, 20), Candidate(narrow, 20)])
 
 
+def test_a_task_is_no_departure_but_the_last_to_decide() -> None:
+    task = {"task": {"name": "control", "checkpoints": [100]}}
+    plain = cell("pendulum", "lookahead")
+    assessed = cell("pendulum", "lookahead", **task)
+    far = cell("pendulum", "lookahead", policy={"horizon": 20})
+    assert choose([Candidate(far, 5), Candidate(assessed, 5)]) == [assessed]
+    assert choose([Candidate(assessed, 5), Candidate(plain, 5), Candidate(far, 5)]) == [plain]
+
+
 def test_a_tie_between_variants_of_one_policy_is_an_error_too() -> None:
     mild, strong = (
         cell("pendulum", "d_optimal", policy={"regularization": value}) for value in (1e-2, 1e-4)

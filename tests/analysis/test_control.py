@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,13 @@ from analysis.figures.registry import build
 from analysis.request import Request
 from analysis.selection import Selection, select
 from analysis.sheets import control_sheet
-from dopt.result import Assessment
+from dopt.result import Assessment, TrialResult
+from dopt.spec import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import fake_result, fill, make_grid
+
+Edit = Callable[[TrialSpec, TrialResult], TrialResult]
 
 
 @pytest.fixture
@@ -107,18 +111,109 @@ def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
         assert tabulate_control(measure_control(reader, part)).n.tolist() == [3, 3, 3]
 
 
+def valued(
+    measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t: int, value: float
+) -> Edit:
+    """Return an edit that gives a measure of some trials a value."""
+
+    def edit(spec: TrialSpec, result: TrialResult) -> TrialResult:
+        if spec.policy.name not in policies or spec.seed not in seeds:
+            return result
+        rows = (
+            row._replace(value=value) if (row.t, row.measure) == (t, measure) else row
+            for row in result.assessments
+        )
+        return dataclasses.replace(result, assessments=tuple(rows))
+
+    return edit
+
+
+def overflown(measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t: int) -> Edit:
+    """Return an edit that makes a number infinite, as the episode of a crashed plant has it."""
+    return valued(measure, policies, seeds, t, np.inf)
+
+
+def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/lost.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **task)
+    fill(url, specs, edit=overflown("control_cost", ("random",), (1, 3), 20))
+    with Reader.open(url) as reader:
+        part = control_part(select(reader, Filter()))
+        curves = measure_control(reader, part)
+        entry = next(entry for entry in part.entries if entry.cell.policy == "random")
+        scores = scores_at(reader, entry, 20).by_seed
+        table = compare_control(reader, part)
+    curve = curve_of(curves, "pendulum", "random")
+    assert curve.n.tolist() == [5, 5, 5]
+    assert curve.lost.tolist() == [0, 2, 0]
+    assert {seed for seed, score in scores.items() if np.isinf(score)} == {1, 3}
+    finite = [score for score in scores.values() if np.isfinite(score)]
+    assert curve.cost[1] == pytest.approx(np.exp(np.mean(np.log(finite))))
+    assert tabulate_control(curves).lost.tolist() == [0, 0, 0, 0, 2, 0]
+    assert "random: 5, 2 lost" in caption_control(curves)
+    assert "Lost: episodes" in caption_control(curves)
+    assert "2 lost" in draw_control(curves).axes[0].get_title()
+    row = table[table.t == 20].iloc[0]
+    assert (row.n_pairs, row.n_lost, row.improvement) == (5, 2, 1.0)
+    assert row.p_value == pytest.approx(2 / 2**5)  # all five, the lost ones too
+    lines = control_sheet(table).markdown().splitlines()
+    assert "], 2 lost |" in lines[2]
+    assert "lost" not in lines[3]
+
+
+def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/truth.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **task)
+    fill(url, specs, edit=overflown("true_model_cost", ("d_optimal", "random"), tuple(range(5)), 0))
+    with Reader.open(url) as reader:
+        part = control_part(select(reader, Filter()))
+        curves = measure_control(reader, part)
+        table = compare_control(reader, part)
+    assert [curve.lost.tolist() for curve in curves] == [[5, 5, 5]] * 2
+    assert np.isnan(curves[0].cost).all()
+    assert curves[0].success[-1] == 1.0
+    assert "| –, 5 lost |" in " ".join(control_sheet(table).markdown().split())
+
+
 def test_the_picture_has_a_column_for_each_task(reader: Reader, part: Selection) -> None:
     curves = measure_control(reader, part)
     figure = draw_control(curves)
     titles = [axes.get_title() for axes in figure.axes]
     assert [title.split("\n")[0] for title in titles[:2]] == ["pendulum", "quadrotor"]
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["D-optimal", "uniform", "random"]
+    assert labels == ["D-optimal", "uniform", "random", "true model"]
     caption = caption_control(curves)
     assert "Wilson" in caption
     assert "pendulum: n = 5" in caption
     odd = dataclasses.replace(curves[0], cost=np.full(4, np.nan), cost_low=np.full(4, np.nan))
     draw_control((odd,))
+
+
+def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/ceiling.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("d_optimal",), range(3), **SHORT, **task)
+    specs += make_grid(("pendulum",), ("random",), range(5), **SHORT, **task)
+    policies = ("d_optimal", "random")
+    missed = valued("true_model_success", policies, (0, 4), 0, 0.0)
+    crashed = overflown("true_model_cost", policies, (4,), 0)
+    fill(url, specs, edit=lambda spec, result: crashed(spec, missed(spec, result)))
+    with Reader.open(url) as reader:
+        curves = measure_control(reader, control_part(select(reader, Filter())))
+    truth = curves[0].truth
+    assert truth == curves[1].truth
+    assert (truth.n, truth.lost) == (5, 1)  # each seed once
+    assert truth.success == pytest.approx(3 / 5)
+    assert truth.success_low < 3 / 5 < truth.success_high
+    assert set(tabulate_control(curves).true_model_success) == {truth.success}
+    rates, costs = draw_control(curves).axes
+    for axes, height in ((rates, truth.success), (costs, 1.0)):
+        flat = [line for line in axes.get_lines() if list(line.get_ydata()) == [height] * 2]
+        assert [line.get_linestyle() != "-" for line in flat] == [True]
+    assert "dashed: of the same planner with the true model" in caption_control(curves)
+    assert "(pendulum 0.60)" in caption_control(curves)
 
 
 def test_a_grid_without_a_task_has_no_such_figure(tmp_path: Path) -> None:

@@ -5,7 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from analysis.paired import benjamini_hochberg, compare, interval_of_mean, signed_rank
+from analysis.paired import (
+    benjamini_hochberg,
+    compare,
+    interval_of_mean,
+    signed_rank,
+    without_ratio,
+)
 
 
 def rng() -> np.random.Generator:
@@ -26,6 +32,21 @@ def test_a_constant_factor_is_found_without_spread() -> None:
     assert (found.low, found.high) == pytest.approx((0.5, 0.5))
     assert found.improvement == 1.0
     assert found.p_value == pytest.approx(2 / 2**5)  # exact: all five signs agree
+
+
+def test_what_was_lost_is_the_worst_in_the_test_and_in_no_ratio() -> None:
+    ours = np.array([1.0, 2.0, np.inf, 4.0, np.inf, np.nan, 1.0])
+    theirs = np.array([2.0, 4.0, 1.0, 1.0, np.inf, 1.0, np.nan])
+    found = compare(ours, theirs, rng())
+    assert found.n_pairs == 5  # but those of which nothing is known
+    assert without_ratio(ours, theirs) == 4
+    assert found.ratio == pytest.approx(1.0)  # 1/2 · 1/2 · 4
+    assert found.improvement == (2 + 0.5) / 5
+    largest = np.log([1 / 2, 1 / 2, 1e9, 4.0, 1.0])
+    assert found.p_value == pytest.approx(signed_rank(largest))
+    nothing = compare(np.full(8, np.inf), np.arange(1.0, 9.0), rng())
+    assert math.isnan(nothing.ratio)
+    assert nothing.p_value == pytest.approx(2 / 2**8)
 
 
 def test_equal_losses_are_no_difference() -> None:

@@ -13,7 +13,6 @@ from scipy import stats
 
 from analysis.__main__ import main
 from analysis.choice import Filter
-from analysis.control import scores_at
 from analysis.errors import AnalysisError
 from analysis.report import numbers, page
 from analysis.report.variants import Field, fields
@@ -62,23 +61,6 @@ def test_every_variant_has_a_label_of_its_own(pendulum: Field) -> None:
     ]
 
 
-def test_variants_of_one_name_are_told_apart_by_their_values(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/values.db"
-    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(2), **SHORT)
-    for rate in (1e-3, 1e-4):
-        learner = {"learner": {"name": "adam", "window": 1, "learning_rate": rate}}
-        specs += make_grid(("pendulum",), ("d_optimal",), range(2), **SHORT, **learner)
-    fill(url, specs)
-    with Reader.open(url) as opened:
-        labels = [one.label for one in fields(opened, Filter())[0].variants]
-    assert labels == [
-        "d optimal",
-        "d optimal, adam, learning_rate=0.0001",
-        "d optimal, adam, learning_rate=0.001",
-        "random",
-    ]
-
-
 def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Field) -> None:
     table = numbers.adjust([numbers.tabulate_field(reader, pendulum)]).set_index("variant")
     finals = {
@@ -94,6 +76,34 @@ def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Field
     assert row["n"] == 6
     assert 0 < row["coverage"] < 1
     assert math.isnan(table.loc["d optimal", "loss_ratio"])
+
+
+def test_steps_to_the_loss_of_random_inputs_are_counted(reader: Reader, pendulum: Field) -> None:
+    table = numbers.tabulate_field(reader, pendulum).set_index("variant")
+    curves = {
+        name: [fake_result(make_spec("pendulum", name, s, **SHORT)).loss for s in SEEDS]
+        for name in ("random", "d_optimal")
+    }
+    epsilon = np.median([curve[-1] for curve in curves["random"]])
+    steps = [
+        np.argmax(curve <= epsilon) + 1 if np.any(curve <= epsilon) else np.inf
+        for curve in curves["d_optimal"]
+    ]
+    assert table.loc["d optimal", "epsilon"] == pytest.approx(epsilon)
+    assert table.loc["d optimal", "steps"] == sorted(steps)[len(steps) // 2]
+    assert table.loc["d optimal", "reached"] == np.mean(np.isfinite(steps))
+    assert table.loc["random", "reached"] <= 0.5
+
+
+def test_without_random_inputs_there_is_no_loss_to_reach(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/uniform.db"
+    fill(url, make_grid(("pendulum",), ("d_optimal", "uniform"), range(3), **SHORT))
+    with Reader.open(url) as opened:
+        table = numbers.adjust(
+            [numbers.tabulate_field(opened, field) for field in fields(opened, Filter())]
+        )
+    assert table[["epsilon", "steps", "reached"]].isna().all(axis=None)
+    assert "ε =" not in page.write(table, [], "origin", "report.png")
 
 
 def test_p_values_are_adjusted_over_the_whole_report(reader: Reader) -> None:
@@ -128,14 +138,28 @@ def test_a_page_calls_what_is_worse_worse() -> None:
         math.nan,
     )
     usual = {"env": "arm", "loss": 1.0, "loss_2se": 0.1, "coverage": 0.3, "coverage_2se": 0.1}
-    usual |= {"plan_us": 2.0, "learn_us": 30.0, "n": 20, "n_diverged": 0}
+    usual |= {"epsilon": 2.5, "horizon": 500, "steps": math.inf}
+    usual |= {"control_lost": 0, "plan_us": 2.0, "learn_us": 30.0, "n": 20, "n_diverged": 0}
     bad = {"loss_ratio": 1.5, "loss_low": 1.2, "loss_high": 1.9, "loss_p_adjusted": 1e-3}
     rows = [{"variant": "d optimal"}, {"variant": "look-ahead", **bad}, {"variant": "max"}]
     table = pd.DataFrame([{**usual, **unknown, **row} for row in rows])
     text = page.write(table, ["arm: one"], "origin", "report.png")
-    assert "better: none; worse: look-ahead (1.50); not told apart: max" in text
+    assert "- better: none\n  - worse: look-ahead (1.50)\n  - not told apart: max" in text
     assert "1.50 [1.20, 1.90]" in text
+    assert "ε = 2.50" in text
+    assert "> 500" in text
     assert "- arm: one" in text
+
+
+def test_entries_with_commas_are_separated_by_semicolons(reader: Reader) -> None:
+    table = numbers.adjust(
+        [numbers.tabulate_field(reader, field) for field in fields(reader, Filter(("pendulum",)))]
+    )
+    text = page.write(table, [], "origin", "report.png")
+    lines = [line for line in text.splitlines() if line.startswith("  - ")]
+    entries = [entry for line in lines for entry in line.split(": ")[1].split("; ")]
+    names = {entry.rpartition(" (")[0] for entry in entries if entry != "none"}
+    assert names == {one.label for one in fields(reader, Filter(("pendulum",)))[0].others}
 
 
 def test_the_command_writes_a_page_with_picture_and_provenance(url: str, tmp_path: Path) -> None:
@@ -150,31 +174,6 @@ def test_the_command_writes_a_page_with_picture_and_provenance(url: str, tmp_pat
     assert main(["report", "--db", url, "--out", str(folder)]) == 0
     assert (folder / "report.png").read_bytes() == again
     assert (folder / "README.md").read_text() == text
-
-
-def test_what_the_models_are_good_for_has_a_section(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/control.db"
-    task = {"task": {"name": "control", "checkpoints": [20]}}
-    specs = make_grid(("pendulum",), ("d_optimal", "uniform"), SEEDS, **SHORT, **task)
-    specs += make_grid(("pendulum",), ("random",), SEEDS, **SHORT)
-    fill(url, specs)
-    assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
-    text = (tmp_path / "out/README.md").read_text()
-    section = text.split("## Control with the learned model")[1].split("\n## ")[0]
-    assert "success after 20" in section
-    assert "| uniform" in section
-    assert "| random" not in section  # was not assessed
-    table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
-    with Reader.open(url) as reader:
-        costs = {
-            one.entry.cell.policy: scores_at(reader, one.entry, 20).by_seed
-            for one in fields(reader, Filter())[0].variants
-            if one.entry.cell.config.get("task")
-        }
-    ratios = [costs["uniform"][seed] / costs["d_optimal"][seed] for seed in SEEDS]
-    expected = np.exp(np.mean(np.log(ratios)))
-    assert table.loc["uniform", "control_ratio"] == pytest.approx(expected)
-    assert math.isnan(table.loc["random", "control_ratio"])
 
 
 def test_missing_trials_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -82,6 +82,20 @@ def test_an_axis_of_nearly_a_decade_has_three_labels(low: float) -> None:
     assert len(shown) >= 3
 
 
+@pytest.mark.parametrize("decades", [0.02, 0.1, 0.2, 0.3, 0.45, 0.55, 0.75])
+@pytest.mark.parametrize("low", np.geomspace(0.08, 1, 12))
+def test_a_short_axis_has_three_labels_and_no_crowd(low: float, decades: float) -> None:
+    axes = Figure().subplots()
+    axes.set_yscale("log")
+    high = low * 10**decades
+    axes.set_ylim(low, high)
+    log_ticks(axes.yaxis, low, high)
+    texts = axes.yaxis.get_major_formatter().format_ticks(list(axes.yaxis.get_majorticklocs()))
+    places = axes.yaxis.get_majorticklocs()
+    shown = {text for place, text in zip(places, texts, strict=True) if low <= place <= high}
+    assert 3 <= len(shown) <= 8
+
+
 def test_small_ticks_are_powers_of_ten() -> None:
     assert log_text(0.03) == "0.03"
     assert log_text(3e-4) == r"$3\times10^{-4}$"

@@ -12,9 +12,12 @@ from analysis.counts import count_text
 from analysis.divergence import DivergenceRule
 from analysis.errors import AnalysisError
 from analysis.loss_curves import Axis, measure_curves, tabulate_curves
+from analysis.measures import Measure
 from analysis.numbers import number, p_text, plus_minus
+from analysis.report.page import EXPLAINED
+from analysis.report.picture import CAPTION
 from analysis.selection import select
-from analysis.sheets import comparison_sheet, summary_sheet
+from analysis.sheets import comparison_sheet, control_sheet, summary_sheet
 from analysis.summary import summarise
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fake_result, make_spec
@@ -144,6 +147,20 @@ def test_markdown_shows_counts_and_dashes() -> None:
     summary = summary_sheet(pd.DataFrame([counts | values]), "worst").markdown()
     assert "1.00 ± 0.10" in summary
     assert "Diverged trials: worst." in summary
+
+
+def test_every_caption_says_what_is_divided_by_what() -> None:
+    for note in (
+        comparison_sheet(pd.DataFrame(), "exclude").note,
+        comparison_sheet(pd.DataFrame(), "exclude", Measure.AUC).note,
+        control_sheet(pd.DataFrame()).note,
+    ):
+        assert "atio: D-optimal / baseline, below 1 D-optimal is better" in note
+        assert "(a report has it the other way, variant / D-optimal)" in note
+    assert "Ratio: variant / D-optimal inputs" in EXPLAINED
+    assert "below 1 the variant is better" in EXPLAINED
+    assert "the other way, D-optimal / baseline" in EXPLAINED
+    assert "variant / D-optimal inputs: left of the line, below 1, the variant is better" in CAPTION
 
 
 def test_count_text() -> None:
