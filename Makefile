@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 DB ?= sqlite:///results/results.db
 STUDY_DB ?= sqlite:///results/study.db
+CLAIMS_DB ?= sqlite:///results/claims.db
 SMOKE_DB := sqlite:///results/smoke.db
 
 # One thread to a process: the grid runs one worker on each core.
@@ -13,7 +14,7 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-machines soak image lint format grid figures study smoke bench clean
+.PHONY: help setup test test-machines soak image lint format grid figures study claims smoke bench clean
 
 help:  ## show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -60,6 +61,10 @@ figures: grid  ## run the paper's grid and draw its figures
 study: setup  ## run everything beyond the paper and compare it on one page, report/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=beyond store.url='$(STUDY_DB)'
 	$(BIN)/python -m analysis report --db '$(STUDY_DB)' --out report
+
+claims: setup  ## run with 100 seeds what few leave open, and compare it on one page, report/claims/README.md
+	$(BIN)/python orchestrate/launch.py -m experiment=claims store.url='$(CLAIMS_DB)'
+	$(BIN)/python -m analysis report --db '$(CLAIMS_DB)' --out report/claims
 
 smoke: setup  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'
