@@ -109,8 +109,8 @@ def _search(policy: Policy, system: System, model: Model) -> dict[str, int]:
     subspace = min(q, policy.subspace) if isinstance(policy, EOptimal) else 0
     return {
         "model.width" if isinstance(model, MLP) else "model": q**2 + r * q,
-        "policy.horizon": 2 * rows * q + rows**2 + steps * (system.n_states + r),
-        "policy.directions": policy.directions**2 * (1 if model.compiled else 2 * rows * q),
+        "policy.lookahead": 2 * rows * q + rows**2 + steps * (system.n_states + r),
+        "policy.candidates": policy.candidates**2 * (1 if model.compiled else 2 * rows * q),
         "policy.count": count * (r * q + system.n_states),
         "policy.subspace": subspace * (2 * q + 2 * subspace) + (r + 1) * q,
     }

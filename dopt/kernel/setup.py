@@ -136,7 +136,7 @@ def _search(cell: Cell) -> args.Search:
     candidates = np.zeros((0, system.n_inputs))
     if isinstance(policy, Search):
         steps, score = policy.steps(system), SCORES.index(policy.score)
-        candidates = policy.candidates(system)
+        candidates = policy.compared_inputs(system)
     states = np.zeros((0, system.n_states))
     if isinstance(policy, TaskOptimal):
         states = task_states(system, policy)

@@ -7,10 +7,11 @@ from typing import ClassVar
 
 from dopt.fields import quantity
 from dopt.policies.base import ClosedLoop
+from dopt.policies.compared import Compared
 
 
 @dataclass(frozen=True, kw_only=True)
-class GradientDOptimal(ClosedLoop):
+class GradientDOptimal(Compared, ClosedLoop):
     """Maximise G_D(u) = log det(M + J(x(u))ᵀ J(x(u))) on the sphere ‖u‖ = γ (Definition 1).
 
     All learned components count, and x(u) = x_t + dt f_θ(x_t, u) is exact. The value of each
@@ -24,7 +25,7 @@ class GradientDOptimal(ClosedLoop):
     regularization : float
         λ of M₀ = λI.
     candidates : int
-        Inputs on the sphere that are compared first.
+        As of :class:`dopt.policies.compared.Compared`.
     starts : int
         How many of them the ascent starts from.
     iterations : int
@@ -35,6 +36,5 @@ class GradientDOptimal(ClosedLoop):
     compiled: ClassVar[bool] = False
 
     regularization: float = quantity(1e-3, bound="positive")
-    candidates: int = quantity(16, "inputs", "positive")
     starts: int = quantity(2, "inputs", "positive")
     iterations: int = quantity(4, "steps", "positive")

@@ -28,7 +28,7 @@ class Lookahead(Search):
 
     Parameters
     ----------
-    horizon : int or None
+    lookahead : int or None
         H; None takes 0.6 periods of the least damped oscillation about the stable equilibrium, and
         10 steps where there is none. The period is the true system's, as that of the periodic
         policy is: give H where it is unknown.
@@ -42,18 +42,18 @@ class Lookahead(Search):
 
     name: ClassVar[str] = "lookahead"
 
-    directions: int = quantity(8, "directions", "positive")
-    horizon: int | None = quantity(None, "steps", "positive")
+    candidates: int = quantity(8, "inputs", "positive")
+    lookahead: int | None = quantity(None, "steps", "positive")
     criterion: str = quantity("sum", choices=("joint", "sum"))
     stride: int | None = quantity(None, "steps", "positive")
 
     def check(self, system: System) -> None:
-        if self.horizon is not None:
-            check_length("policy.horizon", self.horizon, system)
+        if self.lookahead is not None:
+            check_length("policy.lookahead", self.lookahead, system)
         if self.stride is not None and self.stride > self.steps(system):
             raise IncompatibleError(
                 f"policy.stride is {self.stride} steps, but the plans have {self.steps(system)}: "
-                f"make it smaller, or policy.horizon larger."
+                f"make it smaller, or policy.lookahead larger."
             )
 
     @property
@@ -61,8 +61,8 @@ class Lookahead(Search):
         return self.criterion
 
     def steps(self, system: System) -> int:
-        if self.horizon is not None:
-            return self.horizon
+        if self.lookahead is not None:
+            return self.lookahead
         mode = eigenmode(system)
         if mode is None:
             return STEPS_WITHOUT_PERIOD

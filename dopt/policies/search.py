@@ -6,8 +6,8 @@ from abc import abstractmethod
 from dataclasses import dataclass
 
 from dopt.fields import quantity
-from dopt.policies.base import Array, Informed
-from dopt.policies.directions import sphere_inputs
+from dopt.policies.base import Informed
+from dopt.policies.compared import Compared
 from dopt.systems.base import System
 
 SCORES = ("joint", "sum", "trace", "a", "e", "task")
@@ -15,7 +15,7 @@ SCORES = ("joint", "sum", "trace", "a", "e", "task")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search(Informed):
+class Search(Compared, Informed):
     """Roll the learned model along every plan of a finite set and take the best plan's first input.
 
     From x_t the model runs x ← x + dt f_θ(x, u) without linearisation. The rows J at the states of
@@ -32,13 +32,12 @@ class Search(Informed):
 
     Parameters
     ----------
-    directions : int
-        Candidate inputs on the sphere ‖u‖ = γ; with one input there are two, ±γ.
+    candidates : int
+        As of :class:`dopt.policies.compared.Compared`.
     budget_us : float
         Time for the search of one step [µs]; 0 is no limit. The first plan is always scored.
     """
 
-    directions: int = quantity(16, "directions", "positive")
     budget_us: float = quantity(0.0, "µs", "nonnegative")
 
     @property
@@ -52,7 +51,3 @@ class Search(Informed):
 
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # one form only
         return "primal"
-
-    def candidates(self, system: System) -> Array:
-        """Return the candidate inputs, (C, m)."""
-        return sphere_inputs(system, self.directions)

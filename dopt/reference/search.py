@@ -39,7 +39,7 @@ def searched_inputs(
 
     Given are parameters (n, q), M (n, q, q), states (n, d) and tie-breaking directions (n, m).
     """
-    candidates = torch.tensor(policy.candidates(system)).to(x)
+    candidates = torch.tensor(policy.compared_inputs(system)).to(x)
     pairs = plans(policy, system, len(candidates))
     inputs = candidates[torch.tensor(pairs)]
     states = vmap(lambda p, z: paths(policy, system, model, p, z, inputs))(theta, x)

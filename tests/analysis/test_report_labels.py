@@ -39,12 +39,15 @@ def ahead(**policy: object) -> Sections:
         ),
         (
             ("d_optimal", "lookahead"),
-            [("lookahead", ahead(horizon=20)), ("lookahead", ahead(horizon=20, criterion="joint"))],
+            [
+                ("lookahead", ahead(lookahead=20)),
+                ("lookahead", ahead(lookahead=20, criterion="joint")),
+            ],
             [
                 "d optimal",
                 "lookahead",
-                "lookahead, criterion=joint, horizon=20",
-                "lookahead, horizon=20",
+                "lookahead, criterion=joint, lookahead=20",
+                "lookahead, lookahead=20",
             ],
         ),
     ],

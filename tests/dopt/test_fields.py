@@ -29,7 +29,7 @@ POSITIVE = {
     *("inertia", "half_span", "width", "depth", "learning_rate", "window", "epsilon"),
     *("ensemble", "lookahead", "candidates", "starts", "n_features", "lengthscale", "amplitude"),
     *("regularization", "sketch_size", "hold", "iterations", "frequency", "band"),
-    *("directions", "subspace", "count", "radius", "stride"),
+    *("subspace", "count", "radius", "stride"),
     *("n_links", "time_constant", "capacity", "batch", "steps", "noise_variance", "forgetting"),
 }
 NONNEGATIVE = {

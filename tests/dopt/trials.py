@@ -18,7 +18,7 @@ SMALL_GRIDS = {
     "drifting_pendulum": (4, 4),
     "chain": (16,),
 }
-SMALL_SEARCHES = {"lookahead": {"horizon": 6, "directions": 4}, "task": {"count": 8}}
+SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"count": 8}}
 SMALL_GRIDS |= {"mass_spring": (2, 2, 2, 2)}
 MODELS = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}
 LEARNERS = {"oracle": "recursive_least_squares", "linear": "recursive_least_squares"}

@@ -27,7 +27,7 @@ def test_a_setting_holds_for_the_choices_that_have_it(command_line: Command) -> 
     ("choice", "setting", "note"),
     [
         ("policy=beyond/exact,beyond/trace", "policy.budget_us=20", ""),
-        ("policy=d_optimal,beyond/exact", "policy.directions=8", "policy=exact"),
+        ("policy=d_optimal,beyond/exact", "policy.candidates=8", "policy=exact"),
         ("learner=ekf,adam_window", "learner.forgetting=0.99", "learner=ekf"),
         ("task=none,control", "task.steps=60", "task=control"),
     ],

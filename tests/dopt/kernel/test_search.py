@@ -27,18 +27,18 @@ SEARCHES: list[tuple[str, dict[str, Any]]] = [
     ("a_optimal", {}),
     ("e_optimal", {"subspace": 12}),
     ("task", {"count": 5}),
-    ("lookahead", {"horizon": 7, "criterion": "joint"}),
-    ("lookahead", {"horizon": 8, "criterion": "sum", "stride": 2}),
+    ("lookahead", {"lookahead": 7, "criterion": "joint"}),
+    ("lookahead", {"lookahead": 8, "criterion": "sum", "stride": 2}),
 ]
 """An odd and an even length, whole and thinned paths."""
 
 
 @pytest.mark.parametrize(("policy", "fields"), SEARCHES)
-@pytest.mark.parametrize(("env", "directions"), [("pendulum", 2), ("quadrotor", 5)])
+@pytest.mark.parametrize(("env", "candidates"), [("pendulum", 2), ("quadrotor", 5)])
 def test_kernel_and_reference_choose_the_same_plans_for_many_steps(
-    env: str, directions: int, policy: str, fields: dict[str, Any]
+    env: str, candidates: int, policy: str, fields: dict[str, Any]
 ) -> None:
-    given = fields | {"directions": directions}
+    given = fields | {"candidates": candidates}
     spec = trial(env, policy, 3, env={"horizon": 60}, policy=given, model={"width": 8})
     fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
     assert np.array_equal(fast.inputs, plain.inputs)
@@ -57,7 +57,7 @@ def rows_of_candidates(fast: KernelTrial) -> tuple[np.ndarray, np.ndarray]:
     """Return the candidates, (C, m), and J at the states that they lead to, (C, r, q)."""
     system, policy = fast.spec.system, fast.spec.policy
     assert isinstance(policy, Search)
-    candidates = policy.candidates(system)
+    candidates = policy.compared_inputs(system)
     x, theta = fast.record.states[fast.done], fast.state.theta
     learned = fast.spec.model.predict(system, theta, x[None])[0]
     states = []
@@ -122,9 +122,9 @@ def test_with_one_input_and_a_short_step_the_sign_is_that_of_d_optimal(policy: s
 @pytest.mark.parametrize("criterion", ["joint", "sum"])
 @pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
 def test_a_plan_of_one_step_is_one_step_of_exact(env: str, criterion: str) -> None:
-    fields = {"horizon": 1, "criterion": criterion, "directions": 6}
+    fields = {"lookahead": 1, "criterion": criterion, "candidates": 6}
     ahead = run_trial(trial(env, "lookahead", 4, policy=fields))
-    exact = run_trial(trial(env, "exact", 4, policy={"directions": 6}))
+    exact = run_trial(trial(env, "exact", 4, policy={"candidates": 6}))
     assert np.array_equal(ahead.inputs, exact.inputs)
 
 
@@ -144,7 +144,7 @@ def test_all_components_at_once_in_every_form(form: str) -> None:
 def test_plans_that_leave_the_bounds_of_a_state_do_not_count() -> None:
     limit = 0.5
     env = {"horizon": 60, "state_limit": limit, "gamma": 1.0}
-    careful = trial("pendulum", "lookahead", 1, env=env, policy={"horizon": 4})
+    careful = trial("pendulum", "lookahead", 1, env=env, policy={"lookahead": 4})
     fast, plain = run_trial(careful, "kernel"), run_trial(careful, "reference")
     assert fast.diverged_at == plain.diverged_at
     assert np.array_equal(fast.inputs, plain.inputs, equal_nan=True)
@@ -155,7 +155,7 @@ def test_plans_that_leave_the_bounds_of_a_state_do_not_count() -> None:
 
 def test_where_every_plan_leaves_the_bounds_chance_decides() -> None:
     env = {"horizon": 40, "state_limit": 0.1, "gamma": 1.0}
-    spec = trial("pendulum", "lookahead", 1, env=env, policy={"horizon": 12})
+    spec = trial("pendulum", "lookahead", 1, env=env, policy={"lookahead": 12})
     fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
     end = fast.diverged_at
     assert end is not None
@@ -165,7 +165,7 @@ def test_where_every_plan_leaves_the_bounds_chance_decides() -> None:
 
 
 class TestBudget:
-    FIELDS: dict[str, Any] = {"horizon": 10, "directions": 8}  # noqa: RUF012  # read only
+    FIELDS: dict[str, Any] = {"lookahead": 10, "candidates": 8}  # noqa: RUF012  # read only
 
     def spec(self, budget_us: float) -> TrialSpec:
         return trial("quadrotor", "lookahead", 2, policy=self.FIELDS | {"budget_us": budget_us})
@@ -179,7 +179,7 @@ class TestBudget:
     def test_without_time_the_input_nearest_to_a_random_direction_is_taken(self) -> None:
         spec = self.spec(1e-9)
         assert isinstance(spec.policy, Search)
-        candidates = spec.policy.candidates(spec.system)
+        candidates = spec.policy.compared_inputs(spec.system)
         nearest = np.argmax(draw(spec).ties @ candidates.T, axis=1)
         assert np.array_equal(run_trial(spec).inputs[1:], candidates[nearest][1:])
 
@@ -192,7 +192,7 @@ class TestBudget:
         for t in range(12, 20):
             pairs, values = self.scores(fast)
             fast.advance(t + 1)
-            candidates = spec.policy.candidates(spec.system)  # type: ignore[attr-defined]  # a Search
+            candidates = spec.policy.compared_inputs(spec.system)  # type: ignore[attr-defined]  # a Search
             taken = int(np.flatnonzero((candidates == fast.record.inputs[t]).all(axis=1))[0])
             best = max(v for (c, _), v in zip(pairs, values, strict=True) if c == taken)
             first = int(np.argmax(candidates @ ties[t]))
@@ -204,7 +204,7 @@ class TestBudget:
         assert isinstance(policy, Search)
         model = model_function(system, fast.spec.model)
         theta, x = torch.tensor(fast.state.theta), torch.tensor(fast.record.states[fast.done])
-        candidates = torch.tensor(policy.candidates(system))
+        candidates = torch.tensor(policy.compared_inputs(system))
         pairs = plans(policy, system, len(candidates))
         states = paths(policy, system, model, theta, x, candidates[torch.tensor(pairs)])
         score = score_function(policy, system, model)

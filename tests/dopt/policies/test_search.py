@@ -29,7 +29,7 @@ from tests.dopt.trials import trial
 @pytest.mark.parametrize("env", SYSTEMS)
 def test_candidates_have_the_largest_norm(env: str) -> None:
     system = SYSTEMS[env]()
-    candidates = Exact(directions=12).candidates(system)
+    candidates = Exact(candidates=12).compared_inputs(system)
     assert np.linalg.norm(candidates, axis=1) == pytest.approx(system.gamma, rel=1e-12)
 
 
@@ -43,10 +43,10 @@ def test_a_plan_lasts_a_share_of_the_natural_period(env: str) -> None:
     else:
         period = 2 * np.pi / mode.frequency
         assert abs(steps * system.dt - PERIOD_SHARE * period) <= system.dt / 2
-    assert Lookahead(horizon=7).steps(system) == 7
-    assert Lookahead(horizon=27).stride_of(system) == 5
-    assert Lookahead(horizon=27, stride=2).stride_of(system) == 2
-    assert Lookahead(horizon=1).stride_of(system) == 1
+    assert Lookahead(lookahead=7).steps(system) == 7
+    assert Lookahead(lookahead=27).stride_of(system) == 5
+    assert Lookahead(lookahead=27, stride=2).stride_of(system) == 2
+    assert Lookahead(lookahead=1).stride_of(system) == 1
 
 
 def test_the_states_of_a_task_are_those_that_its_goal_weighs() -> None:
@@ -94,13 +94,13 @@ def test_of_a_tiny_task_the_nearest_state_is_left() -> None:
     [
         (
             "exact",
-            {"directions": 0},
-            r"policy\.directions is 0 .* from 1 to 2147483647: set it so",
+            {"candidates": 0},
+            r"policy\.candidates is 0 .* from 1 to 2147483647: set it so",
         ),
         ("exact", {"budget_us": -1.0}, r"policy\.budget_us is -1\.0 µs, .* at least 0"),
         ("exact", {"form": "dual"}, r"form"),
         ("lookahead", {"criterion": "jont"}, r"policy\.criterion .* did you mean 'joint'"),
-        ("lookahead", {"horizon": 0}, r"policy\.horizon is 0 steps, .* from 1 to 2147483647: set"),
+        ("lookahead", {"lookahead": 0}, r"policy\.lookahead is 0 steps, .* 1 to 2147483647: set"),
         ("task", {"states": "gird"}, r"policy\.states .* did you mean 'grid'"),
     ],
 )
@@ -115,11 +115,11 @@ def test_a_wrong_field_is_answered_by_one_sentence(
     ("policy", "fields", "message"),
     [
         ("task", {"goal": (1.0,)}, r"policy\.goal has 1 entries, .* has 2: give one for each"),
-        ("lookahead", {"horizon": 4, "stride": 5}, r"policy\.stride is 5 steps, .* have 4: make"),
+        ("lookahead", {"lookahead": 4, "stride": 5}, r"policy\.stride is 5 steps, .* have 4: make"),
         (
             "lookahead",
-            {"horizon": 31},
-            r"policy\.horizon is 31 steps, but a trial .* has 30: lower",
+            {"lookahead": 31},
+            r"policy\.lookahead is 31 steps, but a trial .* has 30: lower",
         ),
         ("max", {"lookahead": 31}, r"policy\.lookahead is 31 steps, but a trial .* has 30: lower"),
     ],
@@ -140,7 +140,7 @@ def test_the_reference_scores_all_plans_at_once_and_keeps_no_budget() -> None:
 def test_plans_along_a_model_in_the_physical_parametrisation() -> None:
     """What searches runs with least squares of the physical parameters, as the oracle does."""
     oracle = trial("pendulum", "oracle")
-    policy = Lookahead(horizon=12, regularization=1e-6)
+    policy = Lookahead(lookahead=12, regularization=1e-6)
     cell = Cell(oracle.system, policy, oracle.model, oracle.learner)
     result = run_trial(dataclasses.replace(oracle, cell=cell))
     assert np.isfinite(result.loss).all()
@@ -175,7 +175,7 @@ def test_a_state_counts_stride_times_in_the_joint_determinant_alone(
     values: list[torch.Tensor] = []
     monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
     search.searched_inputs(spec.policy, spec.system, model, theta, information, x, ties)
-    inputs = torch.tensor(spec.policy.candidates(spec.system))[[0, 0]][None]
+    inputs = torch.tensor(spec.policy.compared_inputs(spec.system))[[0, 0]][None]
     path = search.paths(spec.policy, spec.system, model, theta[0], x[0], inputs)[0, 2::3]
     rows = vmap(jacrev(model), (None, 0))(theta[0], path)
     assert float(values[0][0, 0]) == pytest.approx(weight * float((rows**2).sum()))
