@@ -148,9 +148,22 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
 
 
 def newest(cells: list[Cell]) -> list[Cell]:
-    """Return the cells of the newest code version: numbers of different versions do not mix."""
-    last = max((cell.config.get("code_version", 0) for cell in cells), default=0)
-    return [cell for cell in cells if cell.config.get("code_version", 0) == last]
+    """Return the cells of the newest code version: numbers of different versions do not mix.
+
+    Of those with a task, whose assessments have a version of their own, the newest of these.
+    """
+    code = max((cell.config.get("code_version", 0) for cell in cells), default=0)
+    assessment = max((_assessment_version(cell) or 0 for cell in cells), default=0)
+    return [
+        cell
+        for cell in cells
+        if cell.config.get("code_version", 0) == code
+        and _assessment_version(cell) in (None, assessment)
+    ]
+
+
+def _assessment_version(cell: Cell) -> int | None:
+    return int(cell.config.get("assessment_version", 1)) if cell.config.get("task") else None
 
 
 def _check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:

@@ -129,7 +129,7 @@ def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
         }
     if isinstance(policy, GradientDOptimal):
         width = "model.width" if isinstance(model, MLP) else "model"
-        return {"policy.candidates": policy.candidates * 2 * r * q, width: 3 * q**2}
+        return {"policy.candidates": policy.candidates * 2 * r * q, width: q**2}
     if isinstance(model, GaussianProcess):
         # the factor, and the kernel between all samples and all evaluation points
         return {"env.horizon": 2 * T**2, "env.grid_points": 2 * N * T}

@@ -29,10 +29,10 @@ _STREAMS = {
     "ties": 4,
     "planner": 5,
     "updater": 6,
-    "environment": 7,
     "control_noise": 7,
     "control_plans": 8,
     "replay": 9,
+    "environment": 10,
 }
 
 

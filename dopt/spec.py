@@ -7,7 +7,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Collection, Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from dopt.compatibility import check_together, mismatch
 from dopt.control import Control, task_from
@@ -26,6 +26,11 @@ from dopt.systems.black_box import BlackBox
 
 CODE_VERSION = 1
 """Raised whenever a change of the code changes the numbers of a trial."""
+
+ASSESSMENT_VERSION = 2
+"""Raised whenever one changes the numbers of an assessment alone: for trials that have a task."""
+
+_VERSIONS = ("code_version", "assessment_version")
 
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
@@ -133,6 +138,7 @@ class Cell:
         content |= {key: section_of(part) for key, part in zip(_SECTIONS, self._parts, strict=True)}
         if self.task is not None:
             content["task"] = section_of(self.task)
+            content["assessment_version"] = ASSESSMENT_VERSION
         return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
     @functools.cached_property
@@ -243,9 +249,7 @@ class TrialSpec(Checked):
 
     def to_mapping(self) -> dict[str, object]:
         """Return the mapping that :meth:`from_mapping` turns into this trial."""
-        content: dict[str, object] = json.loads(self.canonical_json())
-        del content["code_version"]
-        return content
+        return without_versions(json.loads(self.canonical_json()))
 
     def columns(self) -> dict[str, str | int | float | None]:
         """Return what a table of configurations shows in columns of its own."""
@@ -261,6 +265,11 @@ class TrialSpec(Checked):
             "dt": self.system.dt,
             "gamma": self.system.gamma,
         }
+
+
+def without_versions(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a trial or a cell without the versions of the code."""
+    return {key: value for key, value in content.items() if key not in _VERSIONS}
 
 
 def _model(section: Mapping[str, object]) -> Model:

@@ -12,7 +12,7 @@ from analysis.portraits import DrawnPlane
 from analysis.selection import Entry
 from dopt.geometry import Body, body
 from dopt.replay import replay
-from dopt.spec import TrialSpec
+from dopt.spec import TrialSpec, without_versions
 from dopt.systems import System
 from orchestrate.store import Reader
 
@@ -96,8 +96,7 @@ def _specification(entry: Entry, seed: int) -> TrialSpec:
             f"{entry.cell.env} × {entry.cell.policy} has no finished trial of seed {seed}, "
             f"finished are {listed}: choose one of these with --seed."
         )
-    config = {key: value for key, value in entry.cell.config.items() if key != "code_version"}
-    return TrialSpec.from_mapping({**config, "seed": seed})
+    return TrialSpec.from_mapping({**without_versions(entry.cell.config), "seed": seed})
 
 
 def _check_same(replayed: Array, stored: Array, entry: Entry, seed: int) -> None:

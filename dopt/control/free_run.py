@@ -16,7 +16,7 @@ from dopt.systems.base import System
 Array = npt.NDArray[np.float64]
 
 STARTS = 256
-"""Held-out states from which the predictions start."""
+"""Held-out states from which the predictions start, at most."""
 
 HOLD_STEPS = 10
 """Steps for which a held-out input is held."""
@@ -47,7 +47,8 @@ class HeldOut:
 def held_out(system: System, steps: int) -> HeldOut:
     """Return the trajectories of n steps; a function of the system's parameters alone."""
     points = evaluation_set(system)
-    starts = points.states[points.n_grid :][:STARTS]
+    reachable = points.states[points.n_grid :]  # in the order of time
+    starts = reachable[:: -(-len(reachable) // STARTS)]
     rng = np.random.default_rng(_SEED)
     draws = rng.standard_normal((len(starts), -(-steps // HOLD_STEPS), system.n_inputs))
     inputs = np.repeat(on_sphere(draws, system.gamma), HOLD_STEPS, axis=1)[:, :steps]

@@ -43,21 +43,29 @@ class CrossEntropy:
     elites: int
 
     def plan(self, objective: Objective, start: Array, rng: np.random.Generator) -> Array:
-        """Return a sequence, (H, m), of low cost; ``start`` (H, m) is tried in the first round.
+        """Return the best sequence that was tried, (H, m); ``start`` (H, m) is the first.
 
-        Every round tries the mean of the elites of the one before as it is. The first is as wide
-        as the ball of inputs, each component with standard deviation γ/√m.
+        Every round tries the mean of the elites of the one before as it is, and the last mean is
+        tried as well. The first round is as wide as the ball of inputs, each component with
+        standard deviation γ/√m.
         """
+        best, lowest = start, np.inf
         mean, deviation = start, np.full(start.shape, self.gamma / np.sqrt(start.shape[1]))
         for _ in range(self.iterations):
             draws = rng.standard_normal((self.samples, *start.shape))
             draws[0] = 0.0
             U = within_ball(mean + deviation * draws, self.gamma)
-            J = objective(U)
-            J = np.where(np.isfinite(J), J, np.inf)
-            best = U[np.argsort(J, kind="stable")[: self.elites]]
-            mean, deviation = best.mean(axis=0), best.std(axis=0)
-        return mean
+            J = _costs(objective, U)
+            elites = U[np.argsort(J, kind="stable")[: self.elites]]
+            if J.min() < lowest:
+                best, lowest = elites[0], J.min()
+            mean, deviation = elites.mean(axis=0), elites.std(axis=0)
+        return mean if _costs(objective, mean[None])[0] < lowest else best
+
+
+def _costs(objective: Objective, inputs: Array) -> Array:
+    J = objective(inputs)
+    return np.where(np.isfinite(J), J, np.inf)
 
 
 def within_ball(inputs: Array, radius: float) -> Array:

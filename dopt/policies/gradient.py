@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dopt.fields import quantity
-from dopt.policies.base import ClosedLoop
+from dopt.policies.base import Informed
 from dopt.policies.compared import Compared
 
 
 @dataclass(frozen=True, kw_only=True)
-class GradientDOptimal(Compared, ClosedLoop):
+class GradientDOptimal(Compared, Informed):
     """Maximise G_D(u) = log det(M + J(x(u))ᵀ J(x(u))) on the sphere ‖u‖ = γ (Definition 1).
 
     All learned components count, and x(u) = x_t + dt f_θ(x_t, u) is exact. The value of each
@@ -22,8 +22,6 @@ class GradientDOptimal(Compared, ClosedLoop):
 
     Parameters
     ----------
-    regularization : float
-        λ of M₀ = λI.
     candidates : int
         As of :class:`dopt.policies.compared.Compared`.
     starts : int
@@ -35,6 +33,8 @@ class GradientDOptimal(Compared, ClosedLoop):
     name: ClassVar[str] = "gradient"
     compiled: ClassVar[bool] = False
 
-    regularization: float = quantity(1e-3, bound="positive")
     starts: int = quantity(2, "inputs", "positive")
     iterations: int = quantity(4, "steps", "positive")
+
+    def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # one form only
+        return "primal"

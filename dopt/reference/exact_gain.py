@@ -55,16 +55,6 @@ def log_det_gain(rows: Tensor, covariance: Tensor) -> Tensor:
     return total
 
 
-def updated_covariance(covariance: Tensor, rows: Tensor) -> Tensor:
-    """Return (M + JᵀJ)⁻¹, (n, s, s), from M⁻¹ and J (n, r, s)."""
-    solved = rows @ covariance
-    gram = solved @ rows.mT + torch.eye(rows.shape[1]).to(rows)
-    factor, _ = torch.linalg.cholesky_ex(gram)
-    root = torch.linalg.solve_triangular(factor, solved, upper=False)
-    updated: Tensor = covariance - root.mT @ root
-    return updated
-
-
 class ExactGain:
     """G_D(u) - log det M of Definition 1 for a batch: of all learned components, or of one."""
 
@@ -146,20 +136,17 @@ class GradientPlan:
         self._batch, self._policy = batch, policy
         self._gain = ExactGain(batch)
         self._candidates = candidates(batch, policy)
-        size = batch.project(batch.theta).shape[1]
-        prior = torch.eye(size).to(batch.theta) / policy.regularization
-        self.covariance = prior.repeat(len(batch.theta), 1, 1)
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m)."""
         batch = self._batch
-        components = batch.components[:, t]
-        now = Situation(batch.theta, self.covariance, batch.states[:, t], components)
+        assert batch.information is not None
+        covariance = torch.linalg.inv_ex(batch.information)[0]
+        now = Situation(batch.theta, covariance, batch.states[:, t], batch.components[:, t])
         return self._gain.optimum(self._candidates, now, self._policy)
 
     def inform(self, t: int) -> None:
-        """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t."""
-        self.covariance = updated_covariance(self.covariance, self._batch.rows(t))
+        """Do nothing: the batch holds M."""
 
 
 def candidates(batch: Lockstep, policy: GradientDOptimal) -> Tensor:

@@ -14,6 +14,9 @@ Array = npt.NDArray[np.float64]
 STEP = 1e-30
 """Imaginary step: the derivative is exact to rounding, nothing is subtracted."""
 
+EQUAL = 1e-9
+"""Decay rates that differ by less than this share of the largest eigenvalue are equal."""
+
 
 @dataclass(frozen=True)
 class Eigenmode:
@@ -48,7 +51,10 @@ def jacobians(system: System, state: npt.ArrayLike, inputs: npt.ArrayLike) -> tu
 
 
 def eigenmode(system: System) -> Eigenmode | None:
-    """Return the least damped oscillation about the stable equilibrium, None when none exists."""
+    """Return the least damped oscillation about the stable equilibrium, None when none exists.
+
+    Of modes that are equally damped, the slowest: rounding must not choose.
+    """
     if system.equilibrium is None:
         return None
     A, B = jacobians(system, system.equilibrium, np.zeros(system.n_inputs))
@@ -56,7 +62,9 @@ def eigenmode(system: System) -> Eigenmode | None:
     oscillating = np.flatnonzero(values.imag > 1e-9)
     if not len(oscillating):
         return None
-    least = oscillating[np.argmax(values[oscillating].real)]
+    growth = values[oscillating].real
+    least_damped = oscillating[growth >= growth.max() - EQUAL * np.abs(values).max()]
+    least = least_damped[np.argmin(values[least_damped].imag)]
     drive = np.linalg.inv(vectors)[least] @ B
     _, axes = np.linalg.eigh(np.real(np.outer(drive, drive.conj())))
     direction = axes[:, -1] * np.sign(axes[np.argmax(np.abs(axes[:, -1])), -1])

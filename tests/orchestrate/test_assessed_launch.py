@@ -8,7 +8,7 @@ import pytest
 
 from dopt.errors import SpecificationError
 from dopt.exploration import run_trial
-from dopt.spec import TrialSpec
+from dopt.spec import TrialSpec, without_versions
 from orchestrate.campaign import Work, launch_grid
 from orchestrate.errors import ExitCode
 from orchestrate.grid import Combination, Grid, build_grid
@@ -58,9 +58,7 @@ def test_the_rows_do_not_depend_on_the_executor(tmp_path: Path) -> None:
     assert [one for one in examine(alone) if one.severity == "error"] == []
     with Reader.open(alone) as reader:
         (cell,) = reader.cells()
-    again = TrialSpec.from_mapping(
-        {key: value for key, value in cell.config.items() if key != "code_version"}
-    )
+    again = TrialSpec.from_mapping(without_versions(cell.config))
     assert [trial.trial_key for trial in trials.trials][:1] == [again.trial_key]
 
 

@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dopt.control.free_run import free_run_error, held_out
+from dopt.control.free_run import STARTS, free_run_error, held_out
 from dopt.control.prediction import forecast_by
+from dopt.evaluation import reachable_states
 from dopt.systems import SYSTEMS, Pendulum
 
 
@@ -44,6 +45,17 @@ def test_what_is_held_out_depends_on_the_system_alone() -> None:
     np.testing.assert_array_equal(first.states, again.states)
     assert first.inputs.shape == (256, 25, 1)
     assert np.allclose(np.abs(first.inputs), Pendulum().gamma)
+
+
+def test_it_starts_all_along_the_reachable_trajectories() -> None:
+    """Those of the first steps alone are slow: the system was still gaining energy."""
+    system = SYSTEMS["cartpole"]()
+    reachable = reachable_states(system)
+    starts = held_out(system, 5).starts
+    assert len(starts) == STARTS
+    late = np.any(np.all(starts[:, None] == reachable[-3:], axis=2), axis=0)
+    assert late.any()
+    assert starts.std(axis=0) == pytest.approx(reachable.std(axis=0), rel=0.1)
 
 
 def test_a_model_that_explodes_has_no_finite_error() -> None:

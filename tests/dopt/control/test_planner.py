@@ -69,6 +69,20 @@ def test_costs_that_overflow_are_the_worst() -> None:
     assert plan[0, 0] == pytest.approx(0.2, abs=0.05)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_no_sequence_that_was_tried_is_better_than_the_plan(seed: int) -> None:
+    planner = CrossEntropy(gamma=1.0, samples=16, iterations=3, elites=8)
+    costs: list[float] = []
+
+    def cost(plans: np.ndarray) -> np.ndarray:
+        found = np.cos(7 * plans).sum(axis=(1, 2))  # the mean of two optima is none
+        costs.extend(found)
+        return np.asarray(found)
+
+    plan = planner.plan(cost, np.zeros((3, 2)), np.random.default_rng(seed))
+    assert np.cos(7 * plan).sum() == min(costs)
+
+
 def test_a_warm_start_that_is_the_optimum_is_kept_in_sight() -> None:
     planner = CrossEntropy(gamma=1.0, samples=2, iterations=1, elites=1)
     best = np.full((30, 1), 0.123)

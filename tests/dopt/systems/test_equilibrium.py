@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopt.systems import Arm, Cartpole, Pendulum, Quadrotor
+from dopt.systems import Arm, Cartpole, MassSpring, Pendulum, Quadrotor
 from dopt.systems.equilibrium import eigenmode, euler_spectral_radius, jacobians
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems
 
@@ -65,6 +65,13 @@ def test_a_free_cartpole_swings_against_its_cart() -> None:
     mode = eigenmode(cartpole)
     assert mode is not None
     assert mode.frequency == pytest.approx(math.sqrt(10.0 / 0.7 * (1 + 0.5 / 2.0)), rel=1e-9)
+
+
+@pytest.mark.parametrize("stiffness", [7.0, 9.9, 10.0, 10.1, 11.0, 12.0, 13.0])
+def test_of_equally_damped_modes_the_slowest_is_taken(stiffness: float) -> None:
+    mode = eigenmode(MassSpring(stiffness=stiffness, damping=0.0))
+    assert mode is not None
+    assert mode.frequency == pytest.approx(math.sqrt(stiffness), rel=1e-9)
 
 
 def test_the_arm_mode_is_a_normal_mode_driven_along_its_best_direction() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dopt.spec import TrialSpec
+from dopt.spec import TrialSpec, without_versions
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.faults.outcome import Rows, flaws, results
@@ -92,5 +92,5 @@ def test_what_was_stored_is_read_back_as_the_trial_that_it_was(
     assert {cell.config["model"]["width"] for cell in cells} == {16}
     monkeypatch.syspath_prepend(str(EXAMPLE))
     for cell in cells:
-        config = {key: part for key, part in cell.config.items() if key != "code_version"}
+        config = without_versions(cell.config)
         assert TrialSpec.from_mapping({**config, "seed": 0}).config_key == cell.config_key
