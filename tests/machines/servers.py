@@ -64,9 +64,9 @@ class Database:
     def start(self) -> None:
         self._control("start")
 
-    def restart(self, mode: str) -> None:
-        """Restart the server as an administrator does: ``fast`` or ``immediate``."""
-        self._control("restart", "-m", mode)
+    def stop(self, mode: str) -> None:
+        """Stop the server as an administrator does: ``fast`` or ``immediate``."""
+        self._control("stop", "-m", mode)
 
     def _control(self, *words: str) -> None:
         self._run("pg_ctl", *words, "--wait", f"--log={self._data / 'server.log'}")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from tests.machines.hosts import until
 from tests.machines.lab import Lab
 from tests.machines.outcome import Outcome
 from tests.machines.witness import PAUSE, read_notes
@@ -22,12 +23,14 @@ def test_a_launch_waits_for_a_server_that_restarts(
     launched = lab.launch(witness=True)
     lab.until_done(launched, 4)
     start = time.monotonic()
-    lab.database.restart(mode)
+    lab.database.stop(mode)
+    waits = "waiting for up to 30 s"
+    until(lambda: waits in launched.output, 20.0, lambda: f"'{waits}':\n{launched.output}")
+    lab.database.start()
     before = lab.done()
     lab.until_done(launched, before + 1)
     measured(f"server restarted, {mode}: next trial stored", time.monotonic() - start)
     assert launched.wait() == 0, launched.output
-    assert "waiting for up to 30 s" in launched.output
     outcome = lab.outcome()
     outcome.check_complete(undisturbed)
     assert outcome.launches == [(1, "done")]
