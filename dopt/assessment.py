@@ -56,8 +56,8 @@ def assess(
     plane = Plane.of(spec.system)
     for t, theta in sorted(parameters.items()):
         forecast = model_forecast(spec.system, spec.model, theta)
-        if t == 0:
-            outcome = _untrained(spec.system, spec.model, task, spec.seed, theta.tobytes())
+        if t == 0 and np.array_equal(theta, _initial(spec.system, spec.model, spec.seed)):
+            outcome = _untrained(spec.system, spec.model, task, spec.seed)
         else:
             outcome = _controlled(spec.system, task, spec.seed, forecast)
         rows += _measured(t, "control", outcome)
@@ -90,11 +90,13 @@ def _with_the_truth(system: System, task: Control, seed: int) -> Outcome:
 
 
 @functools.lru_cache(maxsize=KEPT_OUTCOMES)
-def _untrained(
-    system: System, model: Model, task: Control, seed: int, parameters: bytes
-) -> Outcome:
-    forecast = model_forecast(system, model, np.frombuffer(parameters).copy())
+def _untrained(system: System, model: Model, task: Control, seed: int) -> Outcome:
+    forecast = model_forecast(system, model, _initial(system, model, seed))
     return _controlled(system, task, seed, forecast)
+
+
+def _initial(system: System, model: Model, seed: int) -> Array:
+    return model.initial_parameters(system, stream(seed, "weights"))
 
 
 def _measured(t: int, name: str, outcome: Outcome) -> Iterator[Assessment]:

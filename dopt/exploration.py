@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal
 
 from dopt.assessment import assessed
@@ -20,8 +21,15 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
         What to run.
     path : {"kernel", "reference"}, optional
         Compiled kernel or torch reference, in place of what the specification says.
+
+    Raises
+    ------
+    SpecificationError
+        If that path cannot run the trial.
     """
-    if (path or spec.cell.path) == "reference":
+    if path is not None:
+        spec = dataclasses.replace(spec, cell=dataclasses.replace(spec.cell, path=path))
+    if spec.cell.path == "reference":
         from dopt.reference.lockstep import run_trials
 
         return assessed(spec, run_trials([spec])[0])

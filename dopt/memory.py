@@ -12,7 +12,7 @@ from dopt.control import Control
 from dopt.control.free_run import STARTS
 from dopt.information import held_information
 from dopt.learning import Adam, AdamReplay, Learner
-from dopt.models import MLP, GaussianProcess, Model
+from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
     Disagreement,
     DOptimal,
@@ -33,11 +33,17 @@ STRONG_INPUTS = 8
 
 
 def memory_by_setting(
-    system: System, policy: Policy, model: Model, learner: Learner, task: Control | None = None
+    system: System,
+    policy: Policy,
+    model: Model,
+    learner: Learner,
+    path: str = "kernel",
+    task: Control | None = None,
 ) -> dict[str, int]:
     """Return the bytes that a trial holds at once, by the setting that decides about them.
 
-    A ``task`` has every field set. The interpreter and its libraries, some 0.2 GiB, come on top.
+    ``path`` is what runs it, "kernel" or "reference". A ``task`` has every field set. The
+    interpreter and its libraries, some 0.2 GiB, come on top.
     """
     T, d, m, r = system.horizon, system.n_states, system.n_inputs, system.n_learned
     p, q = len(system.features), model.n_parameters(system)
@@ -51,7 +57,7 @@ def memory_by_setting(
         # states and their mesh, targets, and features in both precisions
         "env.grid_points": N * (2 * d + 2 * r + 2 * p),
         # parameters, two moments, gradient, and the copies for the evaluation
-        "model.width" if isinstance(model, MLP) else "model": 6 * q,
+        _size_of(model): 6 * q,
         "learner.window": window * (p + r + (L + 3) * max(w, r)),
     }
     if isinstance(learner, AdamReplay):
@@ -61,15 +67,21 @@ def memory_by_setting(
         numbers["learner.batch"] = drawn + learner.batch * (p + r + (L + 3) * max(w, r))
     held = held_information(policy, learner, q, r * T)
     form = held.form if held else "none"
-    if model.compiled:
+    if path == "kernel":
         information = _information(policy, form, q, r * T, T * (p + L * w * (1 + r)))
     else:
-        information = _information_of_module(policy, form, q)
-    parts = (information, _search(policy, system, model), _beyond(policy, system, model))
+        information = _information_of_reference(policy, form, model, q)
+    parts = (information, _search(policy, system, model, path), _beyond(policy, system, model))
     for part in (*parts, _task(task, system, q) if task else {}):
         for setting, count in part.items():
             numbers[setting] = numbers.get(setting, 0) + count
     return {setting: NUMBER * count for setting, count in numbers.items()}
+
+
+def _size_of(model: Model) -> str:
+    """Return the setting that decides how many parameters a model has."""
+    names = {MLP: "model.width", RFF: "model.n_features"}
+    return names.get(type(model), "model")
 
 
 def _information(policy: Policy, form: str, q: int, n_rows: int, n_factors: int) -> dict[str, int]:
@@ -87,16 +99,21 @@ def _information(policy: Policy, form: str, q: int, n_rows: int, n_factors: int)
     return {"policy.sketch_size": 2 * size**2, "model.width": 2 * q}
 
 
-def _information_of_module(policy: Policy, form: str, q: int) -> dict[str, int]:
-    """Return the numbers of M, its factor and its update, which the reference holds as they are."""
+def _information_of_reference(policy: Policy, form: str, model: Model, q: int) -> dict[str, int]:
+    """Return the numbers of M, its factor and its update, which the reference holds as they are.
+
+    It has no dual form, and its sketch is a matrix.
+    """
     if form == "none":
         return {}
+    setting = _size_of(model)
     if isinstance(policy, DOptimal) and form == "sketch":
-        return {"policy.sketch_size": 3 * policy.sketch_size**2}
-    return {"model": 3 * q**2}
+        size = policy.sketch_size
+        return {"policy.sketch_size": 3 * size**2, setting: q * size}
+    return {setting: 3 * q**2}
 
 
-def _search(policy: Policy, system: System, model: Model) -> dict[str, int]:
+def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str, int]:
     """Return the numbers of a search: M⁻¹ in full, the rows of a path, all scores.
 
     The kernel holds one path at a time, the reference all of them.
@@ -108,9 +125,9 @@ def _search(policy: Policy, system: System, model: Model) -> dict[str, int]:
     count = policy.count if isinstance(policy, TaskOptimal) else 0
     subspace = min(q, policy.subspace) if isinstance(policy, EOptimal) else 0
     return {
-        "model.width" if isinstance(model, MLP) else "model": q**2 + r * q,
+        _size_of(model): q**2 + r * q,
         "policy.lookahead": 2 * rows * q + rows**2 + steps * (system.n_states + r),
-        "policy.candidates": policy.candidates**2 * (1 if model.compiled else 2 * rows * q),
+        "policy.candidates": policy.candidates**2 * (1 if path == "kernel" else 2 * rows * q),
         "policy.count": count * (r * q + system.n_states),
         "policy.subspace": subspace * (2 * q + 2 * subspace) + (r + 1) * q,
     }
@@ -128,8 +145,7 @@ def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
             "policy.candidates": policy.candidates * policy.ensemble * (r + units),
         }
     if isinstance(policy, GradientDOptimal):
-        width = "model.width" if isinstance(model, MLP) else "model"
-        return {"policy.candidates": policy.candidates * 2 * r * q, width: q**2}
+        return {"policy.candidates": policy.candidates * 2 * r * q, _size_of(model): q**2}
     if isinstance(model, GaussianProcess):
         # the factor, and the kernel between all samples and all evaluation points
         return {"env.horizon": 2 * T**2, "env.grid_points": 2 * N * T}

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from dopt.errors import SpecificationError
 from dopt.learning import AdamReplay, Learner
-from dopt.policies.base import OpenLoop, on_sphere
+from dopt.policies.base import ROUNDING, OpenLoop, on_sphere
+from dopt.systems.base import System
 
 if TYPE_CHECKING:
     from dopt.spec import TrialSpec
@@ -75,7 +77,7 @@ def draw(spec: TrialSpec) -> Draws:
     system, policy, seed = spec.system, spec.policy, spec.seed
     sphere = (system.horizon, system.n_inputs)
     if isinstance(policy, OpenLoop):
-        inputs = policy.inputs(system, stream(seed, "inputs"))
+        inputs = _open_loop(policy, system, stream(seed, "inputs"))
     else:
         inputs = on_sphere(stream(seed, "inputs").standard_normal(sphere), system.gamma)
     noise = stream(seed, "noise").standard_normal((system.horizon, system.n_states))
@@ -87,6 +89,25 @@ def draw(spec: TrialSpec) -> Draws:
         ties=on_sphere(stream(seed, "ties").standard_normal(sphere), 1.0),
         replay=_replay(spec.learner, system.horizon, seed),
     )
+
+
+def _open_loop(policy: OpenLoop, system: System, rng: np.random.Generator) -> Array:
+    """Return the inputs of a policy, (T, m), which may be a user's own."""
+    inputs = np.asarray(policy.inputs(system, rng))
+    expected = (system.horizon, system.n_inputs)
+    if inputs.shape != expected or inputs.dtype.kind not in "fiu":
+        raise SpecificationError(
+            f"policy '{policy.name}' returned inputs of shape {inputs.shape} and type "
+            f"{inputs.dtype}, but real numbers of shape {expected} are expected: correct its "
+            f"inputs()."
+        )
+    largest = float(np.linalg.norm(inputs, axis=1).max())
+    if not largest <= system.gamma * (1 + ROUNDING) and not policy.exceeds:
+        raise SpecificationError(
+            f"policy '{policy.name}' returned an input of norm {largest:.6g}, but env.gamma is "
+            f"{system.gamma:g}: scale it down, or set exceeds = True in its class if that is meant."
+        )
+    return inputs.astype(np.float64)
 
 
 def _replay(learner: Learner, horizon: int, seed: int) -> npt.NDArray[np.int64]:

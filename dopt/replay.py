@@ -27,7 +27,7 @@ class Replay:
     parameters : (k, q)
         Parameters of the model after each of them.
     states : (T + 1, d)
-        All states, to compare with stored ones.
+        All states, to compare with stored ones; NaN from the step of a divergence on, as there.
     """
 
     steps: npt.NDArray[np.int64]
@@ -53,10 +53,12 @@ def replay(spec: TrialSpec, steps: Sequence[int]) -> Replay:
     Raises
     ------
     SpecificationError
-        If the numbers do not ascend or lie beyond the horizon.
+        If the numbers do not ascend, or are not of the trial's steps.
     """
     if any(a >= b for a, b in itertools.pairwise(steps)):
         raise SpecificationError(f"the steps {list(steps)} do not ascend: sort them.")
+    if steps and steps[0] < 0:
+        raise SpecificationError(f"step {steps[0]} was asked for, but the first is 0: begin there.")
     trial = _run(spec)
     seen: list[int] = []
     parameters: list[Array] = []
@@ -66,12 +68,11 @@ def replay(spec: TrialSpec, steps: Sequence[int]) -> Replay:
             break
         seen.append(step)
         parameters.append(trial.parameters.copy())
+    states = trial.states.copy()
+    if trial.diverged_at is not None:
+        states[trial.diverged_at :] = np.nan
     q = spec.model.n_parameters(spec.system)
-    return Replay(
-        np.array(seen, dtype=np.int64),
-        np.array(parameters).reshape(-1, q),
-        trial.states.copy(),
-    )
+    return Replay(np.array(seen, dtype=np.int64), np.array(parameters).reshape(-1, q), states)
 
 
 def _run(spec: TrialSpec) -> Run:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from dopt.compatibility import check_together, mismatch
 from dopt.control import Control, task_from
-from dopt.errors import SpecificationError, unknown_name
+from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.fields import Checked, quantity
 from dopt.learning import LEARNERS, Learner
 from dopt.learning.base import Updated
@@ -72,10 +72,16 @@ class Cell:
                 raise mismatch("a task", "a system with equations", f"env '{self.system.name}'")
             object.__setattr__(self, "task", self.task.resolved(self.system))
         self._check_runnable()
+        if type(self.system) not in SYSTEMS.values():
+            self.system.check()
         self.policy.check(self.system)
         self._check_size()
         if isinstance(self.policy, Search) and self.policy.budget_us and self.path != "kernel":
-            raise mismatch("policy.budget_us", "path 'kernel'", f"path '{self.path}'")
+            raise IncompatibleError(
+                f"policy.budget_us is {self.policy.budget_us:g} µs, but only the compiled kernel "
+                f"heeds it, which runs the shipped systems, networks and learners one trial at a "
+                f"time: set it to 0."
+            )
         check_together(self.system, self.policy, self.model, self.learner)
 
     def _check_runnable(self) -> None:
@@ -129,7 +135,7 @@ class Cell:
 
     @functools.cached_property
     def _memory_by_setting(self) -> dict[str, int]:
-        return memory_by_setting(*self._parts, self.task)
+        return memory_by_setting(*self._parts, self.path, self.task)
 
     @functools.cached_property
     def canonical_json(self) -> str:

@@ -31,7 +31,8 @@ class Story:
     steps : (k,)
         Steps done at each frame, the first 0.
     states : (T + 1, d), inputs : (T, m), loss : (T,)
-        As stored; the loss is that on the grid after each step.
+        As stored; the loss is that on the grid after each step. A trial that diverged has as many
+        steps as lead from a stored state to another.
     body : Body or None
         The system at all states, None where it has none.
     plane : DrawnPlane
@@ -60,13 +61,19 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
     Raises
     ------
     AnalysisError
-        If the trial is not finished, or its replay does not lead through the stored states.
+        If the trial is not finished, diverged at its first step, or its replay does not lead
+        through the stored states.
     """
     spec = _specification(entry, seed)
     stored = reader.trajectory(entry.cell.config_key, seed)
     curves = reader.curves(entry.cell.config_key)
     loss = curves.values[int(np.flatnonzero(curves.seeds == seed)[0])]
-    end = int(np.isfinite(loss).sum())
+    end = int(np.isfinite(stored.states).all(axis=1).sum()) - 1
+    if end < 1:
+        raise AnalysisError(
+            f"Seed {seed} of {entry.cell.env} × {entry.cell.policy} diverged at its first steps, "
+            f"so that there is nothing to show: choose another with --seed."
+        )
     steps = np.unique(np.linspace(0, end, frames).round().astype(np.int64))
     seen = replay(spec, steps.tolist())
     _check_same(seen.states[: end + 1], stored.states[: end + 1], entry, seed)

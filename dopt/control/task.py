@@ -169,7 +169,7 @@ def _given(fields: dict[str, Any]) -> dict[str, Any]:
 
 GOALS = {
     # From hanging to upright in 8 s and upright for the last second; γ is 40 % of the torque that
-    # holds the rod level, so the planner has to see a whole swing of 1.6 s to pump.
+    # holds the rod level, so the planner has to see most of a swing of 1.6 s to pump.
     "pendulum": Goal(
         initial_state=(1e-3, 0.0),
         goal=(math.pi, 0.0),

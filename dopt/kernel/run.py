@@ -55,11 +55,11 @@ class KernelTrial:
 
     @property
     def states(self) -> args.Floats:
-        """States x_0 ... x_T, (T + 1, d)."""
+        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
         return self.record.states
 
     def advance(self, last: int) -> None:
-        """Run the steps up to ``last``, unless the trial has diverged.
+        """Run the steps up to ``last``, unless they are done or the trial has diverged.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class KernelTrial:
                 f"step {last} was asked for, but the horizon is {self.spec.system.horizon}: raise "
                 f"env.horizon."
             )
-        if self.diverged_at is not None:
+        if self.diverged_at is not None or last <= self.done:
             return
         world, network, rules, points = self.constants
         equations = compiled_equations(self.spec.system)

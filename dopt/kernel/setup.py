@@ -219,7 +219,7 @@ def _form(cell: Cell) -> int:
 
 def empty_record(system: System) -> args.Record:
     steps = system.horizon
-    states = np.zeros((steps + 1, system.n_states))
+    states = np.full((steps + 1, system.n_states), np.nan)
     states[0] = system.initial_state
     rows = (np.full(steps, np.nan) for _ in range(5))
     return args.Record(states, np.zeros((steps, system.n_inputs)), *rows)

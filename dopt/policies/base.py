@@ -21,6 +21,9 @@ from dopt.view import View
 
 Array = npt.NDArray[np.float64]
 
+ROUNDING = 1e-9
+"""Share of γ by which an input may exceed it."""
+
 
 def check_length(key: str, steps: int, system: System) -> None:
     """Raise IncompatibleError if a plan is longer than a trial of the system."""
@@ -48,7 +51,12 @@ class Policy(Checked):
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoop(Policy):
-    """A policy whose inputs do not depend on what is observed."""
+    """A policy whose inputs do not depend on what is observed.
+
+    ``exceeds`` says that single inputs may be larger than γ.
+    """
+
+    exceeds: ClassVar[bool] = False
 
     @abstractmethod
     def inputs(self, system: System, rng: np.random.Generator) -> Array:

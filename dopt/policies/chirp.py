@@ -29,7 +29,7 @@ class Chirp(OpenLoop):
 
     name: ClassVar[str] = "chirp"
 
-    band: float = quantity(0.1, "1", "positive")
+    band: float = quantity(0.1, "1", "share")
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         T, m = system.horizon, system.n_inputs

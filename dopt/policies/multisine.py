@@ -30,11 +30,11 @@ class Multisine(OpenLoop):
 
     name: ClassVar[str] = "multisine"
 
-    band: float = quantity(0.1, "1", "positive")
+    band: float = quantity(0.1, "1", "share")
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         T, m = system.horizon, system.n_inputs
-        highest = max(m, int(min(self.band, 1.0) * T / 2))
+        highest = max(m, int(self.band * T / 2))
         time = np.arange(T) + rng.uniform(0, T)
         waves = np.stack([_wave(np.arange(1 + j, highest + 1, m), time / T) for j in range(m)], 1)
         scaled: Array = system.gamma / np.linalg.norm(waves, axis=1).max() * waves

@@ -17,8 +17,9 @@ from dopt.systems.base import System
 class PRBS(OpenLoop):
     """Every component is ±γ/√m, by a shift register of maximal length; the seed gives the phase.
 
-    The register is the shortest whose period, 2ⁿ - 1 clocks, is not shorter than the trial. Input j
-    of m is the same sequence a j-th of the period later: sequences so shifted are uncorrelated.
+    The register is the shortest whose period, 2ⁿ - 1 clocks, is not shorter than the trial and has
+    a place for each input. Input j of m is the same sequence a j-th of the period later: sequences
+    so shifted are uncorrelated.
     Reference: L. Ljung, "System identification: theory for the user", 2nd ed., section 13.3 (1999).
 
     Parameters
@@ -35,9 +36,9 @@ class PRBS(OpenLoop):
         from scipy.signal import max_len_seq  # its import takes longer than a short trial
 
         clocks = -(-system.horizon // self.hold)
-        bits, _ = max_len_seq(max(2, math.ceil(math.log2(clocks + 1))))
-        signs = 2.0 * bits - 1.0
         m = system.n_inputs
+        bits, _ = max_len_seq(max(2, math.ceil(math.log2(max(clocks, m) + 1))))
+        signs = 2.0 * bits - 1.0
         starts = rng.integers(len(signs)) + np.arange(m) * len(signs) // m
         sequence = signs[(np.arange(clocks)[:, None] + starts) % len(signs)]
         held = np.repeat(system.gamma / math.sqrt(m) * sequence, self.hold, axis=0)

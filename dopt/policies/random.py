@@ -21,6 +21,7 @@ class RandomGaussian(OpenLoop):
     """
 
     name: ClassVar[str] = "random"
+    exceeds: ClassVar[bool] = True
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         shape = (system.horizon, system.n_inputs)

@@ -9,6 +9,7 @@ from dopt.errors import IncompatibleError
 from dopt.fields import quantity
 from dopt.policies.search import Search
 from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +47,11 @@ class TaskOptimal(Search):
         return "task"
 
     def check(self, system: System) -> None:
+        if self.states == "reachable" and isinstance(system, BlackBox):
+            raise IncompatibleError(
+                f"policy.states is 'reachable', but where env '{system.name}' can be driven is not "
+                f"known without its equations: set it to grid."
+            )
         if self.goal and len(self.goal) != system.n_states:
             raise IncompatibleError(
                 f"policy.goal has {len(self.goal)} entries, but a state of env '{system.name}' has "

@@ -11,16 +11,13 @@ from torch import Tensor
 
 from dopt.errors import SpecificationError
 from dopt.learning.base import Updated
-from dopt.policies.base import Array, Planned, Planner
+from dopt.policies.base import ROUNDING, Array, Planned, Planner
 from dopt.randomness import stream
 from dopt.reference.view import TrialView
 from dopt.spec import TrialSpec
 
 if TYPE_CHECKING:
     from dopt.reference.lockstep import Lockstep
-
-ROUNDING = 1e-9
-"""Share of γ by which an input may exceed it."""
 
 
 def planners_for(specs: Sequence[TrialSpec]) -> list[Planner]:

@@ -32,7 +32,7 @@ class ReferenceTrial:
 
     @torch.no_grad()
     def advance(self, last: int) -> None:
-        """Run the steps up to ``last``, unless the trial has diverged.
+        """Run the steps up to ``last``, unless they are done or the trial has diverged.
 
         Raises
         ------

@@ -19,6 +19,7 @@ from analysis.errors import AnalysisError
 from analysis.figures.style import styled
 from analysis.selection import select
 from dopt.exploration import run_trial
+from dopt.spec import TrialSpec
 from dopt.systems import SYSTEMS
 from orchestrate.store import LaunchRecord, Reader, Store
 from tests.analysis.synthetic import make_spec
@@ -30,9 +31,13 @@ HORIZON = 30
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return real trials, one of each system, and one of the oracle."""
-    url = f"sqlite:///{tmp_path_factory.mktemp('films')}/results.db"
     specs = [make_spec(env, "d_optimal", 1, env={"horizon": HORIZON}) for env in SYSTEMS]
     specs.append(make_spec("pendulum", "oracle", 1, env={"horizon": HORIZON}))
+    return stored(tmp_path_factory.mktemp("films"), specs)
+
+
+def stored(folder: Path, specs: list[TrialSpec]) -> str:
+    url = f"sqlite:///{folder}/results.db"
     with Store.open(url) as store:
         launch = store.begin_launch(LaunchRecord(["test"], [], "here", 1))
         for claim in store.claim(launch, store.register(launch, specs).todo):
@@ -98,6 +103,29 @@ def test_an_mp4_is_written_by_ffmpeg(story: Callable[..., Story], tmp_path: Path
 def test_another_ending_is_refused(story: Callable[..., Story], tmp_path: Path) -> None:
     with pytest.raises(AnalysisError, match=r"a film is a \.gif or an \.mp4"):
         shoot(story(), tmp_path / "film.avi", 10)
+
+
+def test_a_trial_that_diverged_is_shown_as_far_as_it_went(tmp_path: Path) -> None:
+    limits = {"horizon": HORIZON, "state_limit": 0.4}
+    spec = make_spec("pendulum", "random", 1, env=limits)
+    end = run_trial(spec).diverged_at
+    assert end is not None
+    with Reader.open(stored(tmp_path, [spec])) as reader:
+        (entry,) = select(reader, Filter(("pendulum",))).entries
+        told = tell(reader, entry, 1, 4)
+    assert told.states.shape == (end, 2)
+    assert told.inputs.shape == (end - 1, 1)
+    assert np.isfinite(told.states).all()
+    shoot(told, tmp_path / "film.gif", 10)
+
+
+def test_a_trial_that_diverged_at_once_has_no_film(tmp_path: Path) -> None:
+    limits = {"horizon": HORIZON, "state_limit": 1e-6}
+    url = stored(tmp_path, [make_spec("pendulum", "random", 1, env=limits)])
+    with Reader.open(url) as reader:
+        (entry,) = select(reader, Filter(("pendulum",))).entries
+        with pytest.raises(AnalysisError, match=r"diverged at its first steps, .* another with"):
+            tell(reader, entry, 1, 4)
 
 
 def test_a_trial_that_runs_another_way_is_refused(

@@ -37,7 +37,7 @@ NONNEGATIVE = {
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction"),
 }
 FRACTIONS = {"beta_1", "beta_2"}
-SHARES = {"forgetting"}
+SHARES = {"forgetting", "band"}
 TEXTS = {"form", "criterion", "states"}
 OF_ANY_SIZE = {"goal"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tracemalloc
 from typing import Any
 
@@ -88,6 +89,32 @@ def test_what_the_reference_cannot_hold_is_refused_by_name(
 ) -> None:
     with pytest.raises(SpecificationError, match=rf"GiB .* because of {setting}, .* smaller\.$"):
         trial("cartpole", policy, **changes)
+
+
+def test_features_are_what_makes_a_linear_model_large() -> None:
+    with pytest.raises(SpecificationError, match=r"because of model\.n_features, .* smaller\.$"):
+        trial(
+            "pendulum",
+            "d_optimal",
+            model={"name": "rff", "n_features": 1_000_000},
+            learner={"name": "recursive_least_squares"},
+        )
+
+
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_the_reference_holds_the_matrix_in_any_form(form: str) -> None:
+    spec = trial("cartpole", "d_optimal", model={"width": 256}, policy={"form": form})
+    q = spec.model.n_parameters(spec.system)
+    there = dataclasses.replace(spec.cell, path="reference")
+    assert there.memory > 3 * 8 * q**2
+    assert there.largest_setting == "model.width"
+
+
+def test_the_sketch_of_the_reference_is_a_matrix() -> None:
+    spec = trial("cartpole", "d_optimal", model={"width": 256}, policy={"form": "sketch"})
+    q = spec.model.n_parameters(spec.system)
+    there = dataclasses.replace(spec.cell, path="reference")
+    assert there.memory - spec.cell.memory == pytest.approx(8 * 256 * q, rel=0.05)
 
 
 TASK = {"name": "control", "checkpoints": []}

@@ -40,6 +40,23 @@ def test_the_first_look_is_at_the_initial_parameters() -> None:
     assert replay(specification(), []).parameters.shape == (0, 353)
 
 
+def test_a_trial_that_diverges_is_seen_until_then() -> None:
+    for path in ("kernel", "reference"):
+        mapping = {**specification(policy="random").to_mapping(), "path": path}
+        env = {**mapping["env"], "state_limit": 0.4}  # type: ignore[dict-item]  # a section
+        spec = TrialSpec.from_mapping({**mapping, "env": env})
+        seen, whole = replay(spec, [0, 3, 40]), run_trial(spec)
+        assert whole.diverged_at is not None
+        assert 3 < whole.diverged_at < 40
+        assert seen.steps.tolist() == [0, 3]
+        np.testing.assert_array_equal(seen.states, whole.states)
+
+
+def test_steps_begin_with_the_first() -> None:
+    with pytest.raises(SpecificationError, match="step -3 was asked for, but the first is 0"):
+        replay(specification(), [-3, 10])
+
+
 def test_steps_must_ascend() -> None:
     with pytest.raises(SpecificationError, match="do not ascend"):
         replay(specification(), [5, 5])

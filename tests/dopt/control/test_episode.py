@@ -14,13 +14,6 @@ from dopt.forecasts import true_forecast
 from dopt.systems import SYSTEMS, Pendulum, Quadrotor
 from dopt.systems.base import System
 
-EXPLORED = {"quadrotor": {"gamma": 10.0, "dt": 0.1}}
-"""What conf/env says beyond the defaults of the classes, where a task depends on it."""
-
-
-def system_of(name: str) -> System:
-    return SYSTEMS[name](**EXPLORED.get(name, {}))  # type: ignore[arg-type]
-
 
 def by_the_truth(system: System) -> tuple[Forecast, Forecast]:
     """Return the plant and the forecast of a planner that knows it."""
@@ -33,7 +26,7 @@ def quiet(task: Control, system: System) -> np.ndarray:
 
 @pytest.mark.parametrize("name", sorted(GOALS))
 def test_the_true_model_succeeds(name: str) -> None:
-    system, task = system_of(name), Control()
+    system, task = SYSTEMS[name](), Control()
     noise = np.random.default_rng(1).standard_normal((task.on(system).steps, system.n_states))
     noise *= system.noise * math.sqrt(system.dt)
     episode = run_episode(system, task, *by_the_truth(system), noise, np.random.default_rng(2))

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dopt.errors import SpecificationError
 from dopt.exploration import run_trial
 from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
@@ -105,3 +106,9 @@ def test_times_are_measured_and_add_up_to_less_than_the_whole() -> None:
     for column in (result.plan_us, result.learn_us, result.evaluate_us):
         assert np.all(column[1:] > 0.0)
         assert column.sum() < 1e6 * result.wall_seconds
+
+
+@pytest.mark.parametrize("policy", ["gradient", "max"])
+def test_the_kernel_does_not_pretend_to_run_what_it_lacks(policy: str) -> None:
+    with pytest.raises(SpecificationError, match=f"path is 'kernel', but policy '{policy}'"):
+        run_trial(trial("pendulum", policy), "kernel")

@@ -63,9 +63,11 @@ def test_any_number_of_points_is_evaluated(points: list[int]) -> None:
     assert fast.record.reachable_loss[0] == pytest.approx(reachable, rel=1e-5)
 
 
-def test_the_reachable_loss_of_no_states_is_not_a_number() -> None:
-    env = {"horizon": 1, "state_limit": 1e-6, "initial_state": [0.0, 0.0], "gamma": 1e-12}
-    spec = trial("pendulum", "random", env=env | {"noise": 0.0})
-    fast = KernelTrial(spec)
-    fast.advance(1)
-    assert np.isfinite(fast.record.loss[0])
+def test_steps_that_are_done_are_not_done_again() -> None:
+    spec = trial("pendulum", "d_optimal", 1)
+    straight, back = KernelTrial(spec), KernelTrial(spec)
+    straight.advance(20)
+    for last in (10, 5, 10, 20):
+        back.advance(last)
+    np.testing.assert_array_equal(back.parameters, straight.parameters)
+    assert np.isnan(back.states[21:]).all()

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
+from dopt.errors import SpecificationError
 from dopt.exploration import run_trial
 from dopt.policies import POLICIES
 from dopt.policies.base import OpenLoop
 from dopt.randomness import draw
+from dopt.spec import TrialSpec
+from dopt.systems import System
 from dopt.systems.equilibrium import eigenmode
 from tests.dopt.trials import ALL_PAIRS, trial
 
@@ -86,6 +91,46 @@ def test_a_periodic_input_takes_another_frequency() -> None:
     u = open_loop("pendulum", "periodic", 1_000, frequency=5.0)
     times = 0.02 * np.arange(1_000)
     assert np.abs(u[:, 0]) == pytest.approx(np.abs(3.0 * np.sin(5.0 * times)), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_two_inputs_of_a_short_binary_sequence_are_the_same(seed: int) -> None:
+    spec = trial("chain", "prbs", seed, env={"horizon": 30}, policy={"hold": 10})
+    columns = np.unique(draw(spec).inputs, axis=1)
+    assert columns.shape == (30, 5)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wrong(OpenLoop):
+    """Returns what it is told to return."""
+
+    name: ClassVar[str] = "wrong"
+    shape: tuple[int, ...] = ()
+    value: float = 1.0
+
+    def inputs(self, system: System, rng: np.random.Generator) -> Any:  # noqa: ARG002  # the same
+        return np.full(self.shape, np.nan if self.value < 0 else self.value)
+
+
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+@pytest.mark.parametrize(
+    ("shape", "value", "sentence"),
+    [
+        ((3, 3), 1.0, r"of shape \(3, 3\) .* of shape \(30, 1\) are expected: correct its"),
+        ((30,), 1.0, r"of shape \(30,\) .* of shape \(30, 1\) are expected"),
+        ((30, 4), 1.0, r"of shape \(30, 4\) .* of shape \(30, 1\) are expected"),
+        ((30, 1), 1e3, r"an input of norm 1000, but env\.gamma is 2: scale it down"),
+        ((30, 1), -1.0, r"an input of norm nan, but env\.gamma is 2"),
+    ],
+)
+def test_wrong_inputs_of_ones_own_are_refused(
+    path: str, shape: tuple[int, ...], value: float, sentence: str
+) -> None:
+    cell = trial("pendulum", "random", env={"gamma": 2.0}).cell
+    policy = Wrong(shape=shape, value=value)
+    spec = TrialSpec(dataclasses.replace(cell, policy=policy, path=path), 0)
+    with pytest.raises(SpecificationError, match=sentence):
+        run_trial(spec)
 
 
 @pytest.mark.parametrize("env", ["pendulum", "arm"])

@@ -1,0 +1,92 @@
+"""Whether the class of a user's own system is what a system has to be: tried out, not trusted."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from dopt.errors import SpecificationError
+from dopt.systems.base import Array, System
+from dopt.systems.features import KINDS
+
+STATES = 5
+"""States at once at which the equations are tried."""
+
+ROUNDING = 1e-9
+"""Largest relative departure from an affine effect of the inputs."""
+
+_SEED = 20_240_601
+
+
+@functools.lru_cache(maxsize=64)
+def check_system(system: System) -> None:
+    """Try a system's declarations and equations.
+
+    Raises
+    ------
+    SpecificationError
+        If a declared index is none of a state's, or the equations fail, return something else than
+        was declared, or depend on the inputs in another way than an affine one.
+    """
+    _check_indices(system)
+    rng = np.random.default_rng(_SEED)
+    states = rng.uniform(-1, 1, (system.n_states, STATES))
+    inputs = rng.uniform(-1, 1, (system.n_inputs, STATES))
+    _tried(system, "accelerations", system.n_learned, tuple(states))
+    free, whole, double = (
+        _tried(system, "known", system.n_states, tuple(states), tuple(scale * inputs))
+        for scale in (0.0, 1.0, 2.0)
+    )
+    if not np.allclose(double - free, 2 * (whole - free), rtol=ROUNDING, atol=ROUNDING):
+        raise SpecificationError(
+            f"known() of env '{system.name}' is not affine in the inputs, but a derivative of the "
+            f"form f(x) + B(x) u is expected: make the input another quantity, in which it is."
+        )
+
+
+def _check_indices(system: System) -> None:
+    d, name = system.n_states, system.name
+    declared = {
+        "learned_rows": system.learned_rows,
+        "grid_indices": system.grid_indices,
+        "angle_indices": system.angle_indices,
+        "phase_plane": system.phase_plane,
+        "features": tuple(feature.index for feature in system.features),
+    }
+    for what, indices in declared.items():
+        for index in indices:
+            if not 0 <= index < d:
+                raise SpecificationError(
+                    f"{what} of env '{name}' holds {index}, but its {d} states have the numbers 0 "
+                    f"to {d - 1}: correct it."
+                )
+    for feature in system.features:
+        if feature.kind not in KINDS:
+            raise SpecificationError(
+                f"features of env '{name}' hold one of kind '{feature.kind}', but the kinds are "
+                f"{', '.join(KINDS)}: take one of them."
+            )
+
+
+def _tried(system: System, what: str, size: int, *arguments: Sequence[Any]) -> Array:
+    """Return what an equation gives for many states at once, (size, STATES)."""
+    equation: Callable[..., Any] = getattr(system, what)
+    try:
+        values = equation(*arguments, system.parameters)
+        found = np.array([np.broadcast_to(value, (STATES,)) for value in values], dtype=float)
+    except Exception as error:
+        raise SpecificationError(
+            f"{what}() of env '{system.name}' fails for arrays of {STATES} states "
+            f"({type(error).__name__}: {error}), but sums, products and the functions of "
+            f"dopt.systems.elementary are expected in it, which serve numbers, arrays and tensors "
+            f"alike: write it with these."
+        ) from error
+    if len(found) != size:
+        raise SpecificationError(
+            f"{what}() of env '{system.name}' returns {len(found)} numbers, but {size} are "
+            f"expected, one for each {'state' if what == 'known' else 'learned row'}: correct it."
+        )
+    return found
