@@ -19,6 +19,8 @@ from tests.orchestrate.conftest import ROOT
 
 Command = Callable[..., tuple[int, str, str]]
 
+OPTIONS = ROOT / "docs" / "example" / "conf"
+
 SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
 
 
@@ -62,8 +64,10 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["--package"], "--package/-p: expected one argument"),
         (["-m", "--cfg", "job"], "-m and --cfg cannot be combined"),
         (["--resolve"], "--resolve goes with --cfg or --help"),
-        (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor is expected"),
+        (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor, beyond/chain,"),
         (["env="], "env is empty, but one of arm"),
+        (["policy=5"], "choice of a group is a number, but the name of one of its options is"),
+        (["--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "add it with \\+env\\.mass="),
         (["env=[arm,cartpole]"], "env is the list \\[arm,cartpole\\], .*-m env=a,b"),
         (["-m", "env=null,arm"], "env 'null' is unknown"),
         (["pendulum"], "'pendulum' is no setting: write key=value"),

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from dopt.errors import DoptError, unknown_name
+from dopt.registry import TARGET
 
 _SEVERAL = re.compile(r"(?:Ambiguous value for argument|Sweep parameters) ('.*?')(?: requires|\n)")
 CONFIGURATION = Path(__file__).resolve().parents[2] / "conf"
@@ -39,6 +40,11 @@ def sentence_for(error: Exception) -> str:
         return _one_line(f"cannot read the override '{error.override}': {error.message}")
     if match := _SEVERAL.search(str(error)):
         return f"{match[1]} gives several values to one trial: add -m for a grid, or quote it."
+    if str(error).startswith("Config group override must be"):
+        return (
+            "the choice of a group is a number, but the name of one of its options is expected: "
+            "write for instance env=pendulum or policy=d_optimal."
+        )
     cause = error.__cause__ if isinstance(error, ConfigCompositionException) else error
     if isinstance(cause, ConfigAttributeError | ConfigKeyError) and cause.full_key:
         return _unknown_key(cause)
@@ -64,6 +70,12 @@ def _unknown_key(cause: OmegaConfBaseException) -> str:
     names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
     holder, _, last = str(cause.full_key).rpartition(".")
     names = [name for name in names if name not in ("hydra", "name")]
+    if TARGET in names:
+        return (
+            f"'{cause.full_key}' is not in the configuration of {holder}, a class of your own that "
+            f"may have it: add it with +{cause.full_key}=, or set one of "
+            f"{', '.join(name for name in names if name != TARGET)}."
+        )
     return _unknown(f"setting of {holder}" if holder else "setting", last, names)
 
 

@@ -74,7 +74,11 @@ def _check_choice(word: str, folder: Path) -> None:
     if not match or match["group"] == "experiment" or not (folder / match["group"]).is_dir():
         return
     group, value = match["group"], match["value"]
-    options = ", ".join(sorted(path.stem for path in (folder / group).glob("*.yaml")))
+    paths = (path.relative_to(folder / group) for path in (folder / group).rglob("*.yaml"))
+    names = sorted(
+        (path.with_suffix("").as_posix() for path in paths), key=lambda name: ("/" in name, name)
+    )
+    options = ", ".join(names)
     what = f"the list {value}" if value.startswith("[") else value or "empty"
     raise SpecificationError(
         f"{group} is {what}, but one of {options} is expected: give one, or several to a grid as "
