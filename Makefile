@@ -7,6 +7,8 @@ DB ?= sqlite:///results/results.db
 STUDY_DB ?= sqlite:///results/study.db
 CLAIMS_DB ?= sqlite:///results/claims.db
 SMOKE_DB := sqlite:///results/smoke.db
+# The policies of which figure 5 shows what their models are good for: all would hide each other.
+CONTROLLED := d_optimal lookahead uniform periodic random random_held
 
 # One thread to a process: the grid runs one worker on each core.
 export OMP_NUM_THREADS := 1
@@ -61,10 +63,12 @@ figures: grid  ## run the paper's grid and draw its figures
 study: setup  ## run everything beyond the paper and compare it on one page, report/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=beyond store.url='$(STUDY_DB)'
 	$(BIN)/python -m analysis report --db '$(STUDY_DB)' --out report
+	$(BIN)/python -m analysis figures --db '$(STUDY_DB)' --out report --only figure5_control --policy $(CONTROLLED)
 
 claims: setup  ## run with 100 seeds what few leave open, and compare it on one page, report/claims/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=claims store.url='$(CLAIMS_DB)'
 	$(BIN)/python -m analysis report --db '$(CLAIMS_DB)' --out report/claims
+	$(BIN)/python -m analysis figures --db '$(CLAIMS_DB)' --out report/claims --only figure5_control --policy $(CONTROLLED)
 
 smoke: setup  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'

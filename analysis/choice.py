@@ -25,6 +25,9 @@ from orchestrate.store import Cell
 REFERENCE = "d_optimal"
 """The policy that all others are compared with."""
 
+USUAL = {"model": "mlp", "learner": "adam_window"}
+"""Names of what a launch takes by itself."""
+
 Setting = tuple[str, str, str]
 """JSON of the sections env, model and learner."""
 
@@ -143,15 +146,17 @@ def _first(
     return [candidate for candidate in candidates if rank(candidate) == top]
 
 
-def nearness(cell: Cell) -> tuple[int, int]:
+def nearness(cell: Cell) -> tuple[int, int, int]:
     """Return a key by which the configuration that is nearest to the defaults is the largest.
 
-    Fewer values that are not defaults come first, then no task: it changes nothing of the trial.
+    The model and the learner that a launch takes by itself come first, then fewer values that are
+    not defaults of what is named, then no task: it changes nothing of the trial.
     """
     usual, parts = defaults(cell), _sections(cell)
     task = parts.pop("task", None) is not None
     own = flatten(parts) if usual else {}
-    return -sum(usual.get(path) != value for path, value in own.items()), -task
+    names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
+    return -sum(names), -sum(usual.get(path) != value for path, value in own.items()), -task
 
 
 def defaults(cell: Cell) -> dict[str, object]:
@@ -191,9 +196,13 @@ def _setting(cell: Cell) -> Setting:
 
 
 def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]:
-    """Return the first dotted path in which configurations differ, and its values."""
+    """Return the first dotted path in which configurations differ, and its values.
+
+    One that all of them have goes before one that some lack.
+    """
     flat = [flatten(config) for config in configs]
-    for path in sorted(set().union(*flat)):
+    paths = set().union(*flat)
+    for path in sorted(paths, key=lambda one: (not all(one in entry for entry in flat), one)):
         values = [entry.get(path) for entry in flat]
         if any(value != values[0] for value in values):
             return path, values

@@ -72,6 +72,13 @@ def steps_to(
     return _scores(reader, entry, column, rule, lambda values: first_passage(values, threshold))
 
 
+def lasting_steps(
+    reader: Reader, entry: Entry, column: str, rule: DivergenceRule, threshold: float
+) -> Scores:
+    """Return the steps until the loss stays at most the threshold, inf where it does not."""
+    return _scores(reader, entry, column, rule, lambda values: last_passage(values, threshold))
+
+
 def geometric_mean(values: Array) -> Array:
     """Return exp of the mean logarithm along the steps of losses (n, T); 0 where one of them is."""
     with np.errstate(divide="ignore"):
@@ -86,6 +93,17 @@ def first_passage(values: Array, threshold: float) -> Array:
     """
     reached = values <= threshold
     return np.where(reached.any(axis=1), reached.argmax(axis=1) + 1.0, np.inf)
+
+
+def last_passage(values: Array, threshold: float) -> Array:
+    """Return the number of inputs after which a curve of (n, T) stays at most the threshold.
+
+    The first loss counts as one input. A curve that ends above it is censored: inf.
+    """
+    above = ~(values <= threshold)
+    n_steps = values.shape[1]
+    last = np.where(above.any(axis=1), n_steps - above[:, ::-1].argmax(axis=1), 0)
+    return np.where(last < n_steps, last + 1.0, np.inf)
 
 
 def _scores(

@@ -15,8 +15,9 @@ Array = npt.NDArray[np.float64]
 
 RESAMPLES = 9999
 
-FEW = 10
-"""Pairs below which a bootstrap is too narrow (5 normal pairs: 82 % for 95 %); Student's is not."""
+FEW = 30
+"""Pairs below which a bootstrap is too narrow (95 % meant, of normal differences: 82 % for 5 pairs,
+93.8 % for 20; of exponential ones 89 % for 20); Student's is nearer (91 % of exponential ones)."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,14 @@ def race(steps: Array, baseline: Array) -> Race:
         improvement=(earlier + (n - earlier - later) / 2) / n if n else float("nan"),
         p_value=sign_test(earlier, later) if n else float("nan"),
     )
+
+
+def mcnemar(successes: Array, baseline: Array) -> float:
+    """Return the exact two-sided McNemar p of successes, 0 or 1, both (n,) and paired by position.
+
+    It is the sign test of the pairs of which one succeeded alone.
+    """
+    return sign_test(int(np.sum(successes > baseline)), int(np.sum(successes < baseline)))
 
 
 def censored_median(steps: Array) -> float:

@@ -82,5 +82,9 @@ def describe(reader: Reader, selection: Selection) -> dict[str, Any]:
             for env, policy in missing
             if all((e.cell.env, e.cell.policy) != (env, policy) for e in selection.entries)
         ],
+        "launches": [
+            {"commit": one.git_commit, "dirty": bool(one.git_dirty), "host": one.host}
+            for one in reader.launches()
+        ],
         "notes": list(selection.notes),
     }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,8 +21,11 @@ from analysis.selection import policy_rank
 
 ROW_HEIGHT = 1.9
 LEGEND_HEIGHT = 0.5
-SHARE = 0.012
+SHARE = 0.008
 """Distance of neighbouring policies' bars, as a part of the axis."""
+
+MARKERS = "osD^vP*X<>ph"
+"""Of the policies in the order of the legend: more than colours and lines can tell apart."""
 
 TRUTH = {**GUIDE, "lw": 0.6}
 """Look of what the planner achieves with the true model."""
@@ -49,45 +54,52 @@ def draw_control(curves: Curves) -> Figure:
     size = (TEXT_WIDTH, 2 * ROW_HEIGHT + LEGEND_HEIGHT)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(2, len(environments), sharex="col", squeeze=False)
+    policies = sorted({curve.policy for curve in curves}, key=policy_rank)
+    markers = dict(zip(policies, itertools.cycle(MARKERS), strict=False))
     for column, env in enumerate(environments):
         own = [curve for curve in curves if curve.env == env]
-        _panel(grid[0, column], grid[1, column], own)
+        _panel(grid[0, column], grid[1, column], own, markers)
     grid[0, 0].set_ylabel("success rate")
     grid[1, 0].set_ylabel("cost / cost with\nthe true model")
-    policies = sorted({curve.policy for curve in curves}, key=policy_rank)
-    styles = [policy_style(policy) for policy in policies]
     handles = [
-        Line2D([], [], color=s.colour, ls=s.line, lw=s.width, marker="o", ms=3, label=s.label)
-        for s in styles
+        Line2D([], [], ms=3.5, label=policy_style(policy).label, **_look(policy, markers))
+        for policy in policies
     ]
     handles.append(Line2D([], [], **TRUTH, label="true model"))
     figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)))
     return figure
 
 
-def _panel(rates: Axes, costs: Axes, curves: Sequence[ControlCurve]) -> None:
+def _panel(
+    rates: Axes, costs: Axes, curves: Sequence[ControlCurve], markers: Mapping[str, str]
+) -> None:
     last = max(int(curve.t[-1]) for curve in curves)
     for place, curve in reversed(list(enumerate(curves))):
         x = curve.t + SHARE * last * (place - (len(curves) - 1) / 2)
-        _line(rates, x, curve, "success")
-        _line(costs, x, curve, "cost")
+        look = _look(curve.policy, markers)
+        _line(rates, x, curve, "success", look)
+        _line(costs, x, curve, "cost", look)
     rates.set_title(f"{environment_title(curves[0].env)}\n({_counts(curves)})", fontsize=7)
     rates.set_ylim(-0.04, 1.04)
     rates.axhline(curves[0].truth.success, **TRUTH)
     drawn = [np.r_[c.cost, c.cost_low, c.cost_high, 1.0] for c in curves]
     log_scale(costs, *log_limits(np.concatenate(drawn)))
     costs.axhline(1.0, **TRUTH)
+    costs.set_xticks(sorted({int(t) for curve in curves for t in curve.t}))
     costs.set_xlabel("explored steps")
 
 
-def _line(axes: Axes, x: np.ndarray, curve: ControlCurve, name: str) -> None:
-    style = policy_style(curve.policy)
+def _look(policy: str, markers: Mapping[str, str]) -> dict[str, Any]:
+    style = policy_style(policy)
+    return {
+        "color": style.colour, "ls": style.line, "lw": style.width, "marker": markers[policy],
+    }  # fmt: skip
+
+
+def _line(axes: Axes, x: np.ndarray, curve: ControlCurve, name: str, look: dict[str, Any]) -> None:
     y, low, high = (getattr(curve, f"{name}{end}") for end in ("", "_low", "_high"))
     half = np.nan_to_num(np.maximum(0.0, np.array([y - low, high - y])))
-    axes.errorbar(
-        x, y, half, color=style.colour, ls=style.line, lw=style.width, marker="o", ms=2.5,
-        elinewidth=0.7, capsize=1.5,
-    )  # fmt: skip
+    axes.errorbar(x, y, half, ms=3, elinewidth=0.7, capsize=1.5, **look)
 
 
 def _counts(curves: Sequence[ControlCurve]) -> str:

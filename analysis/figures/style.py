@@ -19,6 +19,9 @@ GREY = "#8c8c8c"
 CYAN, WINE, INDIGO, OLIVE = "#7fc4e8", "#882255", "#332288", "#999933"
 """Where the sequence ends: as Paul Tol's muted colours, those that are far from the others."""
 
+BROWN, PINK = "#8b4513", "#e7298a"
+"""Further ones, likewise."""
+
 TEXT_WIDTH = 6.75
 """Width of a figure over the page [inches]."""
 
@@ -83,19 +86,19 @@ _STYLES = {
     "uniform": PolicyStyle("uniform", PURPLE, (0, (6, 1.2, 1.2, 1.2))),
     "periodic": PolicyStyle("periodic", BLUE, (0, (1.2, 1.2)), 1.4),
     "random": PolicyStyle("random", CYAN, (0, (2.5, 1.2))),
-    "random_held": PolicyStyle("random, held", GREEN, (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2))),
+    "random_held": PolicyStyle("held random", GREEN, (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2))),
     "random_sphere": PolicyStyle("random on the sphere", ORANGE, (0, (8, 2))),
     "prbs": PolicyStyle("PRBS", WINE, (0, (1.2, 2.4))),
     "multisine": PolicyStyle("multisine", INDIGO, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2))),
     "chirp": PolicyStyle("chirp", OLIVE, (0, (6, 2.4))),
     "lookahead": PolicyStyle("look-ahead", BLACK, (0, (9, 1)), 1.6),
-    "exact": PolicyStyle("exact gain", BLUE, (0, (5, 1))),
+    "exact": PolicyStyle("exact gain", BROWN, (0, (5, 1))),
     "trace": PolicyStyle("trace", CYAN, (0, (2, 1))),
     "trace_linearized": PolicyStyle("trace, linearised", ORANGE, (0, (3, 1, 1, 1))),
     "a_optimal": PolicyStyle("A-optimal", PURPLE, (0, (7, 1.5))),
     "e_optimal": PolicyStyle("E-optimal", OLIVE, (0, (1, 2))),
     "task": PolicyStyle("task-optimal", GREEN, (0, (5, 1, 1, 1, 1, 1))),
-    "max": PolicyStyle("ensemble disagreement", "#44aa99", (0, (4, 1, 1, 1))),
+    "max": PolicyStyle("ensemble disagreement", PINK, (0, (4, 1, 1, 1))),
     "gaussian_process": PolicyStyle("Gaussian process", "#aa4499", (0, (5, 1, 2, 1))),
     "gradient": PolicyStyle("D-optimal, by gradient", INDIGO, (0, (7, 1))),
     "linear": PolicyStyle("D-optimal, linear", "#661100", (0, (2, 1, 5, 1))),

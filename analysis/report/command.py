@@ -21,6 +21,7 @@ from orchestrate.store import Reader
 
 HELP = "compare every policy, model and learner with D-optimal inputs, on one page"
 NAME = "report"
+CONTROL = f"{NAME}_control"
 PAGE = "README.md"
 
 
@@ -36,21 +37,32 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         gaps = [gap for field in found for gap in _gaps(field)]
         if gaps and not options.allow_partial:
             raise IncompleteError(_refusal(gaps))
-        table = numbers.adjust([numbers.tabulate_field(moment, field) for field in found])
-        controlled = control.section(moment, found)
+        table = numbers.adjust(
+            [numbers.tabulate_field(moment, field, options.diverged) for field in found]
+        )
+        controlled = control.tabulate(moment, found)
         selection = Selection(tuple(one.entry for field in found for one in field.variants))
         facts = provenance.describe(moment, selection)
     options.out.mkdir(parents=True, exist_ok=True)
+    pictures = {}
     with styled():
         mark = publish.fingerprint({"cells": facts["cells"], "selection": facts["selection"]})
-        title = "Ratios of final losses"
-        publish.write_pictures(picture.draw(table), options.out, NAME, title, mark)
+        for env, rows in table.groupby("env", sort=False):
+            pictures[str(env)] = f"{NAME}_{env}"
+            title = f"Ratios of final losses: {env}"
+            publish.write_pictures(picture.draw(rows), options.out, pictures[str(env)], title, mark)
     publish.write_table(table, options.out, NAME)
+    if controlled is not None:
+        publish.write_table(controlled, options.out, CONTROL)
     notes = [f"{field.env}: {note}" for field in found for note in field.notes]
     if gaps:
         notes.insert(0, f"PARTIAL: {sum(len(gap.seeds) for gap in gaps)} trials are missing")
     text = page.write(
-        table, notes, _origin(facts), f"{NAME}.png", [controlled] if controlled else []
+        table,
+        notes,
+        _origin(facts, controlled=controlled is not None),
+        pictures,
+        [] if controlled is None else [control.section(controlled)],
     )
     publish.write_text(text, options.out / PAGE)
     publish.write_provenance(facts, options.out, NAME)
@@ -58,16 +70,17 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
     return 0
 
 
-def _origin(facts: dict[str, object]) -> str:
+def _origin(facts: dict[str, object], *, controlled: bool) -> str:
     versions = facts["versions"]
     assert isinstance(versions, dict)
     cells = facts["cells"]
     assert isinstance(cells, list)
     trials = sum(cell["n_finished"] for cell in cells)
+    control = f" and [{CONTROL}.csv]({CONTROL}.csv)" if controlled else ""
     return (
         f"Made by dopt {versions['dopt']} from {trials:,} trials of {len(cells)} configurations in "
-        f"`{facts['database']}`. The numbers are in [{NAME}.csv]({NAME}.csv), where they come from "
-        f"in [{NAME}.json]({NAME}.json)."
+        f"`{facts['database']}`. The numbers are in [{NAME}.csv]({NAME}.csv){control}, where they "
+        f"come from in [{NAME}.json]({NAME}.json)."
     )
 
 

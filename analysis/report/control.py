@@ -3,97 +3,182 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
+import pandas as pd
 
-from analysis.control import ControlCurve, TrueModel, measure_control
+from analysis.control import TrueModel, measure_control
 from analysis.figures.style import environment_title
-from analysis.numbers import but_lost, number, share, within
+from analysis.numbers import but_lost, number, within
+from analysis.paired import benjamini_hochberg, mcnemar
+from analysis.reading import read_curves
+from analysis.report.numbers import LEVEL
 from analysis.report.variants import Field, Variant
 from analysis.selection import Selection
 from analysis.sheets import Sheet
-from orchestrate.store import Reader
+from orchestrate.store import Assessments, Reader
 
 NOTE = (
-    "Success: share of trials whose planned episode reached its goal, with the Wilson interval. "
-    "Cost: geometric mean of the episode's cost by that of the true model under the same planner, "
-    "noise and draws, with Student's interval. True model: what the same "
-    "planner achieves that predicts with the true system, on the same seeds; no explored step "
-    "changes it, and its cost is the unit. Lost: episodes in no mean of costs, as theirs or "
-    "that of the true model is not finite; they are in the success. Free run: root mean square "
-    "error of predictions that run free, beside the spread of what they predict, at the end of the "
-    "trial, without those lost as the error is not finite."
+    "Success: share of trials whose planned episode reached its goal, with the Wilson interval; "
+    f"with a star where the adjusted p is below {LEVEL}: exact McNemar test against the first row, "
+    "paired over seeds, the false discovery rate of all variants and numbers of steps of the "
+    "report (Benjamini-Hochberg). Cost: geometric mean of the episode's cost by that of the true "
+    "model under the same planner, noise and draws, with Student's interval. True model: what the "
+    "same planner achieves that predicts with the true system, on the same seeds; no explored step "
+    "changes it, and its cost is the unit. Lost: episodes in no mean of costs, as theirs or that "
+    "of the true model is not finite; they are in the success. Loss: that on the grid after as "
+    "many steps, geometric mean. Free run: root mean square error of predictions that run free, by "
+    "that of the prediction that nothing changes, mean at the end of the trial without those lost "
+    "as the error is not finite."
 )
-FREE_RUN = "free_run_error"
+TRUTH = "true model"
+SUCCESS, FREE_RUN = "control_success", "free_run_error"
+
+Array = npt.NDArray[np.float64]
+Row = Mapping[str, object]
 
 
-def section(reader: Reader, fields: Sequence[Field]) -> str | None:
-    """Return the section in Markdown, None where no trial has a task."""
-    parts = [part for field in fields if (part := _part(reader, field))]
-    if not parts:
+def tabulate(reader: Reader, fields: Sequence[Field]) -> pd.DataFrame | None:
+    """Return one row for each environment, variant and number of steps, None without a task."""
+    rows = [row for field in fields if field.assessed for row in _rows(reader, field)]
+    if not rows:
         return None
+    table = pd.DataFrame(rows)
+    table["success_p_adjusted"] = benjamini_hochberg(table["success_p"].tolist())
+    return table
+
+
+def _rows(reader: Reader, field: Field) -> Iterator[dict[str, object]]:
+    assessed = field.assessed
+    curves = measure_control(reader, Selection(tuple(one.entry for one in assessed)))
+    reference = assessed[0] if assessed[0] is field.reference else None
+    for one, curve in zip(assessed, curves, strict=True):
+        compared = reference if one is not reference else None
+        losses = read_curves(reader, one.entry, "loss").values
+        free_runs = reader.assessments(one.entry.cell.config_key, FREE_RUN)
+        for k, t in enumerate(curve.t.tolist()):
+            names = ("success", "success_low", "success_high", "cost", "cost_low", "cost_high")
+            yield {
+                **{"env": field.env, "variant": one.label, "t": t, "n": int(curve.n[k])},
+                **{name: float(getattr(curve, name)[k]) for name in names},
+                **{"lost": int(curve.lost[k]), "success_p": _test(reader, one, compared, t)},
+                "loss": _geometric_mean(losses[:, t - 1]) if t else math.nan,
+                **_free_run(free_runs, t, int(curve.n[k])),
+                "described": curve.described,
+            }
+    steps = sorted({int(t) for curve in curves for t in curve.t})
+    yield from (_truth(field.env, curves[0].truth, t) for t in steps)
+
+
+def _truth(env: str, truth: TrueModel, t: int) -> dict[str, object]:
+    """Return a row of the true model: the same after any number of steps, its cost the unit."""
+    return {
+        **{"env": env, "variant": TRUTH, "t": t, "n": truth.n},
+        **{"success": truth.success, "success_low": truth.success_low},
+        **{"success_high": truth.success_high, "lost": truth.lost},
+        **{"cost": 1.0 if truth.lost < truth.n else math.nan, "described": str(truth.n)},
+    }
+
+
+def _test(reader: Reader, one: Variant, reference: Variant | None, t: int) -> float:
+    """Return p of the successes after t explored steps, over the seeds that reached them."""
+    if reference is None or t == 0:
+        return math.nan
+    ours, theirs = (_successes(reader, each, t) for each in (one, reference))
+    seeds = sorted(set(ours) & set(theirs))
+    return mcnemar(*(np.array([each[seed] for seed in seeds]) for each in (ours, theirs)))
+
+
+def _successes(reader: Reader, variant: Variant, t: int) -> dict[int, float]:
+    found = reader.assessments(variant.entry.cell.config_key, SUCCESS)
+    column = found.values[:, found.t == t].reshape(len(found.seeds), -1)
+    known = np.isfinite(column).all(axis=1) & (column.shape[1] == 1)
+    return dict(zip(found.seeds[known].tolist(), column[known].ravel().tolist(), strict=True))
+
+
+def _geometric_mean(values: Array) -> float:
+    known = values[np.isfinite(values) & (values > 0)]
+    return float(np.exp(np.mean(np.log(known)))) if len(known) else math.nan
+
+
+def _free_run(found: Assessments, t: int, reached: int) -> dict[str, object]:
+    """Return the mean error after t steps, and of how many trials it is not finite."""
+    errors = found.values[:, found.t == t]
+    finite = errors[np.isfinite(errors)]
+    mean = float(np.mean(finite)) if len(finite) else math.nan
+    return {"free_run": mean, "free_run_lost": max(0, reached - len(finite))}
+
+
+def section(table: pd.DataFrame) -> str:
+    """Return the section in Markdown of a table of :func:`tabulate`."""
+    parts = [_part(str(env), rows) for env, rows in table.groupby("env", sort=False)]
     return "\n\n".join(["## Control with the learned model", NOTE, *parts])
 
 
-def _part(reader: Reader, field: Field) -> str | None:
-    assessed = field.assessed
-    if not assessed:
-        return None
-    curves = measure_control(reader, Selection(tuple(one.entry for one in assessed)))
-    steps = sorted({int(t) for curve in curves for t in curve.t})
-    headers = [
-        "variant",
-        *(f"success after {t}" for t in steps),
-        *(f"cost after {t}" for t in steps),
-        "free run",
-        "n",
-    ]
-    rows = [
+def _part(env: str, table: pd.DataFrame) -> str:
+    rows: dict[str, dict[int, Row]] = {}
+    for row in table.to_dict("records"):
+        rows.setdefault(str(row["variant"]), {})[int(row["t"])] = {
+            str(key): value for key, value in row.items()
+        }
+    steps = sorted({t for found in rows.values() for t in found})
+    success = Sheet(
+        ["variant", *(f"success after {t}" for t in steps), "n"],
         [
-            one.label,
-            *_cells(curve, steps),
-            _free_run(reader, one, curve, steps[-1]),
-            curve.described,
-        ]
-        for one, curve in zip(assessed, curves, strict=True)
-    ]
-    rows.append(_ceiling(curves[0].truth, len(steps)))
-    return f"### {environment_title(field.env)}\n\n{Sheet(headers, rows).markdown()}"
+            [label, *(_cell(found, t, _success) for t in steps), _last(found)["described"]]
+            for label, found in rows.items()
+        ],
+    )
+    worth = Sheet(
+        [
+            "variant",
+            *(f"cost after {t}" for t in steps),
+            *(f"loss after {t}" for t in steps if t),
+            "free run",
+        ],
+        [
+            [
+                label,
+                *(_cell(found, t, _cost) for t in steps),
+                *(_cell(found, t, lambda row: number(_float(row, "loss"))) for t in steps if t),
+                _cell(found, steps[-1], _free_run_text),
+            ]
+            for label, found in rows.items()
+        ],
+    )
+    return f"### {environment_title(env)}\n\n{success.markdown()}\n\n{worth.markdown()}"
 
 
-def _ceiling(truth: TrueModel, columns: int) -> list[str]:
-    """Return the row of the true model: the same after any number of steps, its cost the unit."""
-    success = _rate(truth.success, truth.success_low, truth.success_high)
-    cost = but_lost("1" if truth.lost < truth.n else number(math.nan), truth.lost)
-    return ["true model", *[success] * columns, *[cost] * columns, number(math.nan), str(truth.n)]
+def _last(found: Mapping[int, Row]) -> Row:
+    return found[max(found)]
 
 
-def _cells(curve: ControlCurve, steps: Sequence[int]) -> list[str]:
-    """Return the successes and the costs after each number of steps, a dash where there is none."""
-    places = {int(t): k for k, t in enumerate(curve.t)}
-    successes = [_success(curve, places[t]) if t in places else "–" for t in steps]
-    return successes + [_cost(curve, places[t]) if t in places else "–" for t in steps]
+def _cell(found: Mapping[int, Row], t: int, text: Callable[[Row], str]) -> str:
+    """Return the text of a number of steps, a dash where there is none."""
+    return text(found[t]) if t in found else "–"
 
 
-def _success(curve: ControlCurve, k: int) -> str:
-    return _rate(*(float(of[k]) for of in (curve.success, curve.success_low, curve.success_high)))
+def _success(row: Row) -> str:
+    centre, low, high = (_float(row, f"success{end}") for end in ("", "_low", "_high"))
+    star = "*" if _float(row, "success_p_adjusted") < LEVEL else ""
+    return number(math.nan) if math.isnan(low) else f"{centre:.2f}{star} [{low:.2f}, {high:.2f}]"
 
 
-def _rate(centre: float, low: float, high: float) -> str:
-    return share(centre) if math.isnan(low) else f"{centre:.2f} [{low:.2f}, {high:.2f}]"
+def _cost(row: Row) -> str:
+    centre, low, high = (_float(row, f"cost{end}") for end in ("", "_low", "_high"))
+    alone = "1" if row["variant"] == TRUTH and centre == 1 else number(centre)
+    text = alone if math.isnan(low) else within(centre, low, high)
+    return but_lost(text, int(_float(row, "lost")))
 
 
-def _cost(curve: ControlCurve, k: int) -> str:
-    centre, low, high = (float(of[k]) for of in (curve.cost, curve.cost_low, curve.cost_high))
-    return but_lost(within(centre, low, high), int(curve.lost[k]))
+def _free_run_text(row: Row) -> str:
+    if row["variant"] == TRUTH:
+        return number(math.nan)
+    return but_lost(number(_float(row, "free_run")), int(_float(row, "free_run_lost")))
 
 
-def _free_run(reader: Reader, variant: Variant, curve: ControlCurve, t: int) -> str:
-    """Return the mean error after t steps, and of how many trials it is not finite."""
-    found = reader.assessments(variant.entry.cell.config_key, FREE_RUN)
-    errors = found.values[:, found.t == t]
-    finite = errors[np.isfinite(errors)]
-    reached = int(np.sum(curve.n[curve.t == t]))
-    mean = float(np.mean(finite)) if len(finite) else math.nan
-    return but_lost(number(mean), max(0, reached - len(finite)))
+def _float(row: Row, column: str) -> float:
+    value = row[column]
+    return float(value) if isinstance(value, int | float) else math.nan

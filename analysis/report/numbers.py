@@ -13,8 +13,9 @@ import pandas as pd
 from analysis.comparisons import loss_of_random_inputs
 from analysis.control import scores_at
 from analysis.divergence import DivergenceRule
-from analysis.measures import final_losses, mean_losses, steps_to
-from analysis.paired import benjamini_hochberg, censored_median, compare, without_ratio
+from analysis.figures.style import policy_style
+from analysis.measures import final_losses, lasting_steps, mean_losses
+from analysis.paired import benjamini_hochberg, censored_median, compare, race, without_ratio
 from analysis.reading import read_curves
 from analysis.report.variants import Field, Variant
 from analysis.statistics import mean, standard_error
@@ -38,19 +39,21 @@ LEVEL = 0.05
 """Adjusted p below which a report says that a variant is better or worse."""
 
 
-def tabulate_field(reader: Reader, field: Field) -> pd.DataFrame:
+def tabulate_field(
+    reader: Reader, field: Field, rule: DivergenceRule = DivergenceRule.EXCLUDE
+) -> pd.DataFrame:
     """Return one row for each variant of an environment, the reference first."""
     plane = Plane.of(system_from_mapping(field.reference.entry.cell.config["env"]))
     entries = tuple(one.entry for one in field.variants)
-    epsilon = loss_of_random_inputs(reader, entries, "loss", DivergenceRule.EXCLUDE)
-    scores = {one.label: _scores(reader, one, plane) for one in field.variants}
+    epsilon = loss_of_random_inputs(reader, entries, "loss", rule)
+    scores = {one.label: _scores(reader, one, plane, rule) for one in field.variants}
     costs = _control_costs(reader, field)
     for label, own in scores.items():
         own["control"] = costs.get(label, {})
     return pd.DataFrame(
         [
             _row(reader, field, one, scores[one.label], scores)
-            | _samples(reader, one, math.nan if epsilon is None else epsilon)
+            | _samples(reader, field, one, math.nan if epsilon is None else epsilon, rule)
             for one in field.variants
         ]
     )
@@ -59,15 +62,20 @@ def tabulate_field(reader: Reader, field: Field) -> pd.DataFrame:
 def adjust(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Join the tables and adjust each measure's p-values over the whole report."""
     table = pd.concat(tables, ignore_index=True)
-    for measure in MEASURES:
+    for measure in (*MEASURES, "steps"):
         table[f"{measure}_p_adjusted"] = benjamini_hochberg(table[f"{measure}_p"].tolist())
     return table
 
 
 def verdict(row: Mapping[str, object], measure: str = "loss") -> str:
-    """Return "better" or "worse" than the reference, or "open" where the test does not tell."""
-    p, ratio = _float(row[f"{measure}_p_adjusted"]), _float(row[f"{measure}_ratio"])
-    if not p < LEVEL or math.isnan(ratio):
+    """Return "better" or "worse" than the reference, or "open".
+
+    It is open unless both tell: the test, of ranks and adjusted, and the interval, of the mean.
+    """
+    p, ratio, low, high = (
+        _float(row[f"{measure}_{name}"]) for name in ("p_adjusted", "ratio", "low", "high")
+    )
+    if not p < LEVEL or not (high < 1 or low > 1):
         return "open"
     return "better" if (ratio < 1) != (measure == "coverage") else "worse"
 
@@ -76,8 +84,10 @@ def _float(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
 
-def _scores(reader: Reader, variant: Variant, plane: Plane) -> dict[str, Scores]:
-    entry, rule = variant.entry, DivergenceRule.EXCLUDE
+def _scores(
+    reader: Reader, variant: Variant, plane: Plane, rule: DivergenceRule
+) -> dict[str, Scores]:
+    entry = variant.entry
     return {
         "loss": final_losses(reader, entry, "loss", rule).by_seed,
         "reachable_loss": final_losses(reader, entry, "reachable_loss", rule).by_seed,
@@ -112,8 +122,11 @@ def _row(
         "env": field.env,
         "variant": variant.label,
         "policy": variant.entry.cell.policy,
+        "policy_label": policy_style(variant.entry.cell.policy).label,
         "model": variant.entry.cell.model,
         "learner": variant.entry.cell.learner,
+        "path": variant.entry.cell.config["path"],
+        "dt": variant.entry.cell.config["env"]["dt"],
         "n": len(own["loss"]),
         "n_diverged": sum(trial.status == "diverged" for trial in trials),
         "plan_us": _typical(reader, variant, "plan_us"),
@@ -130,18 +143,28 @@ def _row(
     return row
 
 
-def _samples(reader: Reader, variant: Variant, epsilon: float) -> dict[str, float]:
-    """Return how many inputs it takes to the loss ε: the median over the trials, and how many do.
+def _samples(
+    reader: Reader, field: Field, variant: Variant, epsilon: float, rule: DivergenceRule
+) -> dict[str, float]:
+    """Return how many inputs it takes until the loss stays at most ε.
 
-    A trial that never gets there is censored: later than any that does.
+    They are the median over the trials, the share of those that get there, and the p of the sign
+    test against the reference. A trial that does not get there is censored: later than any that
+    does.
     """
-    steps = steps_to(reader, variant.entry, "loss", DivergenceRule.EXCLUDE, epsilon).values
     known = not math.isnan(epsilon)
+    own, reference = (
+        lasting_steps(reader, one.entry, "loss", rule, epsilon).by_seed
+        for one in (variant, field.reference)
+    )
+    steps = np.array(list(own.values()))
+    compared = known and variant is not field.reference
     return {
         "epsilon": epsilon,
         "horizon": variant.entry.cell.horizon,
         "steps": censored_median(steps) if known else math.nan,
         "reached": float(np.mean(np.isfinite(steps))) if known and len(steps) else math.nan,
+        "steps_p": race(*_paired(own, reference)).p_value if compared else math.nan,
     }
 
 

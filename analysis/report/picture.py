@@ -1,4 +1,4 @@
-"""The picture of a report: ratios of the final loss to the reference's, one panel a system."""
+"""The picture of a system in a report: ratios of the final loss to the reference's."""
 
 from __future__ import annotations
 
@@ -7,44 +7,37 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.figures.axes import log_ticks
-from analysis.figures.style import BLUE, GREY, TEXT_WIDTH, VERMILLION, environment_title
+from analysis.figures.style import BLUE, GREY, TEXT_WIDTH, VERMILLION
 from analysis.report.numbers import LEVEL, verdict
 
 _LOOK = {"better": (BLUE, "o"), "worse": (VERMILLION, "s"), "open": (GREY, "D")}
 _INCHES_PER_ROW = 0.16
-_INCHES_PER_PANEL = 0.62
+_INCHES_AROUND = 0.62
 
 CAPTION = (
     "Ratio of final losses, variant / D-optimal inputs: left of the line, below 1, the variant is "
     "better. Geometric mean over shared seeds with its 95 % interval, the best at the top. "
-    f"Circles: better, squares: worse, diamonds: not told apart at an adjusted p of {LEVEL}. The "
-    "oracle, which knows the form of the physics and is orders of magnitude below, is in the "
-    "tables alone."
+    "Circles: better, squares: worse, diamonds: not told apart, as the adjusted p is not below "
+    f"{LEVEL} or the interval holds 1. The oracle, which knows the form of the physics and is "
+    "orders of magnitude below, is in the tables alone."
 )
 APART = "oracle"
 """The policy that would leave no room for the others."""
 
 
-def draw(table: pd.DataFrame) -> Figure:
-    """Return the figure of a table of :func:`analysis.report.numbers.adjust`."""
-    panels = dict(iter(table.groupby("env", sort=False)))
-    shown = {env: _ranked(part) for env, part in panels.items()}
-    heights = [_INCHES_PER_PANEL + _INCHES_PER_ROW * len(part) for part in shown.values()]
-    figure = Figure(figsize=(TEXT_WIDTH, sum(heights)), layout="constrained")
-    axes = figure.subplots(len(shown), 1, height_ratios=heights, squeeze=False)[:, 0]
-    for panel, (env, part) in zip(axes, shown.items(), strict=True):
-        _panel(panel, part)
-        panel.set_title(environment_title(str(env)))
-    axes[-1].set_xlabel("final loss / final loss of D-optimal inputs")
+def draw(part: pd.DataFrame) -> Figure:
+    """Return the figure of one system's rows of :func:`analysis.report.numbers.adjust`."""
+    known = part[part["loss_ratio"].notna() & (part["policy"] != APART)]
+    rows = known.sort_values("loss_ratio", ascending=False, kind="stable")
+    height = _INCHES_AROUND + _INCHES_PER_ROW * len(rows)
+    figure = Figure(figsize=(TEXT_WIDTH, height), layout="constrained")
+    axes = figure.subplots()
+    _fill(axes, rows)
+    axes.set_xlabel("final loss / final loss of D-optimal inputs")
     return figure
 
 
-def _ranked(part: pd.DataFrame) -> pd.DataFrame:
-    known = part[part["loss_ratio"].notna() & (part["policy"] != APART)]
-    return known.sort_values("loss_ratio", ascending=False, kind="stable")
-
-
-def _panel(axes: Axes, part: pd.DataFrame) -> None:
+def _fill(axes: Axes, part: pd.DataFrame) -> None:
     for place, row in enumerate(part.to_dict("records")):
         colour, marker = _LOOK[verdict({str(key): value for key, value in row.items()})]
         ratio = float(row["loss_ratio"])

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from analysis.choice import REFERENCE, Filter, defaults, difference, flatten, nearness
 from analysis.control import common_task, task_of
 from analysis.errors import AnalysisError
+from analysis.figures.style import policy_style
 from analysis.selection import Entry, environment_rank, newest, policy_rank
 from orchestrate.store import Reader
 
@@ -154,7 +155,7 @@ def _labels(entries: Sequence[Entry], reference: Entry) -> dict[str, str]:
     """
     flat = {one.cell.config_key: flatten(one.cell.config) for one in entries}
     own = flatten(reference.cell.config)
-    words = {one.cell.config_key: [one.cell.policy.replace("_", " ")] for one in entries}
+    words = {one.cell.config_key: [policy_style(one.cell.policy).label] for one in entries}
     for path in (f"{section}.name" for section in _SETTING):
         for group in _alike(words):
             for key in group if _differ(flat, group, path) else ():
@@ -185,5 +186,11 @@ def _word(path: str, config: Mapping[str, object], usual: Mapping[str, object]) 
     if path not in config or (path in usual and config[path] == usual[path]):
         return []
     name, value = path.rpartition(".")[2], config[path]
-    text = f"{value:g}" if isinstance(value, float) else str(value)
+    text = _text(value)
     return [text.replace("_", " ") if name == "name" else f"{name}={text}"]
+
+
+def _text(value: object) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_text, value))}]"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

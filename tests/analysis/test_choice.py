@@ -59,9 +59,31 @@ def test_a_task_is_no_departure_but_the_last_to_decide() -> None:
     task = {"task": {"name": "control", "checkpoints": [100]}}
     plain = cell("pendulum", "lookahead")
     assessed = cell("pendulum", "lookahead", **task)
-    far = cell("pendulum", "lookahead", policy={"horizon": 20})
+    far = cell("pendulum", "lookahead", policy={"lookahead": 20})
     assert choose([Candidate(far, 5), Candidate(assessed, 5)]) == [assessed]
     assert choose([Candidate(assessed, 5), Candidate(plain, 5), Candidate(far, 5)]) == [plain]
+
+
+def test_of_learners_with_as_many_trials_that_of_a_launch_decides() -> None:
+    learners = {name: {"learner": {"name": name}} for name in ("adam_window", "ekf", "adam_replay")}
+    cells = {
+        (policy, name): cell("pendulum", policy, **learner)
+        for policy in ("d_optimal", "random")
+        for name, learner in learners.items()
+    }
+    chosen = choose([Candidate(one, 5) for one in cells.values()])
+    assert chosen == [cells["d_optimal", "adam_window"], cells["random", "adam_window"]]
+
+
+def test_the_advice_on_a_tie_names_what_all_of_them_have() -> None:
+    filters = [
+        cell("pendulum", "d_optimal", learner={"name": "ekf", "forgetting": value})
+        for value in (0.9, 0.95)
+    ]
+    with pytest.raises(AnalysisError, match=r"differ in learner\.forgetting .* --where learner\."):
+        choose([Candidate(one, 5) for one in filters])
+    path, values = difference([filters[0].config, cell("pendulum", "d_optimal").config])
+    assert (path, values) == ("learner.name", ["ekf", "adam_window"])
 
 
 def test_a_tie_between_variants_of_one_policy_is_an_error_too() -> None:

@@ -9,7 +9,14 @@ from analysis.choice import Filter
 from analysis.comparisons import compare_policies, compare_steps
 from analysis.divergence import DivergenceRule
 from analysis.errors import AnalysisError
-from analysis.measures import Measure, first_passage, geometric_mean, mean_losses, steps_to
+from analysis.measures import (
+    Measure,
+    first_passage,
+    geometric_mean,
+    last_passage,
+    mean_losses,
+    steps_to,
+)
 from analysis.paired import censored_median, race, sign_test
 from analysis.selection import select
 from analysis.sheets import race_sheet
@@ -33,6 +40,13 @@ def test_geometric_mean_by_hand() -> None:
 def test_first_passage_by_hand() -> None:
     curves = np.array([[5.0, 2, 3, 1], [5.0, 4, 4, 4], [1.0, 9, 9, 9], [5.0, 4, 3, 2]])
     assert first_passage(curves, 2.0).tolist() == [2, INF, 1, 4]
+
+
+def test_last_passage_by_hand() -> None:
+    """It is the first step of the last stretch below, so that a dip does not count."""
+    curves = np.array([[5.0, 2, 3, 1], [5.0, 1, 4, 4], [1.0, 2, 1, 2], [5.0, 4, 3, 2]])
+    assert last_passage(curves, 2.0).tolist() == [4, INF, 1, 4]
+    assert last_passage(np.array([[1.0, math.nan], [math.nan, 1.0]]), 2.0).tolist() == [INF, 2]
 
 
 def test_a_scale_moves_threshold_and_curve_alike() -> None:

@@ -21,6 +21,7 @@ from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec
 
 SHORT = {"env": {"horizon": 40}}
 SEEDS = range(6)
+KINDS = ("png", "svg", "pdf")
 ONE_SAMPLE = {"learner": {"name": "adam", "window": 1}}
 
 
@@ -50,10 +51,10 @@ def pendulum(reader: Reader) -> Field:
 
 
 def test_every_variant_has_a_label_of_its_own(pendulum: Field) -> None:
-    assert pendulum.reference.label == "d optimal"
+    assert pendulum.reference.label == "D-optimal"
     assert [one.label for one in pendulum.others] == [
-        "d optimal, adam",
-        "d optimal, form=dual",
+        "D-optimal, adam",
+        "D-optimal, form=dual",
         "oracle",
         "uniform",
         "random",
@@ -75,10 +76,12 @@ def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Field
     assert row["reachable_loss_ratio"] == pytest.approx(row["loss_ratio"])
     assert row["n"] == 6
     assert 0 < row["coverage"] < 1
-    assert math.isnan(table.loc["d optimal", "loss_ratio"])
+    assert math.isnan(table.loc["D-optimal", "loss_ratio"])
 
 
-def test_steps_to_the_loss_of_random_inputs_are_counted(reader: Reader, pendulum: Field) -> None:
+def test_steps_until_the_loss_stays_at_that_of_random_inputs_are_counted(
+    reader: Reader, pendulum: Field
+) -> None:
     table = numbers.tabulate_field(reader, pendulum).set_index("variant")
     curves = {
         name: [fake_result(make_spec("pendulum", name, s, **SHORT)).loss for s in SEEDS]
@@ -86,12 +89,12 @@ def test_steps_to_the_loss_of_random_inputs_are_counted(reader: Reader, pendulum
     }
     epsilon = np.median([curve[-1] for curve in curves["random"]])
     steps = [
-        np.argmax(curve <= epsilon) + 1 if np.any(curve <= epsilon) else np.inf
+        next((t + 1 for t in range(len(curve)) if np.all(curve[t:] <= epsilon)), np.inf)
         for curve in curves["d_optimal"]
     ]
-    assert table.loc["d optimal", "epsilon"] == pytest.approx(epsilon)
-    assert table.loc["d optimal", "steps"] == sorted(steps)[len(steps) // 2]
-    assert table.loc["d optimal", "reached"] == np.mean(np.isfinite(steps))
+    assert table.loc["D-optimal", "epsilon"] == pytest.approx(epsilon)
+    assert table.loc["D-optimal", "steps"] == sorted(steps)[len(steps) // 2]
+    assert table.loc["D-optimal", "reached"] == np.mean(np.isfinite(steps))
     assert table.loc["random", "reached"] <= 0.5
 
 
@@ -103,7 +106,7 @@ def test_without_random_inputs_there_is_no_loss_to_reach(tmp_path: Path) -> None
             [numbers.tabulate_field(opened, field) for field in fields(opened, Filter())]
         )
     assert table[["epsilon", "steps", "reached"]].isna().all(axis=None)
-    assert "ε =" not in page.write(table, [], "origin", "report.png")
+    assert "ε =" not in page.write(table, [], "origin", {})
 
 
 def test_p_values_are_adjusted_over_the_whole_report(reader: Reader) -> None:
@@ -123,12 +126,16 @@ def test_p_values_are_adjusted_over_the_whole_report(reader: Reader) -> None:
         (2.0, 0.01, "loss", "worse"),
         (0.5, 0.2, "loss", "open"),
         (0.5, math.nan, "loss", "open"),
+        (0.9, 0.01, "loss", "open"),  # the interval holds 1
         (2.0, 0.01, "coverage", "better"),
         (0.5, 0.01, "coverage", "worse"),
     ],
 )
-def test_a_verdict_needs_the_adjusted_test(ratio: float, p: float, measure: str, said: str) -> None:
+def test_a_verdict_needs_the_adjusted_test_and_the_interval(
+    ratio: float, p: float, measure: str, said: str
+) -> None:
     row = {f"{measure}_ratio": ratio, f"{measure}_p_adjusted": p}
+    row |= {f"{measure}_low": ratio / 1.2, f"{measure}_high": ratio * 1.2}
     assert numbers.verdict(row, measure) == said
 
 
@@ -138,16 +145,20 @@ def test_a_page_calls_what_is_worse_worse() -> None:
         math.nan,
     )
     usual = {"env": "arm", "loss": 1.0, "loss_2se": 0.1, "coverage": 0.3, "coverage_2se": 0.1}
-    usual |= {"epsilon": 2.5, "horizon": 500, "steps": math.inf}
+    usual |= {"epsilon": 2.5, "horizon": 500, "steps": math.inf, "reached": 0.25, "dt": 0.02}
+    usual |= {"steps_p_adjusted": 0.5, "policy": "d_optimal", "policy_label": "D-optimal"}
+    usual |= {"path": "kernel"}
     usual |= {"control_lost": 0, "plan_us": 2.0, "learn_us": 30.0, "n": 20, "n_diverged": 0}
     bad = {"loss_ratio": 1.5, "loss_low": 1.2, "loss_high": 1.9, "loss_p_adjusted": 1e-3}
-    rows = [{"variant": "d optimal"}, {"variant": "look-ahead", **bad}, {"variant": "max"}]
+    rows = [{"variant": "D-optimal"}, {"variant": "look-ahead", **bad}, {"variant": "max"}]
     table = pd.DataFrame([{**usual, **unknown, **row} for row in rows])
-    text = page.write(table, ["arm: one"], "origin", "report.png")
+    text = page.write(table, ["arm: one"], "origin", {"arm": "report_arm"})
     assert "- better: none\n  - worse: look-ahead (1.50)\n  - not told apart: max" in text
     assert "1.50 [1.20, 1.90]" in text
     assert "ε = 2.50" in text
-    assert "> 500" in text
+    assert "> 500 (0.25)" in text
+    assert "500 steps of dt = 20 ms." in text
+    assert "](report_arm.png)" in text
     assert "- arm: one" in text
 
 
@@ -155,7 +166,7 @@ def test_entries_with_commas_are_separated_by_semicolons(reader: Reader) -> None
     table = numbers.adjust(
         [numbers.tabulate_field(reader, field) for field in fields(reader, Filter(("pendulum",)))]
     )
-    text = page.write(table, [], "origin", "report.png")
+    text = page.write(table, [], "origin", {})
     lines = [line for line in text.splitlines() if line.startswith("  - ")]
     entries = [entry for line in lines for entry in line.split(": ")[1].split("; ")]
     names = {entry.rpartition(" (")[0] for entry in entries if entry != "none"}
@@ -166,13 +177,15 @@ def test_the_command_writes_a_page_with_picture_and_provenance(url: str, tmp_pat
     folder = tmp_path / "report"
     assert main(["report", "--db", url, "--out", str(folder)]) == 0
     names = {path.name for path in folder.iterdir()}
-    assert {"README.md", "report.csv", "report.json", "report.png", "report.svg"} <= names
+    pictures = {f"report_{env}.{kind}" for env in ("pendulum", "quadrotor") for kind in KINDS}
+    assert {"README.md", "report.csv", "report.json", *pictures} <= names
+    assert "- uniform: " in (folder / "README.md").read_text()
     text = (folder / "README.md").read_text()
     assert "| random, adam " in text
     assert "5, 1 diverged" in text
-    again = (folder / "report.png").read_bytes()
+    again = (folder / "report_pendulum.png").read_bytes()
     assert main(["report", "--db", url, "--out", str(folder)]) == 0
-    assert (folder / "report.png").read_bytes() == again
+    assert (folder / "report_pendulum.png").read_bytes() == again
     assert (folder / "README.md").read_text() == text
 
 

@@ -15,7 +15,8 @@ from analysis.choice import Filter
 from analysis.control import measure_control, scores_at
 from analysis.numbers import number
 from analysis.report import numbers
-from analysis.report.control import section
+from analysis.report.control import section, tabulate
+from analysis.report.numbers import LEVEL
 from analysis.report.variants import fields
 from analysis.selection import Selection
 from dopt.result import TrialResult
@@ -57,11 +58,16 @@ def control_task(*checkpoints: int, **fields: object) -> dict[str, dict[str, obj
 
 
 def control_rows(text: str) -> list[dict[str, str]]:
-    """Return the rows of the first table of the section on control."""
+    """Return the rows of the section on control, the two tables of a system side by side."""
     section = text.split("## Control with the learned model")[1].split("\n## ")[0]
-    lines = [line for line in section.splitlines() if line.startswith("|")]
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    return [dict(zip(cells[0], row, strict=True)) for row in cells[2:]]
+    tables = [part for part in section.split("\n\n") if part.startswith("|")]
+    rows: list[dict[str, str]] = []
+    for table in tables:
+        lines = [line.strip("|").split("|") for line in table.splitlines()]
+        cells = [[cell.strip() for cell in line] for line in lines]
+        found = [dict(zip(cells[0], row, strict=True)) for row in cells[2:]]
+        rows = [one | other for one, other in zip(rows or found, found, strict=True)]
+    return rows
 
 
 def test_costs_of_different_tasks_are_not_compared(tmp_path: Path) -> None:
@@ -81,7 +87,7 @@ def test_costs_of_different_tasks_are_not_compared(tmp_path: Path) -> None:
         "success after 20",
         "success after 40",
     ]
-    assert {row["variant"] for row in rows} >= {"d optimal", "uniform"}
+    assert {row["variant"] for row in rows} >= {"D-optimal", "uniform"}
     assert not {row["variant"] for row in rows} & {"random", "periodic"}
     notes = text.split("## Left out")[1]
     assert "control with random: assessed by another task" in notes
@@ -90,7 +96,7 @@ def test_costs_of_different_tasks_are_not_compared(tmp_path: Path) -> None:
     assert "input_weight = 7.0 instead of" in notes
     table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     assert table["control_ratio"].notna().to_dict() == {
-        "d optimal": False,
+        "D-optimal": False,
         "uniform": True,
         "periodic": False,
         "random": False,
@@ -113,13 +119,14 @@ def test_cells_of_control_are_below_their_own_steps(tmp_path: Path) -> None:
     fill(url, specs, edit=stopped)
     with Reader.open(url) as opened:
         found = fields(opened, Filter())
-        text = section(opened, found)
+        controlled = tabulate(opened, found)
+        assert controlled is not None
+        text = section(controlled)
         table = numbers.tabulate_field(opened, found[0]).set_index("variant")
         whole = measure_control(opened, Selection((found[0].others[0].entry,)))[0]
-    assert text is not None
     rows = {row["variant"]: row for row in control_rows(text)}
-    assert rows["d optimal"]["success after 10"] == rows["d optimal"]["cost after 10"] == "–"
-    assert rows["d optimal"]["success after 20"].startswith("1.00")
+    assert rows["D-optimal"]["success after 10"] == rows["D-optimal"]["cost after 10"] == "–"
+    assert rows["D-optimal"]["success after 20"].startswith("1.00")
     assert rows["uniform"]["cost after 10"].startswith(number(float(whole.cost[1])))
     # no number of the reference after the task's first steps: no ratio, rather than one of others
     assert math.isnan(table.loc["uniform", "control_ratio"])
@@ -146,9 +153,9 @@ def test_lost_episodes_are_counted_beside_every_mean(tmp_path: Path) -> None:
     rows = {row["variant"]: row for row in control_rows(text)}
     assert rows["uniform"]["cost after 20"].endswith("], 1 lost")
     assert rows["uniform"]["free run"].endswith(", 1 lost")
-    assert "lost" not in rows["uniform"]["cost after 0"] + "".join(rows["d optimal"].values())
-    (line,) = [line for line in text.split("## Control")[0].splitlines() if "| uniform" in line]
-    assert line.split("|")[9].strip().endswith("], 1 lost")
+    assert "lost" not in rows["uniform"]["cost after 0"] + "".join(rows["D-optimal"].values())
+    _, line = [line for line in text.split("## Control")[0].splitlines() if "| uniform" in line]
+    assert line.split("|")[5].strip().endswith("], 1 lost")
     table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     assert table.loc["uniform", "control_lost"] == 1
     assert math.isfinite(table.loc["uniform", "control"])
@@ -176,3 +183,33 @@ def test_the_true_model_has_a_row_of_its_own(tmp_path: Path) -> None:
         assert row[f"success after {t}"].startswith("0.50 [0.")
         assert row[f"cost after {t}"] == "1, 1 lost"
     assert (row["free run"], row["n"]) == ("–", "6")
+
+
+def test_successes_are_tested_in_pairs(tmp_path: Path) -> None:
+    """Where D-optimal inputs succeed with two of eight models and uniform ones with all."""
+
+    def decided(spec: TrialSpec, result: TrialResult) -> TrialResult:
+        success = float(spec.policy.name == "uniform" or spec.seed < 2)
+        rows = (
+            row._replace(value=success) if row.measure == "control_success" and row.t else row
+            for row in result.assessments
+        )
+        return replace(result, assessments=tuple(rows))
+
+    url = f"sqlite:///{tmp_path}/pairs.db"
+    specs = make_grid(
+        ("pendulum",), ("d_optimal", "uniform"), range(8), **SHORT, **control_task(20)
+    )
+    fill(url, specs, edit=decided)
+    with Reader.open(url) as opened:
+        table = tabulate(opened, fields(opened, Filter()))
+    assert table is not None
+    rows = table.set_index(["variant", "t"])
+    for t in (20, 40):
+        assert rows.loc[("uniform", t), "success_p"] == pytest.approx(2 / 2**6)
+        assert math.isnan(rows.loc[("D-optimal", t), "success_p"])
+        assert rows.loc[("uniform", t), "success_p_adjusted"] < LEVEL
+    assert math.isnan(rows.loc[("uniform", 0), "success_p"])
+    cells = {row["variant"]: row for row in control_rows(section(table))}
+    assert cells["uniform"]["success after 20"].startswith("1.00* [")
+    assert cells["D-optimal"]["success after 20"].startswith("0.25 [")

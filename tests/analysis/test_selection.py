@@ -7,7 +7,8 @@ import pytest
 from analysis.choice import Filter
 from analysis.errors import AnalysisError
 from analysis.gaps import ranges
-from analysis.selection import Selection, environment_rank, policy_rank, select
+from analysis.selection import Selection, environment_rank, newest, policy_rank, select
+from dopt import spec
 from dopt.policies import POLICIES
 from dopt.spec import TrialSpec
 from dopt.systems import SYSTEMS
@@ -74,6 +75,24 @@ def test_other_configurations_are_noted(tmp_path: Path) -> None:
     assert selection.notes == (
         "pendulum: 1 other stored configurations are not part of this (see --where)",
     )
+
+
+def test_assessments_of_different_versions_do_not_mix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = {"task": {"name": "control", "checkpoints": [10]}}
+    policies = ("d_optimal", "random")
+    plain = make_grid(("pendulum",), policies, range(2))
+    new = make_grid(("pendulum",), policies, range(2), **task)
+    keys = {one.trial_key for one in (*plain, *new)}
+    monkeypatch.setattr(spec, "ASSESSMENT_VERSION", 1)
+    old = make_grid(("pendulum",), policies, range(2), **task)
+    assert keys.isdisjoint(one.trial_key for one in old)
+    url = f"sqlite:///{tmp_path}/versions.db"
+    fill(url, [*plain, *old, *new])
+    with Reader.open(url) as opened:
+        kept = {cell.config_key for cell in newest(list(opened.cells()))}
+    assert kept == {one.config_key for one in (*plain, *new)}
 
 
 def test_fingerprint_tells_outcomes_apart(tmp_path: Path, reader: Reader) -> None:
