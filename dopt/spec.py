@@ -21,6 +21,7 @@ from dopt.models.mlp import MLP
 from dopt.policies import POLICIES, Policy, Search
 from dopt.policies.base import OpenLoop, Planned
 from dopt.registry import TARGET, build, section_of
+from dopt.soundness import check_system
 from dopt.systems import SYSTEMS, System
 from dopt.systems.black_box import BlackBox
 
@@ -73,7 +74,7 @@ class Cell:
             object.__setattr__(self, "task", self.task.resolved(self.system))
         self._check_runnable()
         if type(self.system) not in SYSTEMS.values():
-            self.system.check()
+            check_system(self.system)
         self.policy.check(self.system)
         self._check_size()
         if isinstance(self.policy, Search) and self.policy.budget_us and self.path != "kernel":

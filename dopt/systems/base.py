@@ -97,12 +97,6 @@ class System(Checked):
     def accelerations(state: Any, parameters: Any) -> Sequence[Any]:
         """Return the learned accelerations at zero input: r scalars."""
 
-    def check(self) -> None:
-        """Raise SpecificationError if the class, one of a user's own, is none of a system."""
-        from dopt.systems.soundness import check_system
-
-        check_system(self)
-
     @property
     def n_states(self) -> int:
         """State dimension d."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -72,10 +71,6 @@ class BlackBox(System):
                 f"leave it out."
             )
 
-    def check(self) -> None:
-        """Start a run in vain, so that what is wrong is said before any trial."""
-        _started(self)
-
     @abstractmethod
     def episode(self, seed: int) -> Episode:
         """Start a run; the seed decides about all that is random in it."""
@@ -93,11 +88,6 @@ class BlackBox(System):
         flow = np.stack(np.broadcast_arrays(*known), axis=-1)
         difference: Array = (following - states) / self.dt - flow
         return difference[:, list(self.learned_rows)]
-
-
-@functools.lru_cache(maxsize=64)
-def _started(system: BlackBox) -> None:
-    system.episode(0)
 
 
 def transitions(

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from dopt.errors import SpecificationError
+from dopt.soundness import check_system
 from dopt.systems import SYSTEMS, Feature, Pendulum, System
-from dopt.systems.soundness import check_system
 from tests.dopt.trials import trial
 
 

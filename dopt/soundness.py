@@ -10,6 +10,7 @@ import numpy as np
 
 from dopt.errors import SpecificationError
 from dopt.systems.base import Array, System
+from dopt.systems.black_box import BlackBox
 from dopt.systems.features import KINDS
 
 STATES = 5
@@ -23,15 +24,19 @@ _SEED = 20_240_601
 
 @functools.lru_cache(maxsize=64)
 def check_system(system: System) -> None:
-    """Try a system's declarations and equations.
+    """Try a system's declarations and equations; of a black box, begin a run in vain.
 
     Raises
     ------
     SpecificationError
         If a declared index is none of a state's, or the equations fail, return something else than
-        was declared, or depend on the inputs in another way than an affine one.
+        was declared, or depend on the inputs in another way than an affine one; if a run of a black
+        box says so.
     """
     _check_indices(system)
+    if isinstance(system, BlackBox):
+        system.episode(0)
+        return
     rng = np.random.default_rng(_SEED)
     states = rng.uniform(-1, 1, (system.n_states, STATES))
     inputs = rng.uniform(-1, 1, (system.n_inputs, STATES))
