@@ -193,4 +193,4 @@ def _word(path: str, config: Mapping[str, object], usual: Mapping[str, object]) 
 def _text(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_text, value))}]"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
