@@ -63,12 +63,12 @@ figures: grid  ## run the paper's grid and draw its figures
 study: setup  ## run everything beyond the paper and compare it on one page, report/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=beyond store.url='$(STUDY_DB)'
 	$(BIN)/python -m analysis report --db '$(STUDY_DB)' --out report
-	$(BIN)/python -m analysis figures --db '$(STUDY_DB)' --out report --only figure5_control --env pendulum cartpole arm quadrotor --policy $(CONTROLLED)
+	$(BIN)/python -m analysis figures --db '$(STUDY_DB)' --out report/figures --only figure5_control --env pendulum cartpole arm quadrotor --policy $(CONTROLLED)
 
 claims: setup  ## run with 100 seeds what few leave open, and compare it on one page, report/claims/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=claims store.url='$(CLAIMS_DB)'
 	$(BIN)/python -m analysis report --db '$(CLAIMS_DB)' --out report/claims
-	$(BIN)/python -m analysis figures --db '$(CLAIMS_DB)' --out report/claims --only figure5_control --env pendulum --policy $(CONTROLLED)
+	$(BIN)/python -m analysis figures --db '$(CLAIMS_DB)' --out report/claims/figures --only figure5_control --env pendulum --policy $(CONTROLLED)
 
 smoke: setup  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'
