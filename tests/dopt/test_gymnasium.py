@@ -125,6 +125,12 @@ def test_every_policy_explores_a_black_box(policy: str) -> None:
     np.testing.assert_allclose(speeds[1:], expected, atol=1e-6)
 
 
+def test_where_a_black_box_can_be_driven_is_not_known() -> None:
+    mapping = specification().to_mapping()
+    with pytest.raises(IncompatibleError, match=r"policy\.states is 'reachable', .* to grid"):
+        TrialSpec.from_mapping({**mapping, "policy": {"name": "task", "states": "reachable"}})
+
+
 def test_the_seed_decides_about_the_start_and_policies_share_it() -> None:
     first, second = (run_trial(specification(policy=p)) for p in ("random", "d_optimal"))
     other = run_trial(specification(seed=1))
