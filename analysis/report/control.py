@@ -15,7 +15,7 @@ from analysis.numbers import but_lost, number, within
 from analysis.paired import benjamini_hochberg, mcnemar
 from analysis.reading import read_curves
 from analysis.report.numbers import LEVEL
-from analysis.report.variants import Field, Variant
+from analysis.report.variants import Field
 from analysis.selection import Selection
 from analysis.sheets import Sheet
 from orchestrate.store import Assessments, Reader
@@ -35,6 +35,7 @@ NOTE = (
 )
 TRUTH = "true model"
 SUCCESS, FREE_RUN = "control_success", "free_run_error"
+ESTIMATES = ("success", "success_low", "success_high", "cost", "cost_low", "cost_high")
 
 Array = npt.NDArray[np.float64]
 Row = Mapping[str, object]
@@ -53,17 +54,20 @@ def tabulate(reader: Reader, fields: Sequence[Field]) -> pd.DataFrame | None:
 def _rows(reader: Reader, field: Field) -> Iterator[dict[str, object]]:
     assessed = field.assessed
     curves = measure_control(reader, Selection(tuple(one.entry for one in assessed)))
-    reference = assessed[0] if assessed[0] is field.reference else None
-    for one, curve in zip(assessed, curves, strict=True):
-        compared = reference if one is not reference else None
+    successes = [reader.assessments(one.entry.cell.config_key, SUCCESS) for one in assessed]
+    reference = successes[0] if assessed[0] is field.reference else None
+    for one, curve, own in zip(assessed, curves, successes, strict=True):
         losses = read_curves(reader, one.entry, "loss").values
         free_runs = reader.assessments(one.entry.cell.config_key, FREE_RUN)
         for k, t in enumerate(curve.t.tolist()):
-            names = ("success", "success_low", "success_high", "cost", "cost_low", "cost_high")
             yield {
-                **{"env": field.env, "variant": one.label, "t": t, "n": int(curve.n[k])},
-                **{name: float(getattr(curve, name)[k]) for name in names},
-                **{"lost": int(curve.lost[k]), "success_p": _test(reader, one, compared, t)},
+                "env": field.env,
+                "variant": one.label,
+                "t": t,
+                "n": int(curve.n[k]),
+                **{name: float(getattr(curve, name)[k]) for name in ESTIMATES},
+                "lost": int(curve.lost[k]),
+                "success_p": _test(own, reference, t),
                 "loss": _geometric_mean(losses[:, t - 1]) if t else math.nan,
                 **_free_run(free_runs, t, int(curve.n[k])),
                 "described": curve.described,
@@ -75,27 +79,32 @@ def _rows(reader: Reader, field: Field) -> Iterator[dict[str, object]]:
 def _truth(env: str, truth: TrueModel, t: int) -> dict[str, object]:
     """Return a row of the true model: the same after any number of steps, its cost the unit."""
     return {
-        **{"env": env, "variant": TRUTH, "t": t, "n": truth.n},
-        **{"success": truth.success, "success_low": truth.success_low},
-        **{"success_high": truth.success_high, "lost": truth.lost},
-        **{"cost": 1.0 if truth.lost < truth.n else math.nan, "described": str(truth.n)},
+        "env": env,
+        "variant": TRUTH,
+        "t": t,
+        "n": truth.n,
+        "success": truth.success,
+        "success_low": truth.success_low,
+        "success_high": truth.success_high,
+        "cost": 1.0 if truth.lost < truth.n else math.nan,
+        "lost": truth.lost,
+        "described": str(truth.n),
     }
 
 
-def _test(reader: Reader, one: Variant, reference: Variant | None, t: int) -> float:
+def _test(own: Assessments, reference: Assessments | None, t: int) -> float:
     """Return p of the successes after t explored steps, over the seeds that reached them."""
-    if reference is None or t == 0:
+    if reference is None or own is reference or t == 0:
         return math.nan
-    ours, theirs = (_successes(reader, each, t) for each in (one, reference))
+    ours, theirs = (_at(found, t) for found in (own, reference))
     seeds = sorted(set(ours) & set(theirs))
     return mcnemar(*(np.array([each[seed] for seed in seeds]) for each in (ours, theirs)))
 
 
-def _successes(reader: Reader, variant: Variant, t: int) -> dict[int, float]:
-    found = reader.assessments(variant.entry.cell.config_key, SUCCESS)
-    column = found.values[:, found.t == t].reshape(len(found.seeds), -1)
-    known = np.isfinite(column).all(axis=1) & (column.shape[1] == 1)
-    return dict(zip(found.seeds[known].tolist(), column[known].ravel().tolist(), strict=True))
+def _at(found: Assessments, t: int) -> dict[int, float]:
+    """Return the number of each seed that reached t steps."""
+    rows, columns = np.nonzero(np.isfinite(found.values) & (found.t == t))
+    return dict(zip(found.seeds[rows].tolist(), found.values[rows, columns].tolist(), strict=True))
 
 
 def _geometric_mean(values: Array) -> float:

@@ -9,6 +9,7 @@ import pandas as pd
 
 from analysis.figures.style import environment_title
 from analysis.numbers import but_lost, number, p_text, plus_minus, share, steps_text, within
+from analysis.paired import FEW
 from analysis.report.numbers import LEVEL, verdict
 from analysis.report.picture import CAPTION
 from analysis.sheets import Sheet
@@ -29,7 +30,7 @@ EXPLAINED = (
     "Ratio: variant / D-optimal inputs (the first row of a table), below 1 the variant is better; "
     "the comparison tables of the figures have it the other way, D-optimal / baseline. It is the "
     "geometric mean over shared seeds, of losses and of control costs alike, with its unadjusted "
-    "95 % interval: paired BCa bootstrap of the log ratio, Student's below 30 pairs. Reachable "
+    f"95 % interval: paired BCa bootstrap of the log ratio, Student's below {FEW} pairs. Reachable "
     "set: of the final loss over states that the true system visits under strong inputs; where it "
     "and the grid disagree, the order of two variants depends on where a model is judged. Curve: "
     "of the loss over all steps (geometric mean).",

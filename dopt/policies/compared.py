@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from dopt.fields import quantity
 from dopt.policies.base import Array, Policy
-from dopt.policies.directions import sphere_inputs
+from dopt.policies.directions import sphere_directions
 from dopt.systems.base import System
 
 
@@ -24,4 +24,4 @@ class Compared(Policy):
 
     def compared_inputs(self, system: System) -> Array:
         """Return the candidates, (C, m), with norm γ."""
-        return sphere_inputs(system, self.candidates)
+        return system.gamma * sphere_directions(system.n_inputs, self.candidates)

@@ -9,7 +9,6 @@ import numpy as np
 
 from dopt.errors import SpecificationError
 from dopt.policies.base import Array, on_sphere
-from dopt.systems.base import System
 
 LARGEST_REPELLED = 256
 """More points than these stay where the sequence has them: repulsion takes their number squared."""
@@ -49,11 +48,6 @@ def sphere_directions(n_inputs: int, count: int) -> Array:
         return np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = _quasirandom(n_inputs, count)
     return _repelled(points) if count <= LARGEST_REPELLED else points
-
-
-def sphere_inputs(system: System, count: int) -> Array:
-    """Return inputs of norm γ, (C, m), spread well over the sphere."""
-    return system.gamma * sphere_directions(system.n_inputs, count)
 
 
 def _quasirandom(m: int, count: int) -> Array:

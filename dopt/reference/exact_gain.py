@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 from torch.func import grad_and_value, jacrev, vmap
 
-from dopt.policies.directions import sphere_inputs
 from dopt.policies.gradient import GradientDOptimal
 from dopt.reference.dynamics import flow
 
@@ -151,6 +150,5 @@ class GradientPlan:
 
 def candidates(batch: Lockstep, policy: GradientDOptimal) -> Tensor:
     """Return the candidates of a policy for every trial of a batch, (n, C, m)."""
-    system = batch.system
-    inputs = sphere_inputs(system, policy.candidates)
+    inputs = policy.compared_inputs(batch.system)
     return torch.tensor(inputs).to(batch.theta).expand(len(batch.theta), -1, -1)

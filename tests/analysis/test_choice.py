@@ -4,11 +4,13 @@ import json
 from collections.abc import Mapping
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
-from analysis.choice import Candidate, Filter, choose, difference, flatten
+from analysis.choice import USUAL, Candidate, Filter, choose, difference, flatten
 from analysis.errors import AnalysisError
 from orchestrate.store import Cell
 from tests.analysis.synthetic import make_spec
+from tests.orchestrate.conftest import ROOT
 
 
 def cell(system: str, name: str, **sections: Mapping[str, object]) -> Cell:
@@ -73,6 +75,13 @@ def test_of_learners_with_as_many_trials_that_of_a_launch_decides() -> None:
     }
     chosen = choose([Candidate(one, 5) for one in cells.values()])
     assert chosen == [cells["d_optimal", "adam_window"], cells["random", "adam_window"]]
+
+
+def test_what_is_usual_is_what_a_launch_takes() -> None:
+    listed = OmegaConf.load(ROOT / "conf" / "config.yaml").defaults
+    groups = [one for one in listed if isinstance(one, DictConfig)]
+    taken = {key: option for group in groups for key, option in group.items()}
+    assert {group: taken[group] for group in USUAL} == USUAL
 
 
 def test_the_advice_on_a_tie_names_what_all_of_them_have() -> None:
