@@ -6,151 +6,24 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Collection, Mapping
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from typing import ClassVar
 
-from dopt.compatibility import check_together, mismatch
+from dopt.cell import SECTIONS, Cell, without_versions
 from dopt.control import Control, task_from
-from dopt.errors import IncompatibleError, SpecificationError, unknown_name
+from dopt.errors import SpecificationError, unknown_name
 from dopt.fields import Checked, quantity
 from dopt.learning import LEARNERS, Learner
-from dopt.learning.base import Updated
-from dopt.memory import memory_by_setting
 from dopt.models import MODELS, Model
 from dopt.models.mlp import MLP
-from dopt.policies import POLICIES, Policy, Search
-from dopt.policies.base import OpenLoop, Planned
-from dopt.registry import TARGET, build, section_of
-from dopt.soundness import check_system
+from dopt.policies import POLICIES, Policy
+from dopt.registry import TARGET, build
 from dopt.systems import SYSTEMS, System
-from dopt.systems.black_box import BlackBox
-
-CODE_VERSION = 1
-"""Raised whenever a change of the code changes the numbers of a trial."""
-
-ASSESSMENT_VERSION = 2
-"""Raised whenever one changes the numbers of an assessment alone: for trials that have a task."""
-
-_VERSIONS = ("code_version", "assessment_version")
 
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
 
-LARGEST_HORIZON = 10_000_000
-"""A trial is committed whole, one row for each step."""
-
-LARGEST_MEMORY = 2**40
-"""Bytes that a trial may need on any machine; a launch also asks its own."""
-
-PATHS = ("kernel", "reference")
-
-_SECTIONS = ("env", "policy", "model", "learner")
-_KEYS = (*_SECTIONS, "task", "path", "seed")
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """A trial without its seed: one cell of a grid.
-
-    ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
-    agree to rounding only, which grows over a trial: so it is part of the trial's identity. What
-    the kernel does not know runs on the reference alone. ``task`` is what the trial is assessed by
-    on the way, and no part of its identity where there is none.
-    """
-
-    system: System
-    policy: Policy
-    model: Model
-    learner: Learner
-    path: str = "kernel"
-    task: Control | None = None
-
-    def __post_init__(self) -> None:
-        if self.path not in PATHS:
-            raise unknown_name("path", self.path, PATHS)
-        if self.task is not None:
-            if isinstance(self.system, BlackBox):
-                raise mismatch("a task", "a system with equations", f"env '{self.system.name}'")
-            object.__setattr__(self, "task", self.task.resolved(self.system))
-        self._check_runnable()
-        if type(self.system) not in SYSTEMS.values():
-            check_system(self.system)
-        self.policy.check(self.system)
-        self._check_size()
-        if isinstance(self.policy, Search) and self.policy.budget_us and self.path != "kernel":
-            raise IncompatibleError(
-                f"policy.budget_us is {self.policy.budget_us:g} µs, but only the compiled kernel "
-                f"heeds it, which runs the shipped systems, networks and learners one trial at a "
-                f"time: set it to 0."
-            )
-        check_together(self.system, self.policy, self.model, self.learner)
-
-    def _check_runnable(self) -> None:
-        """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""
-        for part, registry, bases in (
-            (self.policy, POLICIES, (OpenLoop, Planned)),
-            (self.learner, LEARNERS, (Updated,)),
-        ):
-            shipped: Collection[type] = registry.values()
-            if type(part) not in shipped and not isinstance(part, bases):
-                derived = " or ".join(base.__name__ for base in bases)
-                raise SpecificationError(
-                    f"{part.section} is a {type(part).__name__} of your own, which brings nothing "
-                    f"to run: derive it from {derived}, or take one of "
-                    f"{', '.join(sorted(registry))}."
-                )
-        foreign = [part for part in self._parts if not part.compiled]
-        if self.path == "kernel" and foreign:
-            raise SpecificationError(
-                f"path is 'kernel', but {foreign[0].section} '{foreign[0].name}' is not written "
-                f"for it: set path to 'reference', or leave it out."
-            )
-
-    @property
-    def _parts(self) -> tuple[System, Policy, Model, Learner]:
-        return self.system, self.policy, self.model, self.learner
-
-    def _check_size(self) -> None:
-        """Refuse what no machine can run, such as a mistyped number of zeros."""
-        if self.system.horizon > LARGEST_HORIZON:
-            raise SpecificationError(
-                f"env.horizon is {self.system.horizon:,} steps, but it has to be at most "
-                f"{LARGEST_HORIZON:,}: set it so."
-            )
-        if self.memory > LARGEST_MEMORY:
-            raise SpecificationError(
-                f"a trial would need {self.memory / 2**30:,.0f} GiB of memory, most of it because "
-                f"of {self.largest_setting}, but at most {LARGEST_MEMORY / 2**30:,.0f} GiB are "
-                f"allowed: make {self.largest_setting} smaller."
-            )
-
-    @property
-    def memory(self) -> int:
-        """Bytes that one trial holds at once, beside the interpreter."""
-        return sum(self._memory_by_setting.values())
-
-    @property
-    def largest_setting(self) -> str:
-        """The setting that decides about most of the memory."""
-        return max(self._memory_by_setting, key=lambda key: self._memory_by_setting[key])
-
-    @functools.cached_property
-    def _memory_by_setting(self) -> dict[str, int]:
-        return memory_by_setting(*self._parts, self.path, self.task)
-
-    @functools.cached_property
-    def canonical_json(self) -> str:
-        """Sorted, compact JSON of the content and the code version, without the seed."""
-        content: dict[str, object] = {"code_version": CODE_VERSION, "path": self.path}
-        content |= {key: section_of(part) for key, part in zip(_SECTIONS, self._parts, strict=True)}
-        if self.task is not None:
-            content["task"] = section_of(self.task)
-            content["assessment_version"] = ASSESSMENT_VERSION
-        return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
-
-    @functools.cached_property
-    def key(self) -> str:
-        return hashlib.sha256(self.canonical_json.encode()).hexdigest()
+_KEYS = (*SECTIONS, "task", "path", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +69,7 @@ class TrialSpec(Checked):
         for key in given:
             if key not in _KEYS:
                 raise unknown_name("configuration key", key, _KEYS)
-        sections = {key: _section(given, key) for key in _SECTIONS}
+        sections = {key: _section(given, key) for key in SECTIONS}
         system = build("env", SYSTEMS, sections["env"])
         policy = build("policy", POLICIES, sections["policy"])
         model = _model(sections["model"])
@@ -272,11 +145,6 @@ class TrialSpec(Checked):
             "dt": self.system.dt,
             "gamma": self.system.gamma,
         }
-
-
-def without_versions(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a trial or a cell without the versions of the code."""
-    return {key: value for key, value in content.items() if key not in _VERSIONS}
 
 
 def _model(section: Mapping[str, object]) -> Model:

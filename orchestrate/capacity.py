@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from pathlib import Path
 
-from dopt.spec import Cell
+from dopt.cell import Cell
 from orchestrate.errors import LaunchError
 from orchestrate.grid import Grid
 from orchestrate.settings import LaunchSettings

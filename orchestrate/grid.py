@@ -6,9 +6,10 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from dopt.cell import Cell
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.registry import name_of
-from dopt.spec import Cell, TrialSpec
+from dopt.spec import TrialSpec
 
 TRIAL_SECTIONS = ("env", "policy", "model", "learner", "task", "seed")
 """The parts of a configuration that make a trial."""

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from analysis.errors import AnalysisError
 from analysis.portraits import DrawnPlane
 from analysis.selection import Entry
+from dopt.cell import without_versions
 from dopt.geometry import Body, body
 from dopt.replay import replay
-from dopt.spec import TrialSpec, without_versions
+from dopt.spec import TrialSpec
 from dopt.systems import System
 from orchestrate.store import Reader
 

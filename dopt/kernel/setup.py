@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dopt.cell import Cell
 from dopt.information import Information, held_information
 from dopt.kernel import arguments as args
 from dopt.kernel.information import PENDING_ROWS, SMALL
@@ -29,7 +30,7 @@ from dopt.policies import (
 from dopt.policies.base import OpenLoop
 from dopt.policies.d_optimal import count_sketch
 from dopt.policies.search import SCORES
-from dopt.spec import Cell, TrialSpec
+from dopt.spec import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.features import KINDS
 

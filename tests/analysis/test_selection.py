@@ -8,7 +8,7 @@ from analysis.choice import Filter
 from analysis.errors import AnalysisError
 from analysis.gaps import ranges
 from analysis.selection import Selection, environment_rank, newest, policy_rank, select
-from dopt import spec
+from dopt import cell
 from dopt.policies import POLICIES
 from dopt.spec import TrialSpec
 from dopt.systems import SYSTEMS
@@ -85,7 +85,7 @@ def test_assessments_of_different_versions_do_not_mix(
     plain = make_grid(("pendulum",), policies, range(2))
     new = make_grid(("pendulum",), policies, range(2), **task)
     keys = {one.trial_key for one in (*plain, *new)}
-    monkeypatch.setattr(spec, "ASSESSMENT_VERSION", 1)
+    monkeypatch.setattr(cell, "ASSESSMENT_VERSION", 1)
     old = make_grid(("pendulum",), policies, range(2), **task)
     assert keys.isdisjoint(one.trial_key for one in old)
     url = f"sqlite:///{tmp_path}/versions.db"

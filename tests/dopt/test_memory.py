@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dopt.cell import LARGEST_HORIZON
 from dopt.control.episode import run_episode
 from dopt.control.free_run import free_run_error
 from dopt.control.prediction import forecast_by
 from dopt.errors import SpecificationError
 from dopt.kernel import setup
 from dopt.randomness import draw
-from dopt.spec import LARGEST_HORIZON, TrialSpec
+from dopt.spec import TrialSpec
 from tests.dopt.trials import PAIRS, trial
 
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dopt.cell import Cell
 from dopt.errors import SpecificationError
 from dopt.exploration import run_trial
 from dopt.reference.lockstep import run_trials
-from dopt.spec import Cell, TrialSpec
+from dopt.spec import TrialSpec
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = "tests.dopt.own_parts"

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from dopt.cell import without_versions
 from dopt.errors import SpecificationError
 from dopt.exploration import run_trial
-from dopt.spec import TrialSpec, without_versions
+from dopt.spec import TrialSpec
 from orchestrate.campaign import Work, launch_grid
 from orchestrate.errors import ExitCode
 from orchestrate.grid import Combination, Grid, build_grid

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
+from dopt.cell import Cell
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set, reachable_states
 from dopt.exploration import run_trial
@@ -20,7 +21,6 @@ from dopt.policies.lookahead import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
 from dopt.randomness import draw
 from dopt.reference import search
 from dopt.reference.models import model_function
-from dopt.spec import Cell
 from dopt.systems import SYSTEMS
 from dopt.systems.equilibrium import eigenmode
 from tests.dopt.trials import trial

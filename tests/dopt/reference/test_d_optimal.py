@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.func import jacrev
 
+from dopt.cell import Cell
 from dopt.planning.sphere import maximize_on_sphere
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem
-from dopt.spec import Cell, TrialSpec
+from dopt.spec import TrialSpec
 from tests.dopt.reference.batch import Situation, situation, sphere, step_from
 from tests.dopt.trials import PAIRS, trial
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.func import grad_and_value, jacrev
 
+from dopt.cell import Cell
 from dopt.policies.gradient import GradientDOptimal
 from dopt.reference.exact_gain import (
     ExactGain,
@@ -19,7 +20,7 @@ from dopt.reference.exact_gain import (
 )
 from dopt.reference.lockstep import Lockstep, run_trials
 from dopt.reference.shortfall import shortfalls
-from dopt.spec import Cell, TrialSpec
+from dopt.spec import TrialSpec
 from tests.dopt.reference.batch import circle, situation, step_from
 from tests.dopt.trials import trial
 

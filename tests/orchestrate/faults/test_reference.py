@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from dopt.spec import TrialSpec, without_versions
+from dopt.cell import without_versions
+from dopt.spec import TrialSpec
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.faults.outcome import Rows, flaws, results
