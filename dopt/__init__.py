@@ -1,6 +1,86 @@
 """D-optimal neural exploration of nonlinear physical systems.
 
 The science, as functions of their arguments: no files, no database, no command line. A
-:class:`~dopt.spec.TrialSpec` says everything that a trial depends on, and
-:func:`dopt.exploration.run_trial` turns it into a :class:`~dopt.result.TrialResult`.
+:class:`TrialSpec` describes everything that a trial depends on, and :func:`run_trial` turns it into
+a :class:`TrialResult`:
+
+>>> import dopt
+>>> spec = dopt.TrialSpec.from_names(env="pendulum", policy="d_optimal", seed=0)
+>>> result = dopt.run_trial(spec)
+>>> result.loss[-1]  # L2 model error over the evaluation grid [rad/s²]
+>>> result.states  # (501, 2): angle [rad] and angular rate [rad/s]
+
+The four registries map the names of a specification to its classes; ``help(dopt.SYSTEMS["arm"])``
+shows the equations, units and defaults of one.
+
+======================  ========================================================================
+``run_trial``           run one trial, in compiled code where there is some for its parts
+``TrialSpec``           one trial: system, policy, model, learner and seed
+``TrialResult``         losses, states, inputs and model parameters of one trial
+``SYSTEMS``             physical systems by name
+``POLICIES``            exploration policies by name
+``MODELS``              models of the learned accelerations by name
+``LEARNERS``            learning rules by name
+======================  ========================================================================
+
+Each name is imported when it is first used: ``import dopt`` alone loads none of the libraries.
 """
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dopt.learning import LEARNERS as LEARNERS
+    from dopt.models import MODELS as MODELS
+    from dopt.policies import POLICIES as POLICIES
+    from dopt.result import TrialResult as TrialResult
+    from dopt.run import run_trial as run_trial
+    from dopt.spec.trial import TrialSpec as TrialSpec
+    from dopt.systems import SYSTEMS as SYSTEMS
+
+    __version__: str
+
+__all__ = [
+    "LEARNERS",
+    "MODELS",
+    "POLICIES",
+    "SYSTEMS",
+    "TrialResult",
+    "TrialSpec",
+    "__version__",
+    "run_trial",
+]
+
+_MODULES = {
+    "LEARNERS": "dopt.learning",
+    "MODELS": "dopt.models",
+    "POLICIES": "dopt.policies",
+    "SYSTEMS": "dopt.systems",
+    "TrialResult": "dopt.result",
+    "TrialSpec": "dopt.spec.trial",
+    "run_trial": "dopt.run",
+}
+
+
+def _load(name: str) -> object:
+    """Import a public name on its first use."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value: object = version(__name__)
+    elif name in _MODULES:
+        value = getattr(importlib.import_module(_MODULES[name]), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+if not TYPE_CHECKING:  # a type checker would take every name for one that there is
+    __getattr__ = _load  # PEP 562
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

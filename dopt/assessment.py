@@ -1,4 +1,4 @@
-"""What a trial is worth at some of its steps: the rows of its assessment."""
+"""Assessment of a trial: control, free-run error and coverage after some of its steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dopt.forecasts import model_forecast, true_forecast
 from dopt.models.base import Model
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 
 Array = npt.NDArray[np.float64]
@@ -68,7 +68,7 @@ def assess(
 
 
 class Outcome(NamedTuple):
-    """What a controller achieved in an episode."""
+    """Success and cost of an episode."""
 
     success: bool
     cost: float

@@ -1,4 +1,4 @@
-"""How much of the evaluation box a trajectory visits: one definition for trials and figures."""
+"""Coverage: the share of the evaluation box that a trajectory visits."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def turns(angle: Array, centre: float = 0.0) -> Array:
 
 @dataclass(frozen=True)
 class Plane:
-    """The phase plane of a system: state indices, labels, which axes are angles, box.
+    """Phase plane of a system: state indices, labels, axes that are angles, box.
 
-    Angles are centred on the stable equilibrium, so that small oscillations about it are in one
-    piece, wherever the angle is measured from. A box that covers the whole turn moves with them.
+    Angles are centred on the stable equilibrium, so that small oscillations about it are not split
+    at the wrap. A box that covers the whole turn moves with them.
     Where the evaluation grid has no such axis, the box is the whole turn of an angle, and otherwise
     what the reachable set spans.
     """

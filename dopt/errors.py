@@ -1,4 +1,4 @@
-"""Every error that the package raises on purpose; each message is one sentence that helps."""
+"""Errors of the package; each message is one sentence: what was given, what was expected."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ class SpecificationError(DoptError, ValueError):
 
 class IncompatibleError(SpecificationError):
     """Two valid choices that make no sense together, such as a periodic input without a mode."""
+
+
+class ScaleWarning(UserWarning):
+    """The quantities that a network is to learn are of another size than its outputs."""
 
 
 def unknown_name(kind: str, given: object, valid: Iterable[str]) -> SpecificationError:

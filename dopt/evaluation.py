@@ -1,4 +1,4 @@
-"""Where a model is judged: the evaluation grid and the reachable set of a system."""
+"""Evaluation points of a system: the grid and the reachable set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Forecasts of a system by the truth or a model, in compiled code where there is some for them."""
+"""Forecasts by the true system or a model, in compiled code where the kernel supports them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What a system looks like from the side: its body as lines, for pictures.
+"""Drawings of systems in a vertical plane, as polylines and masses.
 
-A system of one's own gets a body by registering one::
+A custom system gets a drawing by registering one::
 
     @body.register
     def _(system: MySystem, states: Array) -> Body: ...

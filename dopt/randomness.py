@@ -1,14 +1,13 @@
-"""All the randomness of a trial, drawn before it starts.
+"""Random numbers of a trial, all drawn before it starts.
 
-One seed gives named child streams, so that a draw for one purpose never moves another: policies
-that are compared at the same seed share the initial weights and the process noise (common random
-numbers), and both execution paths use the very same numbers.
+One seed gives named child streams, so that a draw for one purpose does not shift another. Policies
+that are compared at the same seed share initial weights and process noise (common random numbers).
+Both execution paths use the same numbers.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +15,8 @@ import numpy.typing as npt
 from dopt.errors import SpecificationError
 from dopt.learning import AdamReplay, Learner
 from dopt.policies.base import ROUNDING, OpenLoop, on_sphere
+from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-
-if TYPE_CHECKING:
-    from dopt.spec import TrialSpec
 
 Array = npt.NDArray[np.float64]
 

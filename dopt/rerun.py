@@ -1,4 +1,4 @@
-"""A trial again, looked at on the way: what the model knew after some of its steps."""
+"""Rerun of a trial that returns the model's parameters after chosen steps."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import SpecificationError
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Replay:
-    """What a trial looked like on the way.
+class Rerun:
+    """States of a trial, and the model's parameters after chosen steps.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Run(Protocol):
     def advance(self, last: int) -> None: ...
 
 
-def replay(spec: TrialSpec, steps: Sequence[int]) -> Replay:
+def rerun(spec: TrialSpec, steps: Sequence[int]) -> Rerun:
     """Run a trial on its path and note the parameters after ascending numbers of steps.
 
     Raises
@@ -72,12 +72,12 @@ def replay(spec: TrialSpec, steps: Sequence[int]) -> Replay:
     if trial.diverged_at is not None:
         states[trial.diverged_at :] = np.nan
     q = spec.model.n_parameters(spec.system)
-    return Replay(np.array(seen, dtype=np.int64), np.array(parameters).reshape(-1, q), states)
+    return Rerun(np.array(seen, dtype=np.int64), np.array(parameters).reshape(-1, q), states)
 
 
 def _run(spec: TrialSpec) -> Run:
-    if spec.cell.path == "reference":
-        from dopt.reference.pieces import ReferenceTrial
+    if spec.config.path == "reference":
+        from dopt.reference.stepper import ReferenceTrial
 
         return ReferenceTrial(spec)
     from dopt.kernel.run import KernelTrial

@@ -1,4 +1,4 @@
-"""What a trial returns."""
+"""Result of a trial."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Assessment(NamedTuple):
-    """A number that says what a trial was worth after t explored steps.
+    """Value of one measure after t explored steps.
 
     The measures and their meanings are :data:`dopt.assessment.MEASURES`; a value that is
     not finite stands for an overflow.
@@ -24,29 +24,33 @@ class Assessment(NamedTuple):
     value: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrialResult:
     """Everything that is measured in one trial of T steps.
+
+    d is the number of states, m of inputs, r of learned accelerations and q of parameters of the
+    model. States, inputs and accelerations have the units that their system declares
+    (``spec.system.state_labels``, ``input_labels``).
 
     Attributes
     ----------
     loss, reachable_loss : (T,)
-        L2 norm of the model error over the evaluation grid and over the reachable set, after
-        the learning step of time t.
+        Model error after the learning step of time t, sqrt(mean ‖a_θ(x) - a(x)‖²), over the
+        evaluation grid and over the reachable set, in the unit of the accelerations.
     plan_us, learn_us, evaluate_us : (T,)
-        Microseconds spent on planning (with the update of the information matrix), on learning
-        and on the evaluation.
+        Time spent on planning (with the update of the information matrix), on learning and on the
+        evaluation [µs].
     states : (T + 1, d)
         States x_0 ... x_T.
     inputs : (T, m)
         Inputs u_0 ... u_{T-1}.
     parameters : (q,)
-        Parameters of the model at the end.
+        Parameters of the model at the end; ``spec.model.predict`` takes them.
     diverged_at : int or None
         First step at which the state left the system's limit or a number was not finite. All rows
         from there on are NaN.
     wall_seconds, cpu_seconds : float
-        Duration of the exploration.
+        Duration of the exploration [s].
     checkpoints : mapping of int to (q,)
         Parameters of the model after the numbers of steps at which the trial is to be assessed, up
         to a divergence.
@@ -70,6 +74,7 @@ class TrialResult:
 
     @property
     def diverged(self) -> bool:
+        """Whether the trial ended before its horizon."""
         return self.diverged_at is not None
 
     @property
@@ -79,8 +84,10 @@ class TrialResult:
 
     @property
     def final_loss(self) -> float | None:
+        """Loss after the last step; None where the trial diverged."""
         return None if self.diverged or not len(self.loss) else float(self.loss[-1])
 
     @property
     def best_loss(self) -> float | None:
+        """Smallest loss of the trial; None where no step was finished."""
         return float(np.min(self.loss[: self.n_steps])) if self.n_steps else None

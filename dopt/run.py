@@ -7,7 +7,7 @@ from typing import Literal
 
 from dopt.assessment import assessed
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 
 Path = Literal["kernel", "reference"]
 
@@ -22,15 +22,20 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     path : {"kernel", "reference"}, optional
         Compiled kernel or torch reference, in place of what the specification says.
 
+    Returns
+    -------
+    TrialResult
+        Losses, trajectory, timings and final parameters, as numpy arrays.
+
     Raises
     ------
     SpecificationError
         If that path cannot run the trial.
     """
     if path is not None:
-        spec = dataclasses.replace(spec, cell=dataclasses.replace(spec.cell, path=path))
-    if spec.cell.path == "reference":
-        from dopt.reference.lockstep import run_trials
+        spec = dataclasses.replace(spec, config=dataclasses.replace(spec.config, path=path))
+    if spec.config.path == "reference":
+        from dopt.reference.batch import run_trials
 
         return assessed(spec, run_trials([spec])[0])
     from dopt.kernel.run import run_trial_in_kernel

@@ -1,4 +1,4 @@
-"""What a plan or an update of one's own sees of a running trial, in numpy."""
+"""View of a running trial that custom policies and learners receive, as numpy arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dopt.systems.base import System
 Array = npt.NDArray[np.float64]
 
 
-class View(ABC):
+class TrialView(ABC):
     """A trial after t steps: what was observed, and the model as it is now.
 
     Attributes

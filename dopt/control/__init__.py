@@ -1,7 +1,7 @@
-"""What exploration is for: control with the learned model, and other measures of it.
+"""Control with the learned model, as a measure of what exploration taught it.
 
-A trial with a ``task`` section is assessed at some of its steps: the model that it has learned by
-then plans a control task on the true system, beside the true model under the same planner.
+A trial with a ``task`` section is assessed at some of its steps: the model learned so far plans a
+control task on the true system. The true model plans the same task with the same planner.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dopt.control.task import Control
+from dopt.declare.registry import build
 from dopt.errors import SpecificationError
-from dopt.registry import build
 
 TASKS: dict[str, type[Control]] = {Control.name: Control}
 

@@ -1,4 +1,4 @@
-"""One control episode: the plant is the true system with its noise, the planner has a model."""
+"""Control episodes by model-predictive control: the plant is the true system with its noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Episode:
-    """What a controller achieved.
+    """States, inputs and cost of one control episode.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def run_episode(
     plant
         Of the true system.
     forecast
-        What the planner goes by: of a model, or of the true system too.
+        Prediction that the planner uses: that of a model, or of the true system.
     noise : (steps, d)
         w_t of the plant.
     rng

@@ -1,4 +1,4 @@
-"""How far a model is off when it predicts many steps on its own."""
+"""Free-run error: the error of a model that predicts many steps without measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planning by the cross-entropy method: sample inputs, keep the best, sample around them.
+"""Cross-entropy planner: sample input sequences, keep the best, sample around them.
 
 Reference: R. Rubinstein and D. Kroese, "The Cross-Entropy Method", Springer (2004), chapter 5.
 

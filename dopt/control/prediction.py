@@ -1,4 +1,4 @@
-"""Many states many steps on, under the true accelerations or modelled ones."""
+"""Prediction of many states over many steps, with true or modelled accelerations."""
 
 from __future__ import annotations
 

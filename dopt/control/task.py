@@ -1,4 +1,4 @@
-"""The control task of a trial: what it asks of the system, and how the planner looks ahead."""
+"""Control tasks: goal, cost, tolerances and planner settings of an episode."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import dataclasses
 import math
 from typing import Any, ClassVar
 
+from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.fields import Checked, quantity
 from dopt.systems.base import System
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Control(Checked):
+class Control(Validated):
     """A control task, how it is planned, and after which steps of a trial.
 
     The cost of an episode is the sum over its steps of
@@ -55,20 +55,20 @@ class Control(Checked):
     section: ClassVar[str] = "task"
     name: ClassVar[str] = "control"
 
-    checkpoints: tuple[int, ...] = quantity((100, 200), "steps", "positive")
-    initial_state: tuple[float, ...] | None = quantity(None)
-    goal: tuple[float, ...] | None = quantity(None)
-    state_weights: tuple[float, ...] | None = quantity(None, bound="nonnegative")
-    input_weight: float | None = quantity(None, bound="nonnegative")
-    tolerances: tuple[float, ...] | None = quantity(None, bound="nonnegative")
-    steps: int | None = quantity(None, "steps", "positive")
-    settle_steps: int | None = quantity(None, "steps", "positive")
-    hold: int | None = quantity(None, "steps", "positive")
-    lookahead: int | None = quantity(None, bound="positive")
-    samples: int = quantity(64, bound="positive")
-    iterations: int = quantity(3, bound="positive")
-    elites: int = quantity(8, bound="positive")
-    free_run_steps: int = quantity(25, "steps", "positive")
+    checkpoints: tuple[int, ...] = parameter((100, 200), "steps", "positive")
+    initial_state: tuple[float, ...] | None = parameter(None)
+    goal: tuple[float, ...] | None = parameter(None)
+    state_weights: tuple[float, ...] | None = parameter(None, bound="nonnegative")
+    input_weight: float | None = parameter(None, bound="nonnegative")
+    tolerances: tuple[float, ...] | None = parameter(None, bound="nonnegative")
+    steps: int | None = parameter(None, "steps", "positive")
+    settle_steps: int | None = parameter(None, "steps", "positive")
+    hold: int | None = parameter(None, "steps", "positive")
+    lookahead: int | None = parameter(None, bound="positive")
+    samples: int = parameter(64, bound="positive")
+    iterations: int = parameter(3, bound="positive")
+    elites: int = parameter(8, bound="positive")
+    free_run_steps: int = parameter(25, "steps", "positive")
 
     def __post_init__(self) -> None:
         super().__post_init__()

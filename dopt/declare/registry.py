@@ -15,10 +15,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
+from dopt.declare.validated_fields import Validated
 from dopt.errors import SpecificationError, unknown_name
-from dopt.fields import Checked
 
-T = TypeVar("T", bound=Checked)
+T = TypeVar("T", bound=Validated)
 
 TARGET = "_target_"
 SOURCE = "source"
@@ -49,7 +49,7 @@ class Wrapper(Protocol):
     def to_section(self) -> dict[str, object]: ...
 
 
-def section_of(item: Checked) -> dict[str, object]:
+def section_of(item: Validated) -> dict[str, object]:
     """Return the configuration section that :func:`build` turns into ``item``."""
     if isinstance(item, Wrapper):
         return item.to_section()
@@ -106,7 +106,7 @@ def check_source(section: str, path: str, cls: type, given: Mapping[str, object]
         )
 
 
-def _base(cls: type[Checked]) -> type[Checked]:
+def _base(cls: type[Validated]) -> type[Validated]:
     """Return the class that declares the section of a specification."""
     return next(base for base in cls.__mro__ if "section" in base.__dict__)
 
@@ -130,7 +130,7 @@ def _unfit(section: str, path: str, expected: str) -> SpecificationError:
     )
 
 
-def _origin(cls: type[Checked]) -> dict[str, object]:
+def _origin(cls: type[Validated]) -> dict[str, object]:
     """Return what identifies a class of the user's own; nothing for one of this package."""
     if cls.__module__.partition(".")[0] == __name__.partition(".")[0]:
         return {}

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
+import types
+import typing
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from dopt.errors import SpecificationError, unknown_name
 
@@ -34,7 +36,7 @@ _SMALLEST_WHOLE = {
 }
 
 
-def quantity(
+def parameter(
     default: Any,
     unit: str = "1",
     bound: Bound = "any",
@@ -63,7 +65,7 @@ def quantity(
 
 
 @dataclasses.dataclass(frozen=True)
-class Checked:
+class Validated:
     """Base of the frozen specification dataclasses: types and bounds hold once one exists.
 
     Raises
@@ -73,43 +75,116 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
+        kinds = _kinds(type(self))
         for field in dataclasses.fields(self):
-            value = _converted(self._path(field.name), field, getattr(self, field.name))
-            object.__setattr__(self, field.name, value)
+            path, value = self._path(field.name), getattr(self, field.name)
+            object.__setattr__(self, field.name, _converted(path, field, kinds[field.name], value))
 
     @classmethod
     def _path(cls, field: str) -> str:
         return f"{getattr(cls, 'section', 'trial')}.{field}"
 
 
-def _converted(path: str, field: dataclasses.Field[Any], value: object) -> object:
-    """Return ``value`` as the type that the annotation of ``field`` names."""
-    kind = str(field.type)
-    if value is None and "None" in kind:
+class _Kind(NamedTuple):
+    """What a field holds: one value of a type or a tuple of such values, or None."""
+
+    type: type[int] | type[float] | type[str]
+    listed: bool = False
+    optional: bool = False
+
+
+def _kinds(cls: type[Validated]) -> dict[str, _Kind]:
+    """Return what the fields of a class hold, read once from their annotations."""
+    if cls not in _known:
+        _known[cls] = {field.name: _kind(cls, field) for field in dataclasses.fields(cls)}
+    return _known[cls]
+
+
+_known: dict[type, dict[str, _Kind]] = {}
+
+
+def _kind(cls: type[Validated], field: dataclasses.Field[Any]) -> _Kind:
+    """Return what a field holds.
+
+    Raises
+    ------
+    SpecificationError
+        If the annotation names another type than int, float, str, a tuple of one of them of any
+        length, or one of these or None.
+    """
+    annotation = _annotation(cls, field)
+    parts = _parts(annotation)
+    kept = parts - {type(None)}
+    listed = len(kept) == 1 and typing.get_origin(*kept) is tuple
+    entries = (
+        {entry for part in kept for entry in _parts(*typing.get_args(part))} if listed else kept
+    )
+    entries = {float} if entries == {int, float} else entries
+    if len(entries) != 1 or not entries <= {int, float, str}:
+        raise SpecificationError(
+            f"{cls._path(field.name)} of {cls.__name__} is annotated as {_shown(annotation)}, but "
+            f"int, float, str, a tuple of one of them, or one of these with '| None' is "
+            f"expected: change the annotation."
+        )
+    return _Kind(entries.pop(), listed, type(None) in parts)
+
+
+def _parts(*annotations: Any) -> set[Any]:
+    """Return the alternatives of annotations, without the dots of a tuple of any length."""
+    found: set[Any] = set()
+    for annotation in annotations:
+        union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
+        found |= set(typing.get_args(annotation)) if union else {annotation}
+    return found - {...}
+
+
+def _annotation(cls: type[Validated], field: dataclasses.Field[Any]) -> Any:
+    """Return the type of a field, also where the module keeps its annotations as text."""
+    if not isinstance(field.type, str):
+        return field.type
+    owner = next(base for base in cls.__mro__ if field.name in base.__dict__.get(_ANNOTATIONS, ()))
+    holder = types.SimpleNamespace(**{_ANNOTATIONS: {field.name: field.type}})
+    names = vars(sys.modules[owner.__module__])
+    try:
+        return typing.get_type_hints(holder, names, dict(vars(owner)))[field.name]
+    except (NameError, AttributeError, TypeError, SyntaxError):
+        return field.type
+
+
+_ANNOTATIONS = "__annotations__"
+
+
+def _shown(annotation: object) -> str:
+    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
+
+
+def _converted(path: str, field: dataclasses.Field[Any], kind: _Kind, value: object) -> object:
+    """Return ``value`` as what the annotation of ``field`` names."""
+    if value is None and kind.optional:
         return None
-    if kind.startswith("tuple"):
-        return _converted_tuple(path, field, kind, value)
-    if kind.startswith("str"):
-        if not isinstance(value, str):
-            raise _wrong_type(path, value, "a text")
-        choices = field.metadata.get("choices", ())
-        if choices and value not in choices:
-            raise unknown_name(path, value, choices)
-        return value
-    return _converted_number(path, field, kind.startswith("int"), value)
-
-
-def _converted_tuple(
-    path: str, field: dataclasses.Field[Any], kind: str, value: object
-) -> tuple[float, ...]:
+    if not kind.listed:
+        return _converted_entry(path, field, kind, value)
     size = field.metadata.get("size")
-    expected = f"a list of {size} numbers" if size else "a list of numbers"
+    what = "texts" if kind.type is str else "numbers"
+    expected = f"a list of {size} {what}" if size else f"a list of {what}"
     if not isinstance(value, list | tuple) or (size and len(value) != size):
         raise _wrong_type(path, value, expected)
-    whole = "int" in kind
     return tuple(
-        _converted_number(f"{path}[{i}]", field, whole, entry) for i, entry in enumerate(value)
+        _converted_entry(f"{path}[{i}]", field, kind, entry) for i, entry in enumerate(value)
     )
+
+
+def _converted_entry(
+    path: str, field: dataclasses.Field[Any], kind: _Kind, value: object
+) -> object:
+    if kind.type is not str:
+        return _converted_number(path, field, kind.type is int, value)
+    if not isinstance(value, str):
+        raise _wrong_type(path, value, "a text")
+    choices = field.metadata.get("choices", ())
+    if choices and value not in choices:
+        raise unknown_name(path, value, choices)
+    return value
 
 
 def _converted_number(

@@ -1,4 +1,4 @@
-"""Gymnasium, both ways: its environments as systems, and the systems as its environments.
+"""Gymnasium adapters: its environments as systems, and the systems as its environments.
 
 It needs the extra: ``pip install dopt[gymnasium]``. Importing this package makes the systems known
 to ``gymnasium.make`` as ``dopt/Pendulum-v0`` and so on.

@@ -12,8 +12,8 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import SpecificationError
-from dopt.fields import quantity
 from dopt.systems.base import Array
 from dopt.systems.black_box import BlackBox, Episode
 
@@ -37,7 +37,7 @@ class Environment(BlackBox):
         What ``gymnasium.make`` calls it, such as ``Pendulum-v1``.
     """
 
-    id: str = quantity("")
+    id: str = parameter("")
 
     @staticmethod
     @abstractmethod

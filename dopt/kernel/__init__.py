@@ -1,7 +1,7 @@
-"""The compiled twin of the inner loop: one trial on one core.
+"""Compiled execution of a trial on one core.
 
-It computes what :mod:`dopt.reference` defines, for the models, policies and learners of the
-registries and every system whose equations compile.
+It computes what :mod:`dopt.reference` defines, for every model, policy and learner whose class
+declares ``compiled = True`` and every system whose equations compile.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ def warm_up() -> None:
         return
     from dopt.kernel.equations import compiled_equations
     from dopt.kernel.run import run_trial_in_kernel
-    from dopt.spec import TrialSpec
+    from dopt.kernel.warming import compile_in_two_processes
+    from dopt.spec.trial import TrialSpec
     from dopt.systems import SYSTEMS
 
+    compile_in_two_processes()
     for system in SYSTEMS.values():
         compiled_equations(system())
     section = {"name": "pendulum", "horizon": 2, "grid_points": [2, 2]}

@@ -1,7 +1,7 @@
-"""Where compiled code is kept: a folder for each state of the sources, shared by processes.
+"""Folder of compiled code for each state of the sources, and messages while it is filled.
 
-This module does not import Numba, which takes a second: a launch that only wants to know whether
-there is anything to compile does not pay for it.
+All checkouts with the same sources share it. This module does not import Numba, which takes a
+second: a launch that only wants to know whether there is anything to compile does not pay for it.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import logging
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +21,7 @@ import llvmlite.binding
 
 CACHE_VARIABLE = "DOPT_CACHE"
 _PACKAGE = Path(__file__).resolve().parent.parent
-COMPILED_SOURCES = ("kernel", "systems", "planning")
+COMPILED_SOURCES = ("algorithm.py", "kernel", "systems", "math")
 
 
 def _source_digest() -> str:
@@ -33,10 +35,9 @@ def _source_digest() -> str:
     digest.update(llvmlite.binding.get_host_cpu_name().encode())
     # Two virtual machines may name one processor and offer different parts of it.
     digest.update(llvmlite.binding.get_host_cpu_features().flatten().encode())
-    # Numba files what it keeps under the path of its source: another checkout would not find it.
-    digest.update(str(_PACKAGE).encode())
-    for folder in COMPILED_SOURCES:
-        for path in sorted((_PACKAGE / folder).rglob("*.py")):
+    for source in COMPILED_SOURCES:
+        top = _PACKAGE / source
+        for path in [top] if top.is_file() else sorted(top.rglob("*.py")):
             digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -62,16 +63,41 @@ CACHE_FOLDER = _cache_folder()
 def one_compiler_at_a_time(what: str) -> Iterator[None]:
     """Let one process at a time put ``what`` into the cache; once it is there, all read freely.
 
-    Numba numbers the files of its cache without a lock: of two processes that compile at once, one
-    can overwrite the other's function, and later processes then run the wrong one.
+    ``what`` is the name of a function, and what tells its signature from its others after a hyphen.
+    Numba numbers the files of a function without a lock: of two processes that compile it at once,
+    one can overwrite the other's signature, and later processes then run the wrong one.
     """
     if is_complete(what):
         yield
         return
-    with (CACHE_FOLDER / "lock").open("w") as lock:
+    with (CACHE_FOLDER / f"{what.partition('-')[0]}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+        with said(what) if not is_complete(what) else contextlib.nullcontext():
+            yield
         mark_complete(what)
+
+
+@contextlib.contextmanager
+def said(what: str) -> Iterator[None]:
+    """Say at once that a part of the kernel is compiled, and how long all parts have taken.
+
+    The logger is ``dopt.kernel``. Its level is that of a warning, which Python shows on standard
+    error where a program has set up no logging: somebody waits for it.
+    """
+    start = time.perf_counter()
+    _said["parts"] += 1
+    _log.warning(
+        "compiling the kernel, once per machine: part %d, %s, %.0f s so far",
+        _said["parts"],
+        what.partition("-")[0],
+        _said["seconds"],
+    )
+    yield
+    _said["seconds"] += time.perf_counter() - start
+
+
+_log = logging.getLogger("dopt.kernel")
+_said = {"parts": 0, "seconds": 0.0}
 
 
 def is_complete(what: str) -> bool:
@@ -82,3 +108,8 @@ def is_complete(what: str) -> bool:
 def mark_complete(what: str) -> None:
     """Remember that ``what`` is in the cache."""
     (CACHE_FOLDER / f"{what}.complete").touch()
+
+
+def completed() -> int:
+    """Return how many parts are in the cache."""
+    return len(list(CACHE_FOLDER.glob("*.complete")))

@@ -1,14 +1,13 @@
-"""What a state or a parameter vector has to satisfy, in compiled code."""
+"""Bounds of a state or a parameter vector in compiled code."""
 
 from __future__ import annotations
 
-from typing import Any
-
 from dopt.kernel.compiler import compiled
+from dopt.types import Vector
 
 
 @compiled
-def within(x: Any, limit: float) -> bool:
+def within(x: Vector, limit: float) -> bool:
     """Tell whether every entry is finite and within the limit."""
     inside = True
     for i in range(x.shape[0]):

@@ -1,11 +1,11 @@
-"""How functions of the kernel are compiled, and what only the compiler can say."""
+"""Decorators that compile functions of the kernel, and operations that only the compiler has."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from types import FunctionType
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numba
 from llvmlite import ir
@@ -13,11 +13,10 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
-from dopt.kernel.cache import CACHE_FOLDER
+from dopt.kernel.stored_code import stored
+from dopt.types import NumbaType
 
-F = TypeVar("F", bound=Callable[..., Any])
-
-numba.config.CACHE_DIR = str(CACHE_FOLDER)
+F = TypeVar("F", bound=Callable[..., object])
 
 
 def compiled(function: F) -> F:
@@ -40,11 +39,11 @@ def vectorized(function: F) -> F:
     return _njit(function, fastmath={"contract", "reassoc"})
 
 
-def _njit(function: F, **options: Any) -> F:
-    return cast(F, numba.njit(cache=True, error_model="numpy", **options)(function))
+def _njit(function: F, **options: object) -> F:
+    return cast(F, stored(numba.njit(error_model="numpy", **options)(function)))
 
 
-def compilable(function: Callable[..., Any]) -> Callable[..., Any]:
+def compilable(function: F) -> F:
     """Let compiled code call a plain function and the helpers that it uses from its own module."""
     for name in function.__code__.co_names:
         helper = function.__globals__.get(name)
@@ -55,11 +54,16 @@ def compilable(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @intrinsic
-def power_of_two(typing_context: Any, shifted: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
+def power_of_two(typing_context: NumbaType, shifted: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of Numba
     """Return 2^k for a float that holds the integer k in the lowest bits of its significand."""
     bits, exponent_at, bias = (32, 23, 127) if shifted == types.float32 else (64, 52, 1023)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
+    def generate(  # the signature is that of numba
+        context: NumbaType,  # noqa: ARG001
+        builder: NumbaType,
+        signature: NumbaType,  # noqa: ARG001
+        arguments: NumbaType,
+    ) -> NumbaType:
         word = ir.IntType(bits)
         exponent = builder.shl(builder.bitcast(arguments[0], word), ir.Constant(word, exponent_at))
         biased = builder.add(exponent, ir.Constant(word, bias << exponent_at))
@@ -69,11 +73,16 @@ def power_of_two(typing_context: Any, shifted: Any) -> Any:  # noqa: ARG001  # t
 
 
 @intrinsic
-def monotonic_microseconds(typing_context: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
+def monotonic_microseconds(typing_context: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of Numba
     """Read the system's monotonic clock [µs] (POSIX clock_gettime)."""
     monotonic = 6 if os.uname().sysname == "Darwin" else 1
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:  # noqa: ARG001  # the signature is that of Numba
+    def generate(  # the signature is that of numba
+        context: NumbaType,  # noqa: ARG001
+        builder: NumbaType,
+        signature: NumbaType,  # noqa: ARG001
+        arguments: NumbaType,  # noqa: ARG001
+    ) -> NumbaType:
         word = ir.IntType(64)
         timespec = ir.LiteralStructType([word, word])
         kind = ir.FunctionType(ir.IntType(32), [ir.IntType(32), timespec.as_pointer()])

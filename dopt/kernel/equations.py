@@ -8,21 +8,28 @@ once for all systems.
 from __future__ import annotations
 
 import cmath
+import contextlib
 import functools
 import itertools
 import math
+import operator
+import re
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numba
 from numba import complex128, float64, types
 from numba.extending import overload
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
+from dopt.errors import SpecificationError
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import compilable
+from dopt.kernel.stored_code import stored
 from dopt.systems import elementary
 from dopt.systems.base import System
+from dopt.types import Array, CompiledFunction, Equation, NumbaType, Scalar
 
 KNOWN = types.void(float64[::1], float64[::1], float64[::1], float64[::1])
 ACCELERATIONS = types.void(float64[::1], float64[::1], float64[::1])
@@ -30,24 +37,48 @@ COMPLEX_ACCELERATIONS = types.void(complex128[::1], complex128[::1], complex128[
 
 
 @overload(elementary.sin, strict=False)
-def _sin(x: Any) -> Any:
+def _sin(x: NumbaType) -> NumbaType:
     if isinstance(x, types.Complex):
         return lambda x: cmath.sin(x)
     return lambda x: math.sin(x)
 
 
 @overload(elementary.cos, strict=False)
-def _cos(x: Any) -> Any:
+def _cos(x: NumbaType) -> NumbaType:
     if isinstance(x, types.Complex):
         return lambda x: cmath.cos(x)
     return lambda x: math.cos(x)
 
 
 @overload(elementary.magnitude, strict=False)
-def _magnitude(x: Any) -> Any:
+def _magnitude(x: NumbaType) -> NumbaType:
     if isinstance(x, types.Complex):
         return lambda x: x if x.real >= 0 else -x
     return lambda x: abs(x)
+
+
+@overload(elementary.sign, strict=False)
+def _sign(x: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of the function
+    return lambda x: math.nan if math.isnan(x.real) else float((x.real > 0) - (x.real < 0))
+
+
+@overload(elementary.where, strict=False)
+def _where(condition: NumbaType, first: NumbaType, second: NumbaType) -> NumbaType:  # noqa: ARG001
+    return lambda condition, first, second: first if condition else second
+
+
+def _compare_real_parts(compare: Callable[[Scalar, Scalar], Scalar]) -> None:
+    """Let compiled equations compare complex states, by their real parts."""
+
+    @overload(compare, strict=False)
+    def _compare(a: NumbaType, b: NumbaType) -> NumbaType:
+        if isinstance(a, types.Complex) or isinstance(b, types.Complex):
+            return lambda a, b: compare(a.real, b.real)
+        return None
+
+
+for _comparison in (operator.gt, operator.ge, operator.lt, operator.le):
+    _compare_real_parts(_comparison)
 
 
 class Equations(NamedTuple):
@@ -63,9 +94,9 @@ class Equations(NamedTuple):
         The same for complex arguments.
     """
 
-    known: Any
-    accelerations: Any
-    complex_accelerations: Any
+    known: CompiledFunction
+    accelerations: CompiledFunction
+    complex_accelerations: CompiledFunction
 
 
 def compiled_equations(system: System) -> Equations:
@@ -76,15 +107,15 @@ def compiled_equations(system: System) -> Equations:
 
 @functools.cache
 def _compiled_functions(
-    known: Callable[..., Any],
-    accelerations: Callable[..., Any],
+    known: Equation,
+    accelerations: Equation,
     n_states: int,
     n_inputs: int,
     n_parameters: int,
 ) -> Equations:
-    name = f"{known.__module__}.{known.__qualname__}.{n_states}"
+    name = f"equations of {known.__module__}.{known.__qualname__}.{n_states}"
     known, accelerations = compilable(known), compilable(accelerations)
-    with one_compiler_at_a_time(name):
+    with one_compiler_at_a_time(name) if _shipped(known) else contextlib.nullcontext():
         return Equations(
             _known_into(known, n_states, n_inputs, n_parameters),
             _accelerations_into(accelerations, n_states, n_parameters, ACCELERATIONS),
@@ -92,10 +123,30 @@ def _compiled_functions(
         )
 
 
+def _refused(function: Equation, sizes: tuple[int, ...], kind: NumbaType) -> SpecificationError:
+    """Return the sentence for an equation that does not compile: which line, and the reason."""
+    file, place, reason = Path(function.__code__.co_filename).name, "", "its helpers fail"
+    try:
+        numba.njit(function).compile(tuple(types.UniTuple(kind, size) for size in sizes))
+    except Exception as error:
+        text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+        lines = re.findall(rf"{re.escape(file)}\W+(?:line )?(\d+)", text)
+        place = f" at line {lines[-1]}" if lines else ""
+        calls = re.findall(r"^\s*>>> (.*)$", text, re.MULTILINE)
+        said = [line for line in text.splitlines() if line and "nopython mode" not in line]
+        reason = f"nothing compiled for {calls[0]}" if calls else said[0].rstrip(" :.")
+    return SpecificationError(
+        f"{function.__qualname__} of {file} does not compile{place} ({reason}), but sums, "
+        f"products, comparisons and the functions of dopt.systems.elementary are expected: write "
+        f"it with these, or declare compiled = False in the class, whose trials then run on the "
+        f"reference."
+    )
+
+
 def _known_into(
-    function: Callable[..., Any], n_states: int, n_inputs: int, n_parameters: int
-) -> Any:
-    def into(x: Any, u: Any, p: Any, out: Any) -> None:
+    function: Equation, n_states: int, n_inputs: int, n_parameters: int
+) -> CompiledFunction:
+    def into(x: Array, u: Array, p: Array, out: Array) -> None:
         values = function(
             to_fixed_tuple(x, n_states),
             to_fixed_tuple(u, n_inputs),
@@ -104,35 +155,46 @@ def _known_into(
         for i in range(len(values)):
             out[i] = values[i]
 
-    return _compiled_for(function, into, KNOWN, n_states)
+    return _compiled_for(function, into, KNOWN, (n_states, n_inputs, n_parameters))
 
 
 def _accelerations_into(
-    function: Callable[..., Any], n_states: int, n_parameters: int, signature: Any
-) -> Any:
-    def into(x: Any, p: Any, out: Any) -> None:
+    function: Equation, n_states: int, n_parameters: int, signature: NumbaType
+) -> CompiledFunction:
+    def into(x: Array, p: Array, out: Array) -> None:
         values = function(to_fixed_tuple(x, n_states), to_fixed_tuple(p, n_parameters))
         for i in range(len(values)):
             out[i] = values[i]
 
-    return _compiled_for(function, into, signature, n_states)
+    return _compiled_for(function, into, signature, (n_states, n_parameters))
 
 
 def _compiled_for(
-    function: Callable[..., Any], into: Callable[..., None], signature: Any, n_states: int
-) -> Any:
+    function: Equation, into: Callable[..., None], signature: NumbaType, sizes: tuple[int, ...]
+) -> CompiledFunction:
     """Compile ``into`` under a name of its own.
 
     Numba tells functions of one name apart by a number that starts anew in each process. Two of
     them that were cached by different processes, or one cached and one compiled here, would share a
     symbol, and a call of one could run the other. One equation may serve several numbers of states.
     """
-    own = function.__module__.startswith("dopt.systems.")
-    name = f"{function.__module__}.{function.__qualname__}.{n_states}"
+    own = _shipped(function)
+    name = f"{function.__module__}.{function.__qualname__}.{sizes[0]}"
     into.__qualname__ = name if own else f"{name}.{next(_foreign)}"
     into.__name__ = into.__qualname__.replace(".", "_").replace("<", "_").replace(">", "_")
-    # The cache's folder is named after the package's sources: only they may be found in it.
-    return numba.njit(signature, cache=own, error_model="numpy")(into)
+    compiled = numba.njit(error_model="numpy")(into)
+    if own:  # the cache's folder is named after the package's sources: only they belong in it
+        stored(compiled)
+    try:
+        compiled.compile(signature.args)
+    except Exception as error:  # also what the compiler raises on Python that it does not know
+        raise _refused(function, sizes, signature.args[0].dtype) from error
+    compiled.disable_compile()
+    return compiled
+
+
+def _shipped(function: Equation) -> bool:
+    return function.__module__.startswith("dopt.systems.")
 
 
 _foreign = itertools.count()

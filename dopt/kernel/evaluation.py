@@ -1,14 +1,16 @@
-"""L2 error of the model over the evaluation points in compiled code."""
+"""Root mean square error of the model over the evaluation points in compiled code."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
-from dopt.kernel.arguments import LINEAR_MODEL, Evaluation, Network, World
+from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.network import forward
+from dopt.kernel.structs import Evaluation, Network, Plant
+from dopt.types import Matrix, Real, Singles, Vector
 
 BLOCK = 256
 """Points evaluated at a time: the activations of a block stay in the first-level cache."""
@@ -22,17 +24,25 @@ evaluated in double precision.
 """
 
 
+class Buffers(NamedTuple):
+    """Scratch memory of an evaluation: flat activations and outputs of a block, and parameters."""
+
+    hidden_single: Singles  # (L, w BLOCK)
+    outputs_single: Singles  # (r, BLOCK)
+    hidden: Matrix  # (L, w BLOCK)
+    outputs: Matrix  # (r, BLOCK)
+    theta_single: Singles  # (q,)
+
+
 @compiled
 def model_error(
-    network: Network, theta: Any, points: Evaluation, start: int, stop: int, buffers: Any
+    network: Network, theta: Vector, points: Evaluation, start: int, stop: int, buffers: Buffers
 ) -> float:
     """Return sqrt(mean ‖a_θ(x) - a(x)‖²) over the points from ``start`` to ``stop``.
 
     The network's points come in blocks, and both bounds lie between blocks or at the end.
-    ``buffers`` are the flat activations, (L, w BLOCK), and outputs, (r, BLOCK), in single and in
-    double precision, and room for the parameters, (q,), in single precision.
     """
-    if network.kind == LINEAR_MODEL:
+    if network.kind == ModelKind.LINEAR:
         return _linear_error(theta, points, start, stop)
     hidden_single, outputs_single, hidden, outputs, theta_single = buffers
     for i in range(theta.shape[0]):
@@ -48,13 +58,13 @@ def model_error(
 @compiled
 def _network_error(
     network: Network,
-    theta: Any,
-    features: Any,
+    theta: Real,
+    features: Real,
     points: Evaluation,
     start: int,
     stop: int,
-    hidden: Any,
-    outputs: Any,
+    hidden: Real,
+    outputs: Real,
 ) -> float:
     total, count = 0.0, 0
     for block in range(start, stop):
@@ -66,7 +76,7 @@ def _network_error(
 
 
 @vectorized
-def _squared_errors(outputs: Any, targets: Any, n: int) -> float:
+def _squared_errors(outputs: Real, targets: Matrix, n: int) -> float:
     """Return Σ (output - target)² over the first n columns."""
     total = 0.0
     for k in range(outputs.shape[0]):
@@ -78,7 +88,7 @@ def _squared_errors(outputs: Any, targets: Any, n: int) -> float:
 
 
 @compiled
-def _linear_error(theta: Any, points: Evaluation, start: int, stop: int) -> float:
+def _linear_error(theta: Vector, points: Evaluation, start: int, stop: int) -> float:
     total = 0.0
     for i in range(start, stop):
         for k in range(points.targets.shape[1]):
@@ -90,10 +100,10 @@ def _linear_error(theta: Any, points: Evaluation, start: int, stop: int) -> floa
 
 
 @compiled
-def evaluation_buffers(network: Network, q: int, r: int) -> Any:
+def evaluation_buffers(network: Network, q: int, r: int) -> Buffers:
     """Return the scratch memory of :func:`model_error`."""
     depth, room = network.offsets.shape[0] - 1, network.sizes[1] * BLOCK
-    return (
+    return Buffers(
         np.empty((depth, room), np.float32),
         np.empty((r, BLOCK), np.float32),
         np.empty((depth, room)),
@@ -103,23 +113,21 @@ def evaluation_buffers(network: Network, q: int, r: int) -> Any:
 
 
 @compiled
-def follow_truth(
-    accelerations: Any, world: World, network: Network, points: Evaluation, t: int
-) -> None:
+def follow_truth(plant: Plant, network: Network, points: Evaluation, t: int) -> None:
     """Write the accelerations that are true at step t into the targets of all points."""
-    r = world.learned_rows.shape[0]
+    r = plant.learned_rows.shape[0]
     value, offset = np.empty(r), np.empty(r)
-    if network.kind == LINEAR_MODEL:
+    if network.kind == ModelKind.LINEAR:
         for i in range(points.states.shape[0]):
-            accelerations(points.states[i], world.history[t], value)
-            accelerations(points.states[i], world.linear_form[0], offset)
+            plant.accelerations(points.states[i], plant.history[t], value)
+            plant.accelerations(points.states[i], plant.linear_form[0], offset)
             for k in range(r):
                 points.targets[i, k] = value[k] - offset[k]
         return
     i = 0
     for block in range(points.n_all):
         for j in range(points.block_sizes[block]):
-            accelerations(points.states[i], world.history[t], value)
+            plant.accelerations(points.states[i], plant.history[t], value)
             i += 1
             for k in range(r):
                 points.block_targets[block, k, j] = value[k]

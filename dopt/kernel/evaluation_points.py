@@ -1,21 +1,21 @@
-"""The evaluation points of a system as the compiled loop wants them."""
+"""Evaluation points of a system in the arrays of the compiled loop."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from dopt.algorithm import ModelKind
 from dopt.evaluation import EvaluationSet, evaluation_set
-from dopt.kernel import arguments as args
+from dopt.kernel import structs as args
 from dopt.kernel.evaluation import BLOCK
 from dopt.systems.base import System
+from dopt.types import Array, Integers, Stack
 
 
 def evaluation_points(system: System, network: args.Network) -> args.Evaluation:
     """Return the points of a system in the form that its model takes."""
     points = evaluation_set(system)
-    if network.kind == args.LINEAR_MODEL:
+    if network.kind == ModelKind.LINEAR:
         return _linear_evaluation(system, points)
     columns = [system.featurize(points.states).T, points.accelerations.T]
     parts = [slice(0, points.n_grid), slice(points.n_grid, None)]
@@ -37,7 +37,7 @@ def evaluation_points(system: System, network: args.Network) -> args.Evaluation:
     )
 
 
-def _followed(system: System, points: EvaluationSet) -> args.Floats:
+def _followed(system: System, points: EvaluationSet) -> Array:
     """Return the states at which the truth is evaluated anew at each step."""
     return points.states if len(system.history) > 1 else points.states[:0]
 
@@ -49,13 +49,13 @@ def own_targets(points: args.Evaluation) -> args.Evaluation:
     return points._replace(block_targets=points.block_targets.copy(), targets=points.targets.copy())
 
 
-def _blocks(features: args.Floats, targets: args.Floats) -> tuple[Any, Any, Any]:
+def _blocks(features: Array, targets: Array) -> tuple[Stack, Stack, Integers]:
     """Cut columns of points, (·, N), into padded blocks, (blocks, ·, BLOCK), and their sizes."""
     n = features.shape[1]
     starts = range(0, n, BLOCK)
     sizes = np.array([min(BLOCK, n - start) for start in starts], dtype=np.int64)
 
-    def cut(columns: args.Floats) -> args.Floats:
+    def cut(columns: Array) -> Array:
         padded = np.zeros((len(columns), BLOCK * len(starts)))
         padded[:, :n] = columns
         return np.ascontiguousarray(padded.reshape(len(columns), -1, BLOCK).swapaxes(0, 1))

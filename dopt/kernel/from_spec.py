@@ -1,53 +1,50 @@
-"""What a trial's specification means to the compiled loop: constants, first state, empty record."""
+"""Translation of a trial's specification to structures: constants, first state, empty record."""
 
 from __future__ import annotations
 
 import functools
 import itertools
-from typing import Any
 
 import numpy as np
 
-from dopt.cell import Cell
-from dopt.information import Information, held_information
-from dopt.kernel import arguments as args
-from dopt.kernel.information import PENDING_ROWS, SMALL
-from dopt.kernel.points import evaluation_points
-from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, Learner
-from dopt.models import MLP
+from dopt.algorithm import FeatureKind, Form, ModelKind, Score, switch_step
+from dopt.errors import SpecificationError
+from dopt.kernel import structs as args
+from dopt.kernel.equations import compiled_equations
+from dopt.kernel.evaluation_points import evaluation_points
+from dopt.kernel.information.primal import PENDING_ROWS, SMALL
+from dopt.learning import Learner
+from dopt.learning.base import CompiledLearner
+from dopt.models import MLP, Linear
 from dopt.models.base import Model
-from dopt.planning.task_states import task_states
-from dopt.policies import (
-    DOptimal,
-    EOptimal,
-    Informed,
-    Lookahead,
-    Search,
-    TaskOptimal,
-    TraceLinearized,
-    Uniform,
-)
-from dopt.policies.base import OpenLoop
+from dopt.policies import DOptimal, EOptimal, InformationPolicy, Lookahead, Search, TaskOptimal
+from dopt.policies.base import CompiledPolicy, Policy
 from dopt.policies.d_optimal import count_sketch
-from dopt.policies.search import SCORES
-from dopt.spec import TrialSpec
+from dopt.policies.search import score_code
+from dopt.policies.task_states import task_states
+from dopt.spec.config import TrialConfig
+from dopt.spec.information_form import Information, held_information
+from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.systems.features import KINDS
+from dopt.types import Vector
+
+FEATURE_KINDS = {"identity": FeatureKind.IDENTITY, "cos": FeatureKind.COS, "sin": FeatureKind.SIN}
 
 
 @functools.lru_cache(maxsize=64)
 def constants(
-    cell: Cell,
-) -> tuple[args.World, args.Network, args.Rules, args.Evaluation]:
-    """Return everything that the trials of a cell share."""
-    system, network = cell.system, network_of(cell.system, cell.model)
+    config: TrialConfig,
+) -> tuple[args.Plant, args.Network, args.Algorithm, args.Evaluation]:
+    """Return everything that the trials of a configuration share."""
+    system, network = config.system, network_of(config.system, config.model)
     points = evaluation_points(system, network)
-    return world_of(system), network, _rules(cell), points
+    return plant_of(system), network, algorithm_of(config), points
 
 
-def world_of(system: System) -> args.World:
+def plant_of(system: System) -> args.Plant:
     """Return the constants of a system."""
-    return args.World(
+    return args.Plant(
+        *compiled_equations(system),
         np.array(system.parameters),
         np.array(system.history),  # a copy: what came through Ray's memory cannot be written to
         np.array(system.linear_form),
@@ -62,90 +59,55 @@ def world_of(system: System) -> args.World:
 def network_of(system: System, model: Model) -> args.Network:
     """Return the architecture of a model on a system."""
     if isinstance(model, MLP):
-        kind, sizes = args.MLP_MODEL, model.layer_sizes(system)
+        kind, sizes = ModelKind.MLP, model.layer_sizes(system)
+    elif isinstance(model, Linear):
+        kind, sizes = ModelKind.LINEAR, (len(system.features), 1, system.n_learned)
     else:
-        kind, sizes = args.LINEAR_MODEL, (len(system.features), 1, system.n_learned)
+        raise SpecificationError(
+            f"model '{model.name}' says that it is compiled, but the kernel knows 'mlp' and "
+            f"'linear': set compiled = False in its class."
+        )
     lengths = [(n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes)]
     return args.Network(
-        kind,
+        int(kind),
         np.array(sizes),
         np.cumsum([0, *lengths[:-1]]),
-        np.array([KINDS.index(feature.kind) for feature in system.features]),
+        np.array([FEATURE_KINDS[feature.kind] for feature in system.features]),
         np.array([feature.index for feature in system.features]),
         np.array(system.feature_scales),
     )
 
 
-def _learner(cell: Cell) -> dict[str, Any]:
-    """Return the fields of the rules that describe the learner."""
-    learner = cell.learner
-    kinds = {Adam: args.ADAM, AdamReplay: args.REPLAY, ExtendedKalman: args.KALMAN}
-    kind = next((k for cls, k in kinds.items() if isinstance(learner, cls)), args.LEAST_SQUARES)
-    adam = learner if isinstance(learner, AdamRule) else Adam()
-    kalman = learner if isinstance(learner, ExtendedKalman) else ExtendedKalman()
-    replay = learner if isinstance(learner, AdamReplay) else None
-    window = _window(learner, cell.system.horizon)
-    renewed, renewal = kalman.renewal(cell.model.n_parameters(cell.system), _regularization(cell))
-    return {
-        "learner": kind,
-        "learning_rate": adam.learning_rate,
-        "beta_1": adam.beta_1,
-        "beta_2": adam.beta_2,
-        "epsilon": adam.epsilon,
-        "window": max(1, window),
-        "batch": replay.batch if replay else max(1, window),
-        "steps": replay.steps if replay else 1,
-        "noise_variance": kalman.noise_variance,
-        "forgetting": kalman.forgetting,
-        "renewed": renewed,
-        "renewal": renewal,
-    }
-
-
-def _window(learner: Learner, horizon: int) -> int:
-    """Return the number of samples that are kept."""
-    if isinstance(learner, AdamReplay):
-        return min(learner.capacity, horizon)
-    return learner.window if isinstance(learner, Adam) else 0
-
-
-def _rules(cell: Cell) -> args.Rules:
-    policies = {
-        OpenLoop: args.OPEN_LOOP,
-        Uniform: args.UNIFORM,
-        DOptimal: args.D_OPTIMAL,
-        Search: args.SEARCH,
-    }
-    policy = next(code for kind, code in policies.items() if isinstance(cell.policy, kind))
-    steps = cell.policy.iterations if isinstance(cell.policy, Uniform) else 0
-    return args.Rules(
-        policy,
-        isinstance(cell.policy, TraceLinearized),
-        _search(cell),
-        steps,
-        **_learner(cell),
-        informed=isinstance(cell.policy, Informed),
-        form=_form(cell),
-        regularization=_regularization(cell),
+def algorithm_of(config: TrialConfig) -> args.Algorithm:
+    """Return the settings of the policy and the learner of a configuration."""
+    q, policy, learner = config.model.n_parameters(config.system), config.policy, config.learner
+    regularization = _regularization(config)
+    return args.Algorithm(
+        np.array(policy.kernel_numbers(q, regularization)),
+        np.array(learner.kernel_numbers(q, regularization)),
+        _search(config),
+        isinstance(policy, InformationPolicy) and not learner.updates_information,
+        _form(config),
+        regularization,
     )
 
 
-def _search(cell: Cell) -> args.Search:
+def _search(config: TrialConfig) -> args.Search:
     """Return the plans of a policy that searches."""
-    policy, system, q = cell.policy, cell.system, cell.model.n_parameters(cell.system)
-    steps, score = 0, args.JOINT
+    policy, system, q = config.policy, config.system, config.model.n_parameters(config.system)
+    steps, score = 0, Score.JOINT
     candidates = np.zeros((0, system.n_inputs))
     if isinstance(policy, Search):
-        steps, score = policy.steps(system), SCORES.index(policy.score)
+        steps, score = policy.steps(system), score_code(policy)
         candidates = policy.compared_inputs(system)
     states = np.zeros((0, system.n_states))
     if isinstance(policy, TaskOptimal):
         states = task_states(system, policy)
     return args.Search(
         candidates,
-        score,
+        int(score),
         steps,
-        steps // 2 if steps > 1 else steps,
+        switch_step(steps),
         policy.stride_of(system) if isinstance(policy, Lookahead) else 1,
         policy.budget_us if isinstance(policy, Search) else 0.0,
         states,
@@ -154,20 +116,24 @@ def _search(cell: Cell) -> args.Search:
     )
 
 
-def _regularization(cell: Cell) -> float:
+def _regularization(config: TrialConfig) -> float:
     """Return λ of M₀ = λI, 1 where there is no M."""
-    held = _held(cell)
+    held = _held(config)
     return held.regularization if held else 1.0
 
 
-def _held(cell: Cell) -> Information | None:
-    q, n_rows = cell.model.n_parameters(cell.system), cell.system.n_learned * cell.system.horizon
-    return held_information(cell.policy, cell.learner, q, n_rows)
+def _held(config: TrialConfig) -> Information | None:
+    q, n_rows = (
+        config.model.n_parameters(config.system),
+        config.system.n_learned * config.system.horizon,
+    )
+    return held_information(config.policy, config.learner, q, n_rows)
 
 
-def initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:
+def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
+    """Return the state of a trial before its first step, for its initial parameters, (q,)."""
     system = spec.system
-    window = _window(spec.learner, system.horizon)
+    window = spec.learner.samples_kept(system.horizon)
     return args.State(
         weights.copy(),
         np.zeros(len(weights)),
@@ -175,23 +141,41 @@ def initial_state(spec: TrialSpec, weights: np.ndarray[Any, Any]) -> args.State:
         *_information(spec, len(weights)),
         np.zeros((len(system.features), window)),
         np.zeros((system.n_learned, window)),
+        *(
+            np.zeros(_memory_size(part, system, len(weights)))
+            for part in (spec.policy, spec.learner)
+        ),
     )
+
+
+def _memory_size(part: Policy | Learner, system: System, n_parameters: int) -> int:
+    """Return how many numbers a policy or a learner of a user's own keeps from step to step."""
+    if isinstance(part, (CompiledPolicy, CompiledLearner)):
+        return part.memory_size(system, n_parameters)
+    return 0
+
+
+def empty_scratch(spec: TrialSpec, network: args.Network) -> args.Scratch:
+    """Return the memory that a learning step overwrites, for the largest batch of the learner."""
+    room = int(max(network.sizes[1], spec.system.n_learned)) * spec.learner.largest_batch()
+    depth, q = len(network.offsets) - 1, spec.model.n_parameters(spec.system)
+    return args.Scratch(np.empty((depth, room)), np.empty((3, room)), np.empty(q))
 
 
 def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, args.Sketch]:
     """Return the initial information in the chosen form; the other forms are empty."""
     policy = spec.policy
-    form = _form(spec.cell)
+    form = _form(spec.config)
     size, dual, sketch = 0, _empty_dual(spec, 0), count_sketch(0, 1)
-    if form == args.PRIMAL and _held(spec.cell):
+    if form == Form.PRIMAL and _held(spec.config):
         size = q
-    elif form == args.DUAL:
+    elif form == Form.DUAL:
         dual = _empty_dual(spec, spec.system.horizon)
-    elif form == args.SKETCH and isinstance(policy, DOptimal):
+    elif form == Form.SKETCH and isinstance(policy, DOptimal):
         size = policy.sketch_size
         sketch = count_sketch(q, size)
     covariance = args.Covariance(
-        np.eye(size) / _regularization(spec.cell),
+        np.eye(size) / _regularization(spec.config),
         np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
         np.zeros(1, dtype=np.int64),
     )
@@ -211,14 +195,14 @@ def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
     )
 
 
-def _form(cell: Cell) -> int:
+def _form(config: TrialConfig) -> int:
     """Return the form of the information matrix, PRIMAL where there is none."""
-    held = _held(cell)
-    names = {"primal": args.PRIMAL, "dual": args.DUAL, "sketch": args.SKETCH}
-    return names[held.form] if held else args.PRIMAL
+    held = _held(config)
+    return int(Form[held.form.upper()] if held else Form.PRIMAL)
 
 
 def empty_record(system: System) -> args.Record:
+    """Return the record of a trial before its first step."""
     steps = system.horizon
     states = np.full((steps + 1, system.n_states), np.nan)
     states[0] = system.initial_state

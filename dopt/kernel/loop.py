@@ -1,63 +1,79 @@
-"""The loop of a trial and the search of its plans, compiled for function pointers.
-
-Each is compiled once for all systems. The search, which takes as long to compile as all the rest,
-is so only where a policy needs it.
-"""
+"""Algorithm 1 in compiled code: plan, act, observe, learn, update M, evaluate."""
 
 from __future__ import annotations
 
-import hashlib
-from typing import Any
+import numpy as np
 
-import numba
-from numba import float64, int64, types
-
-from dopt.kernel.arguments import SEARCH
-from dopt.kernel.cache import one_compiler_at_a_time
-from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
-from dopt.kernel.search import no_search, search_input
-from dopt.kernel.trial import advance
+from dopt.kernel.checks import within
+from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
+from dopt.kernel.evaluation import evaluation_buffers, follow_truth, model_error
+from dopt.kernel.information.update import update_information
+from dopt.kernel.structs import Evaluation, Learn, Plan, Plant, Trial
+from dopt.types import Vector
 
 
-def compiled_loop(call: tuple[Any, ...]) -> Any:
-    """Return the loop for the arguments of a trial from World to Record."""
-    equations = (pointer(KNOWN), pointer(ACCELERATIONS), pointer(COMPLEX_ACCELERATIONS))
-    kinds = tuple(numba.typeof(argument) for argument in call)
-    search = pointer(types.void(*_search_kinds(call)))
-    return compiled_for("loop", advance, (*equations, search, *kinds, int64, int64))
+@compiled
+def observe(
+    plant: Plant, x: Vector, u: Vector, noise: Vector, t: int, following: Vector, target: Vector
+) -> None:
+    """Write x_{t+1} (equation 2) and the observed accelerations, (r,)."""
+    flow = np.empty(x.shape[0])
+    plant.known(x, u, plant.parameters, flow)
+    plant.accelerations(x, plant.history[min(t, plant.history.shape[0] - 1)], target)
+    for i in range(x.shape[0]):
+        following[i] = flow[i]
+    for k in range(target.shape[0]):
+        following[plant.learned_rows[k]] += target[k]
+    for i in range(x.shape[0]):
+        following[i] = x[i] + plant.dt * following[i] + noise[i]
+    for k in range(target.shape[0]):
+        row = plant.learned_rows[k]
+        target[k] = (following[row] - x[row]) / plant.dt - flow[row]
 
 
-def compiled_search(call: tuple[Any, ...]) -> Any:
-    """Return the search for the same arguments; one that finds nothing if none is needed."""
-    rules = call[2]
-    if rules.policy == SEARCH:
-        return compiled_for("search", search_input, _search_kinds(call))
-    return compiled_for("no-search", no_search, _search_kinds(call))
+@called_from_python
+def advance(
+    trial: Trial, points: Evaluation, plan: Plan, learn: Learn, first: int, last: int
+) -> int:
+    """Run the steps from ``first`` to ``last`` in place.
 
-
-def _search_kinds(call: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the types of the search's arguments."""
-    world, network, rules, _, _, state, _ = call
-    given = (world, network, rules.search, state.theta, state.covariance)
-    kinds = (numba.typeof(argument) for argument in given)
-    return (pointer(KNOWN), pointer(ACCELERATIONS), *kinds, *(float64[::1],) * 3)
-
-
-def pointer(signature: Any) -> Any:
-    """Return the type of a pointer to functions of a signature."""
-    return types.FunctionType(signature)
-
-
-def compiled_for(name: str, function: Any, kinds: tuple[Any, ...]) -> Any:
-    """Compile a function for types of arguments, unless it is."""
-    if (name, kinds) not in _done:
-        with one_compiler_at_a_time(
-            f"{name}-{hashlib.sha256(str(kinds).encode()).hexdigest()[:16]}"
-        ):
-            function.compile(kinds)
-        function.disable_compile()
-        _done.add((name, kinds))
-    return function
-
-
-_done: set[tuple[str, tuple[Any, ...]]] = set()
+    ``plan`` writes the input of a step, of which the first was drawn before the trial; ``learn``
+    updates the parameters with the accelerations that were observed in it. Returns the number of
+    steps done from the start of the trial: ``last``, or the step at which the trial diverged.
+    """
+    plant, network, record, theta = trial.plant, trial.network, trial.record, trial.state.theta
+    buffers = evaluation_buffers(network, theta.shape[0], plant.learned_rows.shape[0])
+    target = np.empty(plant.learned_rows.shape[0])
+    for t in range(first, last):
+        clock_0 = monotonic_microseconds()
+        x, following, u = record.states[t], record.states[t + 1], record.inputs[t]
+        if t > 0:
+            plan(trial, t, u)
+        else:
+            u[:] = trial.randomness.inputs[0]
+        clock_1 = monotonic_microseconds()
+        observe(plant, x, u, trial.randomness.noise[t], t, following, target)
+        if not within(following, plant.state_limit):
+            return t
+        clock_2 = monotonic_microseconds()
+        learn(trial, t, target)
+        clock_3 = monotonic_microseconds()
+        if not within(theta, np.inf):
+            return t
+        if trial.algorithm.informed:
+            update_information(plant, network, trial.algorithm, trial.state, x)
+        clock_4 = monotonic_microseconds()
+        if plant.history.shape[0] > 1:
+            follow_truth(plant, network, points, t)
+        loss = model_error(network, theta, points, 0, points.n_grid, buffers)
+        record.loss[t] = loss
+        record.reachable_loss[t] = model_error(
+            network, theta, points, points.n_grid, points.n_all, buffers
+        )
+        clock_5 = monotonic_microseconds()
+        record.plan_us[t] = (clock_1 - clock_0) + (clock_4 - clock_3)
+        record.learn_us[t] = clock_3 - clock_2
+        record.evaluate_us[t] = clock_5 - clock_4
+        if not np.isfinite(loss):
+            return t
+    return last

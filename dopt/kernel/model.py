@@ -1,4 +1,4 @@
-"""Both models behind one set of functions: accelerations, rows of the Jacobian, their change.
+"""Accelerations of either model, rows of their Jacobian, and the change of these rows.
 
 For the linear model the rows of J are the regressors Ψ(x) and their change along a direction is
 taken by a complex step through the system's own equations.
@@ -6,43 +6,43 @@ taken by a complex step through the system's own equations.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from dopt.algorithm import ModelKind
 from dopt.kernel import network as nn
-from dopt.kernel.arguments import LINEAR_MODEL, Network, Point, World
 from dopt.kernel.compiler import compiled
+from dopt.kernel.structs import Linearization, Network, Plant
+from dopt.types import Matrix, Stack, Vector
 
 STEP = 1e-30
 
 
 @compiled
-def regressors(accelerations: Any, world: World, x: Any, rows: Any, offset: Any) -> None:
+def regressors(plant: Plant, x: Vector, rows: Matrix, offset: Vector) -> None:
     """Write Ψ(x), (r, q), and the offset, (r,), of the linear model."""
-    accelerations(x, world.linear_form[0], offset)
+    plant.accelerations(x, plant.linear_form[0], offset)
     value = np.empty_like(offset)
     for j in range(rows.shape[1]):
-        accelerations(x, world.linear_form[1 + j], value)
+        plant.accelerations(x, plant.linear_form[1 + j], value)
         for k in range(value.shape[0]):
             rows[k, j] = value[k] - offset[k]
 
 
 @compiled
 def regressors_along(
-    complex_accelerations: Any, world: World, x: Any, direction: Any, component: int, out: Any
+    plant: Plant, x: Vector, direction: Vector, component: int, out: Vector
 ) -> None:
     """Write the derivative of row ``component`` of Ψ, (q,), along a direction of the state."""
     z = np.empty(x.shape[0], np.complex128)
     for i in range(x.shape[0]):
         z[i] = complex(x[i], STEP * direction[i])
-    parameters = np.empty(world.linear_form.shape[1], np.complex128)
-    value = np.empty(world.learned_rows.shape[0], np.complex128)
+    parameters = np.empty(plant.linear_form.shape[1], np.complex128)
+    value = np.empty(plant.learned_rows.shape[0], np.complex128)
     offset = 0.0
     for j in range(1 + out.shape[0]):
         for i in range(parameters.shape[0]):
-            parameters[i] = complex(world.linear_form[j, i], 0.0)
-        complex_accelerations(z, parameters, value)
+            parameters[i] = complex(plant.linear_form[j, i], 0.0)
+        plant.complex_accelerations(z, parameters, value)
         slope = value[component].imag / STEP
         if j == 0:
             offset = slope
@@ -51,7 +51,7 @@ def regressors_along(
 
 
 @compiled
-def add_linear(rows: Any, theta: Any, out: Any) -> None:
+def add_linear(rows: Matrix, theta: Vector, out: Vector) -> None:
     """Add Ψ θ to the offset."""
     for k in range(out.shape[0]):
         for j in range(theta.shape[0]):
@@ -60,12 +60,12 @@ def add_linear(rows: Any, theta: Any, out: Any) -> None:
 
 @compiled
 def model_accelerations(
-    accelerations: Any, world: World, network: Network, theta: Any, x: Any, out: Any
+    plant: Plant, network: Network, theta: Vector, x: Vector, out: Vector
 ) -> None:
     """Write a_θ(x), (r,)."""
-    if network.kind == LINEAR_MODEL:
+    if network.kind == ModelKind.LINEAR:
         rows = np.empty((out.shape[0], theta.shape[0]))
-        regressors(accelerations, world, x, rows, out)
+        regressors(plant, x, rows, out)
         add_linear(rows, theta, out)
         return
     phi = np.empty(network.sizes[0])
@@ -76,27 +76,27 @@ def model_accelerations(
 
 @compiled
 def euler_step(
-    known: Any, world: World, x: Any, u: Any, accelerations: Any, flow: Any, following: Any
+    plant: Plant, x: Vector, u: Vector, accelerations: Vector, flow: Vector, following: Vector
 ) -> None:
     """Write x + dt f(x, u), (d,), given the accelerations, (r,)."""
-    known(x, u, world.parameters, flow)
+    plant.known(x, u, plant.parameters, flow)
     for k in range(accelerations.shape[0]):
-        flow[world.learned_rows[k]] += accelerations[k]
+        flow[plant.learned_rows[k]] += accelerations[k]
     for j in range(x.shape[0]):
-        following[j] = x[j] + world.dt * flow[j]
+        following[j] = x[j] + plant.dt * flow[j]
 
 
 @compiled
-def point_at(
-    network: Network, theta: Any, x: Any, directions: Any, component: int, out: Any
-) -> Point:
+def linearization_at(
+    network: Network, theta: Vector, x: Vector, directions: Matrix, component: int, out: Vector
+) -> Linearization:
     """Run the network forward and back at a state and along directions, (m, d).
 
     ``out`` (r,) receives a_θ(x).
     """
     m, p = directions.shape[0], network.sizes[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    point = Point(
+    point = Linearization(
         np.empty(p),
         np.empty((depth, width)),
         np.empty((depth, width)),
@@ -123,7 +123,9 @@ def point_at(
 
 
 @compiled
-def all_components(network: Network, theta: Any, x: Any, out: Any) -> Any:
+def all_components(
+    network: Network, theta: Vector, x: Vector, out: Vector
+) -> tuple[Vector, Matrix, Stack]:
     """Return features, activations and δ of every component, (r, L, w), at a state.
 
     ``out`` (r,) receives a_θ(x).
@@ -139,7 +141,7 @@ def all_components(network: Network, theta: Any, x: Any, out: Any) -> Any:
 
 
 @compiled
-def network_gradients(network: Network, point: Point, component: int, q: int) -> Any:
+def network_gradients(network: Network, point: Linearization, component: int, q: int) -> Matrix:
     """Return g and the columns of D B as rows, (1 + m, q)."""
     m = point.phi_dots.shape[0]
     out = np.empty((1 + m, q))
@@ -160,7 +162,7 @@ def network_gradients(network: Network, point: Point, component: int, q: int) ->
 
 
 @compiled
-def network_rows(network: Network, phi: Any, hidden: Any, deltas: Any, q: int) -> Any:
+def network_rows(network: Network, phi: Vector, hidden: Matrix, deltas: Stack, q: int) -> Matrix:
     """Return the learned rows of J, (r, q)."""
     rows = np.empty((deltas.shape[0], q))
     for k in range(deltas.shape[0]):
@@ -170,20 +172,18 @@ def network_rows(network: Network, phi: Any, hidden: Any, deltas: Any, q: int) -
 
 @compiled
 def linear_gradients(
-    accelerations: Any,
-    complex_accelerations: Any,
-    world: World,
+    plant: Plant,
     q: int,
-    x: Any,
-    directions: Any,
+    x: Vector,
+    directions: Matrix,
     component: int,
-) -> Any:
+) -> Matrix:
     """Return g and the columns of D B of the linear model as rows, (1 + m, q)."""
-    m, r = directions.shape[0], world.learned_rows.shape[0]
+    m, r = directions.shape[0], plant.learned_rows.shape[0]
     out, rows = np.empty((1 + m, q)), np.empty((r, q))
-    regressors(accelerations, world, x, rows, np.empty(r))
+    regressors(plant, x, rows, np.empty(r))
     for i in range(q):
         out[0, i] = rows[component, i]
     for j in range(m):
-        regressors_along(complex_accelerations, world, x, directions[j], component, out[1 + j])
+        regressors_along(plant, x, directions[j], component, out[1 + j])
     return out

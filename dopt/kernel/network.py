@@ -8,44 +8,45 @@ derivative along a direction of the state (forward over reverse).
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from dopt.kernel.arguments import Network
+from dopt.algorithm import FeatureKind
 from dopt.kernel.compiler import compiled, contracted, vectorized
-from dopt.kernel.elementwise import tanh
+from dopt.kernel.structs import Network
+from dopt.kernel.tanh import tanh
+from dopt.types import Matrix, Real, Vector
 
 
 @compiled
-def features_at(network: Network, x: Any, out: Any) -> None:
+def features_at(network: Network, x: Vector, out: Vector) -> None:
     """Write the features of a state."""
     for i in range(out.shape[0]):
         value = x[network.feature_indices[i]]
         kind = network.feature_kinds[i]
-        if kind == 1:
+        if kind == FeatureKind.COS:
             value = math.cos(value)
-        elif kind == 2:
+        elif kind == FeatureKind.SIN:
             value = math.sin(value)
         out[i] = value / network.feature_scales[i]
 
 
 @compiled
-def features_along(network: Network, x: Any, direction: Any, out: Any) -> None:
+def features_along(network: Network, x: Vector, direction: Vector, out: Vector) -> None:
     """Write the derivative of the features along a direction of the state."""
     for i in range(out.shape[0]):
         index = network.feature_indices[i]
         kind = network.feature_kinds[i]
         slope = 1.0
-        if kind == 1:
+        if kind == FeatureKind.COS:
             slope = -math.sin(x[index])
-        elif kind == 2:
+        elif kind == FeatureKind.SIN:
             slope = math.cos(x[index])
         out[i] = slope * direction[index] / network.feature_scales[i]
 
 
 @compiled
-def layer(network: Network, theta: Any, index: int) -> Any:
+def layer(network: Network, theta: Real, index: int) -> tuple[Real, Real]:
     """Return views of the weights, (outputs, inputs), and biases of a layer."""
     n_in, n_out = network.sizes[index], network.sizes[index + 1]
     start = network.offsets[index]
@@ -54,7 +55,7 @@ def layer(network: Network, theta: Any, index: int) -> Any:
 
 
 @contracted
-def _activate(values: Any, bias: Any) -> None:
+def _activate(values: Real, bias: Real) -> None:
     for i in range(values.shape[0]):
         row, shift = values[i], bias[i]
         for n in range(row.shape[0]):
@@ -62,13 +63,13 @@ def _activate(values: Any, bias: Any) -> None:
 
 
 @compiled
-def units_by_points(buffer: Any, units: int, n: int) -> Any:
+def units_by_points(buffer: Real, units: int, n: int) -> Real:
     """Return the start of a flat buffer as a matrix, (units, n)."""
     return buffer[: units * n].reshape(units, n)
 
 
 @compiled
-def forward(network: Network, theta: Any, inputs: Any, hidden: Any, outputs: Any) -> None:
+def forward(network: Network, theta: Real, inputs: Real, hidden: Real, outputs: Real) -> None:
     """Evaluate the network at n points, one to a column so that each unit's row is contiguous.
 
     ``inputs`` (p, n), ``hidden`` (L, at least w n) of flat buffers, ``outputs`` (r, n); the last
@@ -93,7 +94,7 @@ def forward(network: Network, theta: Any, inputs: Any, hidden: Any, outputs: Any
 
 
 @vectorized
-def _row_sums(values: Any, out: Any) -> None:
+def _row_sums(values: Matrix, out: Vector) -> None:
     for i in range(out.shape[0]):
         row, total = values[i], 0.0
         for n in range(row.shape[0]):
@@ -102,7 +103,7 @@ def _row_sums(values: Any, out: Any) -> None:
 
 
 @contracted
-def _through_tanh(delta: Any, activations: Any) -> None:
+def _through_tanh(delta: Matrix, activations: Matrix) -> None:
     for i in range(delta.shape[0]):
         row, h = delta[i], activations[i]
         for n in range(row.shape[0]):
@@ -112,12 +113,12 @@ def _through_tanh(delta: Any, activations: Any) -> None:
 @compiled
 def loss_gradient(
     network: Network,
-    theta: Any,
-    inputs: Any,
-    targets: Any,
-    hidden: Any,
-    deltas: Any,
-    gradient: Any,
+    theta: Vector,
+    inputs: Matrix,
+    targets: Matrix,
+    hidden: Matrix,
+    deltas: Matrix,
+    gradient: Vector,
 ) -> None:
     """Write the gradient of mean_n ‖a_θ(x_n) - y_n‖² over a batch, (q,).
 
@@ -147,7 +148,9 @@ def loss_gradient(
 
 
 @contracted
-def activations_at(network: Network, theta: Any, phi: Any, hidden: Any, output: Any) -> None:
+def activations_at(
+    network: Network, theta: Vector, phi: Vector, hidden: Matrix, output: Vector
+) -> None:
     """Evaluate the network at one point: ``hidden`` (L, w) and ``output`` (r,) are written."""
     depth = network.offsets.shape[0] - 1
     below = phi
@@ -163,7 +166,7 @@ def activations_at(network: Network, theta: Any, phi: Any, hidden: Any, output: 
 
 
 @contracted
-def _affine(W: Any, b: Any, x: Any, out: Any) -> None:
+def _affine(W: Matrix, b: Vector, x: Vector, out: Vector) -> None:
     for i in range(out.shape[0]):
         total = b[i]
         for j in range(x.shape[0]):
@@ -172,7 +175,7 @@ def _affine(W: Any, b: Any, x: Any, out: Any) -> None:
 
 
 @contracted
-def _transposed_product(W: Any, delta: Any, out: Any) -> None:
+def _transposed_product(W: Matrix, delta: Vector, out: Vector) -> None:
     for j in range(out.shape[0]):
         out[j] = 0.0
     for i in range(delta.shape[0]):
@@ -181,7 +184,9 @@ def _transposed_product(W: Any, delta: Any, out: Any) -> None:
 
 
 @contracted
-def back_signals(network: Network, theta: Any, hidden: Any, component: int, deltas: Any) -> None:
+def back_signals(
+    network: Network, theta: Vector, hidden: Matrix, component: int, deltas: Matrix
+) -> None:
     """Write δ, (L, w): the derivative of output k with respect to every pre-activation."""
     depth = network.offsets.shape[0] - 1
     W, _ = layer(network, theta, depth)
@@ -196,7 +201,7 @@ def back_signals(network: Network, theta: Any, hidden: Any, component: int, delt
 
 @contracted
 def parameter_gradient(
-    network: Network, phi: Any, hidden: Any, deltas: Any, component: int, out: Any
+    network: Network, phi: Vector, hidden: Matrix, deltas: Matrix, component: int, out: Vector
 ) -> None:
     """Write g = ∂a_k/∂θ, (q,): in each layer δ ⊗ (activations below, 1)."""
     depth = network.offsets.shape[0] - 1
@@ -219,13 +224,13 @@ def parameter_gradient(
 @contracted
 def tangents_at(
     network: Network,
-    theta: Any,
-    phi_dot: Any,
-    hidden: Any,
+    theta: Vector,
+    phi_dot: Vector,
+    hidden: Matrix,
     component: int,
-    deltas: Any,
-    hidden_dot: Any,
-    deltas_dot: Any,
+    deltas: Matrix,
+    hidden_dot: Matrix,
+    deltas_dot: Matrix,
 ) -> None:
     """Write the derivatives of the activations and of δ, (L, w) each, along a direction."""
     depth, width = network.offsets.shape[0] - 1, hidden.shape[1]
@@ -257,14 +262,14 @@ def tangents_at(
 @contracted
 def gradient_along(
     network: Network,
-    phi: Any,
-    phi_dot: Any,
-    hidden: Any,
-    hidden_dot: Any,
-    deltas: Any,
-    deltas_dot: Any,
+    phi: Vector,
+    phi_dot: Vector,
+    hidden: Matrix,
+    hidden_dot: Matrix,
+    deltas: Matrix,
+    deltas_dot: Matrix,
     component: int,
-    out: Any,
+    out: Vector,
 ) -> None:
     """Write the derivative of g, (q,), along a direction: one column of D B."""
     depth = network.offsets.shape[0] - 1

@@ -1,38 +1,35 @@
 """Many paths at once under a model or the truth, in compiled code.
 
-Legend beside :mod:`dopt.kernel.arguments`: H steps, n paths.
+Legend beside :mod:`dopt.kernel.structs`: H steps, n paths.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from dopt.kernel import network as nn
-from dopt.kernel.arguments import Network, World
 from dopt.kernel.compiler import called_from_python
 from dopt.kernel.model import euler_step
+from dopt.kernel.structs import Network, Plant
+from dopt.types import Stack, Vector
 
 
 @called_from_python
-def follow_equations(
-    known: Any, accelerations: Any, world: World, parameters: Any, inputs: Any, states: Any
-) -> None:
+def follow_equations(plant: Plant, parameters: Vector, inputs: Stack, states: Stack) -> None:
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m)."""
-    flow, value = np.empty(states.shape[2]), np.empty(world.learned_rows.shape[0])
+    flow, value = np.empty(states.shape[2]), np.empty(plant.learned_rows.shape[0])
     for t in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
-            accelerations(states[t, i], parameters, value)
-            euler_step(known, world, states[t, i], inputs[t, i], value, flow, states[t + 1, i])
+            plant.accelerations(states[t, i], parameters, value)
+            euler_step(plant, states[t, i], inputs[t, i], value, flow, states[t + 1, i])
 
 
 @called_from_python
 def follow_network(
-    known: Any, world: World, network: Network, theta: Any, inputs: Any, states: Any
+    plant: Plant, network: Network, theta: Vector, inputs: Stack, states: Stack
 ) -> None:
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m)."""
-    n, r = inputs.shape[1], world.learned_rows.shape[0]
+    n, r = inputs.shape[1], plant.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     flow, value, phi = np.empty(states.shape[2]), np.empty(r), np.empty(network.sizes[0])
     features, outputs = np.empty((network.sizes[0], n)), np.empty((r, n))
@@ -46,4 +43,4 @@ def follow_network(
         for i in range(n):
             for k in range(r):
                 value[k] = outputs[k, i]
-            euler_step(known, world, states[t, i], inputs[t, i], value, flow, states[t + 1, i])
+            euler_step(plant, states[t, i], inputs[t, i], value, flow, states[t + 1, i])

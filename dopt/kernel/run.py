@@ -1,27 +1,27 @@
-"""From a trial's specification to the compiled loop and back."""
+"""Runs of a trial in the compiled kernel, whole or in pieces."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.kernel import arguments as args
-from dopt.kernel.equations import compiled_equations
-from dopt.kernel.loop import compiled_loop, compiled_search
-from dopt.kernel.points import own_targets
-from dopt.kernel.setup import constants, empty_record, initial_state
+from dopt.kernel import structs as args
+from dopt.kernel.evaluation_points import own_targets
+from dopt.kernel.from_spec import constants, empty_record, empty_scratch, initial_state
+from dopt.kernel.pointers import compiled_trial
+from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import draw
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
+from dopt.types import Array
 
 FIRST_STEPS = 300
 """Steps of a trial before it is known what a step costs; those of the paper have no more."""
 
 PIECE_SECONDS = 1.0
-"""How often compiled code comes back to the interpreter, which can then heed a signal."""
+"""Interval at which compiled code comes back to the interpreter, which can then heed a signal."""
 
 
 class KernelTrial:
@@ -39,22 +39,29 @@ class KernelTrial:
 
     def __init__(self, spec: TrialSpec) -> None:
         self.spec = spec
-        *shared, points = constants(spec.cell)
-        self.constants = (*shared, own_targets(points))
+        plant, network, algorithm, points = constants(spec.config)
+        self.constants = (plant, network, algorithm, own_targets(points))
         draws = draw(spec)
-        self.randomness = args.Randomness(*_fields(draws, args.Randomness))
-        self.state = initial_state(spec, draws.weights)
-        self.record = empty_record(spec.system)
+        self.trial = args.Trial(
+            plant,
+            network,
+            algorithm,
+            args.Randomness(*(getattr(draws, name) for name in args.Randomness._fields)),
+            initial_state(spec, draws.weights),
+            empty_scratch(spec, network),
+            empty_record(spec.system),
+        )
+        self.state, self.record = self.trial.state, self.trial.record
         self.done = 0
         self.diverged_at: int | None = None
 
     @property
-    def parameters(self) -> args.Floats:
+    def parameters(self) -> Array:
         """Parameters of the model, (q,)."""
         return self.state.theta
 
     @property
-    def states(self) -> args.Floats:
+    def states(self) -> Array:
         """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
         return self.record.states
 
@@ -73,13 +80,19 @@ class KernelTrial:
             )
         if self.diverged_at is not None or last <= self.done:
             return
-        world, network, rules, points = self.constants
-        equations = compiled_equations(self.spec.system)
-        call = (world, network, rules, self.randomness, points, self.state, self.record)
-        loop, search = compiled_loop(call), compiled_search(call)
-        self.done = int(loop(*equations, search, *call, self.done, last))
+        points = self.constants[3]
+        before = self.done
+        code = compiled_trial(self.spec.policy, self.spec.learner, self.trial, points)
+        self.done = code.advance(self.trial, points, code.plan, code.learn, self.done, last)
+        _check_inputs(self.spec, self.record.inputs, before, self.done)
         if self.done < last:
             self.diverged_at = self.done
+
+
+def _check_inputs(spec: TrialSpec, inputs: Array, first: int, last: int) -> None:
+    """Refuse inputs of a user's own compiled policy that are larger than γ."""
+    if isinstance(spec.policy, CompiledPolicy):
+        check_norms(spec.policy.name, inputs[first:last], first, spec.system.gamma)
 
 
 def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
@@ -114,7 +127,3 @@ def _advance_in_pieces(trial: KernelTrial, last: int) -> None:
         trial.advance(min(last, before + steps))
         rate = (trial.done - before) / (time.perf_counter() - start)
         steps = max(1, int(rate * PIECE_SECONDS))
-
-
-def _fields(source: object, kind: Any) -> list[Any]:
-    return [getattr(source, name) for name in kind._fields]

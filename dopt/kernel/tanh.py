@@ -8,13 +8,13 @@ a few units in the last place everywhere; NaN stays NaN.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import types
 from numba.extending import overload
 
 from dopt.kernel.compiler import contracted, power_of_two
+from dopt.types import NumbaType, Scalar
 
 # Double precision. Adding 1.5 * 2^52 leaves the nearest integer in the low bits; the high part of
 # ln 2 ends in zeros, so that its product with k is exact.
@@ -35,13 +35,13 @@ C_SINGLE = tuple(np.float32(c) for c in C[:9])
 ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 
-def tanh(x: Any) -> Any:
+def tanh(x: Scalar) -> Scalar:
     """Return tanh x in the precision of x."""
     return _tanh_single(x) if isinstance(x, np.float32) else _tanh_double(x)
 
 
 @overload(tanh, strict=False)
-def _tanh(x: Any) -> Any:
+def _tanh(x: NumbaType) -> NumbaType:
     if x == types.float32:
         return lambda x: _tanh_single(x)
     return lambda x: _tanh_double(x)

@@ -1,4 +1,4 @@
-"""How the model learns online: Adam, least squares, the extended Kalman filter, conditioning."""
+"""Learners of the model's parameters, one file for each, and the registry that names them."""
 
 from __future__ import annotations
 

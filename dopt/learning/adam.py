@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.learning.base import Learner
 
 
@@ -28,10 +28,10 @@ class AdamRule(Learner):
         Regulariser of the denominator.
     """
 
-    learning_rate: float = quantity(2e-3, bound="positive")
-    beta_1: float = quantity(0.9, bound="fraction")
-    beta_2: float = quantity(0.999, bound="fraction")
-    epsilon: float = quantity(1e-8, bound="positive")
+    learning_rate: float = parameter(2e-3, bound="positive")
+    beta_1: float = parameter(0.9, bound="fraction")
+    beta_2: float = parameter(0.999, bound="fraction")
+    epsilon: float = parameter(1e-8, bound="positive")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +45,16 @@ class Adam(AdamRule):
     """
 
     name: ClassVar[str] = "adam"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.adam.learn"
 
-    window: int = quantity(1, "samples", "positive")
+    window: int = parameter(1, "samples", "positive")
+
+    def samples_kept(self, horizon: int) -> int:  # noqa: ARG002  # the window has its own size
+        return self.window
+
+    def largest_batch(self) -> int:
+        return self.window
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +62,7 @@ class AdamWindow(Adam):
     """One Adam step on the newest 100 samples, as in the authors' released code."""
 
     name: ClassVar[str] = "adam_window"
+    compiled: ClassVar[bool] = True
 
-    learning_rate: float = quantity(1e-2, bound="positive")
-    window: int = quantity(100, "samples", "positive")
+    learning_rate: float = parameter(1e-2, bound="positive")
+    window: int = parameter(100, "samples", "positive")

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.learning.adam import AdamRule
 
 
@@ -33,11 +33,19 @@ class AdamReplay(AdamRule):
     """
 
     name: ClassVar[str] = "adam_replay"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.replay.learn"
 
-    learning_rate: float = quantity(1e-2, bound="positive")
-    capacity: int = quantity(10_000, "samples", "positive")
-    batch: int = quantity(100, "samples", "positive")
-    steps: int = quantity(1, "steps", "positive")
+    learning_rate: float = parameter(1e-2, bound="positive")
+    capacity: int = parameter(10_000, "samples", "positive")
+    batch: int = parameter(100, "samples", "positive")
+    steps: int = parameter(1, "steps", "positive")
+
+    def samples_kept(self, horizon: int) -> int:
+        return min(self.capacity, horizon)
+
+    def largest_batch(self) -> int:
+        return self.batch
 
     def places(self, horizon: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
         """Draw the places of the buffer that the minibatches are made of, (T, steps, batch).

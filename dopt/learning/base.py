@@ -1,45 +1,53 @@
-"""What every learner specification declares."""
+"""Base classes of learner specifications, and of updates that a user writes."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import Checked
+from dopt.declare.kernel_support import KernelPart
 from dopt.systems.base import System
-from dopt.view import View
+from dopt.trial_view import TrialView
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Learner(Checked):
+class Learner(KernelPart):
     """An online update of the model's parameters from the samples seen so far.
 
-    ``compiled`` says whether the kernel runs it; what it does not runs on the reference path.
-    ``structure`` is that of the models which it teaches (:class:`dopt.models.Model`).
+    ``structure`` is that of the models which it teaches (:class:`dopt.models.Model`), and
+    ``updates_information`` says whether its step also adds the sample to the information matrix.
     """
 
     section: ClassVar[str] = "learner"
     name: ClassVar[str]
     structure: ClassVar[str] = "gradient"
-    compiled: ClassVar[bool] = True
+    updates_information: ClassVar[bool] = False
+
+    def samples_kept(self, horizon: int) -> int:  # noqa: ARG002  # of most learners, none
+        """Return how many of the newest samples the kernel keeps in a trial of so many steps."""
+        return 0
+
+    def largest_batch(self) -> int:
+        """Return the most samples that the kernel takes a gradient of at once."""
+        return 1
 
 
 class Updater(ABC):
     """The learning of one trial; it may keep moments, samples or covariances."""
 
     @abstractmethod
-    def update(self, view: View) -> Array:
+    def update(self, view: TrialView) -> Array:
         """Return the new parameters, (q,), after a step; the newest sample is the last one."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Updated(Learner):
+class CustomLearner(Learner):
     """A learner whose update is written in numpy; it runs on the reference path."""
 
     compiled: ClassVar[bool] = False
@@ -47,3 +55,40 @@ class Updated(Learner):
     @abstractmethod
     def updater(self, system: System, rng: np.random.Generator) -> Updater:
         """Return the learning of a new trial; all that is random in it comes from ``rng``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompiledLearner(Learner):
+    """A learner whose update the kernel compiles.
+
+    Derived from CustomLearner as well, it runs on both paths.
+
+    The update is a plain function of numbers and arrays as Numba compiles them; its helpers lie in
+    the same module, or are functions of :mod:`dopt.kernel`. Its file is part of a trial's key.
+    """
+
+    compiled: ClassVar[bool] = True
+
+    @staticmethod
+    @abstractmethod
+    def learn(
+        trial: Any,  # a Trial of the kernel, which this package does not import
+        t: int,
+        target: Array,
+    ) -> None:
+        """Update ``trial.state.theta``, (q,), after step t, in place.
+
+        Parameters
+        ----------
+        trial : dopt.kernel.structs.Trial
+            ``record.states[: t + 2]`` are x_0 ... x_{t+1}; ``algorithm.learner`` holds the numeric
+            fields of the learner in their order, and ``state.learner_memory`` what it keeps.
+        t : int
+            Number of the step that was just done, from 0.
+        target : (r,)
+            Accelerations observed at x_t.
+        """
+
+    def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of learners that keep nothing
+        """Return how many numbers the learner keeps from step to step; they start at zero."""
+        return 0

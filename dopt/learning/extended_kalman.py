@@ -24,7 +24,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.learning.base import Learner
 
 
@@ -71,10 +71,13 @@ class ExtendedKalman(Learner):
     """
 
     name: ClassVar[str] = "ekf"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn"
+    updates_information: ClassVar[bool] = True
 
-    regularization: float = quantity(1e-3, bound="positive")
-    noise_variance: float = quantity(1.0, bound="positive")
-    forgetting: float = quantity(1.0, bound="share")
+    regularization: float = parameter(1e-3, bound="positive")
+    noise_variance: float = parameter(1.0, bound="positive")
+    forgetting: float = parameter(1.0, bound="share")
 
     def renewal(self, n_parameters: int, regularization: float) -> Renewal:
         """Return what is given back of λI for q parameters.
@@ -89,3 +92,7 @@ class ExtendedKalman(Learner):
         entries = math.ceil(n_parameters / longest)
         period = math.ceil(n_parameters / entries)
         return Renewal(entries, regularization * (1.0 - self.forgetting**period))
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:
+        entries, weight = self.renewal(n_parameters, regularization)
+        return self.noise_variance, self.forgetting, float(entries), weight

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.learning.base import Learner
 
 
@@ -23,6 +23,9 @@ class RecursiveLeastSquares(Learner):
     """
 
     name: ClassVar[str] = "recursive_least_squares"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.least_squares.learn"
+    updates_information: ClassVar[bool] = True
     structure: ClassVar[str] = "least_squares"
 
-    regularization: float = quantity(1e-3, bound="positive")
+    regularization: float = parameter(1e-3, bound="positive")

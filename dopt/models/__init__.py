@@ -1,4 +1,4 @@
-"""What is learned: a network, a form linear in its parameters, or a Gaussian process."""
+"""Models that are learned: a network, a form linear in its parameters, or a Gaussian process."""
 
 from __future__ import annotations
 

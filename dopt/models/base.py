@@ -1,4 +1,4 @@
-"""What every model specification declares."""
+"""Base class of model specifications."""
 
 from __future__ import annotations
 
@@ -9,25 +9,23 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import Checked
+from dopt.declare.kernel_support import KernelSupport
 from dopt.systems.base import System
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Model(Checked):
+class Model(KernelSupport):
     """A parametric model of the r learned accelerations of a system.
 
     ``structure`` says how its parameters can be learned: by gradient, by least squares because the
     model is linear in them, or by conditioning on all samples. A learner names the one it teaches.
-    ``compiled`` says whether the kernel runs it; what it does not runs on the reference path.
     """
 
     section: ClassVar[str] = "model"
     name: ClassVar[str]
     structure: ClassVar[str] = "gradient"
-    compiled: ClassVar[bool] = True
 
     @abstractmethod
     def n_parameters(self, system: System) -> int:

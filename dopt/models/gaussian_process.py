@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.models.base import Array, Model
 from dopt.systems.base import System
 
@@ -41,8 +41,8 @@ class GaussianProcess(Model):
     structure: ClassVar[str] = "conditioning"
     compiled: ClassVar[bool] = False
 
-    lengthscale: float = quantity(1.0, bound="positive")
-    amplitude: float = quantity(10.0, bound="positive")
+    lengthscale: float = parameter(1.0, bound="positive")
+    amplitude: float = parameter(10.0, bound="positive")
 
     def n_parameters(self, system: System) -> int:
         return system.horizon * (len(system.features) + system.n_learned)

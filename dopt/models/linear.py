@@ -21,6 +21,7 @@ class Linear(Model):
 
     name: ClassVar[str] = "linear"
     structure: ClassVar[str] = "least_squares"
+    compiled: ClassVar[bool] = True
 
     def n_parameters(self, system: System) -> int:
         return len(system.linear_parameters)

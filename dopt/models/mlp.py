@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.models.base import Array, Model
 from dopt.systems.base import System
 
@@ -29,9 +29,10 @@ class MLP(Model):
     """
 
     name: ClassVar[str] = "mlp"
+    compiled: ClassVar[bool] = True
 
-    width: int = quantity(16, "units", "positive")
-    depth: int = quantity(2, "layers", "positive")
+    width: int = parameter(16, "units", "positive")
+    depth: int = parameter(2, "layers", "positive")
 
     def layer_sizes(self, system: System) -> tuple[int, ...]:
         """Return the number of units of every layer, from the features to the outputs."""

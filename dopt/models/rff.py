@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.models.base import Array, Model
 from dopt.systems.base import System
 
@@ -39,9 +39,9 @@ class RFF(Model):
     structure: ClassVar[str] = "least_squares"
     compiled: ClassVar[bool] = False
 
-    n_features: int = quantity(100, "features", "positive")
-    lengthscale: float = quantity(1.0, bound="positive")
-    amplitude: float = quantity(10.0, bound="positive")
+    n_features: int = parameter(100, "features", "positive")
+    lengthscale: float = parameter(1.0, bound="positive")
+    amplitude: float = parameter(10.0, bound="positive")
 
     def n_parameters(self, system: System) -> int:
         return self.n_features * system.n_learned + self.n_fixed_parameters(system)

@@ -1,9 +1,9 @@
-"""How the next input is chosen: one file per policy, and the registry that names them."""
+"""Policies that choose the next input, one file for each, and the registry that names them."""
 
 from __future__ import annotations
 
 from dopt.policies.a_optimal import AOptimal
-from dopt.policies.base import Informed, Policy
+from dopt.policies.base import InformationPolicy, Policy
 from dopt.policies.chirp import Chirp
 from dopt.policies.d_optimal import DOptimal
 from dopt.policies.disagreement import Disagreement
@@ -63,7 +63,7 @@ __all__ = [
     "GaussianProcessEntropy",
     "GradientDOptimal",
     "GreedyLinear",
-    "Informed",
+    "InformationPolicy",
     "Lookahead",
     "Multisine",
     "Oracle",

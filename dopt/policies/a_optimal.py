@@ -17,6 +17,7 @@ class AOptimal(Search):
     """
 
     name: ClassVar[str] = "a_optimal"
+    compiled: ClassVar[bool] = True
 
     @property
     def score(self) -> str:

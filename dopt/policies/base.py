@@ -1,4 +1,4 @@
-"""What every policy specification declares.
+"""Base classes of policy specifications, and of plans that a user writes.
 
 A policy is either open-loop, and gives its whole input sequence before the trial, or closed-loop,
 and names the plan that chooses each input from what was observed. A closed-loop policy that the
@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from dopt.errors import IncompatibleError
-from dopt.fields import Checked, quantity
+from dopt.declare.kernel_support import KernelPart
+from dopt.declare.validated_fields import parameter
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.systems.base import System
-from dopt.view import View
+from dopt.trial_view import TrialView
 
 Array = npt.NDArray[np.float64]
 
@@ -35,15 +36,11 @@ def check_length(key: str, steps: int, system: System) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Policy(Checked):
-    """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.
-
-    ``compiled`` says whether the kernel runs it; what it does not runs on the reference path.
-    """
+class Policy(KernelPart):
+    """A rule that chooses the input u_t, ‖u_t‖ ≤ γ."""
 
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
-    compiled: ClassVar[bool] = True
 
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
@@ -56,6 +53,8 @@ class OpenLoop(Policy):
     ``exceeds`` says that single inputs may be larger than γ.
     """
 
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.open_loop.plan"
     exceeds: ClassVar[bool] = False
 
     @abstractmethod
@@ -69,10 +68,10 @@ class ClosedLoop(Policy):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Informed(ClosedLoop):
+class InformationPolicy(ClosedLoop):
     """A closed-loop policy that plans with the information matrix M of the parameters.
 
-    M₀ = λI, and M_{t+1} = M_t + JᵀJ with J at (x_t, u_t) and the parameters after the learning step
+    M₀ = λI, and M_{t+1} = M_t + JᵀJ with J at x_t and the parameters after the learning step
     of time t. The first input is uniform on the sphere.
 
     Parameters
@@ -81,7 +80,7 @@ class Informed(ClosedLoop):
         λ.
     """
 
-    regularization: float = quantity(1e-3, bound="positive")
+    regularization: float = parameter(1e-3, bound="positive")
 
     @abstractmethod
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:
@@ -95,18 +94,18 @@ class Planner(ABC):
     """The plan of one trial; it may keep what it learns itself."""
 
     @abstractmethod
-    def choose(self, view: View) -> Array:
+    def choose(self, view: TrialView) -> Array:
         """Return the input u_t, (m,), ‖u_t‖ ≤ γ, after t ≥ 1 steps: the first one is random.
 
         An input that is not finite ends the trial as diverged.
         """
 
-    def observe(self, view: View) -> None:  # noqa: B027  # most plans keep nothing
+    def observe(self, view: TrialView) -> None:  # noqa: B027  # most plans keep nothing
         """Take in a step that was just done and learned from, t ≥ 1: x_{t-1}, u_{t-1} and x_t."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Planned(ClosedLoop):
+class CustomPolicy(ClosedLoop):
     """A closed-loop policy whose plan is written in numpy; it runs on the reference path."""
 
     compiled: ClassVar[bool] = False
@@ -114,6 +113,58 @@ class Planned(ClosedLoop):
     @abstractmethod
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
         """Return the plan of a new trial; all that is random in it comes from ``rng``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompiledPolicy(ClosedLoop):
+    """A closed-loop policy whose plan the kernel compiles.
+
+    Derived from CustomPolicy as well, it runs on both paths.
+
+    The plan is a plain function of numbers and arrays as Numba compiles them; its helpers lie in
+    the same module, or are functions of :mod:`dopt.kernel`. Its file is part of a trial's key.
+    """
+
+    compiled: ClassVar[bool] = True
+
+    @staticmethod
+    @abstractmethod
+    def plan(
+        trial: Any,  # a Trial of the kernel, which this package does not import
+        t: int,
+        u: Array,
+    ) -> None:
+        """Write the input u_t, (m,), ‖u_t‖ ≤ γ, of a step t ≥ 1: the first one is random.
+
+        Parameters
+        ----------
+        trial : dopt.kernel.structs.Trial
+            ``record.states[: t + 1]`` are x_0 ... x_t; ``algorithm.policy`` holds the numeric
+            fields of the policy in their order, ``randomness.ties[t]`` a random direction, (m,),
+            and ``state.policy_memory`` what the policy keeps.
+        t : int
+            Number of the step.
+        u : (m,)
+            Where the input is written. One that is not finite ends the trial as diverged.
+        """
+
+    def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of policies that keep nothing
+        """Return how many numbers the policy keeps from step to step; they start at zero."""
+        return 0
+
+
+def check_norms(name: str, inputs: Array, first: int, gamma: float) -> None:
+    """Raise SpecificationError if an input, a row of (n, m), is larger than γ.
+
+    ``first`` is the step of the first row.
+    """
+    norms = np.linalg.norm(inputs, axis=1)
+    wrong = np.flatnonzero(norms > gamma * (1 + ROUNDING))
+    if len(wrong):
+        raise SpecificationError(
+            f"policy '{name}' chose an input of norm {norms[wrong[0]]:.6g} at step "
+            f"{first + wrong[0]}, but env.gamma is {gamma:g}: scale it down."
+        )
 
 
 def on_sphere(vectors: Array, radius: float) -> Array:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
+from dopt.math.sphere_directions import sphere_directions
 from dopt.policies.base import Array, Policy
-from dopt.policies.directions import sphere_directions
 from dopt.systems.base import System
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compared(Policy):
+class CandidatePolicy(Policy):
     """A policy that compares candidate inputs.
 
     Parameters
@@ -20,7 +20,7 @@ class Compared(Policy):
         Inputs spread over the sphere ‖u‖ = γ; with one input there are two, ±γ.
     """
 
-    candidates: int = quantity(16, "inputs", "positive")
+    candidates: int = parameter(16, "inputs", "positive")
 
     def compared_inputs(self, system: System) -> Array:
         """Return the candidates, (C, m), with norm γ."""

@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import quantity
-from dopt.policies.base import Informed
+from dopt.declare.validated_fields import parameter
+from dopt.policies.base import InformationPolicy
 
 SMALL_PRIMAL = 600
 LARGE_DUAL = 4000
@@ -17,7 +17,7 @@ _SKETCH_SEED = 1_406_2
 
 
 @dataclass(frozen=True, kw_only=True)
-class DOptimal(Informed):
+class DOptimal(InformationPolicy):
     """Maximise the linearised one-step information gain of one learned component (equation 7).
 
     The component k is drawn uniformly among the learned ones at each step.
@@ -39,9 +39,14 @@ class DOptimal(Informed):
     """
 
     name: ClassVar[str] = "d_optimal"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.d_optimal.plan"
 
-    form: str = quantity("auto", choices=("auto", "primal", "dual", "sketch"))
-    sketch_size: int = quantity(256, "dimensions", "positive")
+    form: str = parameter("auto", choices=("auto", "primal", "dual", "sketch"))
+    sketch_size: int = parameter(256, "dimensions", "positive")
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of a component drawn at each step
+        return (0.0,)
 
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:
         """Return the form for q parameters and N rows in the whole trial.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import SpecificationError
-from dopt.fields import quantity
 from dopt.policies.held_candidates import HeldCandidates
 
 
@@ -39,7 +39,7 @@ class Disagreement(HeldCandidates):
     name: ClassVar[str] = "max"
     compiled: ClassVar[bool] = False
 
-    ensemble: int = quantity(5, "networks", "positive")
+    ensemble: int = parameter(5, "networks", "positive")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.policies.base import Array
 from dopt.policies.search import Search
 
@@ -31,8 +31,9 @@ class EOptimal(Search):
     """
 
     name: ClassVar[str] = "e_optimal"
+    compiled: ClassVar[bool] = True
 
-    subspace: int = quantity(32, "dimensions", "positive")
+    subspace: int = parameter(32, "dimensions", "positive")
 
     @property
     def score(self) -> str:

@@ -18,6 +18,7 @@ class Exact(Search):
     """
 
     name: ClassVar[str] = "exact"
+    compiled: ClassVar[bool] = True
 
     @property
     def score(self) -> str:

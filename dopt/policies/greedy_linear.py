@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
-from dopt.fields import quantity
 from dopt.policies.base import Array, ClosedLoop
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
@@ -34,7 +34,7 @@ class GreedyLinear(ClosedLoop):
     name: ClassVar[str] = "linear"
     compiled: ClassVar[bool] = False
 
-    regularization: float = quantity(1e-3, bound="positive")
+    regularization: float = parameter(1e-3, bound="positive")
 
     def check(self, system: System) -> None:
         if not is_linear(system):

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
-from dopt.fields import quantity
 from dopt.policies.base import check_length
 from dopt.policies.search import Search
 from dopt.systems.base import System
@@ -41,11 +41,12 @@ class Lookahead(Search):
     """
 
     name: ClassVar[str] = "lookahead"
+    compiled: ClassVar[bool] = True
 
-    candidates: int = quantity(8, "inputs", "positive")
-    lookahead: int | None = quantity(None, "steps", "positive")
-    criterion: str = quantity("sum", choices=("joint", "sum"))
-    stride: int | None = quantity(None, "steps", "positive")
+    candidates: int = parameter(8, "inputs", "positive")
+    lookahead: int | None = parameter(None, "steps", "positive")
+    criterion: str = parameter("sum", choices=("joint", "sum"))
+    stride: int | None = parameter(None, "steps", "positive")
 
     def check(self, system: System) -> None:
         if self.lookahead is not None:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.policies.base import Array, OpenLoop
 from dopt.systems.base import System
 
@@ -30,7 +30,7 @@ class Multisine(OpenLoop):
 
     name: ClassVar[str] = "multisine"
 
-    band: float = quantity(0.1, "1", "share")
+    band: float = parameter(0.1, "1", "share")
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         T, m = system.horizon, system.n_inputs

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
-from dopt.fields import quantity
 from dopt.policies.d_optimal import DOptimal
 from dopt.systems.base import System
 
@@ -24,8 +24,9 @@ class Oracle(DOptimal):
     """
 
     name: ClassVar[str] = "oracle"
+    compiled: ClassVar[bool] = True
 
-    regularization: float = quantity(1e-6, bound="positive")
+    regularization: float = parameter(1e-6, bound="positive")
 
     def check(self, system: System) -> None:
         if not system.linear_parameters:

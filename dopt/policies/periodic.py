@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
-from dopt.fields import quantity
 from dopt.policies.base import Array, OpenLoop
 from dopt.systems.base import System
 from dopt.systems.equilibrium import eigenmode
@@ -27,7 +27,7 @@ class Periodic(OpenLoop):
 
     name: ClassVar[str] = "periodic"
 
-    frequency: float | None = quantity(None, "rad/s", "positive")
+    frequency: float | None = parameter(None, "rad/s", "positive")
 
     def check(self, system: System) -> None:
         if eigenmode(system) is None:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.policies.base import Array, OpenLoop
 from dopt.systems.base import System
 
@@ -30,7 +30,7 @@ class PRBS(OpenLoop):
 
     name: ClassVar[str] = "prbs"
 
-    hold: int = quantity(10, "steps", "positive")
+    hold: int = parameter(10, "steps", "positive")
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         from scipy.signal import max_len_seq  # its import takes longer than a short trial

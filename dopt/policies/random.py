@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.policies.base import Array, OpenLoop, on_sphere
 from dopt.systems.base import System
 
@@ -52,7 +52,7 @@ class RandomHeld(OpenLoop):
 
     name: ClassVar[str] = "random_held"
 
-    hold: int = quantity(10, "steps", "positive")
+    hold: int = parameter(10, "steps", "positive")
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         draws = rng.standard_normal((-(-system.horizon // self.hold), system.n_inputs))

@@ -1,21 +1,24 @@
-"""Search for the best plan among a finite set: the frame of the policies beyond D-optimal."""
+"""Base class of policies that search for the best plan among a finite set."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
-from dopt.fields import quantity
-from dopt.policies.base import Informed
-from dopt.policies.compared import Compared
+from dopt.algorithm import Score
+from dopt.declare.validated_fields import parameter
+from dopt.errors import unknown_name
+from dopt.policies.base import InformationPolicy
+from dopt.policies.candidate_policy import CandidatePolicy
 from dopt.systems.base import System
 
-SCORES = ("joint", "sum", "trace", "a", "e", "task")
-"""What a plan is judged by; in the order of the compiled kernel."""
+SCORES = {score.name.lower(): score for score in Score}
+"""Scores by which plans are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search(Compared, Informed):
+class Search(CandidatePolicy, InformationPolicy):
     """Roll the learned model along every plan of a finite set and take the best plan's first input.
 
     From x_t the model runs x ← x + dt f_θ(x, u) without linearisation. The rows J at the states of
@@ -33,12 +36,14 @@ class Search(Compared, Informed):
     Parameters
     ----------
     candidates : int
-        As of :class:`dopt.policies.compared.Compared`.
+        As of :class:`dopt.policies.candidate_policy.CandidatePolicy`.
     budget_us : float
         Time for the search of one step [µs]; 0 is no limit. The first plan is always scored.
     """
 
-    budget_us: float = quantity(0.0, "µs", "nonnegative")
+    kernel_function: ClassVar[str] = "dopt.kernel.search.plans.plan"
+
+    budget_us: float = parameter(0.0, "µs", "nonnegative")
 
     @property
     @abstractmethod
@@ -51,3 +56,16 @@ class Search(Compared, Informed):
 
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # one form only
         return "primal"
+
+
+def score_code(policy: Search) -> Score:
+    """Return the code of a policy's score.
+
+    Raises
+    ------
+    SpecificationError
+        If there is no such score.
+    """
+    if policy.score not in SCORES:
+        raise unknown_name(f"score of policy '{policy.name}'", policy.score, SCORES)
+    return SCORES[policy.score]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
-from dopt.fields import quantity
 from dopt.policies.search import Search
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
@@ -19,7 +19,7 @@ class TaskOptimal(Search):
     With G the rows of the Jacobian at these states and V = J M⁻¹, the decrease by the rows J at
     x_t + dt f_θ(x_t, u) is tr((I + V Jᵀ)⁻¹ V GᵀG Vᵀ): V-optimal design. The states are drawn once
     for all from the evaluation box or the reachable set, with weights exp(-δ²/2) that fall with
-    the distance δ to the goal (:func:`dopt.planning.task_states.task_states`). Reference:
+    the distance δ to the goal (:func:`dopt.policies.task_states.task_states`). Reference:
     A. Atkinson, A. Donev and R. Tobias, "Optimum experimental designs" (2007), chapter 10.
 
     Parameters
@@ -36,11 +36,12 @@ class TaskOptimal(Search):
     """
 
     name: ClassVar[str] = "task"
+    compiled: ClassVar[bool] = True
 
-    states: str = quantity("grid", choices=("grid", "reachable"))
-    count: int = quantity(32, "states", "positive")
-    goal: tuple[float, ...] = quantity(())
-    radius: float = quantity(0.5, "half-widths", "positive")
+    states: str = parameter("grid", choices=("grid", "reachable"))
+    count: int = parameter(32, "states", "positive")
+    goal: tuple[float, ...] = parameter(())
+    radius: float = parameter(0.5, "half-widths", "positive")
 
     @property
     def score(self) -> str:

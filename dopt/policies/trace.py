@@ -17,6 +17,7 @@ class Trace(Search):
     """
 
     name: ClassVar[str] = "trace"
+    compiled: ClassVar[bool] = True
 
     @property
     def score(self) -> str:

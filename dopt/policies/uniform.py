@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.policies.base import ClosedLoop
 
 
@@ -25,5 +25,7 @@ class Uniform(ClosedLoop):
     """
 
     name: ClassVar[str] = "uniform"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.uniform.plan"
 
-    iterations: int = quantity(8, "steps", "positive")
+    iterations: int = parameter(8, "steps", "positive")

@@ -1,149 +1,77 @@
-"""Algorithm 1 in torch: the trials of one cell in lockstep, or a single one."""
+"""Algorithm 1 in torch for the trials of one configuration, which take each step together."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from torch.func import jacrev, vmap
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.information import held_information
 from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
-from dopt.policies.d_optimal import count_sketch
-from dopt.randomness import draw
 from dopt.reference.black_box import episodes_for, initial_states, stepped
+from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.gaussian_process import Posterior
-from dopt.reference.learners import batch_learner
+from dopt.reference.learner_registry import batch_learner
 from dopt.reference.learning import KalmanLearner
-from dopt.reference.models import model_function, network_function
-from dopt.reference.own import observe, planned_inputs, planners_for
+from dopt.reference.planner_registry import plan_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
-from dopt.reference.plans import plan_for
 from dopt.reference.search import searched_inputs
+from dopt.reference.state import BatchState
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
-
-Array = npt.NDArray[np.float64]
+from dopt.spec.trial import TrialSpec
+from dopt.types import Array
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 
-class Lockstep:
-    """A batch of n trials of one cell that take each step together.
+class Lockstep(BatchState):
+    """A batch of n trials of one configuration that take each step together.
 
-    Parameters
-    ----------
-    specs : sequence of TrialSpec
-        Trials that differ in the seed alone.
-    device : str
-        Torch device, ``"cpu"`` or ``"cuda"``.
-    module : torch.nn.Module, optional
-        Network from features to accelerations in place of the registered model; its parameters at
-        the time of the call are the initial ones of every trial.
-
-    Raises
-    ------
-    SpecificationError
-        If the trials belong to different cells.
+    Parameters and errors are those of :class:`dopt.reference.state.BatchState`.
     """
 
     def __init__(
         self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
     ) -> None:
-        if len({spec.config_key for spec in specs}) != 1:
-            raise SpecificationError(
-                f"{len(specs)} trials of different configurations were given, but those of a "
-                f"batch may differ in the seed alone: run one batch for each configuration."
-            )
-        self.specs, self.device = list(specs), device
-        self.system, self.cell = specs[0].system, specs[0].cell
-        draws = [draw(spec) for spec in specs]
-        self.noise = self._tensor(np.stack([d.noise for d in draws]))
-        self.open_loop = self._tensor(np.stack([d.inputs for d in draws]))
-        self.ties = self._tensor(np.stack([d.ties for d in draws]))
-        self.components = torch.tensor(np.stack([d.components for d in draws]), device=device)
-        self.theta = self._tensor(np.stack([d.weights for d in draws]))
-        self.model = model_function(self.system, self.cell.model)
-        if module is not None:
-            self.model = network_function(self.system, module)
-            flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
-            self.theta = flat.to(device).repeat(len(specs), 1)
-        self.n_learned = self.theta.shape[1] - self.cell.model.n_fixed_parameters(self.system)
-        q, n_rows = self.theta.shape[1], self.system.n_learned * self.system.horizon
-        self.held = held_information(self.cell.policy, self.cell.learner, q, n_rows)
-        self._allocate()
-        self.planners = planners_for(self.specs)
-        self.replay = torch.tensor(np.stack([d.replay for d in draws]), device=device)
-        self.learner = batch_learner(self)
-        self._rows = vmap(jacrev(self.model))
-        self.own_plan = plan_for(self)
-
-    def _tensor(self, values: npt.NDArray[np.float64]) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64, device=self.device)
-
-    def _unset(self, *shape: int) -> Tensor:
-        return torch.full(shape, torch.nan, dtype=torch.float64, device=self.device)
-
-    def _allocate(self) -> None:
-        n, T = len(self.specs), self.system.horizon
-        self.states = self._unset(n, T + 1, self.system.n_states)
+        super().__init__(specs, device, module)
         self.episodes = episodes_for(self.specs)
         if self.episodes:
             self.states[:, 0] = initial_states(self.episodes)
-        else:
-            self.states[:, 0] = self._tensor(np.array(self.system.initial_state))
-        self.diverged = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
-        self.inputs = self._unset(n, T, self.system.n_inputs)
-        self.targets = self._unset(n, T, self.system.n_learned)
-        self.project: Callable[[Tensor], Tensor] = lambda rows: rows[..., : self.n_learned]
-        self.columns = {name: np.full((n, T), np.nan) for name in COLUMNS}
-        self.information: Tensor | None = None
-        if self.held:
-            self._choose_form(self.held.form)
-            size = self.project(self.theta).shape[1]
-            prior = self.held.regularization * torch.eye(size).to(self.theta)
-            self.information = prior.repeat(n, 1, 1)
+        self.columns = {
+            name: np.full((len(specs), self.system.horizon), np.nan) for name in COLUMNS
+        }
         points = evaluation_set(self.system)
-        self.points = self._tensor(points.states)
-        self.truth = self._tensor(points.accelerations)
+        self.points, self.truth = self.tensor(points.states), self.tensor(points.accelerations)
         self.n_grid = points.n_grid
-
-    def _choose_form(self, form: str) -> None:
-        """Plan in the space of a sketch where the specification says so.
-
-        The dual form is an algorithm of the kernel for the same M; the reference builds M.
-        """
-        q, policy = self.theta.shape[1], self.cell.policy
-        if self.cell.model.structure == "least_squares":
-            return
-        if form == "sketch":
-            assert isinstance(policy, DOptimal)
-            buckets, signs = count_sketch(q, policy.sketch_size)
-            matrix = torch.zeros(q, policy.sketch_size).to(self.theta)
-            matrix[torch.arange(q), torch.tensor(buckets)] = torch.tensor(signs).to(self.theta)
-            self.project = lambda rows: rows @ matrix
+        self.planners = planners_for(self.specs)
+        self.learner = batch_learner(self, self.points)
+        self.own_plan = plan_for(self, self.learner)
+        self._rows = vmap(jacrev(self.model))
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
-        policy, x = self.cell.policy, self.states[:, t]
+        policy, x = self.config.policy, self.states[:, t]
         if isinstance(policy, OpenLoop) or t == 0:
             return self.open_loop[:, t]
         if self.planners:
-            return planned_inputs(self, t)
+            return planned_inputs(self, self.planners, t)
         if self.own_plan is not None:
             return self.own_plan.plan(t)
         if isinstance(policy, Uniform):
             seen = self.states[:, : t + 1]
             return uniform_inputs(self.system, self.model, self.theta, seen, policy.iterations)
-        assert self.information is not None
+        if self.information is None or not isinstance(policy, (Search, DOptimal)):
+            raise SpecificationError(
+                f"the reference has no plan for policy '{policy.name}': derive its class from "
+                f"CustomPolicy, or enter a plan in dopt.reference.planner_registry."
+            )
         given = (self.system, self.model, self.theta, self.information, x)
         if isinstance(policy, Search):
             return searched_inputs(policy, *given, self.ties[:, t])
@@ -186,7 +114,7 @@ class Lockstep:
 
         A Kalman filter has done so in its learning step.
         """
-        observe(self, t)
+        observe(self, self.planners, t)
         if self.information is not None and not isinstance(self.learner, KalmanLearner):
             J = self.rows(t)
             self.information = self.information + J.mT @ J
@@ -194,7 +122,7 @@ class Lockstep:
             self.own_plan.inform(t)
 
     def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
-        """Return the L2 errors at step t over the grid and over the reachable set, (n,) each."""
+        """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""
         if len(self.system.history) > 1:
             self.truth = true_accelerations(self.system, self.points, t)
         squares = (self._predicted() - self.truth).square().sum(dim=-1)
@@ -242,10 +170,10 @@ class Lockstep:
 def run_trials(
     specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
 ) -> list[TrialResult]:
-    """Run trials of one cell in lockstep; each result is that of the trial run alone.
+    """Run trials of one configuration in lockstep; each result is that of the trial run alone.
 
-    Parameters and errors are those of :class:`Lockstep`. The seconds and microseconds of a result
-    are the batch's divided by its size.
+    Parameters and errors are those of :class:`dopt.reference.state.BatchState`. The seconds and
+    microseconds of a result are the batch's divided by its size.
     """
     wall, cpu = time.perf_counter(), time.process_time()
     batch = Lockstep(specs, device, module)

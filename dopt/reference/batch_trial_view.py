@@ -1,21 +1,17 @@
-"""A trial of a batch as its plan or its update of one's own sees it."""
+"""View of one trial of a batch, for a plan or an update of a user's own."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.func import jacrev, jvp, vmap
 
 from dopt.reference.dynamics import flow, input_matrix
-from dopt.view import Array, View
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
+from dopt.reference.state import BatchState
+from dopt.trial_view import Array, TrialView
 
 
-class TrialView(View):
+class BatchTrialView(TrialView):
     """Trial ``index`` of a batch after t steps.
 
     Attributes
@@ -26,7 +22,7 @@ class TrialView(View):
         Parameters, for plans that are written in torch.
     """
 
-    def __init__(self, batch: Lockstep, index: int, t: int) -> None:
+    def __init__(self, batch: BatchState, index: int, t: int) -> None:
         self.system, self.t = batch.system, t
         self.model, self.theta = batch.model, batch.theta[index].clone()
         self.states = _array(batch.states[index, : t + 1])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dopt.randomness import stream
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import BlackBox, Episode
 
 

@@ -1,34 +1,31 @@
-"""Plans and updates that are written one trial at a time, for the trials of a batch."""
+"""Plans and updates of a user's own, which see one trial at a time, in a batch of trials."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dopt.errors import SpecificationError
-from dopt.learning.base import Updated
-from dopt.policies.base import ROUNDING, Array, Planned, Planner
+from dopt.learning.base import CustomLearner
+from dopt.policies.base import ROUNDING, Array, CustomPolicy, Planner
 from dopt.randomness import stream
-from dopt.reference.view import TrialView
-from dopt.spec import TrialSpec
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
+from dopt.reference.batch_trial_view import BatchTrialView
+from dopt.reference.state import BatchState
+from dopt.spec.trial import TrialSpec
 
 
 def planners_for(specs: Sequence[TrialSpec]) -> list[Planner]:
     """Return the plan of each trial; none for a policy that this package plans in lockstep."""
     policy = specs[0].policy
-    if not isinstance(policy, Planned):
+    if not isinstance(policy, CustomPolicy):
         return []
     return [policy.planner(spec.system, stream(spec.seed, "planner")) for spec in specs]
 
 
-def planned_inputs(batch: Lockstep, t: int) -> Tensor:
+def planned_inputs(batch: BatchState, planners: Sequence[Planner], t: int) -> Tensor:
     """Return the inputs u_t, (n, m), of the trials' own plans; diverged ones get a random one.
 
     Raises
@@ -38,23 +35,23 @@ def planned_inputs(batch: Lockstep, t: int) -> Tensor:
     """
     inputs = batch.open_loop[:, t].clone()
     for i in _alive(batch):
-        chosen = np.asarray(batch.planners[i].choose(TrialView(batch, i, t)), dtype=np.float64)
+        chosen = np.asarray(planners[i].choose(BatchTrialView(batch, i, t)), dtype=np.float64)
         _check(batch, chosen, t)
         inputs[i] = torch.as_tensor(chosen).to(inputs)
     return inputs
 
 
-def observe(batch: Lockstep, t: int) -> None:
+def observe(batch: BatchState, planners: Sequence[Planner], t: int) -> None:
     """Let the plans take in what step t has brought."""
-    if batch.planners:
+    if planners:
         for i in _alive(batch):
-            batch.planners[i].observe(TrialView(batch, i, t + 1))
+            planners[i].observe(BatchTrialView(batch, i, t + 1))
 
 
 class OwnLearner:
     """The updates of a learner of one's own, one trial after the other."""
 
-    def __init__(self, learner: Updated, batch: Lockstep) -> None:
+    def __init__(self, learner: CustomLearner, batch: BatchState) -> None:
         self._batch = batch
         self._updaters = [
             learner.updater(spec.system, stream(spec.seed, "updater")) for spec in batch.specs
@@ -69,24 +66,24 @@ class OwnLearner:
             If there are not as many parameters as before.
         """
         for i in _alive(self._batch):
-            updated = self._updaters[i].update(TrialView(self._batch, i, states.shape[1]))
+            updated = self._updaters[i].update(BatchTrialView(self._batch, i, states.shape[1]))
             theta = np.asarray(updated, dtype=np.float64)
             if theta.shape != self._batch.theta[i].shape:
                 raise SpecificationError(
-                    f"learner '{self._batch.cell.learner.name}' returned parameters of shape "
+                    f"learner '{self._batch.config.learner.name}' returned parameters of shape "
                     f"{theta.shape}, but {tuple(self._batch.theta[i].shape)} is expected: correct "
                     f"its update."
                 )
             self._batch.theta[i] = torch.as_tensor(theta).to(self._batch.theta)
 
 
-def _alive(batch: Lockstep) -> list[int]:
+def _alive(batch: BatchState) -> list[int]:
     diverged: list[bool] = batch.diverged[:, 0].tolist()
     return [i for i, ended in enumerate(diverged) if not ended]
 
 
-def _check(batch: Lockstep, chosen: Array, t: int) -> None:
-    system, name = batch.system, batch.cell.policy.name
+def _check(batch: BatchState, chosen: Array, t: int) -> None:
+    system, name = batch.system, batch.config.policy.name
     if chosen.shape != (system.n_inputs,):
         raise SpecificationError(
             f"policy '{name}' chose an input of shape {chosen.shape} at step {t}, but "

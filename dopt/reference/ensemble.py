@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,20 +12,18 @@ from dopt.randomness import stream
 from dopt.reference.dynamics import flow
 from dopt.reference.learning import learner_for
 from dopt.reference.models import Accelerations
+from dopt.reference.state import BatchState
 from dopt.systems.base import System
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
 
 
 class EnsemblePlan:
     """Networks beside each trial's own, and the choice by their disagreement."""
 
-    def __init__(self, batch: Lockstep, policy: Disagreement) -> None:
+    def __init__(self, batch: BatchState, policy: Disagreement) -> None:
         self._batch, self._lookahead = batch, policy.lookahead
         self._inputs = torch.tensor(policy.compared_inputs(batch.system)).to(batch.theta)
         self._others = torch.tensor(_initial(batch, policy.ensemble - 1)).to(batch.theta)
-        self._learner = learner_for(batch.cell.learner, batch.model, self._others)
+        self._learner = learner_for(batch.config.learner, batch.model, self._others)
 
     @property
     def members(self) -> Tensor:
@@ -89,8 +85,8 @@ def disagreements(
     return values
 
 
-def _initial(batch: Lockstep, count: int) -> np.ndarray:
+def _initial(batch: BatchState, count: int) -> np.ndarray:
     """Return initial parameters of ``count`` more networks for each trial, (n · count, q)."""
     rngs = [stream(spec.seed, "planner") for spec in batch.specs]
-    model, system = batch.cell.model, batch.system
+    model, system = batch.config.model, batch.system
     return np.stack([model.initial_parameters(system, rng) for rng in rngs for _ in range(count)])

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,9 +23,7 @@ from torch.func import grad_and_value, jacrev, vmap
 
 from dopt.policies.gradient import GradientDOptimal
 from dopt.reference.dynamics import flow
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
+from dopt.reference.state import BatchState
 
 WIDENING = 4.0
 """Largest factor from the angle of one ascent step to where the next one aims."""
@@ -57,7 +55,7 @@ def log_det_gain(rows: Tensor, covariance: Tensor) -> Tensor:
 class ExactGain:
     """G_D(u) - log det M of Definition 1 for a batch: of all learned components, or of one."""
 
-    def __init__(self, batch: Lockstep, *, single: bool = False) -> None:
+    def __init__(self, batch: BatchState, *, single: bool = False) -> None:
         system, model, project = batch.system, batch.model, batch.project
 
         def gain(u: Tensor, theta: Tensor, covariance: Tensor, x: Tensor, k: Tensor) -> Tensor:
@@ -131,7 +129,7 @@ def ascend(
 class GradientPlan:
     """The exact optimum of each trial: candidates first, then ascent from the best."""
 
-    def __init__(self, batch: Lockstep, policy: GradientDOptimal) -> None:
+    def __init__(self, batch: BatchState, policy: GradientDOptimal) -> None:
         self._batch, self._policy = batch, policy
         self._gain = ExactGain(batch)
         self._candidates = candidates(batch, policy)
@@ -148,7 +146,7 @@ class GradientPlan:
         """Do nothing: the batch holds M."""
 
 
-def candidates(batch: Lockstep, policy: GradientDOptimal) -> Tensor:
+def candidates(batch: BatchState, policy: GradientDOptimal) -> Tensor:
     """Return the candidates of a policy for every trial of a batch, (n, C, m)."""
     inputs = policy.compared_inputs(batch.system)
     return torch.tensor(inputs).to(batch.theta).expand(len(batch.theta), -1, -1)

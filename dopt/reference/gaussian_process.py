@@ -12,8 +12,6 @@ z       L⁻¹ Y, with Y the observed accelerations               t × r
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
@@ -21,10 +19,8 @@ from dopt.models.gaussian_process import GaussianProcess
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.reference.dynamics import flow
 from dopt.reference.models import features, kernel
+from dopt.reference.state import BatchState
 from dopt.systems.base import System
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
 
 
 class Posterior:
@@ -107,14 +103,15 @@ class Posterior:
 class EntropyPlan:
     """Choice by the joint predictive entropy at the states that an input leads to."""
 
-    def __init__(self, batch: Lockstep, policy: GaussianProcessEntropy) -> None:
-        self._batch, self._lookahead = batch, policy.lookahead
+    def __init__(
+        self, batch: BatchState, policy: GaussianProcessEntropy, posterior: Posterior
+    ) -> None:
+        self._batch, self._posterior, self._lookahead = batch, posterior, policy.lookahead
         self._inputs = torch.tensor(policy.compared_inputs(batch.system)).to(batch.theta)
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m)."""
-        system, posterior = self._batch.system, self._batch.learner
-        assert isinstance(posterior, Posterior)
+        system, posterior = self._batch.system, self._posterior
         z = self._batch.states[:, t].unsqueeze(1).expand(-1, len(self._inputs), -1)
         inputs, visited = self._inputs.expand(*z.shape[:2], -1), []
         for _ in range(self._lookahead):

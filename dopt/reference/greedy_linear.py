@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
@@ -11,15 +9,13 @@ from dopt.policies.greedy_linear import GreedyLinear
 from dopt.reference.dynamics import input_matrix
 from dopt.reference.models import features
 from dopt.reference.planning import QuadraticProblem, d_optimal_inputs, predicted_states
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
+from dopt.reference.state import BatchState
 
 
 class GreedyLinearPlan:
     """uᵀQu - 2vᵀu with Q = BᵀΓ⁻¹B, v = -BᵀΓ⁻¹x̄ and Γ = λI + Σ x_s x_sᵀ, x in feature scales."""
 
-    def __init__(self, batch: Lockstep, policy: GreedyLinear) -> None:
+    def __init__(self, batch: BatchState, policy: GreedyLinear) -> None:
         self._batch = batch
         prior = policy.regularization * torch.eye(batch.system.n_states).to(batch.theta)
         self._gram = prior.repeat(len(batch.theta), 1, 1)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from torch import Tensor
 
 from dopt.learning import ExtendedKalman, RecursiveLeastSquares
-from dopt.learning.base import Updated
+from dopt.learning.base import CustomLearner
 from dopt.models import GaussianProcess
+from dopt.reference.custom_plugins import OwnLearner
 from dopt.reference.gaussian_process import Posterior
 from dopt.reference.learning import (
     BatchLearner,
@@ -14,23 +15,23 @@ from dopt.reference.learning import (
     LeastSquaresLearner,
     learner_for,
 )
-from dopt.reference.own import OwnLearner
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
+from dopt.reference.state import BatchState
 
 
-def batch_learner(batch: Lockstep) -> BatchLearner | KalmanLearner:
-    """Return the learner of a batch; it writes into the parameters of the batch."""
-    model, learner = batch.cell.model, batch.cell.learner
+def batch_learner(batch: BatchState, points: Tensor) -> BatchLearner | KalmanLearner:
+    """Return the learner of a batch; it writes into the parameters of the batch.
+
+    ``points``, (N, d), are the states at which the model is evaluated at each step.
+    """
+    model, learner = batch.config.model, batch.config.learner
     if isinstance(model, GaussianProcess):
-        return Posterior(batch.system, model, batch.theta, batch.points)
-    if isinstance(learner, Updated):
+        return Posterior(batch.system, model, batch.theta, points)
+    if isinstance(learner, CustomLearner):
         return OwnLearner(learner, batch)
     if isinstance(learner, ExtendedKalman):
         assert batch.held is not None
         return KalmanLearner(learner, batch.model, batch.theta, batch.held.regularization)
     if isinstance(learner, RecursiveLeastSquares):
-        ridge = float(getattr(batch.cell.policy, "regularization", learner.regularization))
+        ridge = float(getattr(batch.config.policy, "regularization", learner.regularization))
         return LeastSquaresLearner(batch.model, batch.theta, ridge, batch.n_learned)
     return learner_for(learner, batch.model, batch.theta, batch.replay)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
+from dopt.errors import SpecificationError
 from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, Learner
 from dopt.reference.models import Accelerations
 
@@ -142,6 +143,9 @@ def learner_for(
     """Return the batch learner by gradients of a specification; it writes into ``theta`` (n, q)."""
     if isinstance(learner, Adam):
         return AdamLearner(learner, model, theta, learner.window)
-    assert isinstance(learner, AdamReplay)
-    assert replay is not None
-    return ReplayLearner(learner, model, theta, replay)
+    if isinstance(learner, AdamReplay) and replay is not None:
+        return ReplayLearner(learner, model, theta, replay)
+    raise SpecificationError(
+        f"the reference has no update for learner '{learner.name}': derive its class from "
+        f"CustomLearner, or enter an update in dopt.reference.learner_registry."
+    )

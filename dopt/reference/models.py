@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,7 @@ from torch.func import functional_call
 from dopt.models import MLP, RFF, GaussianProcess, Linear, LinearState, Model
 from dopt.systems.base import System
 from dopt.systems.features import feature_values
+from dopt.types import Scalar
 
 Accelerations = Callable[[Tensor, Tensor], Tensor]
 """a_θ(x): parameters (q,) and state (d,) to accelerations (r,)."""
@@ -131,7 +132,7 @@ def kernel(model: GaussianProcess, phi: Tensor, other: Tensor) -> Tensor:
     return model.amplitude**2 * torch.exp(-0.5 / model.lengthscale**2 * squares)
 
 
-def stack(values: Sequence[Any]) -> Tensor:
+def stack(values: Sequence[Scalar]) -> Tensor:
     """Stack scalars, some of which may be plain numbers, along a new last axis."""
     like = next(value for value in values if isinstance(value, Tensor))
     tensors = [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]

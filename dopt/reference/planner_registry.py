@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -13,11 +13,9 @@ from dopt.policies.gradient import GradientDOptimal
 from dopt.policies.greedy_linear import GreedyLinear
 from dopt.reference.ensemble import EnsemblePlan
 from dopt.reference.exact_gain import GradientPlan
-from dopt.reference.gaussian_process import EntropyPlan
+from dopt.reference.gaussian_process import EntropyPlan, Posterior
 from dopt.reference.greedy_linear import GreedyLinearPlan
-
-if TYPE_CHECKING:
-    from dopt.reference.lockstep import Lockstep
+from dopt.reference.state import BatchState
 
 
 class Plan(Protocol):
@@ -30,16 +28,18 @@ class Plan(Protocol):
         """Take in step t, which was just done and learned from."""
 
 
-PLANS: dict[type, Callable[[Lockstep, Any], Plan]] = {
+PLANS: dict[type, Callable[[BatchState, Any], Plan]] = {
     Disagreement: EnsemblePlan,
-    GaussianProcessEntropy: EntropyPlan,
     GradientDOptimal: GradientPlan,
     GreedyLinear: GreedyLinearPlan,
 }
 
 
-def plan_for(batch: Lockstep) -> Plan | None:
+def plan_for(batch: BatchState, learner: object) -> Plan | None:
     """Return the plan of a batch; None for a policy that has none of its own here."""
-    policy = batch.cell.policy
+    policy = batch.config.policy
+    if isinstance(policy, GaussianProcessEntropy):
+        assert isinstance(learner, Posterior)
+        return EntropyPlan(batch, policy, learner)
     make = PLANS.get(type(policy))
     return make(batch, policy) if make else None

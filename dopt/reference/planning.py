@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp, vmap
 
-from dopt.planning.ties import TIE_MARGIN
+from dopt.algorithm import TIE_MARGIN
 from dopt.reference.dynamics import flow, input_matrix
 from dopt.reference.models import Accelerations
 from dopt.reference.sphere import maximize_on_spheres

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from dopt.planning.task_states import task_states
-from dopt.planning.ties import TIE_MARGIN
+from dopt.algorithm import INVARIANT, TIE_MARGIN, Score, switch_step
 from dopt.policies import EOptimal, Lookahead, Search, TaskOptimal
+from dopt.policies.search import score_code
+from dopt.policies.task_states import task_states
 from dopt.reference.dynamics import flow
 from dopt.reference.models import Accelerations
 from dopt.systems.base import System
@@ -47,7 +48,7 @@ def searched_inputs(
     seen = states[:, :, stride - 1 :: stride]
     rows = vmap(vmap(vmap(jacrev(model), (None, 0)), (None, 0)))(theta, seen)
     rows = rows[..., : information.shape[1]]
-    if policy.score == "joint":
+    if score_code(policy) == Score.JOINT:
         rows = rows * stride**0.5
     score = score_function(policy, system, model)
     values = vmap(vmap(score, (0, None, None)))(rows, theta, torch.linalg.inv_ex(information)[0])
@@ -70,16 +71,16 @@ def paths(
     steps = policy.steps(system)
     states = [x.expand(len(inputs), -1)]
     for i in range(steps):
-        u = inputs[:, 0 if i < max(1, steps // 2) else 1]
+        u = inputs[:, 0 if i < switch_step(steps) else 1]
         accelerations = vmap(model, (None, 0))(theta, states[-1])
         states.append(states[-1] + system.dt * flow(system, states[-1], u, accelerations))
     return torch.stack(states[1:], dim=1)
 
 
-Score = Callable[[Tensor, Tensor, Tensor], Tensor]
+PathScore = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-def score_function(policy: Search, system: System, model: Accelerations) -> Score:
+def score_function(policy: Search, system: System, model: Accelerations) -> PathScore:
     """Return the score of one path from its rows, (B, r, q), the parameters (q,) and M⁻¹ (q, q)."""
 
     def joint(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
@@ -112,8 +113,15 @@ def score_function(policy: Search, system: System, model: Accelerations) -> Scor
         total: Tensor = ((G @ decrease(rows, inverse)) * G).sum()
         return total
 
-    scores = {"joint": joint, "sum": separate, "trace": trace, "a": average}
-    return (scores | {"e": eigenvalue, "task": task})[policy.score]
+    scores = {
+        Score.JOINT: joint,
+        Score.SUM: separate,
+        Score.TRACE: trace,
+        Score.A: average,
+        Score.E: eigenvalue,
+        Score.TASK: task,
+    }
+    return scores[score_code(policy)]
 
 
 def _log_determinant(rows: Tensor, inverse: Tensor) -> Tensor:
@@ -145,7 +153,7 @@ def krylov_basis(inverse: Tensor, starts: Tensor, size: int) -> Tensor:
             for other in basis:
                 row = row - (other @ row) * other
         after = torch.linalg.vector_norm(row)
-        basis.append(torch.where(after > 1e-9 * before, row / after, 0.0))
+        basis.append(torch.where(after > INVARIANT * before, row / after, 0.0))
     return torch.stack(basis)
 
 

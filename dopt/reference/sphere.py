@@ -1,4 +1,4 @@
-"""The quadratic problem on a sphere for a batch, in torch: see :mod:`dopt.planning.sphere`.
+"""The quadratic problem on a sphere for a batch, in torch: see :mod:`dopt.math.sphere`.
 
 The same mathematics in another form: bisection of the secular equation for all problems at once.
 """

@@ -7,8 +7,8 @@ import numpy.typing as npt
 import torch
 
 from dopt.errors import SpecificationError
-from dopt.reference.lockstep import Lockstep
-from dopt.spec import TrialSpec
+from dopt.reference.batch import Lockstep
+from dopt.spec.trial import TrialSpec
 
 Array = npt.NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dopt.errors import IncompatibleError
 from dopt.learning import LEARNERS, Adam, ExtendedKalman, Learner
 from dopt.models import MODELS, GaussianProcess, Linear, LinearState, Model
-from dopt.policies import Informed, Oracle, Policy
+from dopt.policies import InformationPolicy, Oracle, Policy
 from dopt.policies.disagreement import Disagreement
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.greedy_linear import GreedyLinear
@@ -69,7 +69,7 @@ def _check_model(system: System, policy: Policy, model: Model, kalman: bool) -> 
     a variance of each parameter, hence M in the primal form, as least squares do.
     """
     given = f"policy '{policy.name}'"
-    if isinstance(model, Linear) and not (kalman or isinstance(policy, Informed)):
+    if isinstance(model, Linear) and not (kalman or isinstance(policy, InformationPolicy)):
         raise mismatch("model 'linear'", "policy 'oracle'", given)
     if isinstance(model, Linear) and not system.linear_parameters:
         raise mismatch("model 'linear'", "linear parameters", f"env '{system.name}'")

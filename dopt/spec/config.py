@@ -9,17 +9,18 @@ import json
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from dopt.compatibility import check_together, mismatch
 from dopt.control import Control
+from dopt.declare.registry import section_of
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.learning import LEARNERS, Learner
-from dopt.learning.base import Updated
-from dopt.memory import memory_by_setting
+from dopt.learning.base import CompiledLearner, CustomLearner
 from dopt.models import Model
 from dopt.policies import POLICIES, Policy, Search
-from dopt.policies.base import OpenLoop, Planned
-from dopt.registry import section_of
-from dopt.soundness import check_system
+from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop
+from dopt.spec.compatibility import check_together, mismatch
+from dopt.spec.custom_system_check import check_system
+from dopt.spec.memory_estimate import memory_by_setting
+from dopt.spec.scale_check import warn_of_scale
 from dopt.systems import SYSTEMS, System
 from dopt.systems.black_box import BlackBox
 
@@ -40,12 +41,12 @@ LARGEST_MEMORY = 2**40
 PATHS = ("kernel", "reference")
 
 SECTIONS = ("env", "policy", "model", "learner")
-"""Keys of the parts that every cell has."""
+"""Keys of the parts that every configuration has."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Cell:
-    """A trial without its seed: one cell of a grid.
+class TrialConfig:
+    """A trial without its seed: one configuration of a grid.
 
     ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
     agree to rounding only, which grows over a trial: so it is part of the trial's identity. What
@@ -70,6 +71,7 @@ class Cell:
         self._check_runnable()
         if type(self.system) not in SYSTEMS.values():
             check_system(self.system)
+            warn_of_scale(self.system, self.model)
         self.policy.check(self.system)
         self._check_size()
         if isinstance(self.policy, Search) and self.policy.budget_us and self.path != "kernel":
@@ -83,8 +85,8 @@ class Cell:
     def _check_runnable(self) -> None:
         """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""
         for part, registry, bases in (
-            (self.policy, POLICIES, (OpenLoop, Planned)),
-            (self.learner, LEARNERS, (Updated,)),
+            (self.policy, POLICIES, (OpenLoop, CustomPolicy, CompiledPolicy)),
+            (self.learner, LEARNERS, (CustomLearner, CompiledLearner)),
         ):
             shipped: Collection[type] = registry.values()
             if type(part) not in shipped and not isinstance(part, bases):
@@ -100,6 +102,22 @@ class Cell:
                 f"path is 'kernel', but {foreign[0].section} '{foreign[0].name}' is not written "
                 f"for it: set path to 'reference', or leave it out."
             )
+
+        self._check_reference()
+
+    def _check_reference(self) -> None:
+        """Refuse on the reference path what brings a compiled function alone."""
+        for part, compiled, custom in (
+            (self.policy, CompiledPolicy, CustomPolicy),
+            (self.learner, CompiledLearner, CustomLearner),
+        ):
+            alone = isinstance(part, compiled) and not isinstance(part, custom)
+            if self.path == "reference" and alone:
+                raise SpecificationError(
+                    f"path is 'reference', but {part.section} '{part.name}' brings a compiled "
+                    f"function alone: choose parts that the kernel runs too, or derive it from "
+                    f"{custom.__name__} as well."
+                )
 
     @property
     def _parts(self) -> tuple[System, Policy, Model, Learner]:
@@ -149,5 +167,5 @@ class Cell:
 
 
 def without_versions(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a trial or a cell without the versions of the code."""
+    """Return the content of a trial or a configuration without the versions of the code."""
     return {key: value for key, value in content.items() if key not in _VERSIONS}

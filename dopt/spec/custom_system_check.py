@@ -1,4 +1,4 @@
-"""Whether the class of a user's own system is what a system has to be: tried out, not trusted."""
+"""Check of a custom system: its equations are evaluated, differentiated and compiled."""
 
 from __future__ import annotations
 
@@ -19,6 +19,15 @@ STATES = 5
 ROUNDING = 1e-9
 """Largest relative departure from an affine effect of the inputs."""
 
+STEP = 1e-30
+"""Imaginary step, from which the derivative is exact to rounding."""
+
+DIFFERENCES = (1e-4, 1e-6)
+"""Steps of the central differences; one of them has to agree with the complex step."""
+
+AGREEMENT = 1e-3
+"""Largest departure of a derivative, relative to the largest of its equation."""
+
 _SEED = 20_240_601
 
 
@@ -30,8 +39,8 @@ def check_system(system: System) -> None:
     ------
     SpecificationError
         If a declared index is none of a state's, or the equations fail, return something else than
-        was declared, or depend on the inputs in another way than an affine one; if a run of a black
-        box says so.
+        was declared, depend on the inputs in another way than an affine one, or have a wrong
+        derivative by a complex step; if a run of a black box says so.
     """
     _check_indices(system)
     if isinstance(system, BlackBox):
@@ -50,6 +59,44 @@ def check_system(system: System) -> None:
             f"known() of env '{system.name}' is not affine in the inputs, but a derivative of the "
             f"form f(x) + B(x) u is expected: make the input another quantity, in which it is."
         )
+    if system.compiled:
+        for state in states.T:
+            _check_derivatives(system, state)
+
+
+def _check_derivatives(system: System, state: Array) -> None:
+    """Compare the derivatives of the accelerations by a complex step with differences."""
+    exact = _moved(system, state.astype(complex), 1j * STEP).imag / STEP
+    sides = ((_moved(system, state, step), _moved(system, state, -step)) for step in DIFFERENCES)
+    differences = np.array(
+        [(ahead - behind) / (2 * h) for h, (ahead, behind) in zip(DIFFERENCES, sides, strict=True)]
+    )
+    apart = np.abs(exact - differences).min(axis=0)
+    wrong = np.argwhere(apart > AGREEMENT * (1.0 + np.abs(exact).max()))
+    if len(wrong):
+        j, k = wrong[0]
+        raise SpecificationError(
+            f"accelerations() of env '{system.name}' has in entry {k} the derivative "
+            f"{exact[j, k]:.4g} along {system.state_labels[j]} by a complex step, but "
+            f"{differences[-1, j, k]:.4g} by differences: use sign, where and magnitude of "
+            f"dopt.systems.elementary in place of other functions of that kind, such as numpy.sign "
+            f"and abs, or declare compiled = False in the class."
+        )
+
+
+def _moved(system: System, state: Any, step: complex) -> Any:
+    """Return the accelerations, (d, r), with each component of a state moved by a step in turn."""
+    moved = state + step * np.eye(len(state))
+    try:
+        with np.errstate(all="ignore"):
+            return np.array([system.accelerations(tuple(x), system.parameters) for x in moved])
+    except Exception as error:
+        kind = "complex numbers" if np.iscomplexobj(moved) else "numbers"
+        raise SpecificationError(
+            f"accelerations() of env '{system.name}' fails for {kind} "
+            f"({type(error).__name__}: {error}), by which its derivatives are taken: write it with "
+            f"the functions of dopt.systems.elementary, or declare compiled = False in the class."
+        ) from error
 
 
 def _check_indices(system: System) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from dopt.learning import ExtendedKalman, Learner
-from dopt.policies import Informed, Policy
+from dopt.policies import InformationPolicy, Policy
 
 
 class Information(NamedTuple):
@@ -32,7 +32,7 @@ def held_information(
     the parameters and hence the primal form.
     """
     kalman = learner if isinstance(learner, ExtendedKalman) else None
-    if isinstance(policy, Informed):
+    if isinstance(policy, InformationPolicy):
         form = "primal" if kalman else policy.chosen_form(n_parameters, n_rows)
         return Information(form, policy.regularization)
     return Information("primal", kalman.regularization) if kalman else None

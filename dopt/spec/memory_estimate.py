@@ -1,4 +1,4 @@
-"""How much memory a trial needs, from its sizes alone.
+"""Estimate of the memory of a trial, from its sizes alone.
 
 Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
 w units in each of L hidden layers, N points of the evaluation grid.
@@ -10,8 +10,8 @@ import math
 
 from dopt.control import Control
 from dopt.control.free_run import STARTS
-from dopt.information import held_information
 from dopt.learning import Adam, AdamReplay, Learner
+from dopt.learning.base import CompiledLearner
 from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
     Disagreement,
@@ -23,6 +23,8 @@ from dopt.policies import (
     Search,
     TaskOptimal,
 )
+from dopt.policies.base import CompiledPolicy
+from dopt.spec.information_form import held_information
 from dopt.systems import System
 
 NUMBER = 8
@@ -65,6 +67,9 @@ def memory_by_setting(
         numbers["env.horizon"] += min(learner.capacity, T) * (p + r)
         drawn = T * learner.steps * learner.batch
         numbers["learner.batch"] = drawn + learner.batch * (p + r + (L + 3) * max(w, r))
+    for own in (policy, learner):
+        if isinstance(own, (CompiledPolicy, CompiledLearner)):
+            numbers[_size_of(model)] += own.memory_size(system, q)
     held = held_information(policy, learner, q, r * T)
     form = held.form if held else "none"
     if path == "kernel":

@@ -9,15 +9,16 @@ import json
 from collections.abc import Mapping
 from typing import ClassVar
 
-from dopt.cell import SECTIONS, Cell, without_versions
 from dopt.control import Control, task_from
+from dopt.declare.registry import TARGET, build
+from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError, unknown_name
-from dopt.fields import Checked, quantity
 from dopt.learning import LEARNERS, Learner
 from dopt.models import MODELS, Model
 from dopt.models.mlp import MLP
 from dopt.policies import POLICIES, Policy
-from dopt.registry import TARGET, build
+from dopt.spec.config import SECTIONS, TrialConfig, without_versions
+from dopt.spec.label import config_label
 from dopt.systems import SYSTEMS, System
 
 LARGEST_SEED = 2**63 - 1
@@ -27,8 +28,8 @@ _KEYS = (*SECTIONS, "task", "path", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
-class TrialSpec(Checked):
-    """One trial: a cell of the grid and a seed.
+class TrialSpec(Validated):
+    """One trial: a configuration and a seed.
 
     ``trial_key`` is the SHA-256 of the canonical JSON; equal keys are the same trial. Where it runs
     and how it is stored is not part of it.
@@ -36,8 +37,8 @@ class TrialSpec(Checked):
 
     section: ClassVar[str] = "trial"
 
-    cell: Cell
-    seed: int = quantity(0, bound="nonnegative")
+    config: TrialConfig
+    seed: int = parameter(0, bound="nonnegative")
 
     def __post_init__(self) -> None:
         whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
@@ -76,32 +77,63 @@ class TrialSpec(Checked):
         learner = build("learner", LEARNERS, sections["learner"])
         compiled = all(part.compiled for part in (system, policy, model, learner))
         path = str(given.get("path", "kernel" if compiled else "reference"))
-        cell = Cell(system, policy, model, learner, path, task_from(given.get("task")))
-        return cls(cell, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
+        config = TrialConfig(system, policy, model, learner, path, task_from(given.get("task")))
+        return cls(config, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
+
+    @classmethod
+    def from_names(
+        cls,
+        env: str | Mapping[str, object],
+        policy: str | Mapping[str, object],
+        *,
+        model: str | Mapping[str, object] = "mlp",
+        learner: str | Mapping[str, object] = "adam_window",
+        seed: int = 0,
+    ) -> TrialSpec:
+        """Return the trial of parts given by name, such as ``env="pendulum"``.
+
+        Parameters
+        ----------
+        env, policy, model, learner : str or mapping
+            Name of a registered class, with the defaults of its fields; or a section with the
+            ``name`` and the fields that differ: ``env={"name": "pendulum", "gamma": 3.0}``.
+        seed : int
+            Seed of the noise, the initial parameters and the policy's own draws.
+
+        Raises
+        ------
+        SpecificationError, IncompatibleError
+            As :meth:`from_mapping`.
+        """
+        parts = {"env": env, "policy": policy, "model": model, "learner": learner}
+        sections = {
+            key: {"name": part} if isinstance(part, str) else part for key, part in parts.items()
+        }
+        return cls.from_mapping({**sections, "seed": seed})
 
     def with_seed(self, seed: int) -> TrialSpec:
-        """Return the same cell with another seed."""
-        return TrialSpec(self.cell, seed)
+        """Return the same configuration with another seed."""
+        return TrialSpec(self.config, seed)
 
     @property
     def system(self) -> System:
-        return self.cell.system
+        return self.config.system
 
     @property
     def policy(self) -> Policy:
-        return self.cell.policy
+        return self.config.policy
 
     @property
     def model(self) -> Model:
-        return self.cell.model
+        return self.config.model
 
     @property
     def learner(self) -> Learner:
-        return self.cell.learner
+        return self.config.learner
 
     @property
     def task(self) -> Control | None:
-        return self.cell.task
+        return self.config.task
 
     @property
     def assessed_steps(self) -> tuple[int, ...]:
@@ -111,12 +143,12 @@ class TrialSpec(Checked):
     @property
     def config_json(self) -> str:
         """Canonical JSON without the seed."""
-        return self.cell.canonical_json
+        return self.config.canonical_json
 
     @property
     def config_key(self) -> str:
         """SHA-256 of :attr:`config_json`: the trial without its seed."""
-        return self.cell.key
+        return self.config.key
 
     @functools.cached_property
     def trial_key(self) -> str:
@@ -144,6 +176,7 @@ class TrialSpec(Checked):
             "horizon": self.system.horizon,
             "dt": self.system.dt,
             "gamma": self.system.gamma,
+            "label": config_label(json.loads(self.config_json)),
         }
 
 

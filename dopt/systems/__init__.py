@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dopt.registry import build
+from dopt.declare.registry import build
 from dopt.systems.arm import Arm
 from dopt.systems.base import System
 from dopt.systems.cartpole import Cartpole

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.systems.base import System
 from dopt.systems.elementary import cos, sin
 from dopt.systems.features import Feature
+from dopt.types import Scalar
 
 
-def _solved(state: Any, parameters: Any, right_1: Any, right_2: Any) -> tuple[Any, Any]:
+def _solved(
+    state: Scalar, parameters: Scalar, right_1: Scalar, right_2: Scalar
+) -> tuple[Scalar, Scalar]:
     """Return H(φ)⁻¹ (right_1, right_2) with the mass matrix H of the arm."""
     mass_1, mass_2, length_1, length_2, _, _ = parameters
     diagonal_1 = (mass_1 + mass_2) * length_1**2
@@ -72,24 +75,24 @@ class Arm(System):
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
     equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0, 0.0, 0.0)
 
-    mass_1: float = quantity(1.0, "kg", "positive")
-    mass_2: float = quantity(1.0, "kg", "positive")
-    length_1: float = quantity(1.0, "m", "positive")
-    length_2: float = quantity(1.0, "m", "positive")
-    gravity: float = quantity(10.0, "m/s²", "nonnegative")
-    friction: float = quantity(2.0, "N m s", "nonnegative")
-    gamma: float = quantity(5.0, "N m", "positive")
-    initial_state: tuple[float, ...] = quantity((0.0, 0.0, 0.0, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((0.65, 1.6, 1.0, 2.3), bound="positive")
-    grid_points: tuple[int, ...] = quantity((6, 6, 6, 6), bound="positive")
+    mass_1: float = parameter(1.0, "kg", "positive")
+    mass_2: float = parameter(1.0, "kg", "positive")
+    length_1: float = parameter(1.0, "m", "positive")
+    length_2: float = parameter(1.0, "m", "positive")
+    gravity: float = parameter(10.0, "m/s²", "nonnegative")
+    friction: float = parameter(2.0, "N m s", "nonnegative")
+    gamma: float = parameter(5.0, "N m", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0, 0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((0.65, 1.6, 1.0, 2.3), bound="positive")
+    grid_points: tuple[int, ...] = parameter((6, 6, 6, 6), bound="positive")
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         first, second = _solved(state, parameters, inputs[0], inputs[1])
         return state[1], first, state[3], second
 
     @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         mass_1, mass_2, length_1, length_2, gravity, friction = parameters
         angle_1, rate_1, angle_2, rate_2 = state
         twist = mass_2 * length_1 * length_2 * sin(angle_1 - angle_2)

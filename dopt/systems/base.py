@@ -1,4 +1,4 @@
-"""What every physical system declares.
+"""Base class of physical systems.
 
 All systems are control-affine with known kinematics and a known input term,
 
@@ -24,21 +24,22 @@ import functools
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError
-from dopt.fields import Checked, quantity
 from dopt.systems.features import Feature, feature_values
 from dopt.systems.points import check_number, sobol_midpoints
+from dopt.types import Scalar
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class System(Checked):
+class System(Validated):
     """A physical system with its exploration setting; subclasses add the physical parameters.
 
     The two equations are static methods over sequences of scalars, arrays or tensors, so that one
@@ -61,14 +62,14 @@ class System(Checked):
     low_discrepancy: ClassVar[bool] = False
     equilibrium: ClassVar[tuple[float, ...] | None] = None
 
-    gamma: float = quantity(1.0, bound="positive")
-    dt: float = quantity(0.02, "s", "positive")
-    noise: float = quantity(1e-3, bound="nonnegative")
-    horizon: int = quantity(500, "steps", "positive")
+    gamma: float = parameter(1.0, bound="positive")
+    dt: float = parameter(0.02, "s", "positive")
+    noise: float = parameter(1e-3, bound="nonnegative")
+    horizon: int = parameter(500, "steps", "positive")
     initial_state: tuple[float, ...] = ()
-    grid_half_widths: tuple[float, ...] = quantity((), bound="positive")
-    grid_points: tuple[int, ...] = quantity((), bound="positive")
-    state_limit: float = quantity(1e4, bound="positive")
+    grid_half_widths: tuple[float, ...] = parameter((), bound="positive")
+    grid_points: tuple[int, ...] = parameter((), bound="positive")
+    state_limit: float = parameter(1e4, bound="positive")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,12 +90,12 @@ class System(Checked):
 
     @staticmethod
     @abstractmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> Sequence[Any]:
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> Sequence[Scalar]:
         """Return the known part of dx/dt: d scalars."""
 
     @staticmethod
     @abstractmethod
-    def accelerations(state: Any, parameters: Any) -> Sequence[Any]:
+    def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:
         """Return the learned accelerations at zero input: r scalars."""
 
     @property
@@ -176,15 +177,13 @@ class System(Checked):
         values = self.accelerations(tuple(states.T), self._parameters_at(steps))
         return np.stack(np.broadcast_arrays(*values), axis=-1)
 
-    def _parameters_at(self, steps: npt.ArrayLike) -> Sequence[Any]:
+    def _parameters_at(self, steps: npt.ArrayLike) -> Sequence[Scalar]:
         """Return the physical parameters at a step, or arrays of them at (N,) steps."""
         if len(self.history) == 1:
             return self.parameters
         return tuple(self.history[np.minimum(steps, len(self.history) - 1)].T)
 
-    def derivative(
-        self, state: npt.ArrayLike, inputs: npt.ArrayLike, step: int = 0
-    ) -> npt.NDArray[Any]:
+    def derivative(self, state: npt.ArrayLike, inputs: npt.ArrayLike, step: int = 0) -> Array:
         """Return dx/dt = f(x, u), equation 1, of one state (d,) and input (m,) at a step."""
         x, u = tuple(np.asarray(state)), tuple(np.asarray(inputs))
         flow = np.array(self.known(x, u, self.parameters))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from dopt.declare.validated_fields import parameter
 from dopt.errors import SpecificationError
-from dopt.fields import quantity
 from dopt.systems.base import Array, System
+from dopt.types import Scalar
 
 
 class Episode(Protocol):
@@ -48,7 +49,7 @@ class BlackBox(System):
     compiled: ClassVar[bool] = False
     physical: ClassVar[tuple[str, ...]] = ()
 
-    noise: float = quantity(0.0, bound="nonnegative")
+    noise: float = parameter(0.0, bound="nonnegative")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,7 +77,7 @@ class BlackBox(System):
         """Start a run; the seed decides about all that is random in it."""
 
     @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG004
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:  # noqa: ARG004
         raise SpecificationError(
             "the true accelerations of a black box are unknown: use what was observed of it, or "
             "another env."

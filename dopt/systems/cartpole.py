@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.systems.base import System
 from dopt.systems.elementary import cos, sin
 from dopt.systems.features import Feature
+from dopt.types import Scalar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,26 +62,26 @@ class Cartpole(System):
     grid_indices: ClassVar[tuple[int, ...]] = (1, 2, 3)
     equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0, math.pi, 0.0)
 
-    cart_mass: float = quantity(1.0, "kg", "positive")
-    pole_mass: float = quantity(0.1, "kg", "positive")
-    length: float = quantity(1.0, "m", "positive")
-    gravity: float = quantity(10.0, "m/s²", "nonnegative")
-    pivot_friction: float = quantity(0.02, "N m s", "nonnegative")
-    cart_friction: float = quantity(0.5, "N s/m", "nonnegative")
-    gamma: float = quantity(7.0, "N", "positive")
-    initial_state: tuple[float, ...] = quantity((0.0, 0.0, math.pi, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((4.0, math.pi, 6.4), bound="positive")
-    grid_points: tuple[int, ...] = quantity((8, 16, 8), bound="positive")
+    cart_mass: float = parameter(1.0, "kg", "positive")
+    pole_mass: float = parameter(0.1, "kg", "positive")
+    length: float = parameter(1.0, "m", "positive")
+    gravity: float = parameter(10.0, "m/s²", "nonnegative")
+    pivot_friction: float = parameter(0.02, "N m s", "nonnegative")
+    cart_friction: float = parameter(0.5, "N s/m", "nonnegative")
+    gamma: float = parameter(7.0, "N", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0, math.pi, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((4.0, math.pi, 6.4), bound="positive")
+    grid_points: tuple[int, ...] = parameter((8, 16, 8), bound="positive")
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         cart_mass, pole_mass, length, _, _, _ = parameters
         cosine = cos(state[2])
         push = inputs[0] / (cart_mass + pole_mass - pole_mass * cosine**2)
         return state[1], push, state[3], -push * cosine / length
 
     @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         cart_mass, pole_mass, length, gravity, alpha, beta = parameters
         _, speed, angle, rate = state
         sine, cosine = sin(angle), cos(angle)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
+from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError
-from dopt.fields import Checked, quantity
 from dopt.systems.base import System
 from dopt.systems.elementary import cos, sin
 from dopt.systems.features import Feature
+from dopt.types import Scalar
 
 
-def _solved(state: Any, parameters: Any, right: list[Any]) -> list[Any]:
+def _solved(state: Scalar, parameters: Scalar, right: list[Scalar]) -> list[Scalar]:
     """Return H(φ)⁻¹ right with the mass matrix H of the chain, by elimination.
 
     H is symmetric and positive definite: no pivots are sought, and its upper triangle is enough.
@@ -105,18 +106,18 @@ class Chain(System):
     low_discrepancy: ClassVar[bool] = True
     equilibrium: ClassVar[tuple[float, ...] | None] = (0.0,) * (2 * _DEFAULT_LINKS)
 
-    n_links: int = quantity(_DEFAULT_LINKS, "links", "positive")
-    mass: float = quantity(0.2, "kg", "positive")
-    length: float = quantity(0.4, "m", "positive")
-    gravity: float = quantity(10.0, "m/s²", "nonnegative")
-    friction: float = quantity(0.2, "N m s", "nonnegative")
-    gamma: float = quantity(2.0, "N m", "positive")
-    initial_state: tuple[float, ...] = quantity((0.0, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((1.0, 6.0), bound="positive")
-    grid_points: tuple[int, ...] = quantity((1024,), bound="positive")
+    n_links: int = parameter(_DEFAULT_LINKS, "links", "positive")
+    mass: float = parameter(0.2, "kg", "positive")
+    length: float = parameter(0.4, "m", "positive")
+    gravity: float = parameter(10.0, "m/s²", "nonnegative")
+    friction: float = parameter(0.2, "N m s", "nonnegative")
+    gamma: float = parameter(2.0, "N m", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((1.0, 6.0), bound="positive")
+    grid_points: tuple[int, ...] = parameter((1024,), bound="positive")
 
     def __post_init__(self) -> None:
-        Checked.__post_init__(self)
+        Validated.__post_init__(self)
         if self.n_links > LARGEST_CHAIN:
             raise SpecificationError(
                 f"env.n_links is {self.n_links}, but it has to be at most {LARGEST_CHAIN}: "
@@ -144,7 +145,7 @@ class Chain(System):
             object.__setattr__(self, attribute, value)
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> Sequence[Any]:
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> Sequence[Scalar]:
         n = len(inputs)
         torques = [inputs[i] - inputs[i + 1] for i in range(n - 1)] + [inputs[n - 1]]
         accelerations = _solved(state, parameters, torques)
@@ -155,7 +156,7 @@ class Chain(System):
         return flow
 
     @staticmethod
-    def accelerations(state: Any, parameters: Any) -> Sequence[Any]:
+    def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:
         mass, length, gravity, friction = parameters
         n = len(state) // 2
         torques = []

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.systems.base import Array
 from dopt.systems.pendulum import Pendulum
 
@@ -32,9 +32,9 @@ class DriftingPendulum(Pendulum):
 
     name: ClassVar[str] = "drifting_pendulum"
 
-    horizon: int = quantity(1000, "steps", "positive")
-    final_friction: float = quantity(0.5, "N m s", "nonnegative")
-    time_constant: float = quantity(5.0, "s", "positive")
+    horizon: int = parameter(1000, "steps", "positive")
+    final_friction: float = parameter(0.5, "N m s", "nonnegative")
+    time_constant: float = parameter(5.0, "s", "positive")
 
     @functools.cached_property
     def history(self) -> Array:

@@ -1,29 +1,33 @@
 """Elementary functions over floats, complex numbers, arrays and tensors alike.
 
 The equations of a system are written once over these; the compiled kernel replaces each by the
-machine's own (:mod:`dopt.kernel.equations`).
+machine's own (:mod:`dopt.kernel.equations`). A complex argument is that of a complex step, which
+takes derivatives: what is not smooth, :func:`magnitude`, :func:`sign` and :func:`where`, follows
+the real part.
 """
 
 from __future__ import annotations
 
 import cmath
 import math
-from typing import Any
+import sys
 
 import numpy as np
 
+from dopt.types import Scalar
 
-def sin(x: Any) -> Any:
+
+def sin(x: Scalar) -> Scalar:
     """Sine of an angle in radians."""
     return _apply(x, "sin")
 
 
-def cos(x: Any) -> Any:
+def cos(x: Scalar) -> Scalar:
     """Cosine of an angle in radians."""
     return _apply(x, "cos")
 
 
-def magnitude(x: Any) -> Any:
+def magnitude(x: Scalar) -> Scalar:
     """Absolute value of a real quantity, continued to complex arguments along the real axis.
 
     For complex x it is x or -x, by the sign of the real part, so that a complex step gives the
@@ -31,10 +35,37 @@ def magnitude(x: Any) -> Any:
     """
     if isinstance(x, complex | np.complexfloating):
         return x if x.real >= 0 else -x
+    if isinstance(x, np.ndarray) and np.iscomplexobj(x):
+        return np.where(x.real >= 0, x, -x)
     return abs(x)
 
 
-def _apply(x: Any, name: str) -> Any:
+def sign(x: Scalar) -> Scalar:
+    """Sign of a real quantity, -1, 0 or 1; of a complex one, that of its real part.
+
+    Its derivative is 0. Dry friction is ``-c * sign(v)``. ``numpy.sign`` of a complex number is
+    x / |x|, from which a complex step takes another derivative.
+    """
+    if isinstance(x, float | int | complex):
+        return float(x.real > 0) - float(x.real < 0) if not math.isnan(x.real) else math.nan
+    if isinstance(x, np.ndarray | np.generic):
+        return np.sign(x.real) + 0 * x.imag if np.iscomplexobj(x) else np.sign(x)
+    return x.sign()
+
+
+def where(condition: Scalar, first: Scalar, second: Scalar) -> Scalar:
+    """Return ``first`` where a condition holds and ``second`` elsewhere, as ``where(v > 0, a, b)``.
+
+    Both are computed. The condition compares states and parameters; of complex states it compares
+    the real parts.
+    """
+    if isinstance(condition, bool | np.bool_):
+        return first if condition else second
+    library: Scalar = sys.modules[type(condition).__module__.partition(".")[0]]
+    return library.where(condition, first, second)
+
+
+def _apply(x: Scalar, name: str) -> Scalar:
     if isinstance(x, float | int):
         return getattr(math, name)(x)
     if isinstance(x, complex):

@@ -1,11 +1,12 @@
-"""What a network sees of a state: sines and cosines of angles, scaled velocities."""
+"""Features of a state, the inputs of a network: sines and cosines of angles, scaled velocities."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from dopt.systems.elementary import cos, sin
+from dopt.types import Scalar
 
 Kind = Literal["identity", "cos", "sin"]
 KINDS: tuple[Kind, ...] = ("identity", "cos", "sin")
@@ -24,8 +25,8 @@ class Feature:
 
 
 def feature_values(
-    features: tuple[Feature, ...], scales: tuple[float, ...], state: Any
-) -> list[Any]:
+    features: tuple[Feature, ...], scales: tuple[float, ...], state: Scalar
+) -> list[Scalar]:
     """Return the features of a state, given as a sequence of d scalars, arrays or tensors."""
     maps = {"identity": lambda x: x, "cos": cos, "sin": sin}
     return [

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.systems.base import System
 from dopt.systems.features import Feature
+from dopt.types import Scalar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,21 +41,21 @@ class MassSpring(System):
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
     equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0, 0.0, 0.0)
 
-    mass: float = quantity(1.0, "kg", "positive")
-    stiffness: float = quantity(10.0, "N/m", "nonnegative")
-    damping: float = quantity(0.5, "N s/m", "nonnegative")
-    gamma: float = quantity(5.0, "N", "positive")
-    initial_state: tuple[float, ...] = quantity((0.0, 0.0, 0.0, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((1.9, 6.0, 1.9, 6.0), bound="positive")
-    grid_points: tuple[int, ...] = quantity((6, 6, 6, 6), bound="positive")
+    mass: float = parameter(1.0, "kg", "positive")
+    stiffness: float = parameter(10.0, "N/m", "nonnegative")
+    damping: float = parameter(0.5, "N s/m", "nonnegative")
+    gamma: float = parameter(5.0, "N", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0, 0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((1.9, 6.0, 1.9, 6.0), bound="positive")
+    grid_points: tuple[int, ...] = parameter((6, 6, 6, 6), bound="positive")
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         mass, _, _ = parameters
         return state[1], inputs[0] / mass, state[3], inputs[1] / mass
 
     @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         mass, stiffness, damping = parameters
         position_1, rate_1, position_2, rate_2 = state
         force_1 = stiffness * (2.0 * position_1 - position_2) + damping * (2.0 * rate_1 - rate_2)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.systems.base import System
 from dopt.systems.elementary import sin
 from dopt.systems.features import Feature
+from dopt.types import Scalar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,22 +50,22 @@ class Pendulum(System):
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
     equilibrium: ClassVar[tuple[float, ...] | None] = (0.0, 0.0)
 
-    mass: float = quantity(1.0, "kg", "positive")
-    length: float = quantity(1.0, "m", "positive")
-    gravity: float = quantity(10.0, "m/s²", "nonnegative")
-    friction: float = quantity(1.0 / 6.0, "N m s", "nonnegative")
-    gamma: float = quantity(2.0, "N m", "positive")
-    initial_state: tuple[float, ...] = quantity((1e-3, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((math.pi, 8.0), bound="positive")
-    grid_points: tuple[int, ...] = quantity((32, 32), bound="positive")
+    mass: float = parameter(1.0, "kg", "positive")
+    length: float = parameter(1.0, "m", "positive")
+    gravity: float = parameter(10.0, "m/s²", "nonnegative")
+    friction: float = parameter(1.0 / 6.0, "N m s", "nonnegative")
+    gamma: float = parameter(2.0, "N m", "positive")
+    initial_state: tuple[float, ...] = parameter((1e-3, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((math.pi, 8.0), bound="positive")
+    grid_points: tuple[int, ...] = parameter((32, 32), bound="positive")
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         mass, length, _, _ = parameters
         return state[1], 3.0 * inputs[0] / (mass * length**2)
 
     @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         mass, length, gravity, friction = parameters
         inertia = mass * length**2 / 3.0
         torque = mass * gravity * length / 2.0 * sin(state[0]) + friction * state[1]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.systems.base import System
 from dopt.systems.elementary import cos, magnitude, sin
 from dopt.systems.features import Feature
+from dopt.types import Scalar
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,19 +53,19 @@ class Quadrotor(System):
     phase_plane: ClassVar[tuple[int, int]] = (1, 3)
     grid_indices: ClassVar[tuple[int, ...]] = (1, 3)
 
-    mass: float = quantity(2.0, "kg", "positive")
-    inertia: float = quantity(10.0, "kg m²", "positive")
-    half_span: float = quantity(1.0, "m", "positive")
-    gravity: float = quantity(1.0, "m/s²", "nonnegative")
-    drag: float = quantity(0.2, "kg/m", "nonnegative")
-    gamma: float = quantity(10.0, "N", "positive")
-    dt: float = quantity(0.1, "s", "positive")
-    initial_state: tuple[float, ...] = quantity((0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((6.3, 6.3), bound="positive")
-    grid_points: tuple[int, ...] = quantity((24, 24), bound="positive")
+    mass: float = parameter(2.0, "kg", "positive")
+    inertia: float = parameter(10.0, "kg m²", "positive")
+    half_span: float = parameter(1.0, "m", "positive")
+    gravity: float = parameter(1.0, "m/s²", "nonnegative")
+    drag: float = parameter(0.2, "kg/m", "nonnegative")
+    gamma: float = parameter(10.0, "N", "positive")
+    dt: float = parameter(0.1, "s", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((6.3, 6.3), bound="positive")
+    grid_points: tuple[int, ...] = parameter((24, 24), bound="positive")
 
     @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         mass, inertia, half_span, gravity, _ = parameters
         thrust = (inputs[0] + inputs[1]) / mass
         sideways = -thrust * sin(state[4])
@@ -73,7 +74,7 @@ class Quadrotor(System):
         return state[1], sideways, state[3], upwards, state[5], spin
 
     @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
         mass, _, _, _, drag = parameters
         sideways, upwards = state[1], state[3]
         factor = -drag / mass

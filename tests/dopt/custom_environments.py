@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.gymnasium import Environment
 from dopt.systems import Feature
 
@@ -69,12 +69,12 @@ class Point(Environment):
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (1,)
 
-    id: str = quantity("dopt_tests/Point-v0")
-    gamma: float = quantity(2.0, bound="positive")
-    dt: float = quantity(0.1, "s", "positive")
-    horizon: int = quantity(30, "steps", "positive")
-    grid_half_widths: tuple[float, ...] = quantity((2.0,), bound="positive")
-    grid_points: tuple[int, ...] = quantity((50,), bound="positive")
+    id: str = parameter("dopt_tests/Point-v0")
+    gamma: float = parameter(2.0, bound="positive")
+    dt: float = parameter(0.1, "s", "positive")
+    horizon: int = parameter(30, "steps", "positive")
+    grid_half_widths: tuple[float, ...] = parameter((2.0,), bound="positive")
+    grid_points: tuple[int, ...] = parameter((50,), bound="positive")
 
     @staticmethod
     def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG004

@@ -7,14 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.learning.base import Updated, Updater
-from dopt.policies.base import Array, Planned, Planner
+from dopt.learning.base import CustomLearner, Updater
+from dopt.policies.base import Array, CustomPolicy, Planner
 from dopt.systems import System
-from dopt.view import View
+from dopt.trial_view import TrialView
 
 
 @dataclass(frozen=True, kw_only=True)
-class Copy(Planned):
+class Copy(CustomPolicy):
     """Algorithm 2 for one input and one learned acceleration, in the words of Proposition 1."""
 
     name: ClassVar[str] = "copy"
@@ -28,7 +28,7 @@ class CopyPlanner(Planner):
         self._system = system
         self._information: Array | None = None
 
-    def choose(self, view: View) -> Array:
+    def choose(self, view: TrialView) -> Array:
         assert self._information is not None
         center = view.following(view.states[-1], np.zeros((1, 1)))[0]
         g = view.jacobian(center)[0]
@@ -37,14 +37,14 @@ class CopyPlanner(Planner):
         chosen: Array = -self._system.gamma * np.sign(v)
         return chosen
 
-    def observe(self, view: View) -> None:
+    def observe(self, view: TrialView) -> None:
         J = view.jacobian(view.states[-2])
         before = 1e-3 * np.eye(J.shape[1]) if self._information is None else self._information
         self._information = before + J.T @ J
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wild(Planned):
+class Wild(CustomPolicy):
     """Chooses what it may not: ``scale`` times γ, in ``size`` inputs; or gets lost."""
 
     name: ClassVar[str] = "wild"
@@ -60,7 +60,7 @@ class WildPlanner(Planner):
     def __init__(self, value: float, size: int) -> None:
         self._inputs = np.full(size, value)
 
-    def choose(self, view: View) -> Array:
+    def choose(self, view: TrialView) -> Array:
         return np.where(view.t < 5, 0.0, self._inputs) if len(self._inputs) == 1 else self._inputs
 
 
@@ -73,7 +73,7 @@ class Lost(Wild):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coin(Planned):
+class Coin(CustomPolicy):
     """±γ by chance."""
 
     name: ClassVar[str] = "coin"
@@ -86,12 +86,12 @@ class CoinPlanner(Planner):
     def __init__(self, gamma: float, rng: np.random.Generator) -> None:
         self._gamma, self._rng = gamma, rng
 
-    def choose(self, view: View) -> Array:
+    def choose(self, view: TrialView) -> Array:
         return self._rng.choice([-self._gamma, self._gamma], size=view.inputs.shape[1])
 
 
 @dataclass(frozen=True, kw_only=True)
-class Descent(Updated):
+class Descent(CustomLearner):
     """Adam on the newest sample, as printed in Algorithm 1; ``extra`` parameters are a mistake."""
 
     name: ClassVar[str] = "descent"
@@ -106,7 +106,7 @@ class DescentUpdater(Updater):
     def __init__(self, extra: int) -> None:
         self._first, self._second, self._extra = np.zeros(1), np.zeros(1), extra
 
-    def update(self, view: View) -> Array:
+    def update(self, view: TrialView) -> Array:
         x, y = view.states[-2], view.accelerations[-1]
         gradient = 2 * (view.predict(x[None])[0] - y) @ view.jacobian(x)
         self._first = 0.9 * self._first + 0.1 * gradient

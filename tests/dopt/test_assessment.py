@@ -10,11 +10,11 @@ import pytest
 
 from dopt import assessment
 from dopt.assessment import MEASURES, assess
-from dopt.exploration import run_trial
 from dopt.kernel import run
-from dopt.replay import replay
+from dopt.rerun import rerun
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Task
 from orchestrate.executors.lockstep import run_batch
 from tests.dopt.trials import trial
@@ -51,7 +51,7 @@ def test_every_measure_is_there_at_every_step(done: TrialResult) -> None:
 
 
 def test_the_parameters_are_those_of_the_replay(done: TrialResult) -> None:
-    again = replay(short("pendulum", "d_optimal"), [10, 30])
+    again = rerun(short("pendulum", "d_optimal"), [10, 30])
     np.testing.assert_array_equal(done.checkpoints[10], again.parameters[0])
     np.testing.assert_array_equal(done.checkpoints[30], done.parameters)
 
@@ -78,7 +78,7 @@ def test_the_other_steps_change_nothing(done: TrialResult) -> None:
 
 def test_both_paths_and_the_batch_agree(done: TrialResult) -> None:
     spec = short("pendulum", "d_optimal")
-    spec = dataclasses.replace(spec, cell=dataclasses.replace(spec.cell, path="reference"))
+    spec = dataclasses.replace(spec, config=dataclasses.replace(spec.config, path="reference"))
     alone = run_trial(spec).assessments
     tasks = [Task(one.trial_key, one) for one in (spec, spec.with_seed(2))]
     batch = run_batch(tasks, "cpu")[0].outcome
@@ -128,7 +128,7 @@ def test_with_the_true_model_learned_both_costs_are_one() -> None:
 def test_nothing_is_said_of_what_a_diverged_trial_did_not_reach() -> None:
     spec = short("pendulum", "random", checkpoints=[1, 30])
     low = dataclasses.replace(spec.system, state_limit=0.4)
-    result = run_trial(TrialSpec(dataclasses.replace(spec.cell, system=low), 1))
+    result = run_trial(TrialSpec(dataclasses.replace(spec.config, system=low), 1))
     assert result.diverged_at is not None
     assert 1 < result.diverged_at < 30
     assert {row.t for row in result.assessments} == {0, 1}

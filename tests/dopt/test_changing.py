@@ -11,10 +11,10 @@ import pytest
 from scipy import stats
 
 from dopt.evaluation import evaluation_set, simulate
-from dopt.exploration import run_trial
 from dopt.kernel.run import KernelTrial
-from dopt.replay import replay
-from dopt.spec import TrialSpec
+from dopt.rerun import rerun
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems import DriftingPendulum, Pendulum
 from tests.dopt.trials import trial
 
@@ -56,7 +56,7 @@ def test_the_observed_path_is_that_of_the_changing_system(path: Any) -> None:
 @pytest.mark.parametrize("policy", ["random", "oracle"])
 def test_the_loss_of_a_step_is_that_against_the_truth_of_the_step(policy: str) -> None:
     spec = trial("drifting_pendulum", policy, env=DRIFT | {"grid_points": (20, 20)})
-    seen, result = replay(spec, range(1, 31)), run_trial(spec)
+    seen, result = rerun(spec, range(1, 31)), run_trial(spec)
     points = evaluation_set(spec.system)
     for t, theta in enumerate(seen.parameters):
         errors = spec.model.predict(spec.system, theta, points.states)
@@ -70,7 +70,7 @@ def test_the_loss_of_a_step_is_that_against_the_truth_of_the_step(policy: str) -
 def test_without_a_drift_it_is_the_pendulum() -> None:
     plain = trial("pendulum", "d_optimal", 2)
     still = DriftingPendulum(horizon=30, grid_points=(4, 4), final_friction=1 / 6)
-    same = TrialSpec(dataclasses.replace(plain.cell, system=still), 2)
+    same = TrialSpec(dataclasses.replace(plain.config, system=still), 2)
     one, two = run_trial(plain), run_trial(same)
     assert np.array_equal(one.states, two.states)
     assert np.array_equal(one.parameters, two.parameters)

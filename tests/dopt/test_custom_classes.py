@@ -12,13 +12,12 @@ import pytest
 from omegaconf import OmegaConf
 
 from dopt.control.task import GOAL_FIELDS
+from dopt.declare.registry import source_digest
 from dopt.errors import SpecificationError
-from dopt.exploration import run_trial
 from dopt.policies.base import ClosedLoop
-from dopt.registry import source_digest
-from dopt.spec import TrialSpec
-
-EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "example"
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+from tests.paths import EXAMPLE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +124,7 @@ def test_a_wrong_system_is_refused_in_a_sentence(path: str, sentence: str) -> No
     [
         ("Nameless", "a class with a 'name' of its own"),
         ("Thief", "a class with a 'name' of its own"),
-        ("Closed", "derive it from OpenLoop or Planned"),
+        ("Closed", "derive it from OpenLoop or CustomPolicy"),
     ],
 )
 def test_a_wrong_policy_is_refused_in_a_sentence(name: str, sentence: str) -> None:

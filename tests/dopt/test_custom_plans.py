@@ -5,20 +5,19 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from dopt.cell import Cell
 from dopt.errors import SpecificationError
-from dopt.exploration import run_trial
-from dopt.reference.lockstep import run_trials
-from dopt.spec import TrialSpec
+from dopt.reference.batch import run_trials
+from dopt.run import run_trial
+from dopt.spec.config import TrialConfig
+from dopt.spec.trial import TrialSpec
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
-HERE = "tests.dopt.own_parts"
+HERE = "tests.dopt.custom_plugins"
 
 
 def specification(seed: int = 0, **sections: dict[str, Any]) -> TrialSpec:
@@ -59,17 +58,17 @@ def test_trials_in_lockstep_are_those_run_alone() -> None:
 
 
 def test_what_the_kernel_lacks_runs_on_the_reference_by_itself() -> None:
-    assert specification().cell.path == "kernel"
-    assert specification(policy=own("Coin")).cell.path == "reference"
-    assert specification(learner=own("Descent")).cell.path == "reference"
+    assert specification().config.path == "kernel"
+    assert specification(policy=own("Coin")).config.path == "reference"
+    assert specification(learner=own("Descent")).config.path == "reference"
     spec = specification(policy=own("Coin"))
     assert TrialSpec.from_mapping(spec.to_mapping()).trial_key == spec.trial_key
 
 
 def test_the_kernel_refuses_what_it_lacks() -> None:
-    cell = specification(policy=own("Coin")).cell
+    config = specification(policy=own("Coin")).config
     with pytest.raises(SpecificationError, match="policy 'coin' is not written for it"):
-        dataclasses.replace(cell, path="kernel")
+        dataclasses.replace(config, path="kernel")
     mapping = specification(learner=own("Descent")).to_mapping()
     with pytest.raises(SpecificationError, match="learner 'descent' is not written for it"):
         TrialSpec.from_mapping(mapping | {"path": "kernel"})
@@ -100,8 +99,8 @@ def test_a_plan_that_gets_lost_ends_its_trial_alone() -> None:
 
 
 def test_a_cell_of_own_parts_is_a_value() -> None:
-    first, second = (specification(policy=own("Coin")).cell for _ in range(2))
-    assert isinstance(first, Cell)
+    first, second = (specification(policy=own("Coin")).config for _ in range(2))
+    assert isinstance(first, TrialConfig)
     assert first == second
     assert hash(first) == hash(second)
 
@@ -110,9 +109,9 @@ def test_torch_is_loaded_where_a_trial_runs_and_no_sooner() -> None:
     """The driver of a grid only makes the specification, and sends it to its workers."""
     mapping = specification(policy=own("Coin"), learner=own("Descent")).to_mapping()
     program = (
-        "import pickle, sys; from dopt.spec import TrialSpec; "
+        "import pickle, sys; from dopt.spec.trial import TrialSpec; "
         f"spec = TrialSpec.from_mapping({mapping!r}); pickle.dumps(spec); spec.trial_key; "
         "assert 'torch' not in sys.modules; "
-        "from dopt.exploration import run_trial; run_trial(spec); assert 'torch' in sys.modules"
+        "from dopt.run import run_trial; run_trial(spec); assert 'torch' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt.exploration import run_trial
-from dopt.reference.lockstep import run_trials
+from dopt.reference.batch import run_trials
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import PAIRS, trial
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us", "states", "inputs")

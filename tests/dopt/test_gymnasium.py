@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,18 +10,18 @@ import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.exploration import run_trial
-from dopt.reference.lockstep import run_trials
-from dopt.spec import TrialSpec
+from dopt.reference.batch import run_trials
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
+from tests.paths import EXAMPLE
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra: pip install dopt[gymnasium]")
 
 import dopt.gymnasium  # noqa: E402
-from tests.dopt.own_environments import DRAG  # noqa: E402
+from tests.dopt.custom_environments import DRAG  # noqa: E402
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "example"
-POINT = "tests.dopt.own_environments.Point"
+POINT = "tests.dopt.custom_environments.Point"
 IDS = [f"dopt/{''.join(map(str.capitalize, name.split('_')))}-v0" for name in SYSTEMS]
 
 
@@ -173,7 +172,7 @@ def test_an_angle_is_followed_over_the_full_turn(monkeypatch: pytest.MonkeyPatch
         ({"dt": 0.05}, "env.dt is 0.05 s, but a step of .* takes 0.1 s"),
         ({"noise": 0.1}, "env.noise is 0.1, but to point none can be added"),
         ({"initial_state": [0.0, 0.0]}, "env.initial_state is given, but point starts where"),
-        ({"target": "tests.dopt.own_environments.Blurred"}, r"makes a state of shape \(1,\)"),
+        ({"target": "tests.dopt.custom_environments.Blurred"}, r"makes a state of shape \(1,\)"),
         ({"grid_points": [2, 2]}, "env.grid_points has 2 entries"),
     ],
 )

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from dopt.errors import SpecificationError
-from dopt.exploration import run_trial
 from dopt.reference.models import model_function
-from dopt.replay import replay
-from dopt.spec import TrialSpec
+from dopt.rerun import rerun
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 
 
@@ -28,16 +28,16 @@ def specification(env: str = "pendulum", policy: str = "d_optimal", **model: obj
 @pytest.mark.parametrize("policy", ["d_optimal", "oracle", "random"])
 def test_looking_on_the_way_changes_nothing(policy: str) -> None:
     spec = specification(policy=policy)
-    seen, whole = replay(spec, [0, 7, 8, 40]), run_trial(spec)
+    seen, whole = rerun(spec, [0, 7, 8, 40]), run_trial(spec)
     np.testing.assert_array_equal(seen.states, whole.states)
     np.testing.assert_array_equal(seen.parameters[-1], whole.parameters)
     assert seen.steps.tolist() == [0, 7, 8, 40]
 
 
 def test_the_first_look_is_at_the_initial_parameters() -> None:
-    shorter = replay(specification(), [0])
+    shorter = rerun(specification(), [0])
     assert np.abs(shorter.parameters[0]).max() <= 1.0
-    assert replay(specification(), []).parameters.shape == (0, 353)
+    assert rerun(specification(), []).parameters.shape == (0, 353)
 
 
 def test_a_trial_that_diverges_is_seen_until_then() -> None:
@@ -45,7 +45,7 @@ def test_a_trial_that_diverges_is_seen_until_then() -> None:
         mapping = {**specification(policy="random").to_mapping(), "path": path}
         env = {**mapping["env"], "state_limit": 0.4}  # type: ignore[dict-item]  # a section
         spec = TrialSpec.from_mapping({**mapping, "env": env})
-        seen, whole = replay(spec, [0, 3, 40]), run_trial(spec)
+        seen, whole = rerun(spec, [0, 3, 40]), run_trial(spec)
         assert whole.diverged_at is not None
         assert 3 < whole.diverged_at < 40
         assert seen.steps.tolist() == [0, 3]
@@ -54,12 +54,12 @@ def test_a_trial_that_diverges_is_seen_until_then() -> None:
 
 def test_steps_begin_with_the_first() -> None:
     with pytest.raises(SpecificationError, match="step -3 was asked for, but the first is 0"):
-        replay(specification(), [-3, 10])
+        rerun(specification(), [-3, 10])
 
 
 def test_steps_must_ascend() -> None:
     with pytest.raises(SpecificationError, match="do not ascend"):
-        replay(specification(), [5, 5])
+        rerun(specification(), [5, 5])
 
 
 @pytest.mark.parametrize("env", SYSTEMS)

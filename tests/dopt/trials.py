@@ -7,7 +7,7 @@ from typing import Any
 
 from dopt.errors import IncompatibleError
 from dopt.policies import POLICIES
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 
 SMALL_GRIDS = {
@@ -47,5 +47,5 @@ def compatible(env: str, policy: str) -> bool:
 
 
 ALL_PAIRS = [(env, policy) for env in SYSTEMS for policy in POLICIES if compatible(env, policy)]
-PAIRS = [pair for pair in ALL_PAIRS if trial(*pair).cell.path == "kernel"]
+PAIRS = [pair for pair in ALL_PAIRS if trial(*pair).config.path == "kernel"]
 """What the kernel runs; the others run on the reference alone."""

@@ -15,35 +15,37 @@ time (product rule).
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from dopt.kernel.arguments import Dual, Point
 from dopt.kernel.compiler import compiled, vectorized
-from dopt.kernel.information import inner
+from dopt.kernel.information.primal import inner
+from dopt.kernel.structs import Dual, Linearization
+from dopt.types import Matrix, Stack, Vector
 
 
 @compiled
-def below(point: Point, index: int) -> Any:
+def below(point: Linearization, index: int) -> Vector:
     """Return the activations below a layer."""
-    return point.phi if index == 0 else point.hidden[index - 1]
+    activations: Vector = point.phi if index == 0 else point.hidden[index - 1]
+    return activations
 
 
 @compiled
-def below_along(point: Point, j: int, index: int) -> Any:
+def below_along(point: Linearization, j: int, index: int) -> Vector:
     """Return the derivative of the activations below a layer along direction j."""
-    return point.phi_dots[j] if index == 0 else point.hidden_dots[j, index - 1]
+    along: Vector = point.phi_dots[j] if index == 0 else point.hidden_dots[j, index - 1]
+    return along
 
 
 @compiled
-def stored_below(dual: Dual, n: int, index: int) -> Any:
+def stored_below(dual: Dual, n: int, index: int) -> Matrix:
     """Return the activations below a layer at the n states seen."""
-    return dual.features[:n] if index == 0 else dual.hidden[index - 1, :n]
+    stored: Matrix = dual.features[:n] if index == 0 else dual.hidden[index - 1, :n]
+    return stored
 
 
 @compiled
-def dual_forms(dual: Dual, regularization: float, point: Point, component: int) -> Any:
+def dual_forms(dual: Dual, regularization: float, point: Linearization, component: int) -> Matrix:
     """Return xᵀM⁻¹y, (1 + m, 1 + m), for x and y among g and the columns of D B."""
     n, r = dual.n_states[0], dual.deltas.shape[0]
     products = _products(dual, n, point, component)
@@ -56,7 +58,9 @@ def dual_forms(dual: Dual, regularization: float, point: Point, component: int) 
 
 
 @compiled
-def dual_absorb(dual: Dual, regularization: float, phi: Any, hidden: Any, deltas: Any) -> None:
+def dual_rank_update(
+    dual: Dual, regularization: float, phi: Vector, hidden: Matrix, deltas: Stack
+) -> None:
     """Add the r rows of J at one state, given the passes there; ``deltas`` is (r, L, w)."""
     n, r = dual.n_states[0], deltas.shape[0]
     _store(dual, n, phi, hidden, deltas)
@@ -64,7 +68,7 @@ def dual_absorb(dual: Dual, regularization: float, phi: Any, hidden: Any, deltas
     rows = np.empty((r, N + r))
     no_phi, no_hidden = np.empty((0, 0)), np.empty((0, 0, 0))
     for k in range(r):
-        point = Point(phi, hidden, deltas[k], no_phi, no_hidden, no_hidden)
+        point = Linearization(phi, hidden, deltas[k], no_phi, no_hidden, no_hidden)
         products = _products(dual, n + 1, point, k)
         for i in range(N + r):
             rows[k, i] = products[0, i]
@@ -83,7 +87,7 @@ def dual_absorb(dual: Dual, regularization: float, phi: Any, hidden: Any, deltas
 
 
 @compiled
-def _store(dual: Dual, n: int, phi: Any, hidden: Any, deltas: Any) -> None:
+def _store(dual: Dual, n: int, phi: Vector, hidden: Matrix, deltas: Stack) -> None:
     """Keep the activations and δ of a state in place n."""
     for i in range(phi.shape[0]):
         dual.features[n, i] = phi[i]
@@ -95,7 +99,7 @@ def _store(dual: Dual, n: int, phi: Any, hidden: Any, deltas: Any) -> None:
 
 
 @compiled
-def _products(dual: Dual, n: int, point: Point, component: int) -> Any:
+def _products(dual: Dual, n: int, point: Linearization, component: int) -> Matrix:
     """Return the products of g and of each column of D B with all rows seen, (1 + m, n r)."""
     r, depth, m = dual.deltas.shape[0], dual.deltas.shape[1], point.phi_dots.shape[0]
     out = np.zeros((1 + m, n * r))
@@ -120,13 +124,17 @@ def _products(dual: Dual, n: int, point: Point, component: int) -> Any:
 
 
 @vectorized
-def _add_products(out: Any, a: Any, b: Any, one: float, component: int, stride: int) -> None:
+def _add_products(
+    out: Vector, a: Vector, b: Vector, one: float, component: int, stride: int
+) -> None:
     for s in range(a.shape[0]):
         out[s * stride + component] += a[s] * (b[s] + one)
 
 
 @vectorized
-def _add_output_layer(out: Any, values: Any, slopes: Any, component: int, stride: int) -> None:
+def _add_output_layer(
+    out: Matrix, values: Vector, slopes: Matrix, component: int, stride: int
+) -> None:
     for s in range(values.shape[0]):
         out[0, s * stride + component] += values[s] + 1.0
         for j in range(slopes.shape[0]):
@@ -134,7 +142,7 @@ def _add_output_layer(out: Any, values: Any, slopes: Any, component: int, stride
 
 
 @compiled
-def _solve_lower(factor: Any, n_rows: int, right: Any) -> None:
+def _solve_lower(factor: Matrix, n_rows: int, right: Matrix) -> None:
     """Replace the first entries of each right-hand side, (k, ·), by those of C⁻¹ times it."""
     for i in range(n_rows):
         row = factor[i]
@@ -143,7 +151,7 @@ def _solve_lower(factor: Any, n_rows: int, right: Any) -> None:
 
 
 @compiled
-def _own_products(point: Point) -> Any:
+def _own_products(point: Linearization) -> Matrix:
     """Return the inner products among g and the columns of D B, (1 + m, 1 + m)."""
     depth, m = point.hidden.shape[0], point.phi_dots.shape[0]
     out = np.zeros((1 + m, 1 + m))

@@ -1,18 +1,17 @@
-"""Forgetting in compiled code: M fades, and gets back what the prior loses."""
+"""Forgetting in compiled code: M decays, and regains what the prior loses."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from dopt.kernel.arguments import Covariance
 from dopt.kernel.compiler import vectorized
-from dopt.kernel.information import add_multiple, append_row
+from dopt.kernel.information.primal import add_multiple, append_row
+from dopt.kernel.structs import Covariance
+from dopt.types import Vector
 
 
 @vectorized
-def fade(covariance: Covariance, forgetting: float, t: int, renewed: int, renewal: float) -> None:
+def forget(covariance: Covariance, forgetting: float, t: int, renewed: int, renewal: float) -> None:
     """Turn M⁻¹ into (f M + D)⁻¹ at step t (:class:`dopt.learning.ExtendedKalman`).
 
     D has the entry ``renewal`` at the ``renewed`` diagonal places whose turn it is.
@@ -37,7 +36,7 @@ def fade(covariance: Covariance, forgetting: float, t: int, renewed: int, renewa
 
 
 @vectorized
-def _read_column(covariance: Covariance, i: int, out: Any) -> None:
+def _read_column(covariance: Covariance, i: int, out: Vector) -> None:
     """Write column i of M⁻¹, (q,)."""
     upper, pending = covariance.upper, covariance.pending
     for j in range(out.shape[0]):

@@ -11,12 +11,11 @@ several products. They run over slices, whose indices the compiler knows to be w
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from dopt.kernel.arguments import Covariance
 from dopt.kernel.compiler import vectorized
+from dopt.kernel.structs import Covariance
+from dopt.types import Matrix, Vector
 
 PENDING_ROWS = 16
 """Room for pending rows: a multiple of 4."""
@@ -26,7 +25,7 @@ SMALL = 32
 
 
 @vectorized
-def inner(a: Any, b: Any) -> float:
+def inner(a: Vector, b: Vector) -> float:
     """Return aᵀb."""
     total = 0.0
     for i in range(a.shape[0]):
@@ -35,14 +34,14 @@ def inner(a: Any, b: Any) -> float:
 
 
 @vectorized
-def add_multiple(y: Any, factor: float, x: Any) -> None:
+def add_multiple(y: Vector, factor: float, x: Vector) -> None:
     """Add factor x to y."""
     for i in range(x.shape[0]):
         y[i] += factor * x[i]
 
 
 @vectorized
-def symmetric_product(upper: Any, x: Any, y: Any) -> None:
+def symmetric_product(upper: Matrix, x: Vector, y: Vector) -> None:
     """Write y = A x, (q,), four rows of the upper triangle of A at a time."""
     q = x.shape[0]
     y[:] = 0.0
@@ -63,7 +62,7 @@ def symmetric_product(upper: Any, x: Any, y: Any) -> None:
 
 
 @vectorized
-def _triangle(upper: Any, x: Any, y: Any, start: int, stop: int) -> None:
+def _triangle(upper: Matrix, x: Vector, y: Vector, start: int, stop: int) -> None:
     """Add the product with the diagonal block from ``start`` to ``stop``."""
     for i in range(start, stop):
         y[i] += upper[i, i] * x[i]
@@ -74,7 +73,14 @@ def _triangle(upper: Any, x: Any, y: Any, start: int, stop: int) -> None:
 
 @vectorized
 def _four_rows(
-    row_0: Any, row_1: Any, row_2: Any, row_3: Any, factors: Any, x: Any, sums: Any, y: Any
+    row_0: Vector,
+    row_1: Vector,
+    row_2: Vector,
+    row_3: Vector,
+    factors: Vector,
+    x: Vector,
+    sums: Vector,
+    y: Vector,
 ) -> None:
     """Add rowᵀx to the sums of four rows and the rows' multiples to y."""
     factor_0, factor_1, factor_2, factor_3 = factors[0], factors[1], factors[2], factors[3]
@@ -93,7 +99,7 @@ def _four_rows(
 
 
 @vectorized
-def symmetric_products(upper: Any, x: Any, z: Any, y: Any, w: Any) -> None:
+def symmetric_products(upper: Matrix, x: Vector, z: Vector, y: Vector, w: Vector) -> None:
     """Write y = A x and w = A z, (q,), in one pass over the upper triangle of A."""
     q = x.shape[0]
     y[:] = 0.0
@@ -115,16 +121,16 @@ def symmetric_products(upper: Any, x: Any, z: Any, y: Any, w: Any) -> None:
 
 @vectorized
 def _two_rows(
-    row_0: Any,
-    row_1: Any,
+    row_0: Vector,
+    row_1: Vector,
     x_0: float,
     x_1: float,
     z_0: float,
     z_1: float,
-    x: Any,
-    z: Any,
-    y: Any,
-    w: Any,
+    x: Vector,
+    z: Vector,
+    y: Vector,
+    w: Vector,
 ) -> tuple[float, float, float, float]:
     """Do for two rows and two vectors what :func:`_four_rows` does; return the four sums."""
     sum_x0, sum_x1, sum_z0, sum_z1 = 0.0, 0.0, 0.0, 0.0
@@ -140,7 +146,7 @@ def _two_rows(
 
 
 @vectorized
-def multiply_rows(covariance: Covariance, rows: Any, out: Any) -> None:
+def multiply_rows(covariance: Covariance, rows: Matrix, out: Matrix) -> None:
     """Write M⁻¹ times each row of ``rows``, (k, q)."""
     k = rows.shape[0]
     for i in range(0, k - 1, 2):
@@ -154,7 +160,7 @@ def multiply_rows(covariance: Covariance, rows: Any, out: Any) -> None:
 
 
 @vectorized
-def quadratic_forms(covariance: Covariance, left: Any, right: Any) -> Any:
+def quadratic_forms(covariance: Covariance, left: Matrix, right: Matrix) -> Matrix:
     """Return left M⁻¹ rightᵀ for ``left`` (k, q) and ``right`` (n, q)."""
     products = np.empty(left.shape)
     multiply_rows(covariance, left, products)
@@ -166,7 +172,7 @@ def quadratic_forms(covariance: Covariance, left: Any, right: Any) -> Any:
 
 
 @vectorized
-def absorb(covariance: Covariance, rows: Any, residuals: Any, scratch: Any) -> None:
+def rank_update(covariance: Covariance, rows: Matrix, residuals: Vector, scratch: Matrix) -> None:
     """Turn M⁻¹ into (M + JᵀJ)⁻¹ and the residuals e into L⁻¹e (Woodbury identity).
 
     With V = J M⁻¹ and the Cholesky factor L of I + V Jᵀ, the update is M⁻¹ - (L⁻¹V)ᵀ(L⁻¹V).
@@ -236,7 +242,7 @@ def restore(covariance: Covariance) -> None:
 
 
 @vectorized
-def _factorize(L: Any) -> None:
+def _factorize(L: Matrix) -> None:
     """Replace the lower triangle of a positive definite matrix, (r, r), by its Cholesky factor."""
     for k in range(L.shape[0]):
         for i in range(k + 1):
@@ -247,7 +253,7 @@ def _factorize(L: Any) -> None:
 
 
 @vectorized
-def append_row(covariance: Covariance, row: Any) -> None:
+def append_row(covariance: Covariance, row: Vector) -> None:
     """Add a row to V, and subtract VᵀV from A when that fills it."""
     n = covariance.n_pending[0]
     pending = covariance.pending
@@ -271,15 +277,17 @@ def append_row(covariance: Covariance, row: Any) -> None:
 
 
 @vectorized
-def _subtract_four(row: Any, factors: Any, v_0: Any, v_1: Any, v_2: Any, v_3: Any) -> None:
+def _subtract_four(
+    row: Vector, factors: Vector, v_0: Vector, v_1: Vector, v_2: Vector, v_3: Vector
+) -> None:
     factor_0, factor_1, factor_2, factor_3 = factors[0], factors[1], factors[2], factors[3]
     for j in range(row.shape[0]):
         row[j] -= factor_0 * v_0[j] + factor_1 * v_1[j] + factor_2 * v_2[j] + factor_3 * v_3[j]
 
 
-def dense(covariance: Covariance) -> np.ndarray[Any, np.dtype[np.float64]]:
+def dense(covariance: Covariance) -> Matrix:
     """Return M⁻¹ as a full matrix, (q, q)."""
     upper = np.triu(covariance.upper)
     pending = covariance.pending[: covariance.n_pending[0]]
-    full: np.ndarray[Any, np.dtype[np.float64]] = upper + np.triu(upper, 1).T - pending.T @ pending
+    full: Matrix = upper + np.triu(upper, 1).T - pending.T @ pending
     return full

@@ -7,16 +7,15 @@ M. Farach-Colton, "Finding frequent items in data streams" (2002).
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from dopt.kernel.arguments import Sketch
 from dopt.kernel.compiler import compiled
+from dopt.kernel.structs import Sketch
+from dopt.types import Matrix
 
 
 @compiled
-def sketched(sketch: Sketch, rows: Any) -> Any:
+def sketched(sketch: Sketch, rows: Matrix) -> Matrix:
     """Return the sketch, (k, s), of gradients, (k, q)."""
     out = np.zeros((rows.shape[0], sketch.size))
     for k in range(rows.shape[0]):

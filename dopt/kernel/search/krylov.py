@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from dopt.kernel.arguments import Covariance
+from dopt.algorithm import INVARIANT
 from dopt.kernel.compiler import compiled
-from dopt.kernel.information import add_multiple, inner, multiply_rows
-
-INVARIANT = 1e-9
-"""A new direction shorter than this beside its origin is rounding: the space is invariant."""
+from dopt.kernel.information.primal import add_multiple, inner, multiply_rows
+from dopt.kernel.structs import Covariance
+from dopt.types import Matrix
 
 
 @compiled
-def krylov_space(covariance: Covariance, starts: Any, size: int) -> Any:
+def krylov_space(covariance: Covariance, starts: Matrix, size: int) -> tuple[Matrix, Matrix]:
     """Return an orthonormal basis Q, (K, q), and Q M⁻¹ Qᵀ, (K, K).
 
     Row j ≥ b is M⁻¹ times row j - b, orthogonalised, with b the number of starts. Rows that add
@@ -34,7 +31,7 @@ def krylov_space(covariance: Covariance, starts: Any, size: int) -> Any:
 
 
 @compiled
-def _orthogonalize(basis: Any, j: int) -> None:
+def _orthogonalize(basis: Matrix, j: int) -> None:
     """Make row j orthogonal to those before it and of norm 1 (Gram-Schmidt, twice)."""
     row = basis[j]
     before = np.sqrt(inner(row, row))
@@ -48,7 +45,7 @@ def _orthogonalize(basis: Any, j: int) -> None:
 
 
 @compiled
-def largest_eigenvalue(projected: Any, basis: Any, removed: Any) -> float:
+def largest_eigenvalue(projected: Matrix, basis: Matrix, removed: Matrix) -> float:
     """Return the largest eigenvalue of M⁻¹ - WᵀW in the space, W = ``removed``, (r, q)."""
     W, K = np.dot(removed, basis.T), projected.shape[0]
     left = projected.copy()

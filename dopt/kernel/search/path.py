@@ -1,20 +1,22 @@
 """Paths of the learned model and the rows of J along them, in compiled code.
 
-Legend beside :mod:`dopt.kernel.arguments`: H steps of a plan, n rows along a path.
+Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, n rows along a path.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from dopt.algorithm import ModelKind, Score
 from dopt.kernel import network as nn
-from dopt.kernel.arguments import JOINT, LINEAR_MODEL, Covariance, Floats, Network, Search, World
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, vectorized
-from dopt.kernel.information import add_multiple, inner, multiply_rows
+from dopt.kernel.information.primal import add_multiple, inner, multiply_rows
 from dopt.kernel.model import add_linear, euler_step, regressors
+from dopt.kernel.structs import Covariance, Network, Plant, Search
+from dopt.types import Matrix, Vector
 
 FEW_ROWS = 24
 """Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
@@ -23,24 +25,24 @@ FEW_ROWS = 24
 class Path(NamedTuple):
     """A path in the making; written in place."""
 
-    states: Floats  # (H + 1, d)
-    outputs: Floats  # (H + 1, r), a_θ at the states
-    rows: Floats  # (n + r, q), J along the path; the last r are spare
-    products: Floats  # (n, q), J M⁻¹, or L⁻¹ J M⁻¹ once a score has needed it
-    factor: Floats  # (n, n), the Cholesky factor L of I + J M⁻¹ Jᵀ in the lower triangle
-    inverse: Floats  # (q, q), A of M⁻¹ = A - VᵀV; empty where few products are needed
-    flow: Floats  # (d,)
-    phi: Floats  # (p,)
-    hidden: Floats  # (L, w)
-    deltas: Floats  # (L, w)
+    states: Matrix  # (H + 1, d)
+    outputs: Matrix  # (H + 1, r), a_θ at the states
+    rows: Matrix  # (n + r, q), J along the path; the last r are spare
+    products: Matrix  # (n, q), J M⁻¹, or L⁻¹ J M⁻¹ once a score has needed it
+    factor: Matrix  # (n, n), the Cholesky factor L of I + J M⁻¹ Jᵀ in the lower triangle
+    inverse: Matrix  # (q, q), A of M⁻¹ = A - VᵀV; empty where few products are needed
+    flow: Vector  # (d,)
+    phi: Vector  # (p,)
+    hidden: Matrix  # (L, w)
+    deltas: Matrix  # (L, w)
 
 
 @compiled
 def new_path(
-    world: World, network: Network, search: Search, covariance: Covariance, d: int
+    plant: Plant, network: Network, search: Search, covariance: Covariance, d: int
 ) -> Path:
     """Return an empty path."""
-    r, q = world.learned_rows.shape[0], covariance.upper.shape[0]
+    r, q = plant.learned_rows.shape[0], covariance.upper.shape[0]
     C, H = search.candidates.shape[0], search.steps
     n = r * (H // search.stride)
     size = q if n * C > FEW_ROWS else 0
@@ -64,13 +66,13 @@ def new_path(
 
 
 @compiled
-def look(
-    accelerations: Any, world: World, network: Network, theta: Any, path: Path, i: int, rows: Any
+def model_and_jacobian(
+    plant: Plant, network: Network, theta: Vector, path: Path, i: int, rows: Matrix
 ) -> None:
     """Write a_θ and J, (r, q), at state i of the path."""
     x, out = path.states[i], path.outputs[i]
-    if network.kind == LINEAR_MODEL:
-        regressors(accelerations, world, x, rows, out)
+    if network.kind == ModelKind.LINEAR:
+        regressors(plant, x, rows, out)
         add_linear(rows, theta, out)
         return
     nn.features_at(network, x, path.phi)
@@ -81,15 +83,13 @@ def look(
 
 
 @compiled
-def roll(
-    known: Any,
-    accelerations: Any,
-    world: World,
+def rollout(
+    plant: Plant,
     network: Network,
     search: Search,
-    theta: Any,
+    theta: Vector,
     path: Path,
-    u: Any,
+    u: Vector,
     first: int,
     last: int,
 ) -> bool:
@@ -98,26 +98,26 @@ def roll(
     x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written, for the
     determinant of all of them together times the root of the stride.
     """
-    r, stride = world.learned_rows.shape[0], search.stride
+    r, stride = plant.learned_rows.shape[0], search.stride
     spare = path.products.shape[0]
     for i in range(first, last):
         x, following = path.states[i], path.states[i + 1]
-        euler_step(known, world, x, u, path.outputs[i], path.flow, following)
-        if not within(following, world.state_limit):
+        euler_step(plant, x, u, path.outputs[i], path.flow, following)
+        if not within(following, plant.state_limit):
             return False
         wanted = (i + 1) % stride == 0
         block = r * ((i + 1) // stride - 1) if wanted else spare
         # A network's output comes without rows; those of the linear model are its output.
-        count = r if wanted or network.kind == LINEAR_MODEL else 0
+        count = r if wanted or network.kind == ModelKind.LINEAR else 0
         rows = path.rows[block : block + count]
-        look(accelerations, world, network, theta, path, i + 1, rows)
-        if stride > 1 and search.score == JOINT:
+        model_and_jacobian(plant, network, theta, path, i + 1, rows)
+        if stride > 1 and search.score == Score.JOINT:
             scale(rows, np.sqrt(stride))
     return True
 
 
 @compiled
-def scale(rows: Any, factor: float) -> None:
+def scale(rows: Matrix, factor: float) -> None:
     """Multiply a matrix by a number in place."""
     for i in range(rows.shape[0]):
         for j in range(rows.shape[1]):
@@ -125,7 +125,7 @@ def scale(rows: Any, factor: float) -> None:
 
 
 @vectorized
-def weigh(covariance: Covariance, path: Path, first: int, last: int) -> None:
+def apply_inverse(covariance: Covariance, path: Path, first: int, last: int) -> None:
     """Write the products of rows ``first`` to ``last`` with M⁻¹."""
     rows, out = path.rows[first:last], path.products[first:last]
     if path.inverse.shape[0] == 0:

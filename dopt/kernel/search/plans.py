@@ -2,94 +2,57 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from dopt.kernel.arguments import (
-    A_OPTIMAL,
-    E_OPTIMAL,
-    JOINT,
-    SUM,
-    TASK,
-    TRACE,
-    Covariance,
-    Floats,
-    Network,
-    Search,
-    World,
+from dopt.algorithm import TIE_MARGIN, Score
+from dopt.kernel.compiler import compiled, monotonic_microseconds
+from dopt.kernel.search.path import (
+    Path,
+    apply_inverse,
+    log_determinant,
+    model_and_jacobian,
+    new_path,
+    rollout,
 )
-from dopt.kernel.compiler import compiled, monotonic_microseconds, vectorized
-from dopt.kernel.information import inner
-from dopt.kernel.krylov import krylov_space, largest_eigenvalue
-from dopt.kernel.path import Path, log_determinant, look, new_path, roll, weigh, whiten
-from dopt.planning.ties import TIE_MARGIN
-
-
-class Yardstick(NamedTuple):
-    """What a score needs beside the path; empty where it needs nothing."""
-
-    probes: Floats  # (n, q), J at the task's states or the basis of the Krylov space
-    projected: Floats  # (K, K), M⁻¹ in the Krylov space
+from dopt.kernel.search.scores import ScoreContext, score_context, score_of_path
+from dopt.kernel.structs import Covariance, Network, Plant, Search, Trial
+from dopt.types import Booleans, Integers, Matrix, Vector
 
 
 class Problem(NamedTuple):
-    """Everything that the plans of one step share."""
+    """All that the plans of one step share."""
 
-    world: World
+    plant: Plant
     network: Network
     search: Search
-    theta: Floats
+    theta: Vector
     covariance: Covariance
     path: Path
-    yardstick: Yardstick
+    context: ScoreContext
     end: float  # when the time is spent [µs]
 
 
 @compiled
-def search_input(
-    known: Any,
-    accelerations: Any,
-    world: World,
-    network: Network,
-    search: Search,
-    theta: Any,
-    covariance: Covariance,
-    x: Any,
-    tie: Any,
-    u: Any,
-) -> None:
+def plan(trial: Trial, t: int, u: Vector) -> None:
     """Write the first input of the best plan that was found in time, (m,)."""
+    plant, network, search = trial.plant, trial.network, trial.algorithm.search
+    theta, covariance = trial.state.theta, trial.state.covariance
+    x, tie = trial.record.states[t], trial.randomness.ties[t]
     end = monotonic_microseconds() + search.budget_us
-    path = new_path(world, network, search, covariance, x.shape[0])
-    yardstick = _yardstick(accelerations, world, network, search, theta, covariance, path)
+    path = new_path(plant, network, search, covariance, x.shape[0])
+    context = score_context(plant, network, search, theta, covariance, path)
     for i in range(x.shape[0]):
         path.states[0, i] = x[i]
-    look(accelerations, world, network, theta, path, 0, path.rows[path.products.shape[0] :])
-    problem = Problem(world, network, search, theta, covariance, path, yardstick, end)
+    model_and_jacobian(plant, network, theta, path, 0, path.rows[path.products.shape[0] :])
+    problem = Problem(plant, network, search, theta, covariance, path, context, end)
     order = _order(search.candidates, tie)
-    _choose(_values(known, accelerations, problem, order), search.candidates, tie, u)
+    _choose(_values(problem, order), search.candidates, tie, u)
 
 
 @compiled
-def no_search(
-    known: Any,  # noqa: ARG001  # the signature is that of the search
-    accelerations: Any,  # noqa: ARG001
-    world: World,  # noqa: ARG001
-    network: Network,  # noqa: ARG001
-    search: Search,  # noqa: ARG001
-    theta: Any,  # noqa: ARG001
-    covariance: Covariance,  # noqa: ARG001
-    x: Any,  # noqa: ARG001
-    tie: Any,  # noqa: ARG001
-    u: Any,
-) -> None:
-    """Stand where a policy needs no search, which takes long to compile."""
-    u[:] = np.nan
-
-
-@compiled
-def _order(candidates: Any, tie: Any) -> Any:
+def _order(candidates: Matrix, tie: Vector) -> Integers:
     """Return the candidates, (C,), in the order in which they are tried: opposite ones in turn.
 
     The first is that nearest to a random direction, so that haste prefers no input to another.
@@ -102,7 +65,7 @@ def _order(candidates: Any, tie: Any) -> Any:
 
 
 @compiled
-def _values(known: Any, accelerations: Any, problem: Problem, order: Any) -> Any:
+def _values(problem: Problem, order: Integers) -> Matrix:
     """Return the scores of the plans by their two candidates, (C, C); -∞ where there is none.
 
     In a hurry the plans without a switch come first, then the switches from the best of these.
@@ -115,10 +78,10 @@ def _values(known: Any, accelerations: Any, problem: Problem, order: Any) -> Any
         if k > 0 and _late(problem):
             break
         c = order[k]
-        begun = _begin(known, accelerations, problem, c)
-        values[c, c] = _finish(known, accelerations, problem, c, begun)
+        begun = _begin(problem, c)
+        values[c, c] = _finish(problem, c, begun)
         if unhurried and switching:
-            _switches(known, accelerations, problem, order, c, begun, values[c])
+            _switches(problem, order, c, begun, values[c])
     if switching and not unhurried:
         begun_from = np.zeros(C, np.bool_)
         for _ in range(C):
@@ -126,13 +89,13 @@ def _values(known: Any, accelerations: Any, problem: Problem, order: Any) -> Any
                 break
             c = _best_hold(values, begun_from)
             begun_from[c] = True
-            begun = _begin(known, accelerations, problem, c)
-            _switches(known, accelerations, problem, order, c, begun, values[c])
+            begun = _begin(problem, c)
+            _switches(problem, order, c, begun, values[c])
     return values
 
 
 @compiled
-def _best_hold(values: Any, done: Any) -> int:
+def _best_hold(values: Matrix, done: Booleans) -> int:
     """Return the candidate with the best plan without a switch among those that are not done."""
     best = -1
     for c in range(values.shape[0]):
@@ -149,28 +112,26 @@ def _late(problem: Problem) -> bool:
 
 
 @compiled
-def _switches(
-    known: Any, accelerations: Any, problem: Problem, order: Any, c: int, begun: float, values: Any
-) -> None:
+def _switches(problem: Problem, order: Integers, c: int, begun: float, values: Vector) -> None:
     """Score the plans that begin with candidate c, as the path does, and switch to another."""
     for other in order:
         if other != c:
             if _late(problem):
                 break
-            values[other] = _finish(known, accelerations, problem, other, begun)
+            values[other] = _finish(problem, other, begun)
 
 
 @compiled
-def _begin(known: Any, accelerations: Any, problem: Problem, c: int) -> float:
+def _begin(problem: Problem, c: int) -> float:
     """Roll the path under candidate c up to the switch; return log det of its rows so far."""
     switch = problem.search.switch
-    if not _roll(known, accelerations, problem, c, 0, switch):
+    if not _roll(problem, c, 0, switch):
         return -np.inf
     return _gain(problem, 0, switch)
 
 
 @compiled
-def _finish(known: Any, accelerations: Any, problem: Problem, c: int, begun: float) -> float:
+def _finish(problem: Problem, c: int, begun: float) -> float:
     """Roll the path under candidate c from the switch to its end; return the plan's score.
 
     It is -∞ where the path leaves the bounds of a state, or the score is not finite.
@@ -178,20 +139,21 @@ def _finish(known: Any, accelerations: Any, problem: Problem, c: int, begun: flo
     search = problem.search
     if begun == -np.inf:
         return begun
-    if not _roll(known, accelerations, problem, c, search.switch, search.steps):
+    if not _roll(problem, c, search.switch, search.steps):
         return -np.inf
     value = begun + _gain(problem, search.switch, search.steps)
-    if search.score not in (JOINT, SUM):
-        value = _other_score(search.score, problem.path, problem.yardstick)
+    if search.score not in (Score.JOINT, Score.SUM):
+        value = score_of_path(search.score, problem.path, problem.context)
     return value if np.isfinite(value) else -np.inf
 
 
 @compiled
-def _roll(known: Any, accelerations: Any, problem: Problem, c: int, first: int, last: int) -> bool:
+def _roll(problem: Problem, c: int, first: int, last: int) -> bool:
     """Hold candidate c from state ``first`` to state ``last`` of the path."""
-    world, network, search, theta = problem.world, problem.network, problem.search, problem.theta
-    path, u = problem.path, search.candidates[c]
-    inside: bool = roll(known, accelerations, world, network, search, theta, path, u, first, last)
+    path, search = problem.path, problem.search
+    u = search.candidates[c]
+    plant, network, theta = problem.plant, problem.network, problem.theta
+    inside: bool = rollout(plant, network, search, theta, path, u, first, last)
     return inside
 
 
@@ -199,59 +161,16 @@ def _roll(known: Any, accelerations: Any, problem: Problem, c: int, first: int, 
 def _gain(problem: Problem, first: int, last: int) -> float:
     """Return the growth of log det by the rows of steps ``first`` to ``last``."""
     path, search = problem.path, problem.search
-    r = problem.world.learned_rows.shape[0]
+    r = problem.plant.learned_rows.shape[0]
     first, last = r * (first // search.stride), r * (last // search.stride)
-    weigh(problem.covariance, path, first, last)
-    block = r if search.score == SUM else path.products.shape[0]
+    apply_inverse(problem.covariance, path, first, last)
+    block = r if search.score == Score.SUM else path.products.shape[0]
     gain: float = log_determinant(path, first, last, block)
     return gain
 
 
-@vectorized
-def _other_score(score: int, path: Path, yardstick: Yardstick) -> float:
-    """Return the score of a whole path whose factor is known, if it is not a determinant."""
-    n, total = path.products.shape[0], 0.0
-    if score == TRACE:
-        for i in range(n):
-            total += inner(path.products[i], path.rows[i])
-        return total
-    whiten(path, n)
-    if score == E_OPTIMAL:
-        return -largest_eigenvalue(yardstick.projected, yardstick.probes, path.products)
-    for i in range(n):
-        if score == A_OPTIMAL:
-            total += inner(path.products[i], path.products[i])
-        for j in range(yardstick.probes.shape[0]):
-            total += inner(path.products[i], yardstick.probes[j]) ** 2
-    return total
-
-
 @compiled
-def _yardstick(
-    accelerations: Any,
-    world: World,
-    network: Network,
-    search: Search,
-    theta: Any,
-    covariance: Covariance,
-    path: Path,
-) -> Yardstick:
-    """Return what the score needs at these parameters and this M⁻¹."""
-    q, r = theta.shape[0], world.learned_rows.shape[0]
-    if search.score == E_OPTIMAL:
-        basis, projected = krylov_space(covariance, search.starts, search.subspace)
-        return Yardstick(basis, projected)
-    n = search.task_states.shape[0] if search.score == TASK else 0
-    rows = np.empty((n * r, q))
-    for s in range(n):
-        for i in range(path.flow.shape[0]):
-            path.states[0, i] = search.task_states[s, i]
-        look(accelerations, world, network, theta, path, 0, rows[s * r : (s + 1) * r])
-    return Yardstick(rows, np.empty((0, 0)))
-
-
-@compiled
-def _choose(values: Any, candidates: Any, tie: Any, u: Any) -> None:
+def _choose(values: Matrix, candidates: Matrix, tie: Vector, u: Vector) -> None:
     """Write the candidate that begins the best plan; ``tie`` decides among equal ones."""
     best, preferred = np.max(values), -np.inf
     for c in range(values.shape[0]):

@@ -8,7 +8,7 @@ import pytest
 from dopt.control import Control
 from dopt.control.task import GOALS
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, Pendulum
 from tests.dopt.trials import trial
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.exploration import run_trial
 from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.test_information import run
 from tests.dopt.kernel.twin import relative_gap, transplant
 from tests.dopt.trials import PAIRS, trial

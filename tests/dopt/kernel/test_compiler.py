@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -19,6 +20,7 @@ from dopt.kernel import cache, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import compiled_equations
 from dopt.systems import SYSTEMS, Chain, Pendulum, System
+from tests.paths import ROOT
 
 
 @pytest.fixture
@@ -27,22 +29,34 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_second_compiler_waits_for_the_first(folder: Path) -> None:  # noqa: ARG001
+def test_a_second_compiler_of_a_function_waits_for_the_first(folder: Path) -> None:  # noqa: ARG001
     first_ended, second_entered = threading.Event(), threading.Event()
     after_first = []
 
     def second() -> None:
-        with one_compiler_at_a_time("loop"):
+        with one_compiler_at_a_time("loop-second"):
             after_first.append(first_ended.is_set())
             second_entered.set()
 
-    with one_compiler_at_a_time("equations"):
+    with one_compiler_at_a_time("loop-first"):
         thread = threading.Thread(target=second)
         thread.start()
         assert not second_entered.wait(0.2)
-        first_ended.set()
+        with one_compiler_at_a_time("equations"):
+            first_ended.set()
     thread.join(10.0)
     assert after_first == [True]
+
+
+def test_compiling_is_said_at_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:  # noqa: ARG001
+    with one_compiler_at_a_time("loop-1"):
+        [record] = caplog.records
+    assert record.name == "dopt.kernel"
+    assert "compiling the kernel, once per machine" in record.message
+    assert "loop" in record.message
+    with one_compiler_at_a_time("loop-1"):
+        pass
+    assert len(caplog.records) == 1
 
 
 def test_what_is_in_the_cache_is_read_by_all_at_once(folder: Path) -> None:
@@ -131,7 +145,7 @@ def test_systems_cached_by_different_processes_are_not_confused(tmp_path: Path) 
     environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
     for names in (["pendulum"], ["cartpole"], ["cartpole", "pendulum"], ["pendulum", "cartpole"]):
         command = [sys.executable, "-c", program, *names]
-        subprocess.run(command, check=True, env=environment, cwd=Path(__file__).parents[3])
+        subprocess.run(command, check=True, env=environment, cwd=ROOT)
 
 
 def test_a_warm_cache_is_seen_without_the_compiler() -> None:
@@ -139,7 +153,7 @@ def test_a_warm_cache_is_seen_without_the_compiler() -> None:
     program = (
         "import sys; from dopt.kernel import warm_up; warm_up(); assert 'numba' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[3])
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
 
 
 def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,8 +168,51 @@ def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch
     assert cache._source_digest() != here
 
 
-def test_another_checkout_has_a_cache_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numba would not find there what was compiled here, although it is said to be complete."""
-    here = cache._source_digest()
-    monkeypatch.setattr(cache, "_PACKAGE", Path("/elsewhere/dopt"))
-    assert cache._source_digest() != here
+def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
+    """The same sources in another folder: nothing is compiled, and the numbers are the same."""
+    program = (
+        "import numpy as np\n"
+        "from dopt.kernel.equations import compiled_equations\n"
+        "from dopt.kernel.tanh import tanh\n"
+        "from dopt.systems import SYSTEMS\n"
+        "function = compiled_equations(SYSTEMS['pendulum']()).accelerations\n"
+        "out = np.empty(1)\n"
+        "function(np.ones(2), np.array(SYSTEMS['pendulum']().parameters), out)\n"
+        "print(sum(function.stats.cache_misses.values()), out[0].hex())\n"
+    )
+    shutil.copytree(ROOT / "dopt", tmp_path / "elsewhere/dopt")
+    answers = []
+    for checkout in (ROOT, tmp_path / "elsewhere"):
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env=os.environ | {"DOPT_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(checkout)},
+            cwd=checkout,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        answers.append((done.stdout.split(), "compiling" in done.stderr))
+    (first, compiling), (second, again) = answers
+    assert (first[0], compiling) == ("1", True)
+    assert (second[0], again) == ("0", False)
+    assert first[1] == second[1]
+
+
+def test_a_function_compiled_for_another_is_not_stored(tmp_path: Path) -> None:
+    (tmp_path / "pair.py").write_text(
+        "from pathlib import Path\n"
+        "from dopt.kernel import stored_code\n"
+        "stored_code._PACKAGE = Path(__file__).parent\n"
+        "from dopt.kernel.compiler import compiled\n"
+        "@compiled\n"
+        "def inner(x):\n"
+        "    return x + 1.0\n"
+        "@compiled\n"
+        "def outer(x):\n"
+        "    return 2.0 * inner(x)\n"
+        "assert outer(1.0) == 4.0\n"
+    )
+    environment = os.environ | {"DOPT_CACHE": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, tmp_path / "pair.py"], check=True, env=environment)
+    found = [path.name.partition("-")[0] for path in tmp_path.rglob("*.nbi")]
+    assert found == ["pair.outer"]

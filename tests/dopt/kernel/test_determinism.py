@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dopt.exploration import run_trial
 from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import PAIRS, trial
+from tests.paths import ROOT
 
 NUMBERS = ("loss", "reachable_loss", "states", "inputs", "parameters")
 
@@ -49,9 +49,8 @@ def test_another_process_gives_the_same_bits() -> None:
         "from tests.dopt.kernel.test_determinism import numbers, trial, run_trial\n"
         "print(numbers(run_trial(trial('cartpole', 'd_optimal', 8))).hex())"
     )
-    root = Path(__file__).parents[3]
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert bytes.fromhex(done.stdout) == numbers(run_trial(trial("cartpole", "d_optimal", 8)))
 

@@ -9,7 +9,7 @@ import torch
 from dopt.evaluation import evaluation_set
 from dopt.kernel.run import KernelTrial
 from dopt.reference.models import model_function
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import PAIRS, trial
 
 

@@ -7,10 +7,10 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from dopt.kernel.information import dense
+from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
 from dopt.reference.models import model_function
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import trial
 
 

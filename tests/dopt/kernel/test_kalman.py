@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from torch.func import jacrev
 
 from dopt.errors import IncompatibleError
-from dopt.exploration import run_trial
-from dopt.kernel.information import dense
+from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
 from dopt.learning import ExtendedKalman
 from dopt.reference.models import model_function
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.test_information import run
 from tests.dopt.kernel.twin import observed, relative_gap, transplant
@@ -153,7 +153,7 @@ def test_auto_is_primal_for_a_filter_of_any_size() -> None:
     spec = trial("arm", "d_optimal", learner=EKF, model={"width": 30}, env={"horizon": 3})
     fast = KernelTrial(spec)
     assert fast.state.covariance.upper.shape == (1202, 1202)
-    assert spec.cell.memory > 2 * 8 * 1202**2
+    assert spec.config.memory > 2 * 8 * 1202**2
 
 
 def test_a_filter_that_loses_its_numbers_ends_the_trial() -> None:

@@ -9,15 +9,15 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from dopt.exploration import run_trial
-from dopt.kernel.information import dense
+from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
-from dopt.planning.task_states import task_states
 from dopt.policies import Search, TaskOptimal
+from dopt.policies.task_states import task_states
 from dopt.randomness import draw
 from dopt.reference.models import model_function
 from dopt.reference.search import paths, plans, score_function
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dopt.kernel.arguments import Covariance
-from dopt.kernel.information import absorb, dense, restore
+from dopt.kernel.information.primal import dense, rank_update, restore
 from dopt.kernel.run import KernelTrial
+from dopt.kernel.structs import Covariance
 from tests.dopt.kernel.test_information import jacobians
 from tests.dopt.trials import trial
 
@@ -53,7 +53,7 @@ def test_a_negative_variance_is_mended() -> None:
     axes, _ = np.linalg.qr(rng.standard_normal((6, 6)))
     broken = axes @ np.diag([2.0, 1.0, 0.5, 0.1, 1e-3, -1e-6]) @ axes.T
     carried = covariance(broken)
-    absorb(carried, axes[:, 5:].T.copy(), np.zeros(1), np.zeros((1, 6)))
+    rank_update(carried, axes[:, 5:].T.copy(), np.zeros(1), np.zeros((1, 6)))
     assert np.linalg.eigvalsh(dense(carried))[0] >= -1e-15
     assert np.linalg.norm(dense(carried) - broken, 2) < 2e-6
 

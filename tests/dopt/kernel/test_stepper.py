@@ -7,7 +7,7 @@ import pytest
 
 from dopt.kernel import run
 from dopt.kernel.run import KernelTrial, run_trial_in_kernel
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import trial
 
 CASES = [

@@ -7,9 +7,9 @@ import torch
 from torch.func import jacrev, vmap
 
 from dopt.kernel.run import KernelTrial
+from dopt.reference.batch import Lockstep
 from dopt.reference.dynamics import known_flow
 from dopt.reference.learning import AdamLearner
-from dopt.reference.lockstep import Lockstep
 
 
 def transplant(trial: KernelTrial, parameters: np.ndarray | None = None) -> Lockstep:

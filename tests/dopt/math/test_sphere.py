@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dopt.errors import DoptError
-from dopt.planning.sphere import maximize_on_sphere
+from dopt.math.sphere import maximize_on_sphere
 
 TINIEST = 5e-324
 

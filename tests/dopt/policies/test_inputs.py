@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.exploration import run_trial
 from dopt.policies import POLICIES
 from dopt.policies.base import OpenLoop
 from dopt.randomness import draw
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems import System
 from dopt.systems.equilibrium import eigenmode
 from tests.dopt.trials import ALL_PAIRS, trial
@@ -126,9 +126,9 @@ class Wrong(OpenLoop):
 def test_wrong_inputs_of_ones_own_are_refused(
     path: str, shape: tuple[int, ...], value: float, sentence: str
 ) -> None:
-    cell = trial("pendulum", "random", env={"gamma": 2.0}).cell
+    config = trial("pendulum", "random", env={"gamma": 2.0}).config
     policy = Wrong(shape=shape, value=value)
-    spec = TrialSpec(dataclasses.replace(cell, policy=policy, path=path), 0)
+    spec = TrialSpec(dataclasses.replace(config, policy=policy, path=path), 0)
     with pytest.raises(SpecificationError, match=sentence):
         run_trial(spec)
 

@@ -11,16 +11,16 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from dopt.cell import Cell
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set, reachable_states
-from dopt.exploration import run_trial
-from dopt.planning.task_states import goal_weights, task_states
 from dopt.policies import Exact, Lookahead, TaskOptimal
 from dopt.policies.lookahead import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
+from dopt.policies.task_states import goal_weights, task_states
 from dopt.randomness import draw
 from dopt.reference import search
 from dopt.reference.models import model_function
+from dopt.run import run_trial
+from dopt.spec.config import TrialConfig
 from dopt.systems import SYSTEMS
 from dopt.systems.equilibrium import eigenmode
 from tests.dopt.trials import trial
@@ -132,20 +132,20 @@ def test_a_field_that_does_not_fit_the_system_is_answered_by_one_sentence(
 
 
 def test_the_reference_scores_all_plans_at_once_and_keeps_no_budget() -> None:
-    cell = trial("pendulum", "lookahead", policy={"budget_us": 100.0}).cell
+    config = trial("pendulum", "lookahead", policy={"budget_us": 100.0}).config
     with pytest.raises(
         IncompatibleError,
         match=r"budget_us is 100 µs, but only the compiled kernel heeds it, .*: set it to 0",
     ):
-        dataclasses.replace(cell, path="reference")
+        dataclasses.replace(config, path="reference")
 
 
 def test_plans_along_a_model_in_the_physical_parametrisation() -> None:
     """What searches runs with least squares of the physical parameters, as the oracle does."""
     oracle = trial("pendulum", "oracle")
     policy = Lookahead(lookahead=12, regularization=1e-6)
-    cell = Cell(oracle.system, policy, oracle.model, oracle.learner)
-    result = run_trial(dataclasses.replace(oracle, cell=cell))
+    config = TrialConfig(oracle.system, policy, oracle.model, oracle.learner)
+    result = run_trial(dataclasses.replace(oracle, config=config))
     assert np.isfinite(result.loss).all()
     assert result.loss[-1] < 0.05 * result.loss[0]
 

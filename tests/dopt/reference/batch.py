@@ -10,7 +10,7 @@ from torch.func import jacrev
 
 from dopt.randomness import draw
 from dopt.reference.models import Accelerations, model_function
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 
 
 class Situation(NamedTuple):

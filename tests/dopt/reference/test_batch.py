@@ -10,7 +10,7 @@ from torch import nn
 from dopt.errors import SpecificationError
 from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
-from dopt.reference.lockstep import Lockstep, run_trials
+from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.models import network_function, tanh_network
 from tests.dopt.trials import PAIRS, trial
 

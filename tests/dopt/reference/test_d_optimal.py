@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.func import jacrev
 
-from dopt.cell import Cell
-from dopt.planning.sphere import maximize_on_sphere
+from dopt.math.sphere import maximize_on_sphere
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem
-from dopt.spec import TrialSpec
+from dopt.spec.config import TrialConfig
+from dopt.spec.trial import TrialSpec
 from tests.dopt.reference.batch import Situation, situation, sphere, step_from
 from tests.dopt.trials import PAIRS, trial
 
@@ -121,7 +121,7 @@ def _gap_and_effect(env: str, dt: float) -> tuple[float, float]:
     """Return |exact - linearised| gain of one component, and how much the input changes it."""
     spec = trial(env, "d_optimal")
     system = dataclasses.replace(spec.system, dt=dt)
-    spec = TrialSpec(Cell(system, spec.policy, spec.model, spec.learner))
+    spec = TrialSpec(TrialConfig(system, spec.policy, spec.model, spec.learner))
     now, component = situation(spec, 6), system.n_learned - 1
     g, DB = pieces(spec, now, component)
     u = torch.full((system.n_inputs,), system.gamma / system.n_inputs**0.5, dtype=torch.float64)

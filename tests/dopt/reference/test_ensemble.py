@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.ensemble import EnsemblePlan, disagreements
-from dopt.reference.lockstep import Lockstep, run_trials
 from tests.dopt.trials import trial
 
 

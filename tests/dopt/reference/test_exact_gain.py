@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 from torch.func import grad_and_value, jacrev
 
-from dopt.cell import Cell
+from benchmarks.linearisation_gap import linearisation_gaps
 from dopt.policies.gradient import GradientDOptimal
+from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.exact_gain import (
     ExactGain,
     Situation,
     ascend,
     log_det_gain,
 )
-from dopt.reference.lockstep import Lockstep, run_trials
-from dopt.reference.shortfall import shortfalls
-from dopt.spec import TrialSpec
+from dopt.spec.config import TrialConfig
+from dopt.spec.trial import TrialSpec
 from tests.dopt.reference.batch import circle, situation, step_from
 from tests.dopt.trials import trial
 
@@ -147,7 +147,7 @@ def test_a_batch_is_its_trials_one_by_one() -> None:
 
 @pytest.mark.parametrize("env", ENVS)
 def test_the_closed_form_never_beats_the_optimum(env: str) -> None:
-    one, together = shortfalls(
+    one, together = linearisation_gaps(
         [trial(env, "d_optimal", seed, env=SHORT) for seed in range(2)], SEARCH
     )
     for found in (one, together):
@@ -165,7 +165,7 @@ def test_an_input_drawn_at_random_falls_short_for_sure() -> None:
     gain = ExactGain(batch)
     best = gain.values(gain.optimum(circle(5.0, 16)[None], now, SEARCH)[None], now)
     values = gain.values(circle(5.0, 100)[None], now)
-    one, _ = shortfalls([spec], SEARCH)
+    one, _ = linearisation_gaps([spec], SEARCH)
     assert float((best - values.mean()) / (best - values.min())) > 0.2 > 10 * one.of_range.mean()
 
 
@@ -176,8 +176,8 @@ def test_the_shortfall_vanishes_with_the_time_step(env: str) -> None:
     for dt in (0.1, 0.01, 1e-3, 1e-4):
         spec = trial(env, "d_optimal", 1, env=SHORT)
         system = dataclasses.replace(spec.system, dt=dt, noise=0.0)
-        spec = TrialSpec(Cell(system, spec.policy, spec.model, spec.learner, "reference"))
-        one, _ = shortfalls([spec.with_seed(seed) for seed in range(2)], SEARCH)
+        spec = TrialSpec(TrialConfig(system, spec.policy, spec.model, spec.learner, "reference"))
+        one, _ = linearisation_gaps([spec.with_seed(seed) for seed in range(2)], SEARCH)
         missed.append(float(np.mean(one.of_range)))
     assert missed[3] < 1e-6
     if env == "arm":  # the others' inputs act along a line: only its sign is chosen

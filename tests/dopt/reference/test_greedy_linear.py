@@ -10,8 +10,8 @@ import torch
 
 from dopt.errors import IncompatibleError
 from dopt.policies.greedy_linear import is_linear
-from dopt.reference.lockstep import Lockstep, run_trials
-from dopt.spec import TrialSpec
+from dopt.reference.batch import Lockstep, run_trials
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.trials import trial
 

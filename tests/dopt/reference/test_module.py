@@ -12,16 +12,16 @@ import pytest
 import torch
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.exploration import run_trial
 from dopt.models import MLP
 from dopt.policies import POLICIES
-from dopt.reference.lockstep import Lockstep, run_trials
-from dopt.replay import replay
-from dopt.spec import TrialSpec
+from dopt.reference.batch import Lockstep, run_trials
+from dopt.rerun import rerun
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
+from tests.paths import EXAMPLE
 
-EXAMPLE = Path(__file__).resolve().parents[3] / "docs" / "example"
-HERE = "tests.dopt.own_networks"
+HERE = "tests.dopt.custom_networks"
 
 
 def specification(
@@ -99,7 +99,7 @@ def test_the_trial_comes_back_from_its_mapping_and_from_another_process() -> Non
     again = TrialSpec.from_mapping(spec.to_mapping())
     sent = pickle.loads(pickle.dumps(spec))
     assert again.trial_key == spec.trial_key == sent.trial_key
-    assert spec.cell.path == "reference"
+    assert spec.config.path == "reference"
     assert spec.columns()["model"] == "Stack"
     assert spec.trial_key != specification(width=8).trial_key
 
@@ -123,7 +123,7 @@ def test_another_state_of_its_file_is_another_trial(
 
 def test_a_replay_leads_through_the_same_states() -> None:
     spec = specification()
-    seen, whole = replay(spec, [0, 5, 20]), run_trial(spec)
+    seen, whole = rerun(spec, [0, 5, 20]), run_trial(spec)
     np.testing.assert_array_equal(seen.states, whole.states)
     np.testing.assert_array_equal(seen.parameters[-1], whole.parameters)
     assert seen.steps.tolist() == [0, 5, 20]

@@ -10,10 +10,10 @@ import torch
 
 from dopt.models import RFF, GaussianProcess
 from dopt.randomness import draw
+from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.gaussian_process import Posterior
-from dopt.reference.lockstep import Lockstep, run_trials
 from dopt.reference.models import features, model_function
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.trials import trial
 

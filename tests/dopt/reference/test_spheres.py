@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopt.planning.sphere import maximize_on_sphere
+from dopt.math.sphere import maximize_on_sphere
 from dopt.reference.planning import QuadraticProblem, d_optimal_inputs
 from dopt.reference.sphere import maximize_on_spheres
-from tests.dopt.planning.test_sphere import problems, size, value
+from tests.dopt.math.test_sphere import problems, size, value
 
 
 @settings(max_examples=150)

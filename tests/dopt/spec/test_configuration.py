@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
+from dopt.declare.registry import build
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
-from dopt.registry import build
 from dopt.systems import SYSTEMS, System, system_from_mapping
 from dopt.systems.equilibrium import euler_spectral_radius
+from tests.paths import CONF
 
-CONF = Path(__file__).parents[2] / "conf"
 ENVS = sorted((CONF / "env").rglob("*.yaml"))
 GROUPS: list[tuple[str, dict[str, Any]]] = [
     ("policy", POLICIES),

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.soundness import check_system
+from dopt.spec.custom_system_check import check_system
 from dopt.systems import SYSTEMS, Feature, Pendulum, System
 from tests.dopt.trials import trial
 
@@ -67,7 +67,7 @@ def test_what_is_no_system_is_refused(
 ) -> None:
     system = broken(**{attribute: value})
     with pytest.raises(SpecificationError, match=sentence):
-        dataclasses.replace(trial("pendulum", "random").cell, system=system)
+        dataclasses.replace(trial("pendulum", "random").config, system=system)
 
 
 @pytest.mark.parametrize("name", sorted(SYSTEMS))

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt.cell import LARGEST_HORIZON
 from dopt.control.episode import run_episode
 from dopt.control.free_run import free_run_error
 from dopt.control.prediction import forecast_by
 from dopt.errors import SpecificationError
-from dopt.kernel import setup
+from dopt.kernel import from_spec
 from dopt.randomness import draw
-from dopt.spec import TrialSpec
+from dopt.spec.config import LARGEST_HORIZON
+from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import PAIRS, trial
 
 
@@ -31,14 +31,14 @@ def held(spec: TrialSpec) -> int:
     """Return the bytes of what a trial is made of in the kernel, its evaluation aside."""
     draws = draw(spec)
     arrays = (draws.noise, draws.inputs, draws.components, draws.ties)
-    state = setup.initial_state(spec, draws.weights)
-    return size(arrays) + size(setup.empty_record(spec.system)) + size(state)
+    state = from_spec.initial_state(spec, draws.weights)
+    return size(arrays) + size(from_spec.empty_record(spec.system)) + size(state)
 
 
 @pytest.mark.parametrize(("env", "policy"), PAIRS)
 def test_a_usual_trial_needs_little(env: str, policy: str) -> None:
     spec = trial(env, policy, env={"horizon": 500})
-    assert held(spec) <= spec.cell.memory < 2**26
+    assert held(spec) <= spec.config.memory < 2**26
 
 
 @pytest.mark.parametrize(
@@ -53,9 +53,9 @@ def test_a_usual_trial_needs_little(env: str, policy: str) -> None:
 )
 def test_what_is_large_is_reckoned_and_named(changes: dict[str, Any], setting: str) -> None:
     spec = trial("cartpole", "d_optimal", **changes)
-    assert spec.cell.largest_setting == setting
+    assert spec.config.largest_setting == setting
     if setting not in ("env.grid_points", "learner.window"):  # whose arrays the kernel makes
-        assert held(spec) <= spec.cell.memory <= 4 * held(spec)
+        assert held(spec) <= spec.config.memory <= 4 * held(spec)
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_features_are_what_makes_a_linear_model_large() -> None:
 def test_the_reference_holds_the_matrix_in_any_form(form: str) -> None:
     spec = trial("cartpole", "d_optimal", model={"width": 256}, policy={"form": form})
     q = spec.model.n_parameters(spec.system)
-    there = dataclasses.replace(spec.cell, path="reference")
+    there = dataclasses.replace(spec.config, path="reference")
     assert there.memory > 3 * 8 * q**2
     assert there.largest_setting == "model.width"
 
@@ -114,8 +114,8 @@ def test_the_reference_holds_the_matrix_in_any_form(form: str) -> None:
 def test_the_sketch_of_the_reference_is_a_matrix() -> None:
     spec = trial("cartpole", "d_optimal", model={"width": 256}, policy={"form": "sketch"})
     q = spec.model.n_parameters(spec.system)
-    there = dataclasses.replace(spec.cell, path="reference")
-    assert there.memory - spec.cell.memory == pytest.approx(8 * 256 * q, rel=0.05)
+    there = dataclasses.replace(spec.config, path="reference")
+    assert there.memory - spec.config.memory == pytest.approx(8 * 256 * q, rel=0.05)
 
 
 TASK = {"name": "control", "checkpoints": []}
@@ -137,7 +137,7 @@ def with_task(env: str, **fields: Any) -> TrialSpec:
 )
 def test_the_planner_of_a_task_is_reckoned(env: str, sizes: dict[str, Any], setting: str) -> None:
     spec = with_task(env, steps=1, settle_steps=1, iterations=1, **sizes)
-    assert spec.cell.largest_setting == setting
+    assert spec.config.largest_setting == setting
     assert spec.task is not None
     system, task, rng = spec.system, spec.task, np.random.default_rng(0)
     truth = forecast_by(system, system.learned)
@@ -145,19 +145,19 @@ def test_the_planner_of_a_task_is_reckoned(env: str, sizes: dict[str, Any], sett
     run_episode(system, task, truth, truth, np.zeros((1, system.n_states)), rng)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak <= spec.cell.memory <= 2 * peak
+    assert peak <= spec.config.memory <= 2 * peak
 
 
 @pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
 def test_the_free_run_of_a_task_is_reckoned(env: str) -> None:
     spec = with_task(env, free_run_steps=500)
-    assert spec.cell.largest_setting == "task.free_run_steps"
+    assert spec.config.largest_setting == "task.free_run_steps"
     truth = forecast_by(spec.system, spec.system.learned)
     tracemalloc.start()
     free_run_error(spec.system, truth, 500)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak <= spec.cell.memory <= 2 * peak
+    assert peak <= spec.config.memory <= 2 * peak
 
 
 @pytest.mark.parametrize("field", ["samples", "lookahead", "hold", "free_run_steps"])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import ALL_PAIRS, trial
 
 SECTIONS = {"env": "system", "policy": "policy", "model": "model", "learner": "learner"}
@@ -124,6 +124,7 @@ def test_columns_are_those_of_a_table_of_configurations() -> None:
         "horizon": 30,
         "dt": 0.01,
         "gamma": 3.0,
+        "label": "D-optimal, dt=0.01, γ=3, grid_points=[2, 2, 2, 2], horizon 30",
     }
     oracle = trial("arm", "oracle").columns()
     assert (oracle["width"], oracle["depth"]) == (None, None)

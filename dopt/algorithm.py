@@ -1,0 +1,51 @@
+"""Codes, tolerances and rules that the compiled kernel and the torch reference share."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ModelKind(IntEnum):
+    """Model that the kernel evaluates."""
+
+    MLP = 0
+    LINEAR = 1
+
+
+class FeatureKind(IntEnum):
+    """Function of one state component that a feature is."""
+
+    IDENTITY = 0
+    COS = 1
+    SIN = 2
+
+
+class Form(IntEnum):
+    """How the information matrix is held (:class:`dopt.policies.d_optimal.DOptimal`)."""
+
+    PRIMAL = 0
+    DUAL = 1
+    SKETCH = 2
+
+
+class Score(IntEnum):
+    """What a searching policy judges a plan by (:mod:`dopt.policies.search`)."""
+
+    JOINT = 0
+    SUM = 1
+    TRACE = 2
+    A = 3
+    E = 4
+    TASK = 5
+
+
+TIE_MARGIN = 1e-9
+"""Values that differ by less than this relative margin are equal: rounding must not choose."""
+
+INVARIANT = 1e-9
+"""A Krylov direction shorter than this beside its origin is rounding: the space is invariant."""
+
+
+def switch_step(steps: int) -> int:
+    """Return the step at which a plan of so many steps may switch its input, ``steps`` if never."""
+    return steps // 2 if steps > 1 else steps

@@ -1,0 +1,1 @@
+"""Declaration of specifications: validated dataclass fields and registries of named classes."""

@@ -1,0 +1,48 @@
+"""Declarations by which a part of a trial says whether and how the compiled kernel runs it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+from dopt.declare.validated_fields import Validated
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KernelSupport(Validated):
+    """A specification that the kernel may run; the reference path runs what it does not.
+
+    ``compiled`` says whether it does. A class with a ``name`` does not inherit it from another such
+    class, whose algorithm may be another one: it declares it itself or is not compiled. It does
+    inherit it from a class without a name, such as that of all open-loop policies.
+    """
+
+    compiled: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "name" in cls.__dict__ and "compiled" not in cls.__dict__:
+            declaring = next(base for base in cls.__mro__ if "compiled" in base.__dict__)
+            cls.compiled = declaring.__dict__["compiled"] and "name" not in declaring.__dict__
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KernelPart(KernelSupport):
+    """A policy or a learner: what the kernel runs of it is one compiled function.
+
+    Attributes
+    ----------
+    kernel_function : str
+        Dotted path of the function, which takes the trial (:class:`dopt.kernel.structs.Trial`), the
+        step t, and the input to be written or the observed accelerations.
+    """
+
+    kernel_function: ClassVar[str] = ""
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of most parts, the fields are enough
+        """Return the numbers that the function takes, for q parameters and λ of M₀ = λI.
+
+        They are the numeric fields in the order of their declaration, base classes first.
+        """
+        values = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return tuple(float(value) for value in values if isinstance(value, (bool, int, float)))

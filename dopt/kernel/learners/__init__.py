@@ -1,0 +1,1 @@
+"""Compiled functions that update the parameters, one file for each learner."""

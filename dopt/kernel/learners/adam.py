@@ -1,0 +1,59 @@
+"""Adam on the newest samples in compiled code (:mod:`dopt.learning.adam`).
+
+Its numbers are the learning rate, β₁, β₂ and ε.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.kernel.compiler import compiled, contracted
+from dopt.kernel.learners.samples import store_sample
+from dopt.kernel.network import loss_gradient
+from dopt.kernel.structs import Network, Scratch, State, Trial
+from dopt.types import Matrix, Vector
+
+
+@compiled
+def learn(trial: Trial, t: int, target: Vector) -> None:
+    """Take Adam's step t + 1 on the newest samples, which the state's window holds."""
+    features, targets = trial.state.window_features, trial.state.window_targets
+    store_sample(trial.network, features, targets, t, trial.record.states[t], target)
+    if t + 1 < features.shape[1]:
+        features = features[:, : t + 1].copy()
+        targets = targets[:, : t + 1].copy()
+    adam_step(
+        trial.network, trial.algorithm.learner, trial.state, trial.scratch, t, features, targets
+    )
+
+
+@compiled
+def adam_step(
+    network: Network,
+    numbers: Vector,
+    state: State,
+    scratch: Scratch,
+    step: int,
+    features: Matrix,
+    targets: Matrix,
+) -> None:
+    """Take step ``step`` + 1 on a batch: features (p, n) and observed accelerations (r, n)."""
+    gradient = scratch.gradient
+    loss_gradient(network, state.theta, features, targets, scratch.hidden, scratch.deltas, gradient)
+    adam_update(numbers, step, state.theta, state.moment_1, state.moment_2, gradient)
+
+
+@contracted
+def adam_update(
+    numbers: Vector, t: int, theta: Vector, moment_1: Vector, moment_2: Vector, gradient: Vector
+) -> None:
+    """Move θ, (q,), and the moments, (q,), along a gradient: step t + 1."""
+    learning_rate, beta_1, beta_2, epsilon = numbers[0], numbers[1], numbers[2], numbers[3]
+    correction_1 = 1.0 - beta_1 ** (t + 1)
+    correction_2 = 1.0 - beta_2 ** (t + 1)
+    for i in range(gradient.shape[0]):
+        g = gradient[i]
+        moment_1[i] = beta_1 * moment_1[i] + (1.0 - beta_1) * g
+        moment_2[i] = beta_2 * moment_2[i] + (1.0 - beta_2) * g * g
+        deviation = np.sqrt(moment_2[i] / correction_2)
+        theta[i] -= learning_rate * (moment_1[i] / correction_1) / (deviation + epsilon)

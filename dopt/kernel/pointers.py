@@ -1,0 +1,125 @@
+"""Compilation of the loop, the policy and the learner of a trial for function pointers.
+
+The loop is compiled once for all systems, policies and learners; a policy or a learner is compiled
+when a trial first needs it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numba
+from numba import float64, int64, types
+from numba.core.errors import NumbaError
+
+from dopt.errors import SpecificationError
+from dopt.kernel.cache import one_compiler_at_a_time
+from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
+from dopt.kernel.loop import advance
+from dopt.kernel.structs import Evaluation, Plant, Trial
+from dopt.kernel.user_code import compiled_here
+from dopt.learning.base import CompiledLearner, Learner
+from dopt.policies.base import CompiledPolicy, Policy
+from dopt.types import CompiledFunction, NumbaType
+
+
+class Compiled(NamedTuple):
+    """Compiled code of a trial."""
+
+    advance: Callable[..., int]
+    plan: CompiledFunction
+    learn: CompiledFunction
+
+
+def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evaluation) -> Compiled:
+    """Compile the loop for a trial, with the functions of its policy and its learner."""
+    plan, learn = signatures(trial)
+    loop = compiled_loop(trial, points)
+    return Compiled(loop, function_of(policy, plan), function_of(learner, learn))
+
+
+def signatures(trial: Trial) -> tuple[NumbaType, NumbaType]:
+    """Return the types of the functions of a policy and of a learner."""
+    plan = learn = types.void(kind_of(trial), int64, float64[::1])
+    return plan, learn
+
+
+def compiled_loop(trial: Trial, points: Evaluation) -> Callable[..., int]:
+    """Compile the loop for a trial, with pointers to the functions of its policy and learner."""
+    given = (kind_of(trial), kind_of(points), *map(pointer, signatures(trial)))
+    return compiled_for("loop", advance, (*given, int64, int64))
+
+
+def function_of(part: Policy | Learner, signature: NumbaType) -> CompiledFunction:
+    """Return the compiled function of a policy or a learner.
+
+    Raises
+    ------
+    SpecificationError
+        If its class names none, or one that does not exist or does not compile.
+    """
+    if isinstance(part, CompiledPolicy):
+        return _own(part, part.plan, signature)
+    if isinstance(part, CompiledLearner):
+        return _own(part, part.learn, signature)
+    path = part.kernel_function
+    module, _, name = path.rpartition(".")
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SpecificationError(
+            f"{part.section} '{part.name}' names the kernel function '{path}', which cannot be "
+            f"imported ({error}): set kernel_function in its class to the path of one."
+        ) from error
+    compiled_for(path, function, signature.args)
+    return function
+
+
+def _own(
+    part: Policy | Learner, function: Callable[..., None], signature: NumbaType
+) -> CompiledFunction:
+    """Compile the function of a user's own policy or learner."""
+    compiled = compiled_here(function)
+    try:
+        compiled.compile(signature)
+    except NumbaError as error:
+        reason = next((line for line in str(error).splitlines()[1:] if line.strip()), str(error))
+        raise SpecificationError(
+            f"{function.__name__}() of {part.section} '{part.name}' does not compile "
+            f"({reason.strip()}): write it with numbers, arrays and loops that Numba compiles, and "
+            f"functions of dopt.kernel."
+        ) from error
+    return compiled
+
+
+def kind_of(value: object) -> NumbaType:
+    """Return the type of an argument for numba; of equations, that of a pointer to them."""
+    if not isinstance(value, tuple):
+        return numba.typeof(value)
+    kinds = [kind_of(item) for item in value[3 if isinstance(value, Plant) else 0 :]]
+    if isinstance(value, Plant):
+        kinds = [*map(pointer, (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)), *kinds]
+    return types.NamedTuple(kinds, type(value))
+
+
+def pointer(signature: NumbaType) -> NumbaType:
+    """Return the type of a pointer to functions of a signature."""
+    return types.FunctionType(signature)
+
+
+def compiled_for(
+    name: str, function: CompiledFunction, kinds: tuple[NumbaType, ...]
+) -> Callable[..., int]:
+    """Return the machine code of a function for types of arguments; compile it unless it is."""
+    if (name, kinds) not in _done:
+        with one_compiler_at_a_time(
+            f"{name}-{hashlib.sha256(str(kinds).encode()).hexdigest()[:16]}"
+        ):
+            _done[name, kinds] = function.compile(kinds)
+    return _done[name, kinds]
+
+
+_done: dict[tuple[str, tuple[NumbaType, ...]], Callable[..., int]] = {}

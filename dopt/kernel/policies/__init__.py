@@ -1,0 +1,1 @@
+"""Compiled functions that choose the next input, one file for each policy."""

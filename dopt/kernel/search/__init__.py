@@ -1,0 +1,1 @@
+"""Compiled search for the best plan among a finite set."""

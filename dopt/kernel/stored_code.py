@@ -1,0 +1,68 @@
+"""Disk cache of compiled functions, found by what the sources say and not by where they lie.
+
+Numba looks for machine code under the path of its source, and stores a function each time that it
+compiles one, also one that only another function calls, whose code holds it already. Here the
+folder is that of a state of the sources (:mod:`dopt.kernel.cache`), the same for every checkout on
+a machine, and what another function's compilation needed is not stored once more.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.targetconfig import ConfigStack
+
+from dopt.kernel.cache import CACHE_FOLDER
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+class _Place(_CacheLocator):  # type: ignore[misc]  # numba has no types
+    """Folder of a function's machine code, named by its file's path within the package."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._py_file = file  # a warning of numba's names it
+        self._line = function.__code__.co_firstlineno
+
+    def get_cache_path(self) -> str:
+        path = Path(self._py_file).resolve().relative_to(_PACKAGE)
+        return str(CACHE_FOLDER / path.with_suffix(""))
+
+    def get_source_stamp(self) -> str:
+        return hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Self:
+        place = cls(py_func, py_file)
+        place.ensure_cache_path()
+        return place
+
+
+class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (_Place,)
+
+
+class StoredCode(FunctionCache):  # type: ignore[misc]
+    """Machine code of one function of the package for each of its signatures."""
+
+    _impl_class = _Implementation
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Store a function that Python calls; one compiled on the way is part of its caller."""
+        if not len(ConfigStack()):
+            super().save_overload(sig, data)
+
+
+def stored(dispatcher: Any) -> Any:
+    """Let a compiled function keep its machine code on disk, if the package's sources hold it."""
+    if Path(inspect.getfile(dispatcher.py_func)).resolve().is_relative_to(_PACKAGE):
+        dispatcher._cache = StoredCode(dispatcher.py_func)
+    return dispatcher

@@ -1,0 +1,203 @@
+"""Structures that compiled functions receive: constants, mutable state and records, by name.
+
+Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
+w units in each hidden layer, L hidden layers, N evaluation points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from dopt.types import (
+    Accelerations,
+    ComplexAccelerations,
+    Integers,
+    Known,
+    Matrix,
+    Singles,
+    Stack,
+    Vector,
+)
+
+
+class Plant(NamedTuple):
+    """The system: its compiled equations, each writing into its last argument, and constants."""
+
+    known: Known  # (x, u, p, out), known part of dx/dt
+    accelerations: Accelerations  # (x, p, out), learned accelerations
+    complex_accelerations: ComplexAccelerations  # (x, p, out), the same for complex arguments
+    parameters: Vector  # physical parameters, at the start
+    history: Matrix  # (T, number of them) at each step; one row where they stay
+    linear_form: Matrix  # (1 + n_linear, number of physical parameters)
+    learned_rows: Integers  # (r,)
+    n_inputs: int  # m
+    dt: float
+    gamma: float
+    state_limit: float
+
+
+class Network(NamedTuple):
+    """Architecture of the model."""
+
+    kind: int  # dopt.algorithm.ModelKind
+    sizes: Integers  # (L + 2,) units of each layer, from p to r
+    offsets: Integers  # (L + 1,) where each layer's weights start in the parameter vector
+    feature_kinds: Integers  # (p,) dopt.algorithm.FeatureKind
+    feature_indices: Integers  # (p,)
+    feature_scales: Vector  # (p,)
+
+
+class Search(NamedTuple):
+    """Plans among which a policy searches (:mod:`dopt.policies.search`); none in others."""
+
+    candidates: Matrix  # (C, m)
+    score: int  # dopt.algorithm.Score
+    steps: int  # H
+    switch: int  # steps after which the input may switch, H where it may not
+    stride: int
+    budget_us: float
+    task_states: Matrix  # (n, d)
+    starts: Matrix  # (b, q) of the Krylov space
+    subspace: int
+
+
+class Algorithm(NamedTuple):
+    """Settings of policy and learner, and how the information matrix M is held."""
+
+    policy: Vector  # numbers of the policy, in the order that its kernel function takes
+    learner: Vector  # numbers of the learner, in the order that its kernel function takes
+    search: Search
+    informed: bool  # whether the policy plans with an M that the learner does not update
+    form: int  # of M, dopt.algorithm.Form
+    regularization: float  # λ of M₀ = λI
+
+
+class Randomness(NamedTuple):
+    """Numbers of :class:`dopt.randomness.Draws`."""
+
+    noise: Matrix  # (T, d)
+    inputs: Matrix  # (T, m)
+    components: Integers  # (T,)
+    ties: Matrix  # (T, m)
+    replay: Integers  # (T, steps, batch), empty without replay
+
+
+class Evaluation(NamedTuple):
+    """Points at which the model is compared with the truth, the grid's first.
+
+    For the network they come in blocks of a fixed size, one point to a column, the last block of
+    the grid and that of the reachable set padded; for the linear model one after the other.
+    """
+
+    single: Singles  # (blocks, p, block size), features in single precision
+    features: Stack  # (blocks, p, block size)
+    block_targets: Stack  # (blocks, r, block size)
+    block_sizes: Integers  # (blocks,) points that count
+    regressors: Stack  # (N, r, q) of the linear model
+    targets: Matrix  # (N, r) less the offset, of the linear model
+    states: Matrix  # (N, d) where the truth changes; otherwise empty
+    n_grid: int  # blocks of the grid, or its points for the linear model
+    n_all: int  # all blocks or points
+    target_size: float  # root mean square of the targets
+
+
+class Covariance(NamedTuple):
+    """M⁻¹ = A - VᵀV (:mod:`dopt.kernel.information`); all empty where nothing needs it."""
+
+    upper: Matrix  # (q, q), A in the upper triangle
+    pending: Matrix  # (PENDING_ROWS, q), V in the first n_pending rows
+    n_pending: Integers  # (1,)
+
+
+class Dual(NamedTuple):
+    """Rows of the Gram matrix and its factor (:mod:`dopt.kernel.information.dual`).
+
+    Empty in other forms.
+    """
+
+    features: Matrix  # (T, p) at the states seen
+    hidden: Stack  # (L, T, w)
+    deltas: Stack  # (r, L, T, w)
+    factor: Matrix  # (r T, r T), C in the lower triangle
+    n_states: Integers  # (1,)
+
+
+class Sketch(NamedTuple):
+    """Random projection of the parameters (:mod:`dopt.kernel.information.sketch`).
+
+    Empty in other forms.
+    """
+
+    buckets: Integers  # (q,)
+    signs: Vector  # (q,)
+    size: int
+
+
+class Linearization(NamedTuple):
+    """Passes of the network at one state for one component, and along m directions."""
+
+    phi: Vector  # (p,)
+    hidden: Matrix  # (L, w)
+    deltas: Matrix  # (L, w)
+    phi_dots: Matrix  # (m, p)
+    hidden_dots: Stack  # (m, L, w)
+    deltas_dots: Stack  # (m, L, w)
+
+
+class State(NamedTuple):
+    """Everything that changes from step to step; written in place."""
+
+    theta: Vector  # (q,) parameters
+    moment_1: Vector  # (q,) of Adam
+    moment_2: Vector  # (q,)
+    covariance: Covariance
+    dual: Dual
+    sketch: Sketch
+    window_features: Matrix  # (p, window) newest samples, a ring
+    window_targets: Matrix  # (r, window)
+    policy_memory: Vector  # what a compiled policy of a user's own keeps
+    learner_memory: Vector  # what a compiled learner of a user's own keeps
+
+
+class Scratch(NamedTuple):
+    """Memory that a learning step overwrites."""
+
+    hidden: Matrix  # (L, room) flat activations of a batch
+    deltas: Matrix  # (3, room) flat δ of a batch
+    gradient: Vector  # (q,)
+
+
+class Record(NamedTuple):
+    """What a trial leaves behind."""
+
+    states: Matrix  # (T + 1, d)
+    inputs: Matrix  # (T, m)
+    loss: Vector  # (T,)
+    reachable_loss: Vector  # (T,)
+    plan_us: Vector  # (T,)
+    learn_us: Vector  # (T,)
+    evaluate_us: Vector  # (T,)
+
+
+class Trial(NamedTuple):
+    """All that the policy and the learner of a trial work on.
+
+    At step t a policy finds the states x_0 ... x_t in ``record.states[: t + 1]`` and the inputs
+    u_0 ... u_{t-1} in ``record.inputs[:t]``.
+    """
+
+    plant: Plant
+    network: Network
+    algorithm: Algorithm
+    randomness: Randomness
+    state: State
+    scratch: Scratch
+    record: Record
+
+
+Plan = Callable[[Trial, int, Vector], None]
+"""Choice of the input: trial, step t and the input u_t, (m,), which it writes."""
+
+Learn = Callable[[Trial, int, Vector], None]
+"""Learning step: trial, step t and the accelerations observed in it, (r,)."""

@@ -1,1 +1,0 @@
-"""From an information objective to the input that maximises it."""

@@ -1,0 +1,33 @@
+"""Titles of the policies for figures, tables and labels, in the order in which they are listed."""
+
+from __future__ import annotations
+
+TITLES: dict[str, str] = {
+    "d_optimal": "D-optimal",
+    "oracle": "oracle",
+    "uniform": "uniform",
+    "periodic": "periodic",
+    "random": "random",
+    "random_held": "held random",
+    "random_sphere": "random on the sphere",
+    "prbs": "PRBS",
+    "multisine": "multisine",
+    "chirp": "chirp",
+    "max": "ensemble disagreement",
+    "gaussian_process": "Gaussian process",
+    "gradient": "D-optimal, by gradient",
+    "linear": "D-optimal, linear",
+    "lookahead": "look-ahead",
+    "exact": "exact gain",
+    "trace": "trace",
+    "trace_linearized": "trace, linearised",
+    "a_optimal": "A-optimal",
+    "e_optimal": "E-optimal",
+    "task": "task-optimal",
+}
+"""The policies of the paper come first. A policy without an entry follows by its name."""
+
+
+def policy_title(policy: str) -> str:
+    """Return the title of a policy; without an entry, its name with spaces."""
+    return TITLES.get(policy, policy.replace("_", " "))

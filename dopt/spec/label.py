@@ -1,0 +1,227 @@
+"""Short human labels of configurations: the policy, and the settings that differ.
+
+``config_label`` compares one configuration with the defaults of the classes that it names, such as
+``D-optimal, adam_replay ×30, γ=3``; the results database stores it. ``labels`` compares
+configurations that are shown together with each other, such as ``γ=2`` and ``γ=3``.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from dopt.control import TASKS, Control
+from dopt.declare.registry import SOURCE, TARGET, section_of
+from dopt.declare.validated_fields import Validated
+from dopt.errors import SpecificationError
+from dopt.learning import LEARNERS
+from dopt.models import MODELS
+from dopt.policies import POLICIES
+from dopt.policies.titles import policy_title
+from dopt.spec.config import SECTIONS
+from dopt.systems import SYSTEMS, System
+
+Flat = Mapping[str, object]
+"""A configuration by dotted path, such as ``env.gamma``."""
+
+_REGISTRIES: Mapping[str, Mapping[str, type[Validated]]] = {
+    "env": SYSTEMS,
+    "policy": POLICIES,
+    "model": MODELS,
+    "learner": LEARNERS,
+    "task": TASKS,
+}
+_MODEL_OF = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}
+"""Usual model of a policy; of the others it is the network."""
+
+_LEARNER_OF = {"mlp": "adam_window", "gaussian_process": "conditioning"}
+"""Usual learner of a model; of the others it is least squares."""
+
+_TITLED = ("env.name", "policy.name")
+_FIRST = ("model.name", "learner.name", "learner.steps")
+_COLUMNS = {
+    "gamma": "env.gamma",
+    "dt": "env.dt",
+    "horizon": "env.horizon",
+    "width": "model.width",
+    "depth": "model.depth",
+}
+"""Columns of the results database that stand for a setting."""
+
+_FORMATS = {
+    "env.gamma": "γ={}",
+    "env.noise": "σ={}",
+    "env.horizon": "horizon {}",
+    "model.width": "width {}",
+    "model.depth": "depth {}",
+    "policy.regularization": "λ={}",
+    "learner.regularization": "learner λ={}",
+    "learner.steps": "×{}",
+    "task.name": "task {}",
+    "path": "{} path",
+}
+
+
+def config_label(config: Mapping[str, object]) -> str:
+    """Return the policy's title and every setting that is not the default of what is named.
+
+    Settings of a user's class are compared where that class is loaded, and left out elsewhere.
+    """
+    flat, usual = flatten(config), usual_values(config)
+    known = [path for path in _paths([flat]) if path in usual]
+    unusual = [path for path in known if _is_unusual(path, flat, usual)]
+    return ", ".join([_title(flat), *_words(flat, unusual)])
+
+
+def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
+    """Return a label for each configuration that says only what differs among those of its env.
+
+    The policy is named where several are shown. Of the settings that differ, usual values are left
+    out, unless the label would be empty or equal to that of another configuration.
+    """
+    flats = [flatten(config) for config in configs]
+    titled = len({flat.get("policy.name") for flat in flats}) > 1
+    places: dict[object, list[int]] = {}
+    for place, flat in enumerate(flats):
+        places.setdefault(flat.get("env.name"), []).append(place)
+    found: dict[int, str] = {}
+    for group in places.values():
+        usual = [usual_values(configs[place]) for place in group]
+        found |= zip(group, _labels([flats[place] for place in group], usual, titled), strict=True)
+    return [found[place] for place in range(len(configs))]
+
+
+def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[str]:
+    """Return the labels of the configurations of one environment."""
+    paths = [path for path in _paths(flats) if len({repr(flat.get(path)) for flat in flats}) > 1]
+    common = [path for path in paths if all(path in flat for flat in flats)]
+    rows = []
+    for flat, own in zip(flats, usual, strict=True):
+        title = [_title(flat)] if titled or not paths else []
+        words = _words(flat, [path for path in paths if _is_unusual(path, flat, own)])
+        brief = title + words or _words(flat, common) or [_title(flat)]
+        whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
+        rows.append((", ".join(brief), ", ".join(whole)))
+    counts = Counter(brief for brief, _ in rows)
+    return [brief if counts[brief] == 1 else whole for brief, whole in rows]
+
+
+def _is_unusual(path: str, flat: Flat, usual: Flat) -> bool:
+    """Whether a configuration has a setting other than the default, its versions apart."""
+    hidden = path.endswith("_version")
+    return not hidden and path in flat and (path not in usual or flat[path] != usual[path])
+
+
+def value_label(path: str, value: object) -> str:
+    """Return the words for one value of a setting, such as ``γ=3`` or ``width 64``.
+
+    ``path`` is a dotted path or a column; a section, such as ``learner``, stands for its name.
+    """
+    if value is None:
+        return f"no {path.rpartition('.')[2]}"
+    if path in ("policy", "policy.name"):
+        return policy_title(str(value))
+    if path in _REGISTRIES or path.endswith(".name"):
+        return str(value)
+    return _word(_COLUMNS.get(path, path), value)
+
+
+def usual_values(config: Mapping[str, object]) -> dict[str, object]:
+    """Return the defaults of what a configuration names, by dotted path.
+
+    Those of a user's class are known only where that class is loaded.
+    """
+    classes = {key: _class(config, key) for key in _REGISTRIES}
+    usual: dict[str, object] = {}
+    for key, cls in classes.items():
+        if cls is not None:
+            own = _defaults(cls, classes["env"])
+            usual |= {f"{key}.{name}": value for name, value in own.items()}
+    model = _MODEL_OF.get(_name(config, "policy"), "mlp")
+    learner = _LEARNER_OF.get(_name(config, "model"), "recursive_least_squares")
+    usual |= {"model.name": model, "learner.name": learner, "task.name": None}
+    parts = [classes[key] for key in SECTIONS]
+    if None not in parts:
+        compiled = all(getattr(cls, "compiled", False) for cls in parts)
+        usual["path"] = "kernel" if compiled else "reference"
+    return usual
+
+
+def flatten(config: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Return a nested mapping by dotted path."""
+    flat: dict[str, object] = {}
+    for key, value in config.items():
+        path = f"{prefix}{key}"
+        flat.update(flatten(value, f"{path}.") if isinstance(value, Mapping) else {path: value})
+    return flat
+
+
+def _name(config: Mapping[str, object], key: str) -> str:
+    """Return the name in a section, or the text that stands in its place; empty without one."""
+    section = config.get(key)
+    return str(section.get("name")) if isinstance(section, Mapping) else str(section or "")
+
+
+def _class(config: Mapping[str, object], key: str) -> type[Validated] | None:
+    """Return the class of a section: a registered one, or a user's that is loaded already."""
+    section = config.get(key)
+    if not isinstance(section, Mapping) or TARGET not in section:
+        return _REGISTRIES[key].get(_name(config, key))
+    module, _, name = str(section[TARGET]).rpartition(".")
+    found = getattr(sys.modules.get(module), name, None)
+    return found if isinstance(found, type) and issubclass(found, Validated) else None
+
+
+def _defaults(cls: type[Validated], env: type[Validated] | None) -> Mapping[str, object]:
+    """Return the section of a class with nothing set; of a task, as the system resolves it."""
+    if (cls, env) not in _known:
+        _known[cls, env] = _default_section(cls, env)
+    return _known[cls, env]
+
+
+_known: dict[tuple[type, type | None], Mapping[str, object]] = {}
+
+
+def _default_section(cls: type[Validated], env: type[Validated] | None) -> Mapping[str, object]:
+    try:
+        item = cls()
+        system = env() if env else None
+        if isinstance(item, Control) and isinstance(system, System):
+            item = item.resolved(system)
+    except (TypeError, SpecificationError):  # a class that has settings without a default
+        return {}
+    own = section_of(item)
+    return {key: value for key, value in own.items() if key not in ("name", SOURCE, TARGET)}
+
+
+def _title(flat: Flat) -> str:
+    return policy_title(str(flat.get("policy.name", flat.get("policy", ""))))
+
+
+def _paths(flats: Sequence[Flat]) -> list[str]:
+    """Return all paths that a label can name, the model and the learner first."""
+    paths = set().union(*flats) - set(_TITLED)
+    return [*(path for path in _FIRST if path in paths), *sorted(paths - set(_FIRST))]
+
+
+def _words(flat: Flat, paths: Sequence[str], digits: int = 6) -> list[str]:
+    """Return the words of some settings; steps of a learner stand behind its name."""
+    words = {path: _word(path, flat[path], digits) for path in paths}
+    if "learner.steps" in words:
+        words["learner.steps"] = f"{flat['learner.name']} {words['learner.steps']}"
+        words.pop("learner.name", None)
+    return list(words.values())
+
+
+def _word(path: str, value: object, digits: int = 6) -> str:
+    name = path.rpartition(".")[2]
+    return _FORMATS.get(path, "{}" if name == "name" else f"{name}={{}}").format(
+        _text(value, digits)
+    )
+
+
+def _text(value: object, digits: int) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(_text(one, digits) for one in value)}]"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)

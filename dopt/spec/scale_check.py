@@ -1,0 +1,44 @@
+"""Size of the learned accelerations of a user's own system, compared with what a network learns."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+
+import numpy as np
+
+from dopt.errors import ScaleWarning
+from dopt.models import MLP, Model
+from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
+
+LARGEST = 100.0
+"""Root mean square of the accelerations over the grid up to which a network learns them well.
+
+Those of the shipped systems are 2 to 60 in their units.
+"""
+
+SMALLEST = 0.05
+
+
+@functools.lru_cache(maxsize=64)
+def warn_of_scale(system: System, model: Model) -> None:
+    """Warn where the accelerations are of another size than the outputs of a network.
+
+    Weights begin at about 1 and move by the learning rate at each step, in whatever unit the
+    accelerations are: in one in which they are in thousands, most of the error is left at the end.
+    """
+    if isinstance(system, BlackBox) or not isinstance(model, MLP):
+        return
+    values = system.learned(system.grid())
+    sizes = np.sqrt(np.mean(values**2, axis=0))
+    for row, size in zip(system.learned_rows, sizes, strict=True):
+        if size > LARGEST or 0 < size < SMALLEST:
+            warnings.warn(
+                f"The learned acceleration of {system.state_labels[row]} in env '{system.name}' "
+                f"has a root mean square of {size:.3g} over the evaluation grid, but a network "
+                f"learns one of {SMALLEST:g} to {LARGEST:g} well: measure that state in a unit "
+                f"about {size:.1g} times as large.",
+                ScaleWarning,
+                stacklevel=2,
+            )

@@ -1,0 +1,79 @@
+"""A policy and a learner as this package would gain them: class, kernel function, no other code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from dopt.kernel.compiler import compiled
+from dopt.kernel.information.update import model_rows
+from dopt.kernel.structs import Trial
+from dopt.learning.base import Array, CustomLearner, Updater
+from dopt.policies.base import CustomPolicy, Planner
+from dopt.systems import System
+from dopt.trial_view import TrialView
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alternating(CustomPolicy):
+    """A share of γ along the first axis, with a sign that changes at every step."""
+
+    name: ClassVar[str] = "alternating"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "tests.dopt.newcomers.plan"
+
+    share: float = 0.5
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return _Planner(self.share * system.gamma * np.eye(system.n_inputs)[0])
+
+
+class _Planner(Planner):
+    def __init__(self, u: Array) -> None:
+        self._u = u
+
+    def choose(self, view: TrialView) -> Array:
+        return self._u if view.t % 2 == 0 else -self._u
+
+
+@compiled
+def plan(trial: Trial, t: int, u: Array) -> None:
+    size = trial.algorithm.policy[0] * trial.plant.gamma
+    u[:] = 0.0
+    u[0] = size if t % 2 == 0 else -size
+
+
+@dataclass(frozen=True, kw_only=True)
+class Descent(CustomLearner):
+    """A gradient step on the newest sample."""
+
+    name: ClassVar[str] = "descent"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "tests.dopt.newcomers.learn"
+
+    learning_rate: float = 1e-4
+
+    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
+        return _Updater(self.learning_rate)
+
+
+class _Updater(Updater):
+    def __init__(self, learning_rate: float) -> None:
+        self._learning_rate = learning_rate
+
+    def update(self, view: TrialView) -> Array:
+        x = view.states[-2]
+        error = view.predict(x[None])[0] - view.accelerations[-1]
+        return view.parameters - self._learning_rate * error @ view.jacobian(x)
+
+
+@compiled
+def learn(trial: Trial, t: int, target: Array) -> None:
+    value = np.empty(target.shape[0])
+    J = model_rows(trial.plant, trial.network, trial.state.theta, trial.record.states[t], value)
+    for k in range(target.shape[0]):
+        error = value[k] - target[k]
+        for i in range(J.shape[1]):
+            trial.state.theta[i] -= trial.algorithm.learner[0] * error * J[k, i]
