@@ -1,4 +1,4 @@
-"""``python -m orchestrate COMMAND``: see what a launch did, and act on it."""
+"""Program ``python -m orchestrate COMMAND``: commands on a results database."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from orchestrate.commands import COMMANDS
 from orchestrate.commands.command import PROGRAM
 from orchestrate.commands.output import say
 from orchestrate.errors import ExitCode
-from orchestrate.passwords import without_password
+from orchestrate.redaction import without_password
 from orchestrate.store import StoreUnavailableError
 
 
@@ -20,7 +20,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     given = sys.argv[1:] if words is None else list(words)
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # a terminal that knows fewer characters
+        sys.stdout.reconfigure(errors="replace")  # a terminal with a smaller character set
     try:
         if not given or given[0] in ("-h", "--help", "help"):
             say(overview())
@@ -33,7 +33,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except BrokenPipeError:
-        # Whoever read the output has seen enough; the interpreter must not flush the rest to it.
+        # The reader of the output has closed it; the interpreter must not flush the rest.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.DONE
 
@@ -43,7 +43,7 @@ def overview() -> str:
     width = max((len(command.name) for command in COMMANDS), default=0)
     lines = [f"  {command.name:<{width}}  {command.help}" for command in COMMANDS]
     usage = f"Usage: {PROGRAM} COMMAND [--db URL] [--json] ..."
-    return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help says more."])
+    return "\n".join([usage, "", *lines, "", f"{PROGRAM} COMMAND --help shows its options."])
 
 
 def _run(name: str, words: Sequence[str]) -> int:

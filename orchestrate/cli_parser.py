@@ -1,31 +1,31 @@
-"""An argument parser whose refusals are one sentence with the nearest valid name."""
+"""Command-line parser whose error messages are one sentence with the nearest valid name."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn
 
 from dopt.errors import DoptError, unknown_name
 
 
 class UsageError(DoptError):
-    """The words of a command cannot be understood.
+    """Invalid command-line arguments.
 
-    It is no ``ValueError``, so that a type of an argument can raise it through :mod:`argparse`.
+    Not a ``ValueError``, so that argument types can raise it through :mod:`argparse`.
     """
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises ``UsageError`` instead of printing usage; takes no abbreviated options."""
+    """Parser that raises ``UsageError`` instead of exiting, and rejects abbreviated options."""
 
     def __init__(self, prog: str, description: str | None = None, **options: Any) -> None:
         super().__init__(prog=prog, description=description, allow_abbrev=False, **options)
 
     def read(self, words: Sequence[str], *, mixed: bool = False) -> argparse.Namespace:
-        """Return the arguments; raise ``UsageError`` for a word too many.
+        """Return the arguments; raise ``UsageError`` for a surplus one.
 
-        ``mixed`` takes options between the positional words too.
+        ``mixed`` accepts options between the positional arguments too.
         """
         read = self.parse_known_intermixed_args if mixed else self.parse_known_args
         arguments, unknown = read(list(words))
@@ -34,14 +34,14 @@ class Parser(argparse.ArgumentParser):
                 options = {one for one in _options(self, words) if one.startswith("--")}
                 raise UsageError(f"{unknown_name('option', word.split('=')[0], options)}")
         if unknown:
-            self.error(f"there is a word too many, {unknown[0]!r}")
+            self.error(f"unexpected argument {unknown[0]!r}")
         return arguments
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message.removeprefix('argument ')}: see {self.prog} --help.")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Refuse a value that is none of the choices with the nearest one."""
+        """Refuse a value outside the choices, with the nearest one."""
         if action.choices is not None and value not in action.choices:
             name = max(action.option_strings, key=len, default=action.metavar or action.dest)
             names = [str(choice) for choice in action.choices]
@@ -55,3 +55,19 @@ def _options(parser: argparse.ArgumentParser, words: Sequence[str]) -> Iterator[
         if isinstance(action, argparse._SubParsersAction):
             for name in set(words) & set(action.choices):
                 yield from _options(action.choices[name], words)
+
+
+def positive(option: str, number: type[int] | type[float]) -> Callable[[str], float]:
+    """Return the argument type for a number above 0."""
+
+    def read(given: str) -> float:
+        try:
+            value = number(given)
+        except ValueError:
+            value = number(0)
+        if not 0 < value < float("inf"):
+            kind = "whole number" if number is int else "number"
+            raise UsageError(f"{option} is {given!r}, a {kind} above 0 is expected: give one.")
+        return value
+
+    return read

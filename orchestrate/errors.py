@@ -1,4 +1,4 @@
-"""What can go wrong around the trials, and the exit code of each kind."""
+"""Errors of a launch, and exit codes."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dopt.errors import DoptError
 
 
 class ExitCode(enum.IntEnum):
-    """What a launch tells the shell."""
+    """Exit codes of the programs."""
 
     DONE = 0
     SOME_FAILED = 1
     BAD_REQUEST = 2
-    DEFECT = 70  # of the program itself, with a traceback
+    DEFECT = 70  # a bug of the program, with a traceback
     INFRASTRUCTURE = 75
     INTERRUPTED = 130
 
 
 class LaunchError(DoptError, ValueError):
-    """A setting of the launch is wrong; nothing was run."""
+    """Invalid setting of a launch; nothing was run."""
 
 
 class InfrastructureError(DoptError):
-    """Something below the trials was lost, such as Ray; the same command goes on later."""
+    """Loss of a service such as Ray; the same command continues later."""

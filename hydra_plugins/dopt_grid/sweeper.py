@@ -1,7 +1,7 @@
-"""The sweeper that ``-m`` uses.
+"""Sweeper for ``-m``.
 
 Annotations are not postponed here: Hydra's scan executes a plugin before it is in ``sys.modules``,
-where a dataclass would look up postponed ones.
+where a dataclass resolves postponed ones.
 """
 
 import json
@@ -14,17 +14,17 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from orchestrate.grid import Combination
-from orchestrate.hydra_plugins.dopt_grid._expansion import expand
-from orchestrate.hydra_plugins.dopt_grid._unread import check_keys
+from orchestrate.config.expand import expand
+from orchestrate.config.grid import Combination
+from orchestrate.config.unknown_keys import reject_unknown
 
 
 @dataclass
 class GridSweeperConf:
-    """``params`` are sweeps that hold unless the command line names the same key.
+    """Configuration of the sweeper.
 
-    ``grids`` asks for several grids at once: each entry is laid over ``params``, and trials that
-    are in more than one of them run once.
+    ``params`` are sweeps that apply unless the command line sets the same key. ``grids`` defines
+    several grids: each entry is merged over ``params``, and trials in several grids run once.
     """
 
     _target_: str = "hydra_plugins.dopt_grid.sweeper.GridSweeper"
@@ -38,10 +38,10 @@ ConfigStore.instance().store(
 
 
 class GridSweeper(Sweeper):
-    """Hands the common settings, and what expands the grid, to the task function once.
+    """Sweeper that calls the task function once, with the settings and an expansion function.
 
     The task function gets a pair: the configuration without the sweeps, and a function that returns
-    the combinations for the overrides of the command line. Hydra has not seen all of them.
+    the combinations for the overrides of the command line, some of which Hydra has not seen.
     """
 
     def __init__(self, params: Mapping[str, Any], grids: Sequence[Mapping[str, Any]] = ()) -> None:
@@ -54,16 +54,16 @@ class GridSweeper(Sweeper):
         self.task_function = task_function
         self.settings = config
 
-    def sweep(self, arguments: list[str]) -> Any:  # noqa: ARG002  # only what Hydra has seen
+    def sweep(self, arguments: list[str]) -> Any:  # noqa: ARG002  # without the deferred overrides
         return self.task_function((self.settings, self._combinations))
 
     def _combinations(self, words: Sequence[str]) -> list[Combination]:
         grids = [[*(_override(*item) for item in one.items()), *words] for one in self.grids]
-        return expand(self.loader, self.settings, *grids, check=check_keys)
+        return expand(self.loader, self.settings, *grids, check=reject_unknown)
 
 
 def _override(key: str, value: Any) -> str:
-    """Return what would be typed: text as it is, such as ``range(0,5)``, YAML's values as JSON."""
+    """Return the override as typed: text such as ``range(0,5)`` unchanged, the rest as JSON."""
     if isinstance(value, str):
         return f"{key}={value}"
     plain = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value

@@ -1,4 +1,4 @@
-"""What can be asked of a results database, one file for each command.
+"""Commands on a results database, one file for each command.
 
 A new command is a file with a ``COMMAND`` and a line in ``COMMANDS``.
 """

@@ -1,33 +1,32 @@
-"""A command of ``python -m orchestrate``: its name, its arguments, and what it does."""
+"""Interface of a command of ``python -m orchestrate``."""
 
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from orchestrate.commands.parser import Parser
+from orchestrate.cli_parser import Parser
 from orchestrate.errors import ExitCode
+from orchestrate.store import DEFAULT_URL, URL_VARIABLE, default_url
 
 PROGRAM = "python -m orchestrate"
-DEFAULT_URL = "sqlite:///results/results.db"
 
 
 @dataclass(frozen=True)
 class Command:
-    """One word after ``python -m orchestrate``.
+    """Command: the first argument after ``python -m orchestrate``.
 
     Attributes
     ----------
     help
         One line for the list of commands.
     add_arguments
-        Adds what this command takes beside ``--db`` and ``--json``.
+        Adds the arguments of the command, beside ``--db`` and ``--json``.
     run
-        Does it and returns the exit code. With ``arguments.json`` it writes one JSON document to
-        the standard output and nothing else. A ``DoptError`` that it raises is printed as a
-        sentence: exit code 75 for ``StoreUnavailableError``, 2 for the others.
+        Runs the command and returns the exit code. With ``arguments.json`` it writes one JSON
+        document to the standard output and nothing else. A ``DoptError`` is printed as one line,
+        with exit code 75 for ``StoreUnavailableError`` and 2 for the others.
     """
 
     name: str
@@ -36,14 +35,14 @@ class Command:
     run: Callable[[argparse.Namespace], ExitCode]
 
     def parser(self) -> Parser:
-        """Return the parser of the words after the name of the command."""
+        """Return the parser of the arguments after the name of the command."""
         parser = Parser(prog=f"{PROGRAM} {self.name}", description=self.help)
         self.add_arguments(parser)
         parser.add_argument(
             "--db",
             metavar="URL",
-            default=os.environ.get("DOPT_DB") or DEFAULT_URL,
-            help=f"database (the variable DOPT_DB, else {DEFAULT_URL})",
+            default=default_url(),
+            help=f"database (default: the variable {URL_VARIABLE}, else {DEFAULT_URL})",
         )
         parser.add_argument("--json", action="store_true", help="print one JSON document")
         return parser

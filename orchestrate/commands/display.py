@@ -1,4 +1,4 @@
-"""Tables and colours for people: in a terminal its width counts, elsewhere a line is a row."""
+"""Tables and colours for terminals; elsewhere each row is one line, however long."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-_NO_TERMINAL = 100_000  # columns: nothing is folded or cut
+_UNLIMITED_WIDTH = 100_000  # characters: no line is folded or cut
 
 
 def console() -> Console:
     """Return a console on the standard output; colours follow NO_COLOR and the terminal."""
-    width = None if sys.stdout.isatty() else _NO_TERMINAL
+    width = None if sys.stdout.isatty() else _UNLIMITED_WIDTH
     return Console(file=sys.stdout, width=width, highlight=False, markup=False, emoji=False)
 
 
 def show(*parts: RenderableType) -> None:
-    """Print the parts, one below the other; a table wider than the terminal runs over its edge."""
+    """Print the parts below each other; a table may be wider than the terminal."""
     out = console()
     for part in parts:
         if isinstance(part, Table):
@@ -34,7 +34,7 @@ def table(
     styles: Sequence[str] = (),
     footers: Sequence[str] = (),
 ) -> Table:
-    """Return an empty table of columns that do not break; those in ``numbers`` end at the right."""
+    """Return an empty table whose cells do not wrap; columns in ``numbers`` are right-aligned."""
     result = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_footer=bool(footers))
     for i, head in enumerate(heads):
         result.add_column(
@@ -49,7 +49,7 @@ def table(
 
 
 def plain(text: str) -> Text:
-    """Return the text with control characters made visible, so that none reaches the terminal."""
+    """Return the text with control characters escaped."""
     return Text(
         "".join(
             char if char.isprintable() or char == "\n" else repr(char)[1:-1]

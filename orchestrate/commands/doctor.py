@@ -1,4 +1,4 @@
-"""``doctor``: look for everything that can be wrong with a database, and change nothing."""
+"""Command ``doctor``: consistency checks of a results database, without changing it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from orchestrate.store import Finding, examine
 
 
 def add_arguments(_: argparse.ArgumentParser) -> None:
-    """Take nothing beside the database."""
+    """Add no arguments beside ``--db`` and ``--json``."""
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Say what is wrong; exit code 1 where results cannot be trusted."""
+    """Print the findings; exit code 1 if results cannot be trusted."""
     findings = examine(arguments.db, trial_key)
     if arguments.json:
         say_json([dataclasses.asdict(one) for one in findings])
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 
 
 def trial_key(config_json: str, seed: int) -> str:
-    """Return the key of a trial as :class:`dopt.spec.TrialSpec` makes it, from stored text."""
+    """Return the key of a trial as :class:`dopt.spec.trial.TrialSpec` makes it."""
     return hashlib.sha256(f'{config_json[:-1]},"seed":{seed}}}'.encode()).hexdigest()
 
 
@@ -43,4 +43,9 @@ def _lines(findings: list[Finding]) -> list[str]:
     return [*lines, total]
 
 
-COMMAND = Command("doctor", "look for damage and inconsistencies", add_arguments, run)
+COMMAND = Command(
+    "doctor",
+    "check for damage, incomplete results, wrong keys and stale claims",
+    add_arguments,
+    run,
+)

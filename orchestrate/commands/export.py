@@ -1,14 +1,14 @@
-"""``export``: results as a file for other programs, with its provenance beside it."""
+"""Command ``export``: results as a file for other programs, with a manifest of their origin."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
+from orchestrate.cli_parser import UsageError
 from orchestrate.commands.command import Command
 from orchestrate.commands.filtering import add_filters, chosen
 from orchestrate.commands.output import say, say_json
-from orchestrate.commands.parser import UsageError
 from orchestrate.errors import ExitCode
 from orchestrate.export.wanted import FORMATS, KINDS, Export
 from orchestrate.store import Reader

@@ -1,4 +1,4 @@
-"""``merge OTHER``: bring the trials of another results database into this one."""
+"""Command ``merge OTHER``: copy the trials of another results database into this one."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store import Merged, Named, merge
+from orchestrate.store import Merged, TrialName, merge
 
-SHOWN = 10
-"""Trials of a kind that are named; the JSON has all of them."""
+MAX_LISTED = 10
+"""Trials of a kind that are listed; the JSON has all of them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,13 +21,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Merge, and say what came of each trial; exit code 1 where some need a look."""
+    """Merge and print the counts; exit code 1 if there are conflicts or incomplete trials."""
     merged = merge(arguments.db, _url(arguments.other))
     if arguments.json:
         say_json({**_plain(merged), "changed": merged.changed})
     else:
         say("\n".join(_lines(merged)))
-    return ExitCode.SOME_FAILED if merged.conflicts or merged.broken else ExitCode.DONE
+    return ExitCode.SOME_FAILED if merged.conflicts or merged.incomplete else ExitCode.DONE
 
 
 def _url(text: str) -> str:
@@ -40,24 +40,24 @@ def _plain(merged: Merged) -> dict[str, object]:
 
 def _lines(merged: Merged) -> list[str]:
     added = ", ".join(f"{count:,} {status}" for status, count in sorted(merged.added.items()))
-    lines = [f"brought {sum(merged.added.values()):,} trials{f' ({added})' if added else ''}"]
+    lines = [f"copied {sum(merged.added.values()):,} trials{f' ({added})' if added else ''}"]
     told = {
-        f"{merged.identical:,} were here already, with the same numbers": merged.identical,
-        f"{merged.kept:,} failed there and were left as they are here": merged.kept,
-        f"{merged.running:,} are being run here and were left to that launch": merged.running,
+        f"{merged.identical:,} exist here with equal numbers": merged.identical,
+        f"{merged.kept:,} failed there and have an outcome here": merged.kept,
+        f"{merged.running:,} are running here": merged.running,
     }
     lines += [line for line, count in told.items() if count]
-    lines += _named("have other numbers here, which were kept", merged.conflicts)
-    lines += _named("are not whole there and were not brought", merged.broken)
+    lines += _listed("have different numbers here and were not copied", merged.conflicts)
+    lines += _listed("are incomplete there and were not copied", merged.incomplete)
     return lines
 
 
-def _named(what: str, trials: Sequence[Named]) -> list[str]:
+def _listed(what: str, trials: Sequence[TrialName]) -> list[str]:
     if not trials:
         return []
-    rest = [f"  and {len(trials) - SHOWN:,} more"] if len(trials) > SHOWN else []
+    rest = [f"  and {len(trials) - MAX_LISTED:,} more"] if len(trials) > MAX_LISTED else []
     names = [f"  {one.trial_key[:12]}  {one.env} {one.policy} seed {one.seed}" for one in trials]
-    return [f"{len(trials):,} {what}:", *names[:SHOWN], *rest]
+    return [f"{len(trials):,} {what}:", *names[:MAX_LISTED], *rest]
 
 
-COMMAND = Command("merge", "bring in the trials of another database", add_arguments, run)
+COMMAND = Command("merge", "copy the trials of another database", add_arguments, run)

@@ -1,4 +1,4 @@
-"""Words for people and JSON for programs, on the standard output."""
+"""Text and JSON on the standard output."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import numpy as np
 
 
 def say(text: str) -> None:
-    """Write a line at once, also into a pipe."""
+    """Print a line and flush it."""
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
 
 
 def say_json(document: Any) -> None:
-    """Write one JSON document; numbers that are not finite are null, bytes are base64."""
+    """Print one JSON document; numbers that are not finite are null, bytes are base64."""
     say(json.dumps(jsonable(document), indent=2, allow_nan=False))
 
 

@@ -1,4 +1,4 @@
-"""``query "SELECT ..."``: ask the database, read-only and within limits."""
+"""Command ``query "SELECT ..."``: a read-only SQL query with a limit of rows and time."""
 
 from __future__ import annotations
 
@@ -6,39 +6,39 @@ import argparse
 import csv
 import sys
 
+from orchestrate.cli_parser import positive
 from orchestrate.commands.command import Command
 from orchestrate.commands.display import plain, show, table
 from orchestrate.commands.output import jsonable, say_json
-from orchestrate.commands.parser import positive
 from orchestrate.errors import ExitCode
 from orchestrate.store import Reader, Table
 
-LIMIT = 1_000
-TIMEOUT = 60.0
-_WIDEST = 60  # characters of a value in a table
+DEFAULT_LIMIT = 1_000
+DEFAULT_TIMEOUT_SECONDS = 60.0
+_MAX_TEXT = 60  # characters of a value in a table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("sql", metavar="SQL", help="one SELECT; the README has examples")
+    parser.add_argument("sql", metavar="SQL", help="one SELECT; docs/database.md has examples")
     parser.add_argument("--csv", action="store_true", help="print comma-separated values")
     parser.add_argument(
         "--limit",
         type=positive("--limit", int),
-        help=f"most rows ({LIMIT:,} in a table, all of them as CSV or JSON)",
+        help=f"most rows ({DEFAULT_LIMIT:,} in a table, all of them as CSV or JSON)",
     )
     parser.add_argument(
         "--timeout",
         type=positive("--timeout", float),
-        default=TIMEOUT,
+        default=DEFAULT_TIMEOUT_SECONDS,
         metavar="SECONDS",
-        help=f"end the query after this time ({TIMEOUT:g})",
+        help=f"end the query after this time ({DEFAULT_TIMEOUT_SECONDS:g})",
     )
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Print the rows, and on the standard error whether there were more."""
+    """Print the rows, and a note on the standard error if there are more."""
     whole = arguments.csv or arguments.json
-    limit = arguments.limit or (None if whole else LIMIT)
+    limit = arguments.limit or (None if whole else DEFAULT_LIMIT)
     with Reader.open(arguments.db) as reader:
         rows = reader.query(arguments.sql, limit, arguments.timeout)
     if arguments.json:
@@ -79,7 +79,7 @@ def _text(value: object) -> str:
     if isinstance(value, bytes | memoryview):
         return f"({len(value):,} bytes)"
     line = " ".join(str(jsonable(value)).split())
-    return line if len(line) <= _WIDEST else f"{line[: _WIDEST - 1]}…"
+    return line if len(line) <= _MAX_TEXT else f"{line[: _MAX_TEXT - 1]}…"
 
 
-COMMAND = Command("query", "ask the database in SQL, read-only", add_arguments, run)
+COMMAND = Command("query", "run a read-only SQL query", add_arguments, run)

@@ -1,16 +1,15 @@
-"""``retry STATUS``: let trials without a result run again."""
+"""Command ``retry STATUS``: put trials without a result back to pending."""
 
 from __future__ import annotations
 
 import argparse
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 from orchestrate.commands.command import Command
 from orchestrate.commands.filtering import add_filters
 from orchestrate.commands.output import say, say_json
-from orchestrate.commands.trials import listed, the_one
+from orchestrate.commands.trials import ListedTrial, listed, the_one
 from orchestrate.errors import ExitCode
 from orchestrate.store import RETRIED, Reader, Store
 
@@ -19,16 +18,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("status", choices=list(RETRIED), help=", ".join(RETRIED))
     add_filters(parser)
     parser.add_argument("--trial", nargs="+", default=(), metavar="KEY", help="only these trials")
-    parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
+    parser.add_argument("--dry-run", action="store_true", help="only print the number of trials")
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Put the trials back to pending; the next launch of their grid runs them."""
+    """Put the trials back to pending, so that the next launch of their grid runs them."""
     with Reader.open(arguments.db) as reader, reader.moment() as moment:
         trials = _trials(moment, arguments)
-    wanted = RETRIED[arguments.status]
-    keys = [row.trial_key for row in trials if row.status in wanted]
-    left = Counter(row.status for row in trials if row.status not in wanted)
+    statuses = RETRIED[arguments.status]
+    keys = [row.trial_key for row in trials if row.status in statuses]
+    left = Counter(row.status for row in trials if row.status not in statuses)
     if not arguments.dry_run and keys:
         with Store.open(arguments.db) as store:
             count = store.retry(arguments.status, keys)
@@ -41,8 +40,8 @@ def run(arguments: argparse.Namespace) -> ExitCode:
     return ExitCode.DONE
 
 
-def _trials(reader: Reader, arguments: argparse.Namespace) -> Sequence[Any]:
-    """Return the trials that the options name, whatever their status."""
+def _trials(reader: Reader, arguments: argparse.Namespace) -> Sequence[ListedTrial]:
+    """Return the trials that the options select, whatever their status."""
     rows = listed(reader, arguments)
     if not arguments.trial:
         return rows

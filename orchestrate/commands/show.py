@@ -1,4 +1,4 @@
-"""``show TRIAL``: everything that is known of one trial."""
+"""Command ``show TRIAL``: contents of the database about one trial."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from orchestrate.commands.output import say_json
 from orchestrate.commands.sparkline import sparkline
 from orchestrate.commands.trials import describe, listed, the_one
 from orchestrate.errors import ExitCode
+from orchestrate.queries.trial import TrialReport, report
 from orchestrate.store import Reader
-from orchestrate.trial_report import TrialReport, report
 
-_MIB = 2**20
+_BYTES_PER_MIB = 2**20
 _ATTEMPT = ("attempt", "launch", "outcome", "cause", "node", "ended", "wall s", "cpu s", "peak MiB")
 
 
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Show the one trial that the options leave."""
+    """Print the one trial that the options select."""
     with Reader.open(arguments.db) as reader, reader.moment() as moment:
         rows = listed(moment, arguments, width=arguments.width, seed=arguments.seed)
         row = the_one(rows, arguments.trial)
@@ -111,7 +111,7 @@ def _attempts(found: TrialReport) -> Table:
             *(one["attempt"], one["launch_id"], one["outcome"] or "running", one["cause"]),
             *(one["node"], (one["ended"] or "")[:19]),
             *(_number(one["wall_seconds"]), _number(one["cpu_seconds"])),
-            _number(memory / _MIB if memory is not None else None),
+            _number(memory / _BYTES_PER_MIB if memory is not None else None),
         ]
         result.add_row(*(plain("-" if value in (None, "") else str(value)) for value in values))
     return result
@@ -121,4 +121,6 @@ def _number(value: float | None) -> str | None:
     return None if value is None else f"{value:,.2f}"
 
 
-COMMAND = Command("show", "show everything that is known of one trial", add_arguments, run)
+COMMAND = Command(
+    "show", "show one trial: configuration, launches, attempts, loss", add_arguments, run
+)

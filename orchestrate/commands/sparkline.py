@@ -1,4 +1,4 @@
-"""A curve in one line of text."""
+"""Curve in one line of text."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ _BLOCKS = "▁▂▃▄▅▆▇█"
 
 
 def sparkline(values: Sequence[float | None], columns: int = 60) -> str:
-    """Return a positive curve on a logarithmic scale; a part without numbers is a space.
+    """Return a positive curve on a logarithmic scale; parts without numbers are spaces.
 
-    Each character is the geometric mean of its share of the values.
+    Each character is the geometric mean of one part of the values.
     """
     numbers = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
     if not np.isfinite(numbers).any():

@@ -1,40 +1,42 @@
-"""``status``: how far the grid is, what failed and why, who works on it and for how long."""
+"""Command ``status``: progress of the grid, failures and running launches."""
 
 from __future__ import annotations
 
 import argparse
 
+from orchestrate.cli_parser import positive
 from orchestrate.commands.command import Command
 from orchestrate.commands.display import show
 from orchestrate.commands.filtering import add_filters, chosen
 from orchestrate.commands.output import say, say_json
-from orchestrate.commands.parser import positive
 from orchestrate.commands.status_view import document, parts
 from orchestrate.commands.watching import watch
 from orchestrate.errors import ExitCode
-from orchestrate.status import Status, gather
+from orchestrate.queries.status import Status, gather
 from orchestrate.store import Reader
 
-ROWS = 60
-"""Rows of the table, unless --all asks for every configuration."""
+MAX_ROWS = 60
+"""Rows of the table without --all."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_filters(parser)
-    parser.add_argument("--all", action="store_true", help=f"a row for each, also above {ROWS}")
+    parser.add_argument(
+        "--all", action="store_true", help=f"a row for each configuration, also above {MAX_ROWS}"
+    )
     parser.add_argument(
         "--watch",
         nargs="?",
         type=positive("--watch", float),
         const=0.0,
         metavar="SECONDS",
-        help="show it again and again until the grid is complete: every 2 s in a terminal, a line "
-        "every 10 s elsewhere; exit code 1 if trials failed",
+        help="repeat until the grid is complete: every 2 s in a terminal, one line every 10 s "
+        "elsewhere; exit code 1 if trials failed",
     )
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Show the status once, or until the grid is complete."""
+    """Print the status once, or until the grid is complete."""
     with Reader.open(arguments.db) as reader:
         if arguments.watch is None:
             status = _look(reader, arguments)
@@ -49,10 +51,10 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 def _show(status: Status, arguments: argparse.Namespace, database: str) -> None:
     if arguments.json:
         say_json(document(status, database))
-    elif not status.cells:
+    elif not status.configs:
         say(f"{database} holds no trials yet: run a launch that writes to it.")
     else:
-        show(*parts(status, len(status.cells) if arguments.all else ROWS))
+        show(*parts(status, len(status.configs) if arguments.all else MAX_ROWS))
 
 
 def _look(reader: Reader, arguments: argparse.Namespace) -> Status:
@@ -60,4 +62,4 @@ def _look(reader: Reader, arguments: argparse.Namespace) -> Status:
         return gather(moment, chosen(moment, arguments))
 
 
-COMMAND = Command("status", "show how far the grid is, what failed and why", add_arguments, run)
+COMMAND = Command("status", "show progress, failures and running launches", add_arguments, run)

@@ -1,4 +1,4 @@
-"""The status of a grid in words, tables and JSON."""
+"""Status of a grid as text, tables and JSON."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from typing import Any
 from rich.console import RenderableType
 from rich.text import Text
 
-from orchestrate.commands.cells_table import grid_table
+from orchestrate.commands.configs_table import grid_table
 from orchestrate.commands.display import plain
-from orchestrate.passwords import without_password
-from orchestrate.progress import duration
-from orchestrate.status import STATES, FailureKind, Status, seconds_since
+from orchestrate.queries.status import STATES, FailureKind, Status, seconds_since
+from orchestrate.redaction import without_password
+from orchestrate.runner.progress import duration
 from orchestrate.store import LaunchRow
 
 _NAMES = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
-_CELL = ("config_key", *_NAMES, "n", *(f"n_{state}" for state in STATES))
+_CONFIG = ("config_key", *_NAMES, "n", *(f"n_{state}" for state in STATES))
 _LAUNCH = ("launch_id", "alive", "host", "pid", "started", "argv")
 _FAILURE = ("cause", "type", "message", "trials", "attempts", "last_line", "place")
-_KINDS = 10
-_PLACES = 4
-_WIDEST = 200  # characters of a line of a traceback
+_MAX_KINDS = 10
+_MAX_PLACES = 4
+_MAX_LINE = 200  # characters of a line of a traceback
 
 
 def summary(status: Status) -> str:
-    """Return the counts, the rate and the time that is left, on one line."""
+    """Return the counts, the rate and the estimated remaining time on one line."""
     counts, total = status.counts, status.total
     words = [f"{total - status.left:,} of {total:,} trials have an outcome"]
     words += [f"{counts[name]:,} {name}" for name in counts if counts[name]]
@@ -37,28 +37,28 @@ def summary(status: Status) -> str:
     return " · ".join(words)
 
 
-def parts(status: Status, most: int) -> Iterator[RenderableType]:
-    """Yield what is to be shown: the grid in at most ``most`` rows, failures, launches."""
-    yield grid_table(status.cells, most)
+def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
+    """Yield the grid in at most ``max_rows`` rows, the failures and the launches."""
+    yield grid_table(status.configs, max_rows)
     yield Text(f"\n{summary(status)}", style="bold")
     if status.failures:
         yield Text("\nFailures", style="bold red")
-        yield from map(_failure, status.failures[:_KINDS])
-        if len(status.failures) > _KINDS:
-            yield Text(f"  and {len(status.failures) - _KINDS:,} other kinds")
+        yield from map(_failure, status.failures[:_MAX_KINDS])
+        if len(status.failures) > _MAX_KINDS:
+            yield Text(f"  and {len(status.failures) - _MAX_KINDS:,} other kinds")
     if status.launches:
         yield Text("\nLaunches", style="bold")
         yield from map(_launch, status.launches)
     elif status.left:
-        yield Text("\nNo launch is running: the same command as before goes on with the rest.")
+        yield Text("\nNo launch is running: run the same launch command again to continue.")
 
 
 def _failure(kind: FailureKind) -> Text:
-    places = sorted(f"{env}/{policy}" for env, policy in kind.cells)
-    more = [f"and {len(places) - _PLACES} other places"] if len(places) > _PLACES else []
+    places = sorted(f"{env}/{policy}" for env, policy in kind.places)
+    more = [f"and {len(places) - _MAX_PLACES} other places"] if len(places) > _MAX_PLACES else []
     text = Text(f"  {_plural(kind.trials, 'trial')} ({_plural(kind.attempts, 'attempt')}), ")
     text.append(kind.cause, style="red")
-    text.append(f": {', '.join([*places[:_PLACES], *more])}")
+    text.append(f": {', '.join([*places[:_MAX_PLACES], *more])}")
     last = kind.last_line or f"{kind.type or ''}: {kind.message or ''}".strip(": ")
     lines = [kind.message] if kind.message and kind.message not in last else []
     for line in [*lines, last, *([f"at {kind.place}"] if kind.place else [])]:
@@ -75,12 +75,12 @@ def _launch(launch: LaunchRow) -> Text:
     return (
         Text(f"{where}: ")
         .append("dead", style="red")
-        .append("; the same command goes on with its trials")
+        .append("; run the same launch command again to continue")
     )
 
 
 def document(status: Status, database: str) -> dict[str, Any]:
-    """Return the status for a program."""
+    """Return the status as a JSON document."""
     launches = [{name: getattr(one, name) for name in _LAUNCH} for one in status.launches]
     for launch in launches:
         launch["argv"] = [without_password(word) for word in launch["argv"]]
@@ -90,9 +90,9 @@ def document(status: Status, database: str) -> dict[str, Any]:
         "complete": not status.left,
         "per_second": status.rate,
         "seconds_left": status.seconds_left,
-        "cells": [{name: getattr(cell, name) for name in _CELL} for cell in status.cells],
+        "configs": [{name: getattr(one, name) for name in _CONFIG} for one in status.configs],
         "failures": [
-            {**{name: getattr(kind, name) for name in _FAILURE}, "cells": sorted(kind.cells)}
+            {**{name: getattr(kind, name) for name in _FAILURE}, "places": sorted(kind.places)}
             for kind in status.failures
         ],
         "launches": launches,
@@ -105,4 +105,4 @@ def _plural(number: int, noun: str) -> str:
 
 def _first_line(text: str) -> str:
     line = text.strip().splitlines()[0] if text.strip() else ""
-    return line if len(line) <= _WIDEST else f"{line[: _WIDEST - 1]}…"
+    return line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…"

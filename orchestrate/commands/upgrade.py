@@ -1,4 +1,4 @@
-"""``upgrade``: bring a database of an older program to the schema of this one."""
+"""Command ``upgrade``: migration of an older database to the current schema."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from orchestrate.store import Upgrade, upgrade
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--no-backup", action="store_true", help="make no copy first")
+    parser.add_argument("--no-backup", action="store_true", help="do not make a backup first")
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Upgrade the database, in one transaction and with a copy beside it."""
+    """Upgrade the database in one transaction, after a backup."""
     done = upgrade(arguments.db, backup=not arguments.no_backup)
     if arguments.json:
         say_json({**dataclasses.asdict(done), "changed": done.changed})
@@ -35,4 +35,4 @@ def _sentence(done: Upgrade) -> str:
     return f"{done.safe_url} went from schema {done.before} to {done.after}; {copy}."
 
 
-COMMAND = Command("upgrade", "bring an older database to the newest schema", add_arguments, run)
+COMMAND = Command("upgrade", "migrate an older database to the newest schema", add_arguments, run)

@@ -1,4 +1,4 @@
-"""The status again and again: in place on a terminal, as lines elsewhere."""
+"""Repeated status: in place on a terminal, as lines elsewhere."""
 
 from __future__ import annotations
 
@@ -13,54 +13,55 @@ from rich.text import Text
 from orchestrate.commands.display import console
 from orchestrate.commands.output import say
 from orchestrate.commands.status_view import parts, summary
-from orchestrate.status import Status
+from orchestrate.queries.status import Status
 from orchestrate.store import StoreUnavailableError
 
-IN_PLACE = 2.0
-LINES = 10.0
-"""Seconds between two looks."""
+TERMINAL_INTERVAL_SECONDS = 2.0
+LINE_INTERVAL_SECONDS = 10.0
 
-_OTHER_LINES = 14  # of the screen, for what stands above and below the grid
+_LINES_BESIDE_GRID = 14  # of the screen, above and below the grid
 
-Look = Callable[[], Status]
+Read = Callable[[], Status]
 
 
-def watch(look: Look, seconds: float | None, quiet: bool) -> Status:
-    """Show what ``look`` returns until every trial has an outcome, and return the last of it.
+def watch(read: Read, seconds: float | None, quiet: bool) -> Status:
+    """Show what ``read`` returns until every trial has an outcome; return the last status.
 
-    A database that goes away for a while is waited for.
+    A database that cannot be reached is read again later.
     """
     terminal = sys.stdout.isatty() and not quiet
-    looks = _looks(look, seconds or (IN_PLACE if terminal else LINES))
+    statuses = _statuses(
+        read, seconds or (TERMINAL_INTERVAL_SECONDS if terminal else LINE_INTERVAL_SECONDS)
+    )
     if terminal:
-        _in_place(looks)
+        _in_place(statuses)
     else:
-        for status in looks:
+        for status in statuses:
             if not quiet:
                 say(status if isinstance(status, str) else summary(status))
-    return look()
+    return read()
 
 
-def _looks(look: Look, seconds: float) -> Iterator[Status | str]:
-    """Yield status after status, or why there is none now, until the grid is complete."""
+def _statuses(read: Read, seconds: float) -> Iterator[Status | str]:
+    """Yield the status, or the error of a failed read, until the grid is complete."""
     while True:
         try:
-            status = look()
+            status = read()
         except StoreUnavailableError as error:
             if not error.transient:
                 raise
             yield str(error)
         else:
             yield status
-            if status.cells and not status.left:
+            if status.configs and not status.left:
                 return
         time.sleep(seconds)
 
 
-def _in_place(looks: Iterable[Status | str]) -> None:
+def _in_place(statuses: Iterable[Status | str]) -> None:
     screen = console()
     with Live(console=screen, auto_refresh=False) as live:
-        for status in looks:
-            rows = max(4, screen.height - _OTHER_LINES)
+        for status in statuses:
+            rows = max(4, screen.height - _LINES_BESIDE_GRID)
             shown = Text(status) if isinstance(status, str) else Group(*parts(status, rows))
             live.update(shown, refresh=True)

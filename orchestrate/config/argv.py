@@ -1,4 +1,4 @@
-"""The words of a command line, read before Hydra sees them, so that a refusal is one sentence."""
+"""Check and reordering of command-line arguments before Hydra parses them."""
 
 from __future__ import annotations
 
@@ -10,42 +10,42 @@ from pathlib import Path
 from hydra._internal.utils import get_args_parser
 
 from dopt.errors import SpecificationError
-from orchestrate.usage import Parser, UsageError
+from orchestrate.cli_parser import Parser, UsageError
 
 PROGRAM = "python orchestrate/launch.py"
 
-OWN_SWEEPER = (
-    "this program expands its grids itself, but another hydra/sweeper was given: leave it out."
+OTHER_SWEEPER = (
+    "hydra/sweeper is set, but this program expands its grids itself: leave hydra/sweeper out."
 )
 
 _CHOICE = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>null|\[.*\]|)\s*")
 
 
-def ordered(words: Sequence[str], folder: Path) -> list[str]:
-    """Return the words with the flags before the overrides, which Hydra wants in one run.
+def normalize(arguments: Sequence[str], folder: Path) -> list[str]:
+    """Return the arguments with all flags before the overrides, as Hydra requires.
 
     Parameters
     ----------
-    words
-        What was typed after the name of the program.
+    arguments
+        Arguments after the name of the program.
     folder
-        The configuration files; its folders are the groups.
+        Folder of the configuration files, whose subfolders are the groups.
 
     Raises
     ------
     UsageError
         If a flag is unknown, flags contradict each other, or the sweeper is replaced.
     SpecificationError
-        If the option of a group is no name.
+        If the option of a group is not a name.
     """
     parser = Parser(prog=PROGRAM, parents=[get_args_parser()], add_help=False)
-    flags = parser.read(words, mixed=True)
+    flags = parser.read(arguments, mixed=True)
     _check_flags(flags)
     for word in flags.overrides:
         if word.startswith("hydra/sweeper=") and word != "hydra/sweeper=grid":
-            raise UsageError(OWN_SWEEPER)
+            raise UsageError(OTHER_SWEEPER)
         _check_choice(word, folder)
-    return [*(word for word in words if word not in flags.overrides), *flags.overrides]
+    return [*(word for word in arguments if word not in flags.overrides), *flags.overrides]
 
 
 def _check_flags(flags: argparse.Namespace) -> None:
@@ -69,7 +69,7 @@ def _check_flags(flags: argparse.Namespace) -> None:
 
 
 def _check_choice(word: str, folder: Path) -> None:
-    """Refuse null, a list and nothing as the option of a group; Hydra would stumble over them."""
+    """Refuse null, a list or an empty value as the option of a group, which Hydra cannot handle."""
     match = _CHOICE.fullmatch(word)
     if not match or match["group"] == "experiment" or not (folder / match["group"]).is_dir():
         return

@@ -1,8 +1,8 @@
-"""What Hydra composes first, when no choice of a grid has been made yet.
+"""Deferred overrides: keys of a trial that are set after each swept option has been composed.
 
-It has the default option of every group that is swept, so that a setting which only the choices
-have, such as ``policy.budget_us=20`` with ``policy=beyond/exact,beyond/trace``, would be unknown to
-it. The settings inside the parts of a trial therefore wait for the choices.
+Hydra first composes the default configuration, in which keys that exist only in swept options are
+unknown, such as ``policy.budget_us=20`` with ``policy=beyond/exact,beyond/trace``. Such overrides
+are removed from the command line and applied later.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from orchestrate.grid import TRIAL_SECTIONS
+from orchestrate.config.grid import TRIAL_SECTIONS
 
-_WAITS = re.compile(rf"[+~]*(?:{'|'.join(TRIAL_SECTIONS)})\.")
+_DEFERRED = re.compile(rf"[+~]*(?:{'|'.join(TRIAL_SECTIONS)})\.")
 _OF_HYDRA = re.compile(r"[+~]*hydra[./]")
 
 
 @contextlib.contextmanager
-def waiting() -> Iterator[tuple[str, ...]]:
-    """Keep from Hydra what has to wait; yield all overrides that are not about Hydra itself."""
+def hold_back() -> Iterator[tuple[str, ...]]:
+    """Hide deferred overrides from Hydra; yield all overrides except Hydra's own."""
     before = list(sys.argv)
     flags = get_args_parser().parse_known_intermixed_args(before[1:])[0]
-    held = {word for word in flags.overrides if flags.multirun and _WAITS.match(word)}
+    held = {word for word in flags.overrides if flags.multirun and _DEFERRED.match(word)}
     sys.argv[:] = [word for word in before if word not in held]
     try:
         yield tuple(word for word in flags.overrides if not _OF_HYDRA.match(word))
@@ -36,14 +36,14 @@ def waiting() -> Iterator[tuple[str, ...]]:
         sys.argv[:] = before
 
 
-def apply_known(config: DictConfig, words: Sequence[str]) -> None:
-    """Set what waited and has a single value in the first configuration, where it has the key.
+def apply_deferred(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Apply deferred overrides with a single value to the default configuration, if it has the key.
 
-    A setting of the launch may refer to it, as in ``store.url=sqlite:///${env.horizon}.db``.
+    A setting of the launch may refer to one, as in ``store.url=sqlite:///${env.horizon}.db``.
     """
     parser = OverridesParser.create()
-    for word in words:
-        with contextlib.suppress(Exception):  # that it lacks the key, or that the word is wrong
+    for word in overrides:
+        with contextlib.suppress(Exception):  # an unknown key or an invalid value is reported later
             [override] = parser.parse_overrides([word])
-            if _WAITS.match(word) and not override.is_sweep_override():
+            if _DEFERRED.match(word) and not override.is_sweep_override():
                 ConfigLoaderImpl._apply_overrides_to_config([override], config)

@@ -1,13 +1,13 @@
-"""From overrides to the combinations of a grid.
+"""Expansion of overrides to the combinations of a grid.
 
 Hydra composes each distinct choice of groups once, with the first value of every other sweep; the
-remaining values of scalar sweeps are overlaid. An override that is neither a choice nor a scalar
-is composed by Hydra for each of its values. The result equals that of Hydra's own sweeper wherever
-that has one.
+other values of scalar sweeps are then set in the composed configuration. An override that is
+neither a choice nor a scalar is composed by Hydra for each of its values. The result equals that
+of Hydra's basic sweeper wherever that one succeeds.
 
-It has none where an override sets a key that some of the choices have and others lack, such as
-``policy.regularization=1e-2`` with every policy. Here it holds for the choices that have the key,
-and is an error only if none has, in any of the grids that are asked for at once.
+The basic sweeper fails if an override sets a key that only some of the choices have, such as
+``policy.regularization=1e-2`` with every policy. Here the override applies to the choices that have
+the key; it is an error only if no choice of any grid has it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from hydra.core.config_loader import ConfigLoader
 from omegaconf import DictConfig
 
-from orchestrate.grid import TRIAL_SECTIONS, Combination
-from orchestrate.hydra_plugins.dopt_grid._axes import Axis, read_axes
-from orchestrate.hydra_plugins.dopt_grid._composer import Composer
-from orchestrate.hydra_plugins.dopt_grid._keys import Keys
-from orchestrate.hydra_plugins.dopt_grid._overlay import Overlay, has_key
+from orchestrate.config.fast_compose import Composer
+from orchestrate.config.grid import TRIAL_SECTIONS, Combination
+from orchestrate.config.scalar_overrides import ScalarOverrides, has_key
+from orchestrate.config.sweep_axes import Axis, read_axes
+from orchestrate.config.unknown_keys import UnusedKeys
 
 Check = Callable[[DictConfig], None]
 
@@ -49,12 +49,12 @@ def expand(
     inner
         Scalar whose values stay together in one combination, if nothing else depends on it.
     check
-        Is given each configuration that is composed, and raises where it makes no sense.
+        Called with each composed configuration; raises if that is invalid.
 
     Raises
     ------
     SpecificationError
-        If no choice of any grid has a key that is set.
+        If an override sets a key that no choice of any grid has.
     """
     expansion = _Expansion(Composer(loader, config), sections, inner, check)
     result: list[Combination] = []
@@ -69,16 +69,16 @@ def expand(
 
 @dataclasses.dataclass
 class _Expansion:
-    """What the combinations of all choices share."""
+    """State shared by the combinations of all choices."""
 
     composer: Composer
     sections: Sequence[str]
     inner: str
     check: Check
-    keys: Keys = dataclasses.field(default_factory=Keys)
+    keys: UnusedKeys = dataclasses.field(default_factory=UnusedKeys)
 
     def of(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> Iterator[Combination]:
-        """Yield the combinations of one choice of everything but the swept scalars."""
+        """Yield the combinations of one choice of all overrides except swept scalars."""
         first, lacking = self._compose(axes, fixed)
         self.check(first)
         unused = tuple(axis.key for axis in lacking)
@@ -86,10 +86,10 @@ class _Expansion:
         used = tuple(axis.key for axis in kept if axis.replaces)
         self.keys.note(first, used, unused)
         scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
-        words = tuple(fixed[axis.key] for axis in kept if axis.swept and axis.key in fixed)
-        overlay = Overlay(first, [axis.key for axis in scalars], self.sections)
+        overrides = tuple(fixed[axis.key] for axis in kept if axis.swept and axis.key in fixed)
+        overlay = ScalarOverrides(first, [axis.key for axis in scalars], self.sections)
         if overlay.applicable:
-            found = _overlaid(overlay, scalars, words, self.inner)
+            found = _overlaid(overlay, scalars, overrides, self.inner)
         else:
             found = self._one_by_one(kept, fixed, scalars)
         yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
@@ -98,13 +98,13 @@ class _Expansion:
         self, axes: Sequence[Axis], fixed: Mapping[str, str]
     ) -> tuple[DictConfig, list[Axis]]:
         """Return the configuration, and the axes whose key this choice lacks."""
-        words = _in_order(axes, fixed)
-        composed = self.composer.attempt(words)
+        overrides = _in_order(axes, fixed)
+        composed = self.composer.attempt(overrides)
         lacking = [] if composed is not None else self._lacking(axes, fixed)
         if lacking:
             kept = [axis for axis in axes if axis not in lacking]
             composed = self.composer.compose(_in_order(kept, fixed))
-        return composed or self.composer.like_hydra(words), lacking
+        return composed or self.composer.like_hydra(overrides), lacking
 
     def _lacking(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> list[Axis]:
         replacing = [axis for axis in axes if axis.replaces]
@@ -115,12 +115,14 @@ class _Expansion:
     def _one_by_one(
         self, axes: Sequence[Axis], fixed: Mapping[str, str], scalars: Sequence[Axis]
     ) -> Iterator[Combination]:
-        """Let Hydra compose each combination: a typed or structured value is where one varies."""
+        """Compose each combination with Hydra: a swept key holds a typed or structured value."""
         for picks in itertools.product(*(range(len(axis.texts)) for axis in scalars)):
             every = {**fixed, **_arguments(scalars, picks)}
             composed = self.composer.compose(_in_order(axes, every))
-            words = tuple(every[axis.key] for axis in axes if axis.swept)
-            yield Combination(Overlay(composed, [], self.sections).settings([]), None, words)
+            overrides = tuple(every[axis.key] for axis in axes if axis.swept)
+            yield Combination(
+                ScalarOverrides(composed, [], self.sections).settings([]), None, overrides
+            )
 
 
 def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[str, str]:
@@ -133,7 +135,7 @@ def _in_order(axes: Sequence[Axis], fixed: Mapping[str, str]) -> list[str]:
 
 
 def _overlaid(
-    overlay: Overlay, scalars: Sequence[Axis], words: tuple[str, ...], inner: str
+    overlay: ScalarOverrides, scalars: Sequence[Axis], overrides: tuple[str, ...], inner: str
 ) -> Iterator[Combination]:
     """Yield a combination for each set of values but those of ``inner``."""
     together = [axis for axis in scalars if axis.key == inner and overlay.free(inner)]
@@ -143,6 +145,6 @@ def _overlaid(
         yield Combination(
             settings=overlay.settings([axis.values[pick] for axis, pick in chosen]),
             inner=together[0].values if together else None,
-            words=words
+            overrides=overrides
             + tuple(axis.argument(pick) for axis, pick in chosen if axis not in together),
         )

@@ -1,4 +1,4 @@
-"""Hydra's composition, repeated quickly for many choices of groups."""
+"""Fast repetition of Hydra's composition for many choices of groups."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from omegaconf import DictConfig, OmegaConf
 
 
 class Composer:
-    """Composes what Hydra would, from files that are read once and without Hydra's own settings.
+    """Composer with Hydra's result, which reads files once and leaves out Hydra's own settings.
 
-    These settings are half of what Hydra composes for a job, and no trial depends on them. Where
-    something is unusual, or goes wrong, Hydra itself composes and its result or error stands.
+    These settings are half of a composed configuration, and no trial depends on them. In unusual
+    cases and after an error Hydra itself composes, and its result or error is used.
     """
 
     def __init__(self, loader: ConfigLoader, config: DictConfig) -> None:
@@ -33,27 +33,27 @@ class Composer:
         usual = type(loader) is ConfigLoaderImpl and not config.hydra.searchpath
         self._files = _Files(loader.repository) if usual else None  # type: ignore[attr-defined]
 
-    def compose(self, words: Sequence[str]) -> DictConfig:
+    def compose(self, overrides: Sequence[str]) -> DictConfig:
         """Return the configuration for overrides without sweeps."""
-        return self.attempt(words) or self.like_hydra(words)
+        return self.attempt(overrides) or self.like_hydra(overrides)
 
-    def attempt(self, words: Sequence[str]) -> DictConfig | None:
-        """Return the configuration, or None where Hydra itself has to compose or to complain."""
+    def attempt(self, overrides: Sequence[str]) -> DictConfig | None:
+        """Return the configuration, or None if Hydra itself has to compose it or raise an error."""
         if self._files is not None:
             with contextlib.suppress(Exception):
-                return self._quick(self._files, words)
+                return self._quick(self._files, overrides)
         return None
 
-    def like_hydra(self, words: Sequence[str]) -> DictConfig:
-        """Return what Hydra composes for a job of a sweep."""
-        return self._loader.load_sweep_config(self._config, list(words))
+    def like_hydra(self, overrides: Sequence[str]) -> DictConfig:
+        """Return the configuration that Hydra composes for a job of a sweep."""
+        return self._loader.load_sweep_config(self._config, list(overrides))
 
-    def _quick(self, files: _Files, words: Sequence[str]) -> DictConfig:
+    def _quick(self, files: _Files, overrides: Sequence[str]) -> DictConfig:
         files.cache.clear()
         defaults = create_defaults_list(
             repo=files,
             config_name=self._config.hydra.job.config_name,
-            overrides_list=[self._override(word) for word in words],
+            overrides_list=[self._override(word) for word in overrides],
             prepend_hydra=False,
             skip_missing=False,
         )

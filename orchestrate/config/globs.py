@@ -1,4 +1,4 @@
-"""Globs over the options of a group, folders in it too: ``policy=glob([*,beyond/*])``."""
+"""Globs over the options of a group and of its folders: ``policy=glob([*,beyond/*])``."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from hydra.core.override_parser.types import Glob
 def matches(loader: ConfigLoader, group: str, glob: Glob) -> tuple[str, ...]:
     """Return the options that a glob matches, folder by folder in the order of its patterns.
 
-    As in Hydra, a pattern without a folder means the options of the group itself, so that ``*`` has
-    none of its folders; ``beyond/*`` means those in the folder ``beyond``.
+    As in Hydra, a pattern without a folder matches options of the group itself, not those in its
+    folders; ``beyond/*`` matches those in the folder ``beyond``.
     """
     folders = dict.fromkeys(_folder(pattern) for pattern in glob.include)
     names = [name for folder in folders for name in _options(loader, group, folder)]

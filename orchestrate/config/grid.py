@@ -1,4 +1,4 @@
-"""From the combinations of a command line to the trials of a grid."""
+"""Grid of trials, built from the combinations of a command line."""
 
 from __future__ import annotations
 
@@ -6,80 +6,80 @@ import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from dopt.cell import Cell
+from dopt.declare.registry import name_of
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.registry import name_of
-from dopt.spec import TrialSpec
+from dopt.spec.config import TrialConfig
+from dopt.spec.trial import TrialSpec
 
 TRIAL_SECTIONS = ("env", "policy", "model", "learner", "task", "seed")
-"""The parts of a configuration that make a trial."""
+"""Sections of a configuration that define a trial."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Combination:
-    """Settings of one cell of a grid, in plain types.
+    """Settings of one configuration of a grid, in plain types.
 
     Attributes
     ----------
     settings
         Sections of the resolved configuration.
     inner
-        Seeds of the cell, or None for the one in ``settings``.
-    words
-        The swept overrides that made it, as they would be typed.
+        Seeds of the configuration, or None for the one in ``settings``.
+    overrides
+        Swept overrides of this combination, as they would be typed.
     used, unused
-        Keys that its grid sets: those that these choices have, and those that they lack.
+        Keys set by the grid that exist in this choice of groups, and keys that do not.
     """
 
     settings: Mapping[str, Any]
     inner: Sequence[Any] | None = None
-    words: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
     used: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The distinct trials of a launch, and what became of the rest.
+    """Distinct trials of a launch, with the trials that were left out.
 
     Attributes
     ----------
     trials
-        In the order in which they run: every cell with its first seed, then with its second ...
-    asked
-        Number of trials that the command line spans, repeats and left-out ones included.
+        In the order of execution: all configurations with their first seed, then the second, ...
+    n_jobs
+        Number of jobs of the command line, including repeats and left-out ones.
     left_out
-        Sentence for each reason to leave trials out, with their number.
+        Number of left-out trials by reason.
     notes
-        Sentence for each setting that does not hold for the whole grid.
+        Message for each override that applies to a part of the grid only.
     """
 
     trials: list[TrialSpec]
-    asked: int
+    n_jobs: int
     left_out: dict[str, int]
     notes: tuple[str, ...] = ()
 
     @property
     def repeats(self) -> int:
-        """Number of trials that the command line names more than once."""
-        return self.asked - sum(self.left_out.values()) - len(self.trials)
+        """Number of jobs that repeat a trial."""
+        return self.n_jobs - sum(self.left_out.values()) - len(self.trials)
 
     def on_path(self, path: str) -> Grid:
         """Return the grid with its trials on an execution path."""
-        cells: dict[str, Cell] = {}
+        configs: dict[str, TrialConfig] = {}
         trials = []
         for trial in self.trials:
             key = trial.config_key
-            if key not in cells:
-                cells[key] = dataclasses.replace(trial.cell, path=path)
-            trials.append(TrialSpec(cells[key], trial.seed))
+            if key not in configs:
+                configs[key] = dataclasses.replace(trial.config, path=path)
+            trials.append(TrialSpec(configs[key], trial.seed))
         return dataclasses.replace(self, trials=trials)
 
 
-def build_grid(combinations: Iterable[Combination], *, alone: bool = False) -> Grid:
-    """Return the typed trials; pairs of choices that make no sense together are left out.
+def build_grid(combinations: Iterable[Combination], *, single: bool = False) -> Grid:
+    """Return the grid of typed trials; incompatible choices are left out.
 
-    ``alone`` says that a single trial was asked for, and such a pair is an error then.
+    For a ``single`` trial an incompatible choice is an error.
 
     Raises
     ------
@@ -87,27 +87,29 @@ def build_grid(combinations: Iterable[Combination], *, alone: bool = False) -> G
         If a value is unknown, of the wrong type or out of bounds, or if nothing is left.
     """
     combinations = list(combinations)
-    cells: list[list[TrialSpec]] = []
+    by_config: list[list[TrialSpec]] = []
     left_out: dict[str, int] = {}
-    asked = 0
+    n_jobs = 0
     for combination in combinations:
         size = 1 if combination.inner is None else len(combination.inner)
-        asked += size
+        n_jobs += size
         try:
-            cells.append(_trials(combination))
+            by_config.append(_trials(combination))
         except IncompatibleError as error:
-            if alone:
+            if single:
                 raise
             reason = f"{_choices(combination)}: {error}"
             left_out[reason] = left_out.get(reason, 0) + size
-    trials = list({trial.trial_key: trial for trial in _seed_by_seed(cells)}.values())
+    trials = list({trial.trial_key: trial for trial in _seed_by_seed(by_config)}.values())
     if not trials:
-        raise SpecificationError(f"the grid is empty: {' '.join(left_out) or 'nothing was asked'}")
-    return Grid(trials, asked, left_out, tuple(_notes(combinations)))
+        raise SpecificationError(
+            f"the grid is empty: {' '.join(left_out) or 'no trial was requested'}"
+        )
+    return Grid(trials, n_jobs, left_out, tuple(_notes(combinations)))
 
 
 def _notes(combinations: Sequence[Combination]) -> Iterator[str]:
-    """Yield for each key that some choices lack, which of them have it."""
+    """Yield a message for each key that only some of the choices have."""
     for key in dict.fromkeys(key for one in combinations for key in one.unused):
         group = key.split(".")[0]
         having = (one.settings.get(group) for one in combinations if key in one.used)
@@ -128,6 +130,6 @@ def _choices(combination: Combination) -> str:
     return " ".join(f"{key}={name_of(part)}" for key, part in sections if key in ("env", "policy"))
 
 
-def _seed_by_seed(cells: Sequence[Sequence[TrialSpec]]) -> Iterator[TrialSpec]:
-    for index in range(max(map(len, cells), default=0)):
-        yield from (cell[index] for cell in cells if index < len(cell))
+def _seed_by_seed(by_config: Sequence[Sequence[TrialSpec]]) -> Iterator[TrialSpec]:
+    for index in range(max(map(len, by_config), default=0)):
+        yield from (trials[index] for trials in by_config if index < len(trials))

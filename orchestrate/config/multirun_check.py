@@ -1,4 +1,4 @@
-"""One trial is asked for: an experiment that is a grid needs ``-m``."""
+"""Check that an experiment with sweeps is launched with ``-m``."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from orchestrate.usage import UsageError
+from orchestrate.cli_parser import UsageError
 
 
-def check_alone(words: Sequence[str], hydra: DictConfig, folder: Path) -> None:
-    """Refuse an experiment whose sweeps nobody would see without ``-m``.
+def require_multirun(overrides: Sequence[str], hydra: DictConfig, folder: Path) -> None:
+    """Refuse an experiment whose sweeps would be ignored without ``-m``.
 
     Parameters
     ----------
-    words
-        The overrides; a sweep whose key is among them is decided.
+    overrides
+        Overrides; a sweep whose key is among them is replaced.
     hydra
-        Hydra's own settings of this command.
+        Hydra's own settings.
     folder
-        The configuration files, which say what is swept without any experiment.
+        Folder of the configuration files, with the default sweeps.
 
     Raises
     ------
     UsageError
-        If a sweep is left.
+        If a sweep remains.
     """
-    named = {word.lstrip("+").partition("=")[0] for word in words}
+    named = {word.lstrip("+").partition("=")[0] for word in overrides}
     usual = OmegaConf.select(OmegaConf.load(folder / "config.yaml"), "hydra.sweeper.params")
     sweeps = dict(OmegaConf.select(hydra, "sweeper.params") or {})
     for grid in OmegaConf.select(hydra, "sweeper.grids") or []:

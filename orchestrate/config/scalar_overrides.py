@@ -1,4 +1,4 @@
-"""Set scalars in a composed configuration, and what follows them, without composing again."""
+"""Scalar overrides in a composed configuration, with their references, without recomposition."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _REFERENCE = re.compile(r"\$\{\s*([A-Za-z_]\w*(?:\.\w+)*)\s*\}")
 _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env:[^${}]*\}")
 
 
-class Overlay:
-    """A composed configuration in which the scalars at ``keys`` change.
+class ScalarOverrides:
+    """Composed configuration in which the scalars at ``keys`` change.
 
-    Plain references such as ``model.width: ${width}`` are followed by name; any other
-    interpolation is resolved anew by OmegaConf each time.
+    Plain references such as ``model.width: ${width}`` are tracked by name; OmegaConf resolves any
+    other interpolation again each time.
 
     Parameters
     ----------
@@ -43,11 +43,11 @@ class Overlay:
 
     @property
     def applicable(self) -> bool:
-        """Whether every key is an untyped scalar, so that any value can be put there."""
+        """Whether every key holds an untyped scalar, so that it accepts any value."""
         return all(type(_node(self._config, key)) is AnyNode for key in self._keys)
 
     def free(self, key: str) -> bool:
-        """Return whether ``key`` changes nothing but itself."""
+        """Return whether no other key depends on ``key``."""
         return not self._computed and self._paths.get(key) == [key]
 
     def settings(self, values: Sequence[object]) -> Settings:
@@ -66,7 +66,7 @@ class Overlay:
         return result
 
     def _follow(self, path: str, raw: str) -> bool:
-        """Return whether ``path`` is known to be constant or the value of one of the keys."""
+        """Return whether ``path`` is constant, or equal to one of the keys."""
         if _ENVIRONMENT.fullmatch(raw):
             return True
         match = _REFERENCE.fullmatch(raw)
@@ -82,7 +82,7 @@ class Overlay:
 
 
 def interpolations(node: Any, keys: Sequence[Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the dotted path and text of each leaf below ``node`` that refers to something else."""
+    """Yield the dotted path and text of each interpolation below ``node``."""
     for key in keys:
         child, path = node._get_node(key), f"{prefix}{key}"
         if child._is_interpolation():
@@ -103,7 +103,7 @@ def _node(config: DictConfig, key: str) -> Any:
 
 
 def has_key(config: DictConfig, key: str) -> bool:
-    """Return whether a dotted key is there, whatever its value; the entry of a list is one too."""
+    """Return whether a dotted key, or an entry of a list, exists, whatever its value."""
     parent, _, last = key.rpartition(".")
     with contextlib.suppress(OmegaConfBaseException):
         holder = OmegaConf.select(config, parent) if parent else config
@@ -121,7 +121,7 @@ def _resolved(config: DictConfig, path: str) -> Any:
 
 
 def _put(result: Settings, path: str, value: object, fresh: set[str]) -> None:
-    """Set a path in nested dicts, of which those not in ``fresh`` are shared and copied first."""
+    """Set a path in nested dicts; dicts not in ``fresh`` are shared, and are copied first."""
     *parents, last = path.split(".")
     if (parents or [last])[0] not in result:
         return

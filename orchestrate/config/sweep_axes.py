@@ -1,4 +1,4 @@
-"""The axes of a grid: one for each override, with the values that it takes."""
+"""Axes of a grid: one for each override, with its values."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from hydra.core.override_parser.types import Glob, Override, OverrideType, Quote
 from hydra.errors import ConfigCompositionException
 
 from dopt.errors import unknown_name
-from orchestrate.hydra_plugins.dopt_grid._globs import every_option, matches
+from orchestrate.config.globs import every_option, matches
 
 NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
-"""Groups and sections that hold for a whole launch."""
+"""Groups and sections of the whole launch, which cannot be swept."""
 
-MOST_VALUES = 1_000_000
-"""Values of one sweep at most: a mistyped range would fill the memory first."""
+MAX_VALUES = 1_000_000
+"""Largest number of values of one sweep, so that a mistyped range does not fill the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """One key of the command line and its values.
+    """Key of an override and its values.
 
     Attributes
     ----------
     key
-        Configuration key or group as typed, with the prefix ``+``, ``++`` or ``~`` and the package.
+        Configuration key or group as typed, with its prefix ``+``, ``++`` or ``~`` and its package.
     texts
         The values as Hydra would write them after the equals sign.
     values
-        The values themselves, of the types that Hydra's grammar gives them.
+        The values, typed by Hydra's grammar.
     kind
-        A ``choice`` of a group, a ``scalar`` that replaces another one, or an ``edit``: anything
-        else that changes the composed configuration, such as ``+k=1``, a list or a deletion.
+        ``choice`` of a group, ``scalar`` that replaces a value, or ``edit``: any other change of
+        the composed configuration, such as ``+k=1``, a list or a deletion.
     """
 
     key: str
@@ -50,7 +50,7 @@ class Axis:
 
     @property
     def replaces(self) -> bool:
-        """Whether it sets a key that is there already: no group, and without ``+`` and ``~``."""
+        """Whether the override sets an existing key: not a group, and without ``+`` or ``~``."""
         return self.kind != "choice" and self.key[0] not in "+~"
 
     def argument(self, index: int) -> str:
@@ -103,8 +103,8 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
 def _check_key(override: Override) -> None:
     if override.key_or_group.replace("/", ".").split(".")[0] in NOT_SWEPT:
         raise ConfigCompositionException(
-            f"'{override.input_line}' sweeps a setting of the whole launch, only trials can be "
-            "swept: give one value."
+            f"'{override.input_line}' sweeps a setting of the launch, but only settings of trials "
+            "can be swept: give one value."
         )
 
 
@@ -114,14 +114,14 @@ def _check_count(override: Override) -> None:
         raise ConfigCompositionException(
             f"'{line}' has no finite list of values: use a choice a,b or range(start,stop,step)."
         )
-    count = sum(1 for _ in itertools.islice(override.sweep_iterator(), MOST_VALUES + 1))
+    count = sum(1 for _ in itertools.islice(override.sweep_iterator(), MAX_VALUES + 1))
     if count == 0:
         raise ConfigCompositionException(
             f"'{line}' has no values, at least one is expected: check its bounds."
         )
-    if count > MOST_VALUES:
+    if count > MAX_VALUES:
         raise ConfigCompositionException(
-            f"'{line}' has more than {MOST_VALUES:,} values: check its bounds, or sweep in parts."
+            f"'{line}' has more than {MAX_VALUES:,} values: check its bounds, or sweep in parts."
         )
 
 
@@ -131,7 +131,7 @@ def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception
         return unknown_name(f"glob of {key}", ",".join(glob.include), options)
     names = sorted(name for name in loader.list_groups("") if name != "hydra")
     return ConfigCompositionException(
-        f"'{override.input_line}' is a glob, but '{key}' is no group with options: groups are "
+        f"'{override.input_line}' is a glob, but '{key}' is not a group: groups are "
         f"{', '.join(names)}."
     )
 
@@ -141,14 +141,14 @@ def _unquoted(value: object) -> object:
 
 
 def _plain(value: object) -> bool:
-    """Return whether ``value`` stands for itself wherever it is put."""
+    """Return whether ``value`` is a plain value, with no interpolation."""
     if isinstance(value, str):
         return "${" not in value and value != "???"
     return value is None or isinstance(value, bool | int | float)
 
 
 def _without_clash(axis: Axis, axes: Sequence[Axis]) -> Axis:
-    """Take a scalar as an edit when another override touches the same part of the tree."""
+    """Turn a scalar into an edit if another override changes the same part of the tree."""
     edits = (other for other in axes if other is not axis and other.kind != "choice")
     if axis.kind == "scalar" and any(_overlap(axis.key, other.key) for other in edits):
         return dataclasses.replace(axis, kind="edit")

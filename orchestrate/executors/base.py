@@ -1,7 +1,7 @@
-"""The one interface behind which trials run: tasks go in as chunks, outcomes come out as they end.
+"""Interface of executors: chunks of tasks are submitted, outcomes are returned as tasks end.
 
-An executor knows neither the database nor Hydra. It never runs a task twice by itself: what is
-lost is reported, and the driver decides.
+An executor knows neither the database nor Hydra. It never repeats a task: it reports lost tasks,
+and the scheduler decides whether they run again.
 """
 
 from __future__ import annotations
@@ -9,101 +9,78 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Self
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
+from orchestrate.records import Failure, RunRecord
 
 Run = Callable[[TrialSpec], TrialResult]
-"""What is done with a trial: pure, and importable by name where it goes to other processes."""
+"""Function that runs a trial: pure, and importable by name where it goes to other processes."""
+
+Prepare = Callable[[], None]
+"""Function that is called once in a process before its first trial."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One trial to run, with its key."""
+    """Trial to run, with its key."""
 
     key: str
     spec: TrialSpec
 
 
 @dataclass(frozen=True)
-class Usage:
-    """Where and when a task ran, and what it used."""
-
-    node: str
-    pid: int
-    wall_seconds: float
-    cpu_seconds: float
-    peak_memory_bytes: int
-    started: datetime
-    ended: datetime
-
-
-@dataclass(frozen=True)
-class Trouble:
-    """An exception that a task raised.
-
-    ``cause`` is its kind: "exception", "timeout", "out of memory" or "malformed".
-    """
-
-    type: str
-    message: str
-    traceback: str
-    cause: str = "exception"
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A task that ran to its end: a result, or the exception that it raised."""
+class TaskDone:
+    """Finished task: its result, or the exception that it raised."""
 
     key: str
-    usage: Usage
-    outcome: TrialResult | Trouble
+    run: RunRecord
+    outcome: TrialResult | Failure
 
 
 @dataclass(frozen=True)
-class Lost:
-    """Tasks whose worker ended before they did.
+class WorkerLost:
+    """Unfinished tasks of a worker that died.
 
     Attributes
     ----------
     keys
-        The tasks of the chunk without an outcome; one of them may be to blame.
+        Tasks of the chunk without an outcome; one of them may have caused the death.
     reason
-        What is known of the end, such as "been killed by signal 9".
+        Description of the death, such as "killed by signal 9".
     cause
-        Its kind: "killed", "out of memory", or "timeout" where the one task of ``keys`` did not
-        heed its limit of time.
+        "killed", "out of memory", or "timeout" if the only task of ``keys`` exceeded its time
+        limit.
     traceback
-        Where the worker was, as far as it could still say so.
-    blameless
-        Whether the whole node was lost, for which no task is to blame.
+        Stack of the worker when it died; empty if unknown.
+    node_lost
+        Whether the whole node was lost, so that no task caused it.
     node, pid
-        Where the worker ran, as far as it is known.
+        Host name and process number of the worker, if known.
     """
 
     keys: tuple[str, ...]
     reason: str
-    blameless: bool = False
+    node_lost: bool = False
     cause: str = "killed"
     traceback: str = ""
     node: str = "unknown"
     pid: int = 0
 
 
-Event = Finished | Lost
+Event = TaskDone | WorkerLost
 
 
 class Executor(ABC):
-    """Runs chunks of tasks on one or more workers; a context manager that starts and ends them.
+    """Context manager that starts and stops workers, which run chunks of tasks.
 
     Attributes
     ----------
     slots : int
         Number of tasks that run at the same time; known once started.
     batch : int or None
-        Trials of one configuration that make a chunk, where they run together.
+        Chunk size in trials of one configuration, for executors that run a chunk as one batch.
     """
 
     slots: int = 1
@@ -118,33 +95,33 @@ class Executor(ABC):
 
     @abstractmethod
     def start(self) -> None:
-        """Bring the workers up.
+        """Start the workers.
 
         Raises
         ------
         InfrastructureError
-            If that is not possible.
+            If they cannot be started.
         """
 
     @abstractmethod
     def submit(self, chunk: Sequence[Task]) -> None:
-        """Take a chunk without waiting; its tasks run in order on one worker."""
+        """Queue a chunk, whose tasks run in order on one worker; return at once."""
 
     @abstractmethod
     def wait(self, timeout: float) -> list[Event]:
-        """Return what has ended since the last call, after at most about ``timeout`` seconds.
+        """Return the events since the last call, after at most about ``timeout`` seconds.
 
         Raises
         ------
         InfrastructureError
-            If the workers cannot be reached any more.
+            If the connection to the workers is lost.
         """
 
     @property
     @abstractmethod
     def pending(self) -> int:
-        """Number of chunks that were submitted and are not yet over."""
+        """Number of submitted chunks that have not finished."""
 
     @abstractmethod
     def stop(self) -> None:
-        """End the workers at once, whatever they are doing."""
+        """Kill the workers at once."""

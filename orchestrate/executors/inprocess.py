@@ -1,4 +1,4 @@
-"""One trial after the other in this process: breakpoints work."""
+"""Executor that runs trials one after the other in this process, so that breakpoints work."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from collections import deque
 from collections.abc import Sequence
 
 from orchestrate.executors.base import Event, Executor, Run, Task
+from orchestrate.executors.factory import ExecutorFactory, limits_of
 from orchestrate.executors.limits import NO_LIMITS, Limits
 from orchestrate.executors.task import run_task
 
 
 class InProcessExecutor(Executor):
-    """Runs a task each time it is asked for an outcome.
+    """Runs one task at each call of ``wait``.
 
-    A limit of time cannot stop native code that does not come back to the interpreter, and one of
-    memory would be a limit of the whole launch: it is not set.
+    A time limit cannot stop native code that does not return to the interpreter. The memory limit
+    is not set, because it would hold for the whole launch.
     """
 
     def __init__(self, run: Run, limits: Limits = NO_LIMITS) -> None:
@@ -29,7 +30,7 @@ class InProcessExecutor(Executor):
         if chunk:
             self._chunks.append(deque(chunk))
 
-    def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a trial cannot be left
+    def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a running trial is not left
         if not self._chunks:
             return []
         event = run_task(self._run, self._chunks[0].popleft(), self._limits)
@@ -43,3 +44,10 @@ class InProcessExecutor(Executor):
 
     def stop(self) -> None:
         self._chunks.clear()
+
+
+FACTORY = ExecutorFactory(
+    make=lambda settings, run, _: InProcessExecutor(run, limits_of(settings)),
+    trials_at_once=lambda _: 1,
+    in_process=True,
+)

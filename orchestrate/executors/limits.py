@@ -1,8 +1,8 @@
-"""What a trial may take of wall time and memory, and how it is stopped when it takes more.
+"""Limits of wall time and memory of a trial, and their enforcement.
 
-Time has two limits. At the first one a signal raises an exception in the trial, whose traceback
-says where it hung. Native code that never comes back to the interpreter sees no signal: at the
-second limit a thread of C code, which needs no lock of the interpreter, ends the whole process.
+There are two time limits. At the first one a signal raises an exception in the trial, whose
+traceback shows where it hung. Native code that does not return to the interpreter sees no signal:
+at the second limit a C thread, which needs no interpreter lock, ends the process.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from dataclasses import dataclass
 from types import FrameType
 
 GRACE_SECONDS = 10.0
-"""At most so long after the first limit comes the second."""
+"""Largest time between the first limit and the second."""
 
-GIBIBYTE = 2**30
+BYTES_PER_GIB = 2**30
 
 _PR_SET_PDEATHSIG = 1
 
 
 class TrialTimeoutError(BaseException):
-    """A trial took too long; no ``except Exception`` in the trial can take it for its own."""
+    """Raised at the time limit; no ``Exception``, so that a trial does not catch it by accident."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Seconds of wall time for one trial and GiB for a worker process; None for no limit."""
+    """Wall time of one trial [s] and memory of a worker process [GiB]; None for no limit."""
 
     seconds: float | None = None
     memory_gib: float | None = None
 
     @property
     def last_seconds(self) -> float | None:
-        """Seconds after which a trial that did not heed the first limit ends with its process."""
+        """Seconds after which the process of a trial is killed if the first limit had no effect."""
         return None if self.seconds is None else self.seconds + min(GRACE_SECONDS, 1 + self.seconds)
 
     @property
-    def sentence(self) -> str:
-        """What is said of a trial that took too long."""
+    def timeout_message(self) -> str:
+        """Error message of a trial that took too long."""
         return f"timeout after {self.seconds:g} s"
 
 
@@ -53,35 +53,35 @@ NO_LIMITS = Limits()
 def interrupted_after(limits: Limits) -> Iterator[None]:
     """Raise ``TrialTimeoutError`` in the block, which runs in the main thread, at the limit.
 
-    A timer that somebody else has set goes on afterwards.
+    A timer that was set before is restored afterwards.
     """
     if limits.seconds is None:
         yield
         return
 
-    def ring(_: int, __: FrameType | None) -> None:
-        raise TrialTimeoutError(limits.sentence)
+    def raise_timeout(_: int, __: FrameType | None) -> None:
+        raise TrialTimeoutError(limits.timeout_message)
 
-    handler = signal.signal(signal.SIGALRM, ring)
+    handler = signal.signal(signal.SIGALRM, raise_timeout)
     timer = signal.setitimer(signal.ITIMER_REAL, limits.seconds)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, handler)  # a signal that has just come raises here
+        signal.signal(signal.SIGALRM, handler)  # a signal that has just arrived raises here
         signal.setitimer(signal.ITIMER_REAL, *timer)
 
 
 @contextmanager
-def ended_after(limits: Limits, last_words: int) -> Iterator[None]:
+def ended_after(limits: Limits, descriptor: int) -> Iterator[None]:
     """End this process if the block takes longer than the last limit.
 
-    Where every thread was goes to the file descriptor ``last_words``.
+    The stacks of all threads are written to the file ``descriptor``.
     """
     if limits.last_seconds is None:
         yield
         return
-    faulthandler.dump_traceback_later(limits.last_seconds, exit=True, file=last_words)
+    faulthandler.dump_traceback_later(limits.last_seconds, exit=True, file=descriptor)
     try:
         yield
     finally:
@@ -89,17 +89,17 @@ def ended_after(limits: Limits, last_words: int) -> Iterator[None]:
 
 
 def limit_memory(limits: Limits) -> None:
-    """Let this process get no more memory than the limit; beyond it ``MemoryError`` is raised."""
+    """Set the memory limit of this process, beyond which ``MemoryError`` is raised."""
     if limits.memory_gib is not None:
-        most = int(limits.memory_gib * GIBIBYTE)
+        most_bytes = int(limits.memory_gib * BYTES_PER_GIB)
         resource.setrlimit(
-            resource.RLIMIT_DATA, (most, resource.getrlimit(resource.RLIMIT_DATA)[1])
+            resource.RLIMIT_DATA, (most_bytes, resource.getrlimit(resource.RLIMIT_DATA)[1])
         )
 
 
 def die_with_parent() -> None:
-    """Let the kernel kill this process when its parent ends.
+    """Make the kernel kill this process when its parent ends.
 
-    A trial that holds the interpreter's lock lets no thread notice that the parent has gone.
+    A thread cannot do this while a trial holds the interpreter lock.
     """
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)

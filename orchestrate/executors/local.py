@@ -1,7 +1,7 @@
-"""A pool of processes on this machine.
+"""Executor on a pool of processes on this machine.
 
-``concurrent.futures`` gives up a whole pool when one process dies and cannot tell which task it
-was; here each worker has a socket of its own, so its end is seen and only its chunk is lost.
+``concurrent.futures`` breaks the whole pool when one process dies and does not tell which task
+caused it. Here each worker has its own socket, so that only the chunk of a dead worker is lost.
 """
 
 from __future__ import annotations
@@ -15,30 +15,31 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection, wait
 
 from orchestrate.errors import InfrastructureError
-from orchestrate.executors.base import Event, Executor, Finished, Lost, Run, Task
-from orchestrate.executors.ending import Ending, LastWords
+from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
+from orchestrate.executors.exit_status import CrashReport, ExitStatus
+from orchestrate.executors.factory import ExecutorFactory, limits_of
 from orchestrate.executors.limits import NO_LIMITS, Limits
-from orchestrate.surroundings import ONE_THREAD, module_path
+from orchestrate.executors.worker_environment import ONE_THREAD, module_path
 
-AHEAD = 2
-"""Chunks that a worker holds, so that it does not wait for the driver between two of them."""
+PREFETCHED_CHUNKS = 2
+"""Chunks that a worker holds at once, so that it need not wait between two of them."""
 
-MAX_STILLBORN = 3
-"""Workers in a row that may end before they are ready to run anything."""
+MAX_FAILED_STARTS = 3
+"""Consecutive workers that may die before they are ready; then the launch fails."""
 
 
 class Worker:
-    """The driver's end of one process."""
+    """Worker process as seen by the driver."""
 
     def __init__(self, run: Run, limits: Limits) -> None:
         ours, theirs = socket.socketpair()
-        self._last_words = LastWords()
+        self._crash_report = CrashReport()
         try:
             with theirs:
-                self.process = _start(theirs.fileno(), self._last_words.descriptor)
+                self.process = _start(theirs.fileno(), self._crash_report.descriptor)
         except BaseException:
             ours.close()
-            self._last_words.close()
+            self._crash_report.close()
             raise
         self.connection = Connection(ours.detach())
         self.chunks: deque[deque[Task]] = deque()
@@ -46,7 +47,7 @@ class Worker:
         self.send((run, limits))
 
     def send(self, message: object) -> None:
-        """Send, and leave the discovery of a dead worker to the next receive."""
+        """Send a message; a dead worker is detected by the next receive."""
         try:
             self.connection.send(message)
         except (BrokenPipeError, ConnectionError):
@@ -73,8 +74,8 @@ class Worker:
                 raise EOFError from None
         return events
 
-    def _take(self, message: Finished | None, events: list[Event]) -> None:
-        """Note an outcome, or None: first that the process is ready, then that a chunk is over."""
+    def _take(self, message: TaskDone | None, events: list[Event]) -> None:
+        """Take an outcome, or None: first for "ready", then for each finished chunk."""
         if message is not None:
             self.chunks[0].popleft()
             events.append(message)
@@ -83,15 +84,15 @@ class Worker:
         else:
             self.ready = True
 
-    def end(self) -> Ending:
-        """Kill the process if it still runs, and say how it ended."""
+    def end(self) -> ExitStatus:
+        """Kill the process if it still runs, and return its exit status."""
         self.connection.close()
         self.process.kill()
-        return self._last_words.explain(self.process.wait())
+        return self._crash_report.explain(self.process.wait())
 
 
 class LocalExecutor(Executor):
-    """Runs chunks on ``workers`` processes, by default one on each core that we may use."""
+    """Runs chunks on ``workers`` processes, by default one on each core in the affinity mask."""
 
     def __init__(self, run: Run, workers: int | None = None, limits: Limits = NO_LIMITS) -> None:
         self._run = run
@@ -99,7 +100,7 @@ class LocalExecutor(Executor):
         self.slots = workers or len(os.sched_getaffinity(0))
         self._workers: list[Worker] = []
         self._queue: deque[Sequence[Task]] = deque()
-        self._stillborn = 0
+        self._failed_starts = 0
 
     def start(self) -> None:
         try:
@@ -139,31 +140,34 @@ class LocalExecutor(Executor):
     def _feed(self) -> None:
         while self._queue:
             worker = min(self._workers, key=lambda worker: len(worker.chunks))
-            if len(worker.chunks) >= AHEAD:
+            if len(worker.chunks) >= PREFETCHED_CHUNKS:
                 return
             worker.assign(self._queue.popleft())
 
     def _replace(self, worker: Worker) -> list[Event]:
-        """Start a new process for a dead one; only the chunk that it was running is lost."""
+        """Replace a dead process; only the chunk that it was running is lost."""
         self._workers.remove(worker)
         end = worker.end()
-        self._stillborn = 0 if worker.ready else self._stillborn + 1
-        if self._stillborn >= MAX_STILLBORN:
+        self._failed_starts = 0 if worker.ready else self._failed_starts + 1
+        if self._failed_starts >= MAX_FAILED_STARTS:
             raise InfrastructureError(
-                f"{self._stillborn} workers in a row have {end.reason} before they were ready: see "
-                "what they wrote above, then run the same command again."
+                f"{self._failed_starts} workers in a row died before they were ready "
+                f"(last: {end.reason}): see their output above, then run the same command again."
             )
         chunks = [tuple(chunk) for chunk in worker.chunks]
         running = chunks.pop(0) if worker.ready and chunks else ()
         reason = end.reason
-        if end.cause == "timeout":  # the first is to blame, and the others have not begun
-            running, chunks, reason = running[:1], [running[1:], *chunks], self._limits.sentence
+        if end.cause == "timeout":  # the first task exceeded it, the others have not begun
+            running, chunks = running[:1], [running[1:], *chunks]
+            reason = self._limits.timeout_message
         self._queue.extendleft(chunk for chunk in reversed(chunks) if chunk)
         self._workers.append(self._worker())
         if not running:
             return []
         keys, pid = tuple(task.key for task in running), worker.process.pid
-        return [Lost(keys, reason, False, end.cause, end.traceback, socket.gethostname(), pid)]
+        return [
+            WorkerLost(keys, reason, False, end.cause, end.traceback, socket.gethostname(), pid)
+        ]
 
     def _worker(self) -> Worker:
         try:
@@ -182,7 +186,7 @@ def _start(*descriptors: int) -> subprocess.Popen[bytes]:
         stdin=subprocess.DEVNULL,
         stdout=sys.stderr.fileno() if _has_descriptor() else subprocess.DEVNULL,
         env={**os.environ, **ONE_THREAD, **module_path()},
-        process_group=0,  # a Ctrl-C of the terminal reaches the driver only
+        process_group=0,  # Ctrl-C in a terminal reaches the driver only
     )
 
 
@@ -192,3 +196,9 @@ def _has_descriptor() -> bool:
     except (OSError, ValueError):
         return False
     return True
+
+
+FACTORY = ExecutorFactory(
+    make=lambda settings, run, _: LocalExecutor(run, settings.workers, limits_of(settings)),
+    trials_at_once=lambda settings: settings.workers or len(os.sched_getaffinity(0)),
+)

@@ -1,7 +1,7 @@
-"""The trials of one configuration together, in torch: on a graphics processor or on this one.
+"""Executor that runs the trials of one configuration as torch batches, on a GPU or the CPU.
 
-The reference (:mod:`dopt.reference`) takes each step for the whole batch at once. The numbers are
-those of the trials run one by one, to rounding.
+The reference implementation (:mod:`dopt.reference`) takes each step for the whole batch at once.
+The numbers equal those of the kernel up to rounding.
 """
 
 from __future__ import annotations
@@ -16,23 +16,29 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from dopt.result import TrialResult
+from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config.value_checks import count, text
 from orchestrate.errors import LaunchError
-from orchestrate.executors.base import Event, Executor, Finished, Task, Trouble, Usage
-from orchestrate.executors.task import KIBIBYTE, trouble
+from orchestrate.executors.base import Event, Executor, Task, TaskDone
+from orchestrate.executors.factory import ExecutorFactory
+from orchestrate.executors.task import BYTES_PER_KIB, failure_of
+from orchestrate.records import Failure, RunRecord
+
+DEVICE = "cpu"
+BATCH_SIZE = 100
 
 
 class LockstepExecutor(Executor):
-    """Runs a chunk, which holds trials of one configuration, as one batch in this process.
+    """Runs each chunk of trials of one configuration as one batch in this process.
 
-    A batch has no limit of time: its trials take their steps together, and none of them could be
-    stopped without the others.
+    A batch has no time limit: its trials advance together, so that none can be stopped alone.
 
     Parameters
     ----------
     device : str
         Torch device, such as ``"cpu"`` or ``"cuda"``.
     batch : int
-        Trials in a batch at most.
+        Largest number of trials in a batch.
     """
 
     def __init__(self, device: str, batch: int) -> None:
@@ -48,7 +54,7 @@ class LockstepExecutor(Executor):
         if chunk:
             self._chunks.append(list(chunk))
 
-    def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a batch cannot be left
+    def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a running batch is not left
         return list(run_batch(self._chunks.popleft(), self._device)) if self._chunks else []
 
     @property
@@ -60,41 +66,70 @@ class LockstepExecutor(Executor):
 
 
 def check_device(device: str) -> None:
-    """Raise LaunchError if torch cannot run on a device here."""
+    """Raise ``LaunchError`` unless torch can use the device on this machine."""
     import torch
 
     kind, _, number = device.partition(":")
-    there = torch.cuda.device_count() if kind == "cuda" else 0
-    if device != "cpu" and not (kind == "cuda" and (number or "0") in map(str, range(there))):
+    n_devices = torch.cuda.device_count() if kind == "cuda" else 0
+    if device != "cpu" and not (kind == "cuda" and (number or "0") in map(str, range(n_devices))):
         raise LaunchError(
             f"executor.device is '{device}', but torch can run here on cpu and on "
-            f"{there} CUDA devices: set executor.device=cpu."
+            f"{n_devices} CUDA devices: set executor.device=cpu."
         )
 
 
-def run_batch(tasks: Sequence[Task], device: str) -> list[Finished]:
-    """Run tasks of one configuration in lockstep; an exception is every task's."""
+def run_batch(tasks: Sequence[Task], device: str) -> list[TaskDone]:
+    """Run tasks of one configuration as a batch; an exception fails all of them."""
     from dopt.assessment import assessed
-    from dopt.reference.lockstep import run_trials
+    from dopt.reference.batch import run_trials
 
     started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
-    outcomes: Sequence[TrialResult | Trouble]
+    outcomes: Sequence[TrialResult | Failure]
     try:
         specs = [task.spec for task in tasks]
         results = run_trials(specs, device)
         outcomes = [assessed(spec, result) for spec, result in zip(specs, results, strict=True)]
     except Exception as error:
-        outcomes = [trouble(error)] * len(tasks)
-    share = Usage(
+        outcomes = [failure_of(error)] * len(tasks)
+    share = RunRecord(
         node=socket.gethostname(),
         pid=os.getpid(),
         wall_seconds=(time.perf_counter() - wall) / len(tasks),
         cpu_seconds=(time.process_time() - cpu) / len(tasks),
-        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIBIBYTE,
+        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_KIB,
         started=started,
         ended=datetime.now(UTC),
     )
     return [
-        Finished(task.key, dataclasses.replace(share), outcome)
+        TaskDone(task.key, dataclasses.replace(share), outcome)
         for task, outcome in zip(tasks, outcomes, strict=True)
     ]
+
+
+def _device(settings: LaunchSettings) -> str:
+    return text("executor.device", settings.executor_options.get("device", DEVICE))
+
+
+def _batch_size(settings: LaunchSettings) -> int:
+    given = settings.executor_options.get("batch")
+    return count("executor.batch", given) or BATCH_SIZE
+
+
+def _check(settings: LaunchSettings) -> None:
+    _batch_size(settings)
+    check_device(_device(settings))
+
+
+def _trials_at_once(settings: LaunchSettings) -> int | None:
+    """Return the batch size; None on a GPU, whose memory is not known here."""
+    return _batch_size(settings) if _device(settings) == "cpu" else None
+
+
+FACTORY = ExecutorFactory(
+    make=lambda settings, *_: LockstepExecutor(_device(settings), _batch_size(settings)),
+    trials_at_once=_trials_at_once,
+    check=_check,
+    path="reference",
+    in_process=True,
+    limiting_key="executor.batch",
+)

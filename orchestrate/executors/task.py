@@ -1,4 +1,4 @@
-"""Run one task and measure it; the same code on every executor."""
+"""Execution of one task with its time and memory; the same code on every executor."""
 
 from __future__ import annotations
 
@@ -10,61 +10,62 @@ import traceback
 from datetime import UTC, datetime
 
 from dopt.result import TrialResult
-from orchestrate.executors.base import Finished, Run, Task, Trouble, Usage
+from orchestrate.executors.base import Run, Task, TaskDone
 from orchestrate.executors.limits import NO_LIMITS, Limits, TrialTimeoutError, interrupted_after
+from orchestrate.records import Failure, RunRecord
 
-KIBIBYTE = 1024
+BYTES_PER_KIB = 1024
 
 
-def run_task(run: Run, task: Task, limits: Limits = NO_LIMITS) -> Finished:
-    """Return the result of the task, or the exception that it raised, at the latest at its limit.
+def run_task(run: Run, task: Task, limits: Limits = NO_LIMITS) -> TaskDone:
+    """Run the task within its time limit; return its result or the exception that it raised.
 
-    A limit of time needs the main thread of the process.
+    A time limit needs the main thread of the process.
     """
     started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
-    outcome: TrialResult | Trouble
+    outcome: TrialResult | Failure
     try:
         with interrupted_after(limits):
             outcome = _checked(run(task.spec))
     except (Exception, SystemExit, TrialTimeoutError) as error:
-        outcome = trouble(error)
-    usage = Usage(
+        outcome = failure_of(error)
+    run_record = RunRecord(
         node=socket.gethostname(),
         pid=os.getpid(),
         wall_seconds=time.perf_counter() - wall,
         cpu_seconds=time.process_time() - cpu,
-        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIBIBYTE,
+        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_KIB,
         started=started,
         ended=datetime.now(UTC),
     )
-    return Finished(task.key, usage, outcome)
+    return TaskDone(task.key, run_record, outcome)
 
 
-def trouble(error: BaseException) -> Trouble:
-    """Return what is kept of an exception."""
-    # What was lost for want of memory is held by the frames; the text does not need it.
+def failure_of(error: BaseException) -> Failure:
+    """Return the record of an exception."""
+    # The frames may hold the memory that was lacking; the text does not need them.
     traceback.clear_frames(error.__traceback__)
     text = "".join(traceback.format_exception(error))
-    return Trouble(type(error).__name__, str(error), text, _cause(error))
+    return Failure(type(error).__name__, str(error), text, _cause(error))
 
 
 def _cause(error: BaseException) -> str:
     if isinstance(error, TrialTimeoutError):
         return "timeout"
-    # torch has an error of this name for a graphics processor, which is no MemoryError.
+    # torch.OutOfMemoryError, raised for a GPU, is not a MemoryError.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return "out of memory"
     return "malformed" if isinstance(error, _NoResultError) else "exception"
 
 
 class _NoResultError(TypeError):
-    """What a trial returned is no result at all."""
+    """Return value of a trial that is not a TrialResult."""
 
 
 def _checked(result: object) -> TrialResult:
     if isinstance(result, TrialResult):
         return result
     raise _NoResultError(
-        f"The trial returned {type(result).__name__}, but a TrialResult is expected: correct what "
-        "ran it."
+        f"The trial returned {type(result).__name__}, but a TrialResult is expected: correct the "
+        "function that ran it."
     )

@@ -1,8 +1,8 @@
-"""A process of the local pool: ``python -m orchestrate.executors.worker SOCKET LAST_WORDS``.
+"""Worker process of the local pool: ``python -m orchestrate.executors.worker SOCKET CRASH_REPORT``.
 
-Chunks come in on a socket and outcomes go out on it, one by one. A thread reads, so that neither
-side waits for the other with a full pipe, and so that the worker ends with its driver. What the
-process is at when it ends by force goes to a second descriptor.
+Chunks arrive on a socket, and outcomes are sent on it one by one. A thread reads, so that neither
+side blocks on a full pipe, and so that the worker ends with its driver. A dying process writes its
+stack to the second descriptor.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from multiprocessing.connection import Connection
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits, die_with_parent, ended_after, limit_memory
 from orchestrate.executors.task import run_task
-from orchestrate.surroundings import pin_threads
+from orchestrate.executors.worker_environment import pin_threads
 
 
-def main(descriptor: int, last_words: int) -> None:
+def main(descriptor: int, crash_report: int) -> None:
     """Run chunks until the driver closes the socket."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the driver's to handle
-    faulthandler.enable(last_words)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the driver
+    faulthandler.enable(crash_report)
     die_with_parent()
     pin_threads()
     connection = Connection(descriptor)
@@ -37,7 +37,7 @@ def main(descriptor: int, last_words: int) -> None:
     connection.send(None)  # ready
     while True:
         for task in chunks.get():
-            with ended_after(limits, last_words):
+            with ended_after(limits, crash_report):
                 finished = run_task(run, task, limits)
             connection.send(finished)
         connection.send(None)
@@ -48,9 +48,9 @@ def _read(connection: Connection, chunks: queue.SimpleQueue[list[Task]]) -> None
         while True:
             chunks.put(connection.recv())
     except (EOFError, OSError):
-        os._exit(0)  # the driver is gone: nobody would take the outcome of what runs now
+        os._exit(0)  # the driver is gone: no one would receive the outcome
     finally:
-        os._exit(1)  # out of memory, perhaps: without this thread the worker is of no use
+        os._exit(1)  # out of memory, perhaps: the worker is useless without this thread
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What every worker process starts with: the same modules, and one thread.
+"""Environment of worker processes: the module path of the launch, and one thread.
 
 With one thread for each process the workers share the cores, and sums keep their order.
 """
@@ -26,7 +26,7 @@ ONE_THREAD = dict.fromkeys(
 def pin_threads() -> None:
     """Pin the numerical libraries of this process, and of those it starts, to one thread.
 
-    The environment binds libraries that are imported later; torch can be told afterwards too.
+    The variables act on libraries that are imported later; a loaded torch is set directly.
     """
     os.environ.update(ONE_THREAD)
     if "torch" in sys.modules:
@@ -34,13 +34,8 @@ def pin_threads() -> None:
 
 
 def module_path() -> dict[str, str]:
-    """Return the environment in which another interpreter finds the modules that we find.
-
-    The folder of this package is left out: a launch has it on its path for Hydra's plugins, and
-    names such as ``errors`` would hide other people's modules there.
-    """
-    package = Path(__file__).resolve().parent
-    root = str(package.parent)
-    paths = [path for path in sys.path if path and Path(path).resolve() != package]
-    first = [] if root in paths else [root]  # an installed copy stays behind the standard library
+    """Return the environment in which another interpreter finds the modules that this one finds."""
+    root = str(Path(__file__).resolve().parents[2])
+    paths = [path for path in sys.path if path]
+    first = [] if root in paths else [root]  # an installed copy stays after the standard library
     return {"PYTHONPATH": os.pathsep.join([*first, *paths])}

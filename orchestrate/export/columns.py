@@ -1,4 +1,4 @@
-"""What the columns of each table are, in the order of the file."""
+"""Columns of the exported tables, in the order of the file."""
 
 from __future__ import annotations
 

@@ -13,15 +13,17 @@ from orchestrate.export import matrices, streams, tables
 from orchestrate.export.atomic import whole
 from orchestrate.export.manifest import provenance
 from orchestrate.export.wanted import Export, ExportError
-from orchestrate.store import Cell, Reader
+from orchestrate.store import ConfigRow, Reader
 
-_STREAMS: dict[str, Callable[[Reader, Sequence[Cell]], streams.Stream]] = {
+_STREAMS: dict[str, Callable[[Reader, Sequence[ConfigRow]], streams.Stream]] = {
     "curves": streams.curves,
     "trials": streams.trials,
     "trajectories": streams.trajectories,
     "assessments": streams.assessments,
 }
-_MATRICES: dict[str, Callable[[Reader, Sequence[Cell]], Generator[matrices.Named, None, None]]] = {
+_MATRICES: dict[
+    str, Callable[[Reader, Sequence[ConfigRow]], Generator[matrices.Named, None, None]]
+] = {
     "curves": matrices.curves,
     "trials": matrices.trials,
     "trajectories": matrices.trajectories,
@@ -30,7 +32,7 @@ _MATRICES: dict[str, Callable[[Reader, Sequence[Cell]], Generator[matrices.Named
 _WRITERS = {"csv": tables.write_csv, "parquet": tables.write_parquet}
 
 
-def export(reader: Reader, cells: Sequence[Cell], wanted: Export) -> dict[str, Any]:
+def export(reader: Reader, cells: Sequence[ConfigRow], wanted: Export) -> dict[str, Any]:
     """Write the file, and after it its manifest; return what the manifest says.
 
     Both appear whole or not at all. ``reader`` sees one moment, that of ``cells``. Raises
@@ -58,7 +60,7 @@ def export(reader: Reader, cells: Sequence[Cell], wanted: Export) -> dict[str, A
     return document
 
 
-def _write(reader: Reader, cells: Sequence[Cell], wanted: Export, out: Path) -> dict[str, Any]:
+def _write(reader: Reader, cells: Sequence[ConfigRow], wanted: Export, out: Path) -> dict[str, Any]:
     # After an error the cursors must close before the database does.
     if wanted.format == "npz":
         with closing(_MATRICES[wanted.kind](reader, cells)) as arrays:
@@ -69,7 +71,7 @@ def _write(reader: Reader, cells: Sequence[Cell], wanted: Export, out: Path) -> 
         return {"rows": _WRITERS[wanted.format](out, stream), "columns": columns}
 
 
-def _expect_trials(reader: Reader, cells: Sequence[Cell], wanted: Export) -> None:
+def _expect_trials(reader: Reader, cells: Sequence[ConfigRow], wanted: Export) -> None:
     if not cells:
         raise ExportError(
             f"{reader.safe_url} holds no trials yet: run a launch that writes to it first."

@@ -1,4 +1,4 @@
-"""Where exported numbers come from."""
+"""Manifest of an export: the origin of its numbers."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import asdict
 from importlib import metadata
 from typing import Any
 
-from orchestrate.passwords import without_password
-from orchestrate.status import counts
-from orchestrate.store import Cell, Reader
-from orchestrate.store.values import now
+from orchestrate.queries.status import counts
+from orchestrate.redaction import without_password
+from orchestrate.store import ConfigRow, Reader
+from orchestrate.store.serialization import now
 
 _WRITERS = "SELECT DISTINCT config_key, launch_id FROM v_trial WHERE launch_id IS NOT NULL"
 
 
 def provenance(
-    reader: Reader, cells: Sequence[Cell], filters: Mapping[str, Sequence[str]]
+    reader: Reader, cells: Sequence[ConfigRow], filters: Mapping[str, Sequence[str]]
 ) -> dict[str, Any]:
     """Return database, selection, configurations and launches, without passwords."""
     keys = {cell.config_key for cell in cells}

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from orchestrate.export import streams
 from orchestrate.export.columns import STEP_COLUMNS, TRIALS
-from orchestrate.store import Cell, Reader
+from orchestrate.store import ConfigRow, Reader
 
 Named = tuple[str, npt.NDArray[Any], tuple[str, ...]]
 """Name, array and the names of its axes."""
@@ -22,7 +22,7 @@ Named = tuple[str, npt.NDArray[Any], tuple[str, ...]]
 _AT_A_TIME = 100  # trajectories
 
 
-def names(cells: Sequence[Cell]) -> list[str]:
+def names(cells: Sequence[ConfigRow]) -> list[str]:
     """Return env/policy/width of each configuration, and the key where that is not unique."""
     short = [f"{c.env}/{c.policy}/{'-' if c.width is None else c.width}" for c in cells]
     count = Counter(short)
@@ -32,7 +32,7 @@ def names(cells: Sequence[Cell]) -> list[str]:
     ]
 
 
-def curves(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None, None]:
+def curves(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield the curves of the finished trials, (seed, t), NaN from a divergence on."""
     for name, cell in zip(names(cells), cells, strict=True):
         seeds, diverged, steps = _steps(reader, cell)
@@ -43,7 +43,7 @@ def curves(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None, None
 
 
 def _steps(
-    reader: Reader, cell: Cell
+    reader: Reader, cell: ConfigRow
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
     """Return seeds (n,), flags of divergence (n,) and the columns of the steps (5, n, T)."""
     trials: dict[int, bool] = {}
@@ -61,7 +61,7 @@ def _steps(
     )
 
 
-def trajectories(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None, None]:
+def trajectories(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield states, inputs and final parameters of the finished trials."""
     for name, cell in zip(names(cells), cells, strict=True):
         found = list(streams.of_cell(reader, cell, _AT_A_TIME))
@@ -75,7 +75,7 @@ def trajectories(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None
         yield f"{name}/diverged", np.array(diverged, dtype=np.bool_), ("seed",)
 
 
-def assessments(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None, None]:
+def assessments(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield each measure of the finished trials, (seed, t), with its seeds and numbers of steps."""
     for name, cell in zip(names(cells), cells, strict=True):
         for measure in reader.measures(cell.config_key):
@@ -85,7 +85,7 @@ def assessments(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None,
             yield f"{name}/{measure}/t", found.t, ("t",)
 
 
-def trials(reader: Reader, cells: Sequence[Cell]) -> Generator[Named, None, None]:
+def trials(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield the columns of the table of trials; a missing number is NaN, a missing text empty."""
     table = streams.trials(reader, cells)
     batches = list(table.batches)

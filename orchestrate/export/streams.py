@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from orchestrate.export import columns
-from orchestrate.store import Cell, Reader, Trajectory
-from orchestrate.store.packing import unpack
+from orchestrate.store import ConfigRow, Reader, Trajectory
+from orchestrate.store.serialization import unpack
 
 ROWS = 50_000
 """Rows of the database in one batch."""
@@ -53,17 +53,17 @@ class Stream:
     batches: Generator[pa.RecordBatch, None, None]
 
 
-def curves(reader: Reader, cells: Sequence[Cell]) -> Stream:
+def curves(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
     """Return every step of the finished trials, sorted by configuration, seed and t."""
     return Stream(columns.CURVES, _curves(reader, cells))
 
 
-def trials(reader: Reader, cells: Sequence[Cell]) -> Stream:
+def trials(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
     """Return every trial, sorted by configuration and seed."""
     return Stream(columns.TRIALS, _trials(reader, cells))
 
 
-def trajectories(reader: Reader, cells: Sequence[Cell]) -> Stream:
+def trajectories(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
     """Return states and inputs of the finished trials, sorted by configuration, seed and t."""
     firsts = [next(of_cell(reader, cell, 1), None) for cell in cells]
     n_states = max((one[2].states.shape[1] for one in firsts if one), default=0)
@@ -72,17 +72,17 @@ def trajectories(reader: Reader, cells: Sequence[Cell]) -> Stream:
     return Stream(schema, _trajectories(reader, cells, schema))
 
 
-def assessments(reader: Reader, cells: Sequence[Cell]) -> Stream:
+def assessments(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
     """Return what finished trials were worth, sorted by configuration, seed, t and measure."""
     return Stream(columns.ASSESSMENTS, _assessments(reader, cells))
 
 
-def steps(reader: Reader, cell: Cell) -> Generator[list[Sequence[Any]], None, None]:
+def steps(reader: Reader, cell: ConfigRow) -> Generator[list[Sequence[Any]], None, None]:
     """Yield (seed, status, t, *STEP_COLUMNS) of the finished trials, in batches, by seed and t."""
     yield from reader.batches(ROWS, _CURVES, config_key=cell.config_key)
 
 
-def of_cell(reader: Reader, cell: Cell, size: int) -> Iterator[tuple[int, str, Trajectory]]:
+def of_cell(reader: Reader, cell: ConfigRow, size: int) -> Iterator[tuple[int, str, Trajectory]]:
     """Yield (seed, status, trajectory) of a configuration; ``size`` of them are read at a time."""
     for rows in reader.batches(size, _TRAJECTORIES, config_key=cell.config_key):
         for seed, status, dtype, *packed in rows:
@@ -90,7 +90,7 @@ def of_cell(reader: Reader, cell: Cell, size: int) -> Iterator[tuple[int, str, T
             yield seed, status, Trajectory(*arrays)
 
 
-def _curves(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, None, None]:
+def _curves(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
     for cell in cells:
         for rows in steps(reader, cell):
             names = ("seed", "status", "t", *columns.STEP_COLUMNS)
@@ -98,7 +98,9 @@ def _curves(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, 
             yield _batch(columns.CURVES, {**_constants(cell), **values}, len(rows))
 
 
-def _assessments(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, None, None]:
+def _assessments(
+    reader: Reader, cells: Sequence[ConfigRow]
+) -> Generator[pa.RecordBatch, None, None]:
     for cell in cells:
         for rows in reader.batches(ROWS, _ASSESSMENTS, config_key=cell.config_key):
             names = ("seed", "status", "t", "measure", "value")
@@ -106,7 +108,7 @@ def _assessments(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBa
             yield _batch(columns.ASSESSMENTS, {**_constants(cell), **values}, len(rows))
 
 
-def _trials(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, None, None]:
+def _trials(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
     for cell in cells:
         for rows in reader.batches(ROWS, _TRIALS, config_key=cell.config_key):
             values = dict(zip(columns.TRIALS.names, zip(*rows, strict=True), strict=True))
@@ -114,7 +116,7 @@ def _trials(reader: Reader, cells: Sequence[Cell]) -> Generator[pa.RecordBatch, 
 
 
 def _trajectories(
-    reader: Reader, cells: Sequence[Cell], schema: pa.Schema
+    reader: Reader, cells: Sequence[ConfigRow], schema: pa.Schema
 ) -> Generator[pa.RecordBatch, None, None]:
     for cell in cells:
         size = max(1, ROWS // (cell.horizon + 1))
@@ -132,7 +134,7 @@ def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:
     return {f"{name}_{i}": column for i, column in enumerate(padded.T)}
 
 
-def _constants(cell: Cell) -> dict[str, Any]:
+def _constants(cell: ConfigRow) -> dict[str, Any]:
     names = ("env", "policy", "model", "learner", "width", "depth")
     return {
         "config": cell.config_key[:KEY_DIGITS],

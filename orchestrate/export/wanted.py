@@ -1,4 +1,4 @@
-"""What can be exported, and into what."""
+"""Kinds and formats of exports."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ FORMATS = ("csv", "parquet", "npz")
 
 
 class ExportError(DoptError):
-    """There is nothing to export, or the file cannot be written."""
+    """Empty selection, or file that cannot be written."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """What to write: one of ``KINDS``, in one of ``FORMATS``, of which configurations."""
+    """Request of an export: one of ``KINDS`` in one of ``FORMATS``, with filters."""
 
     kind: str
     format: str

@@ -1,4 +1,4 @@
-"""How far a grid is: numbers from the database, for any way to show them."""
+"""Status of a grid: counts, failures, running launches and the rate."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
-from orchestrate.store import Cell, LaunchRow, Reader
-from orchestrate.store.values import utc_text
+from orchestrate.store import ConfigRow, LaunchRow, Reader
+from orchestrate.store.serialization import utc_text
 
-RECENT = 300.0
-"""Seconds over which the rate is taken."""
+RATE_WINDOW_SECONDS = 300.0
+"""Period over which the rate is averaged."""
 
 STATES = ("done", "diverged", "failed", "cancelled", "running", "pending")
+"""Statuses of a trial in the order of display."""
 
 _FAILURES = """
 SELECT c.config_key, a.cause, a.error_id, e.type, e.message, count(*) AS attempts,
@@ -47,11 +48,11 @@ class FailureKind:
     Attributes
     ----------
     trials
-        Trials that stand as failed by it.
+        Trials whose last attempt failed in this way.
     attempts
-        Attempts that ended so, those included that were made good by a later one.
-    cells
-        Names (env, policy) of where it happened.
+        Attempts that failed in this way, including those followed by a successful one.
+    places
+        Names (env, policy) of the configurations.
     """
 
     cause: str
@@ -60,7 +61,7 @@ class FailureKind:
     error_id: int | None
     trials: int = 0
     attempts: int = 0
-    cells: set[tuple[str, str]] = field(default_factory=set)
+    places: set[tuple[str, str]] = field(default_factory=set)
     traceback: str = ""
 
     @property
@@ -78,17 +79,17 @@ class FailureKind:
 
 @dataclass(frozen=True)
 class Status:
-    """Some configurations of a grid, what failed in them and who works on them.
+    """Configurations of a grid with their failures and running launches.
 
     Attributes
     ----------
     launches
-        Those that say they run, dead ones included.
+        Launches recorded as running, including dead ones.
     rate
         Trials per second of the living launches over the last minutes.
     """
 
-    cells: Sequence[Cell]
+    configs: Sequence[ConfigRow]
     failures: Sequence[FailureKind]
     launches: Sequence[LaunchRow]
     rate: float
@@ -96,7 +97,7 @@ class Status:
     @property
     def counts(self) -> Counter[str]:
         """Number of trials in each state."""
-        return counts(self.cells)
+        return counts(self.configs)
 
     @property
     def total(self) -> int:
@@ -112,29 +113,29 @@ class Status:
         return self.left / self.rate if self.left and self.rate else None
 
 
-def counts(cells: Iterable[Cell]) -> Counter[str]:
+def counts(configs: Iterable[ConfigRow]) -> Counter[str]:
     """Return the number of trials in each state."""
     total = Counter(dict.fromkeys(STATES, 0))
-    for cell in cells:
-        total.update({state: getattr(cell, f"n_{state}") for state in STATES})
+    for config in configs:
+        total.update({state: getattr(config, f"n_{state}") for state in STATES})
     return total
 
 
-def gather(reader: Reader, cells: Sequence[Cell], kinds: int = 10) -> Status:
+def gather(reader: Reader, configs: Sequence[ConfigRow], kinds: int = 10) -> Status:
     """Return the status of the configurations, with tracebacks of the ``kinds`` commonest failures.
 
-    ``reader`` sees one moment, that of ``cells``.
+    ``reader`` is the snapshot from which ``configs`` were read.
     """
-    by_key = {cell.config_key: cell for cell in cells}
+    by_key = {config.config_key: config for config in configs}
     running = [launch for launch in reader.launches() if launch.state == "running"]
     failures = _failures(reader, by_key)
     for kind in failures[:kinds]:
         if kind.error_id is not None:
             kind.traceback = str(reader.rows(_TRACEBACK, error_id=kind.error_id)[0][0])
-    return Status(cells, failures, running, _rate(reader, by_key, running))
+    return Status(configs, failures, running, _rate(reader, by_key, running))
 
 
-def _failures(reader: Reader, by_key: dict[str, Cell]) -> list[FailureKind]:
+def _failures(reader: Reader, by_key: dict[str, ConfigRow]) -> list[FailureKind]:
     found: dict[tuple[str, ...], FailureKind] = {}
     for row in reader.rows(_FAILURES):
         if row.config_key in by_key:
@@ -143,19 +144,27 @@ def _failures(reader: Reader, by_key: dict[str, Cell]) -> list[FailureKind]:
             kind = found.setdefault(name, new)
             kind.attempts += row.attempts
             kind.trials += row.trials
-            cell = by_key[row.config_key]
-            kind.cells.add((cell.env, cell.policy))
+            config = by_key[row.config_key]
+            kind.places.add((config.env, config.policy))
     return sorted(found.values(), key=lambda kind: (-kind.trials, -kind.attempts, kind.cause))
 
 
-def _rate(reader: Reader, by_key: dict[str, Cell], running: Sequence[LaunchRow]) -> float:
+def _rate(reader: Reader, by_key: dict[str, ConfigRow], running: Sequence[LaunchRow]) -> float:
     now = datetime.now(UTC)
     ended: Counter[int] = Counter()
-    for row in reader.rows(_ENDED, since=utc_text(now - timedelta(seconds=RECENT))):
+    for row in reader.rows(_ENDED, since=utc_text(now - timedelta(seconds=RATE_WINDOW_SECONDS))):
         ended[row.launch_id] += row.ended if row.config_key in by_key else 0
     alive = (launch for launch in running if launch.alive)
-    spans = {one.launch_id: min(RECENT, max(1.0, seconds_since(one.started, now))) for one in alive}
+    spans = {
+        one.launch_id: min(RATE_WINDOW_SECONDS, max(1.0, seconds_since(one.started, now)))
+        for one in alive
+    }
     return math.fsum(ended[launch_id] / span for launch_id, span in spans.items())
+
+
+def _counted_seconds(launch: LaunchRow, now: datetime) -> float:
+    """Return the part of the rate window in which the launch has run, at least 1 s."""
+    return min(RATE_WINDOW_SECONDS, max(1.0, seconds_since(launch.started, now)))
 
 
 def seconds_since(moment: str, now: datetime) -> float:

@@ -1,4 +1,4 @@
-"""Everything that the database knows of one trial."""
+"""Report of one trial: configuration, launches, attempts and loss curve."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from orchestrate.passwords import without_password
+from orchestrate.redaction import without_password
 from orchestrate.store import Reader
 
 _TRIAL = "SELECT * FROM v_trial WHERE trial_id = :trial_id"
@@ -25,20 +25,20 @@ _LOSS = "SELECT loss FROM step WHERE trial_id = :trial_id ORDER BY t"
 
 @dataclass(frozen=True)
 class TrialReport:
-    """One trial.
+    """Contents of the database about one trial.
 
     Attributes
     ----------
     trial
         Row of ``v_trial``.
     config
-        The whole configuration without the seed.
+        The configuration without the seed.
     launches
-        The commands that tried it, without passwords.
+        The launches that ran it, without passwords.
     attempts
-        One for each time that it was claimed, with its error if there was one.
+        One for each claim, with its error if there was one.
     loss
-        The curve; None where it is not finite, empty where there is none.
+        The loss curve, with None for values that are not finite; empty if there is none.
     """
 
     trial: Mapping[str, Any]
@@ -49,7 +49,7 @@ class TrialReport:
 
 
 def report(reader: Reader, trial_id: int) -> TrialReport:
-    """Return what is known of a trial; ``reader`` sees one moment."""
+    """Return the report of a trial; ``reader`` is a snapshot."""
     trial = reader.rows(_TRIAL, trial_id=trial_id)[0]._asdict()
     attempts = [row._asdict() for row in reader.rows(_ATTEMPTS, trial_id=trial_id)]
     tried = {attempt["launch_id"] for attempt in attempts}

@@ -1,4 +1,4 @@
-"""How many trials a worker gets at once: about a second of work."""
+"""Chunks of trials for the workers, each of about one second of work."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import itertools
 from collections import deque
 from collections.abc import Iterable
 
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Task
 
-LARGEST = 200
-"""Trials in a chunk at most, which bounds what is lost with a worker."""
+MAX_CHUNK_TRIALS = 200
+"""Largest number of trials in a chunk, which bounds the loss when a worker dies."""
 
 
 class Chunks:
-    """The trials that wait, cut into chunks by what their like has cost so far.
+    """Queue of waiting trials, cut into chunks by the measured cost of their configurations.
 
     Parameters
     ----------
     trials
-        In the order in which they are to run.
+        In the order of execution.
     seconds
-        Work in a chunk.
+        Work in a chunk [s].
     slots
-        Workers, which may change; towards the end the chunks get smaller, so that all workers end
-        together.
+        Number of workers, which may change; chunks get smaller towards the end, so that all workers
+        finish together.
     batch
-        Trials of one configuration that make a chunk, whatever they cost; None cuts by cost.
+        Chunk size in trials of one configuration; None cuts by cost.
     """
 
     def __init__(
@@ -44,27 +44,27 @@ class Chunks:
         return len(self._waiting) + len(self._alone)
 
     def add(self, trials: Iterable[TrialSpec], *, alone: bool = False) -> None:
-        """Let more trials wait, each one for a chunk of its own if ``alone``."""
+        """Append trials to the queue, each as a chunk of its own if ``alone``."""
         if self._batch:
-            cells: dict[str, list[TrialSpec]] = {}
+            by_config: dict[str, list[TrialSpec]] = {}
             for trial in trials:
-                cells.setdefault(trial.config_key, []).append(trial)
-            trials = itertools.chain.from_iterable(cells.values())
+                by_config.setdefault(trial.config_key, []).append(trial)
+            trials = itertools.chain.from_iterable(by_config.values())
         (self._alone if alone else self._waiting).extend(trials)
 
     def observe(self, config_key: str, seconds: float) -> None:
-        """Learn what a trial of a configuration has cost."""
+        """Update the mean cost of a configuration with a measured trial."""
         known = self._costs.get(config_key)
         self._costs[config_key] = seconds if known is None else 0.7 * known + 0.3 * seconds
 
     def next(self) -> list[Task]:
-        """Return the next trials; one alone while nothing is known of its configuration."""
+        """Return the next chunk; one trial while the cost of its configuration is unknown."""
         if self._alone:
             trial = self._alone.popleft()
             return [Task(trial.trial_key, trial)]
         if self._batch:
             return self._next_batch(self._batch)
-        limit = min(LARGEST, max(1, len(self._waiting) // (2 * self.slots)))
+        limit = min(MAX_CHUNK_TRIALS, max(1, len(self._waiting) // (2 * self.slots)))
         chunk: list[Task] = []
         cost = 0.0
         while self._waiting and len(chunk) < limit:

@@ -1,4 +1,4 @@
-"""What a grid would do, without doing it: ``launch.dry_run=true``."""
+"""Preview of a grid for ``launch.dry_run=true``: trials to run, done and failed."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Sequence
 
 from dopt.control.task import GOAL_FIELDS
-from dopt.spec import TrialSpec
-from orchestrate.grid import Grid
-from orchestrate.store import NoDatabaseError, Reader
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
+from orchestrate.store import FINISHED, RETRIED, NoDatabaseError, Reader
 
 SECTIONS = ("env", "policy", "model", "learner", "task")
 NO_TASK = {"name": "none"}
@@ -16,27 +16,29 @@ ALWAYS = ("env", "policy")
 COUNTS = ("trials", "done", "failed", "to run")
 
 Values = dict[str, object]
-"""What a cell is made of: the name of each section, and each field by its dotted path."""
+"""Values of a configuration: the name of each section, and each field by its dotted path."""
 
 
-def preview(grid: Grid, url: str) -> str:
-    """Return a table of the cells of the grid: trials asked for, done, and left to run.
+def preview(grid: Grid, url: str, retry: str | None = None) -> str:
+    """Return a table of the configurations: trials requested, done, failed and to run.
 
-    A database that does not exist yet is not made.
+    Trials that ``retry`` runs again count as to run. A database that does not exist is not created.
     """
+    again = RETRIED[retry] if retry else ()
     status = _statuses(url)
     rows: dict[str, Counter[str]] = {}
-    cells: dict[str, Values] = {}
+    configs: dict[str, Values] = {}
     for trial in grid.trials:
-        if trial.config_key not in cells:
-            cells[trial.config_key] = _values(trial)
+        if trial.config_key not in configs:
+            configs[trial.config_key] = _values(trial)
         row = rows.setdefault(trial.config_key, Counter())
         row["trials"] += 1
-        row[_heading(status.get(trial.trial_key))] += 1
-    shown = _columns(list(cells.values()))
+        found = status.get(trial.trial_key)
+        row["to run" if found in again else _heading(found)] += 1
+    shown = _columns(list(configs.values()))
     lines = [[*(_heading_of(column) for column in shown), *COUNTS]]
     for key, row in rows.items():
-        lines.append([_text(cells[key].get(column)) for column in shown])
+        lines.append([_text(configs[key].get(column)) for column in shown])
         lines[-1] += [f"{row[name]:,}" for name in COUNTS]
     left_out = [f"left out {count:,} trials: {why}" for why, count in grid.left_out.items()]
     total = sum(rows.values(), Counter[str]())
@@ -61,7 +63,7 @@ def _rows(reader: Reader) -> list[tuple[object, ...]]:
 
 
 def _heading(status: str | None) -> str:
-    if status in ("done", "diverged"):
+    if status in FINISHED:
         return "done"
     return "failed" if status in ("failed", "cancelled") else "to run"
 
@@ -72,32 +74,34 @@ def _values(trial: TrialSpec) -> Values:
     for section in SECTIONS:
         fields = content.get(section, NO_TASK)
         assert isinstance(fields, dict)
-        # Every system has a goal of its own, which is no news.
-        told = {key: value for key, value in fields.items() if key not in GOAL_FIELDS}
-        values |= {f"{section}.{key}": value for key, value in told.items()}
+        # The goal belongs to the system, so that it distinguishes no configurations.
+        shown = {key: value for key, value in fields.items() if key not in GOAL_FIELDS}
+        values |= {f"{section}.{key}": value for key, value in shown.items()}
         values[section] = values.pop(f"{section}.name")
     return values
 
 
-def _columns(cells: Sequence[Values]) -> list[str]:
-    """Return the columns that tell the cells apart.
+def _columns(configs: Sequence[Values]) -> list[str]:
+    """Return the columns that distinguish the configurations.
 
-    A field counts where it differs between cells with the same option of its section: that two
-    systems have different masses is no news.
+    A field is shown if it differs between configurations with the same option of its section; the
+    masses of two systems always differ.
     """
-    names = [one for one in SECTIONS if one in ALWAYS or len({cell[one] for cell in cells}) > 1]
+    names = [
+        one for one in SECTIONS if one in ALWAYS or len({config[one] for config in configs}) > 1
+    ]
     seen: dict[tuple[str, object], str] = {}
     fields: dict[str, None] = {}
-    for cell in cells:
-        for path in cell.keys() - set(SECTIONS):
-            text = _text(cell[path])
-            if seen.setdefault((path, cell[path.split(".")[0]]), text) != text:
+    for config in configs:
+        for path in config.keys() - set(SECTIONS):
+            text = _text(config[path])
+            if seen.setdefault((path, config[path.split(".")[0]]), text) != text:
                 fields[path] = None
     return [*names, *sorted(fields)]
 
 
 def _heading_of(column: str) -> str:
-    """Return the key that sets the column."""
+    """Return the key that sets a column."""
     return "width" if column == "model.width" else column
 
 

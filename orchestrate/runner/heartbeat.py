@@ -1,4 +1,4 @@
-"""A sign of life for the database, whatever the main thread does meanwhile."""
+"""Heartbeat thread that renews the lease of a launch in the database."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import Self
 
 from orchestrate.store import Store
 
-BEATS = 6
-"""Signs of life in one lease, so that a few may fail."""
+HEARTBEATS_PER_LEASE = 6
+"""Heartbeats in one lease, so that a few may fail."""
 
-LAST_SECONDS = 2.0
-"""Time that a sign of life that is under way gets at the end."""
+JOIN_TIMEOUT_SECONDS = 2.0
+"""Time for the last heartbeat to finish."""
 
 
 class Heartbeat:
-    """While it is entered, renews the lease of a launch from a thread of its own.
+    """Context manager that renews the lease of a launch from a thread.
 
-    It says nothing of a database that went away: the main thread will see that too.
+    It ignores a lost database, which the main thread notices too.
     """
 
     def __init__(self, store: Store, launch: int, lease_seconds: float) -> None:
         self._store = store
         self._launch = launch
-        self._interval = lease_seconds / BEATS
+        self._interval = lease_seconds / HEARTBEATS_PER_LEASE
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
@@ -34,9 +34,9 @@ class Heartbeat:
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
-        self._thread.join(LAST_SECONDS)
+        self._thread.join(JOIN_TIMEOUT_SECONDS)
 
     def _beat(self) -> None:
         while not self._ended.wait(self._interval):
-            with suppress(Exception):  # a beat that fails must not be the last one
+            with suppress(Exception):  # a failed heartbeat must not be the last one
                 self._store.heartbeat(self._launch)

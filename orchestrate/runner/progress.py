@@ -1,4 +1,4 @@
-"""One line that says how far a grid is."""
+"""Progress line of a launch."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-INTERVAL = 10.0
-"""Seconds between two lines where the output is no terminal."""
+LINE_INTERVAL_SECONDS = 10.0
+"""Interval of progress lines if the output is not a terminal."""
 
-RECENT = 30.0
-"""Seconds over which the rate is taken."""
+RATE_WINDOW_SECONDS = 30.0
+"""Period over which the rate is averaged."""
 
 
 @dataclass
 class Tally:
-    """Outcomes of a grid.
+    """Counts of the outcomes of a grid.
 
     Attributes
     ----------
     total
         Trials of the grid.
     before, failed_before
-        Trials with an outcome that is not of this launch, and the failed ones among them.
+        Trials that other launches finished, and the failed ones among them.
     done, diverged, failed
         Outcomes of this launch.
     """
@@ -57,7 +57,7 @@ class Tally:
 
 
 class Progress:
-    """Shows a tally: in place on a terminal, as a line now and then elsewhere, or not at all."""
+    """Display of a tally: in place on a terminal, as lines elsewhere, or none."""
 
     def __init__(self, tally: Tally, stream: TextIO | None) -> None:
         self._tally = tally
@@ -83,17 +83,17 @@ class Progress:
             self._print()
 
     def update(self) -> None:
-        """Take note of the tally as it is now, and show it when it is time."""
+        """Record the current tally, and print a line when one is due."""
         now = time.monotonic()
         self._recent.append((now, self._tally.over))
-        while len(self._recent) > 2 and self._recent[0][0] < now - RECENT:
+        while len(self._recent) > 2 and self._recent[0][0] < now - RATE_WINDOW_SECONDS:
             self._recent.popleft()
-        if self._live is None and now - self._shown >= INTERVAL:
+        if self._live is None and now - self._shown >= LINE_INTERVAL_SECONDS:
             self._shown = now
             self._print()
 
     def line(self) -> str:
-        """Return the tally, the rate and the time that is left."""
+        """Return the tally, the rate and the estimated remaining time."""
         tally = self._tally
         (start, before), (end, over) = self._recent[0], self._recent[-1]
         rate = (over - before) / (end - start) if end > start else 0.0
@@ -118,7 +118,7 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """Return a span of time for people, such as ``2 min 05 s``."""
+    """Return a readable duration, such as ``2 min 05 s``."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -1,4 +1,4 @@
-"""Where a launch comes from: command, host, processor, code and libraries."""
+"""Provenance of a launch: command, host, processor, code and libraries."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
-from orchestrate.passwords import without_password_in_word
+from orchestrate.redaction import without_password_in_word
 from orchestrate.store import LaunchRecord
 
 LIBRARIES = (
@@ -29,10 +29,13 @@ LIBRARIES = (
 )
 
 COMMIT_VARIABLE = "DOPT_COMMIT"
-"""Says the commit where the code is without its repository, as in a container."""
+"""Environment variable with the commit of code outside a repository, as in a container."""
 
-LARGEST_FILE = 16 * 2**20
-"""Bytes of a file outside the commit that is read; a larger one is no source, its size counts."""
+LARGEST_FILE_BYTES = 16 * 2**20
+"""Largest untracked file that is hashed; of a larger one the size is taken."""
+
+SOURCES = ("*.py", "*.yaml", "*.yml", "*.toml", ":(exclude)build", ":(exclude)dist")
+"""Git path patterns of untracked files that can change a result: code and configuration."""
 
 
 def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> LaunchRecord:
@@ -70,19 +73,22 @@ def _commit(root: Path) -> str | None:
 
 
 def _difference(root: Path) -> bytes:
-    """Return all by which the working tree differs from its commit, new files included."""
+    """Return the difference of the working tree from its commit, with untracked sources.
+
+    Untracked files of other kinds, such as exported results, change no number and do not count.
+    """
     changed = _git(root, "diff", "--binary", "--no-ext-diff", "--no-textconv", "HEAD") or b""
-    added = _git(root, "ls-files", "--others", "--exclude-standard", "-z") or b""
+    added = _git(root, "ls-files", "--others", "--exclude-standard", "-z", "--", *SOURCES) or b""
     new = [name + b"\0" + _content(root, name) for name in sorted(added.split(b"\0")) if name]
     return b"\0".join([changed, *new]) if changed or new else b""
 
 
 def _content(root: Path, name: bytes) -> bytes:
-    """Return what tells the content of a file: its hash, or its size."""
+    """Return the hash of a file, or its size if it is too large."""
     path = root / os.fsdecode(name)
     try:
         size = path.stat().st_size
-        if size > LARGEST_FILE:
+        if size > LARGEST_FILE_BYTES:
             return str(size).encode()
         return hashlib.sha256(path.read_bytes()).digest()
     except OSError:
@@ -100,7 +106,7 @@ def _versions() -> dict[str, str]:
 
 
 def _processor() -> dict[str, str]:
-    """Return what the compiler makes its code for: instructions change the last digits."""
+    """Return the processor that the kernel is compiled for; rounding depends on it."""
     from llvmlite import binding
 
     features = binding.get_host_cpu_features().flatten()

@@ -1,4 +1,4 @@
-"""What a launch asks of its database, asked again for a while when the database went away."""
+"""Results database of a launch that repeats operations while it cannot be reached."""
 
 from __future__ import annotations
 
@@ -6,36 +6,35 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from orchestrate.interrupt import undisturbed
+from orchestrate.records import Failure, RunRecord
+from orchestrate.runner.signals import undisturbed
 from orchestrate.store import (
     Claim,
-    Failure,
     Registrable,
     Registration,
     Result,
-    RunRecord,
     Store,
     StoreUnavailableError,
 )
 
-FIRST_PAUSE = 0.1
-LONGEST_PAUSE = 3.0
-"""Seconds between two tries; each pause is twice the one before."""
+FIRST_PAUSE_SECONDS = 0.1
+MAX_PAUSE_SECONDS = 3.0
+"""Pauses between two tries; each is twice the one before, up to the maximum."""
 
 T = TypeVar("T")
 Say = Callable[[str], None]
 
 
-class PatientStore:
-    """The operations of one launch, each tried for ``seconds`` after its first failure.
+class RetryingStore:
+    """Operations of one launch, each retried for ``seconds`` after its first failure.
 
-    Of an operation that failed nobody knows whether it was done: its answer may be what was lost.
-    So each one is repeated in a form that does no harm when it was.
+    A failed operation may have been executed, with only its answer lost. Each one is therefore
+    repeated in a form that is harmless if it was.
 
     Raises
     ------
     StoreUnavailableError
-        From every method, if the database stays away, or at once if waiting cannot help.
+        From every method, if the database stays unreachable, or at once if waiting cannot help.
     """
 
     def __init__(self, store: Store, launch: int, seconds: float, say: Say) -> None:
@@ -54,15 +53,15 @@ class PatientStore:
         self._persist(self._store.recover)
 
     def retry(self, status: str, trial_keys: Sequence[str]) -> None:
-        """Put those of the trials that have the status back to pending."""
+        """Put the trials with the status back to pending."""
         self._persist(lambda: self._store.retry(status, trial_keys))
 
     def register(self, specs: Sequence[Registrable]) -> Registration:
-        """Write down a grid and return the state of each of its trials."""
+        """Register a grid and return the state of its trials."""
         return self._persist(lambda: self._store.register(self._launch, specs))
 
     def claim(self, trial_keys: Sequence[str]) -> list[Claim]:
-        """Take those of the trials, none of which the launch holds, that are pending."""
+        """Claim the pending ones of the trials, none of which the launch holds."""
 
         def again() -> list[Claim]:
             self._store.release(self._launch, trial_keys)
@@ -89,19 +88,19 @@ class PatientStore:
         return self._persist(lambda: self._store.fail(claim, failure, run), again)
 
     def release(self, trial_keys: Sequence[str], cause: str) -> None:
-        """Put trials of the launch back to pending, whose attempts have ended for the cause."""
+        """Put trials of the launch back to pending, and record the cause in their attempts."""
         self._persist(lambda: self._store.release(self._launch, trial_keys, cause))
 
-    def release_forgotten(self) -> None:
-        """Put what the launch holds back to pending, while it runs nothing.
+    def release_all(self) -> None:
+        """Put all trials of the launch back to pending; call it while none of them runs.
 
-        On a server a claim can outlive the connection that asked for it, and so be committed after
-        it was repeated in vain.
+        A server may commit a claim after its connection broke, and so after the claim was repeated
+        without success.
         """
         self._persist(lambda: self._store.release(self._launch))
 
     def end(self, state: str, exit_code: int) -> None:
-        """End the launch in the given state and free its last claims."""
+        """End the launch in the given state and release its last claims."""
         self._persist(lambda: self._store.end_launch(self._launch, state, exit_code))
 
     def _persist(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
@@ -114,11 +113,11 @@ class PatientStore:
         return self._repeat(again or operation)
 
     def _repeat(self, operation: Callable[[], T]) -> T:
-        start, pause = time.monotonic(), FIRST_PAUSE
+        start, pause = time.monotonic(), FIRST_PAUSE_SECONDS
         while True:
             left = start + self._seconds - time.monotonic()
             time.sleep(max(0.0, min(pause, left)))
-            pause = min(2 * pause, LONGEST_PAUSE)
+            pause = min(2 * pause, MAX_PAUSE_SECONDS)
             try:
                 result = _whole(operation)
             except StoreUnavailableError as error:

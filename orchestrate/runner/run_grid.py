@@ -1,4 +1,4 @@
-"""One launch from its grid to its exit code: register, run what is not done, sum up."""
+"""Launch of a grid: registration, execution of unfinished trials, summary and exit code."""
 
 from __future__ import annotations
 
@@ -11,36 +11,47 @@ from dataclasses import dataclass
 from typing import TextIO
 
 from dopt.errors import DoptError
-from dopt.spec import TrialSpec
-from orchestrate.chunks import Chunks
-from orchestrate.driver import Driver
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode, InfrastructureError
-from orchestrate.executors import check_executor, make_executor
-from orchestrate.executors.base import Run
-from orchestrate.grid import Grid
-from orchestrate.heartbeat import Heartbeat
-from orchestrate.interrupt import Interrupt
-from orchestrate.patience import PatientStore
-from orchestrate.progress import Progress, Tally
-from orchestrate.settings import LaunchSettings
+from orchestrate.executors.base import Prepare, Run
+from orchestrate.executors.registry import executor_factory, make_executor
+from orchestrate.runner.batching import Chunks
+from orchestrate.runner.heartbeat import Heartbeat
+from orchestrate.runner.progress import Progress, Tally
+from orchestrate.runner.retrying_store import RetryingStore
+from orchestrate.runner.scheduler import Scheduler
+from orchestrate.runner.signals import Interrupt
+from orchestrate.runner.summary import closing, opening
 from orchestrate.store import LaunchRecord, Registration, Store, StoreUnavailableError
-from orchestrate.summary import closing, opening
 
-OTHERS_SECONDS = 1.0
-"""Time between two looks at trials that another launch runs."""
+POLL_OTHER_LAUNCHES_SECONDS = 1.0
+"""Interval of status queries for trials that another launch runs."""
 
-SILENT_SECONDS = 3.0
-"""What takes longer is announced."""
+ANNOUNCE_AFTER_SECONDS = 1.0
+"""Duration of a preparation after which a message explains the delay."""
+
+COMPILING = "compiling the kernel: this takes a minute or two, and later launches reuse it"
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Work:
-    """What is done with a trial, and what is done once before the first one."""
+    """Function that runs a trial, and function that is called once before the first trial."""
 
     run: Run
-    prepare: Callable[[], None]
+    prepare: Prepare
+
+
+@dataclass(frozen=True)
+class Output:
+    """Destinations of the messages of a launch: summary, delays, and progress lines."""
+
+    say: Say
+    warn: Say
+    progress: TextIO | None
 
 
 def launch_grid(
@@ -61,13 +72,13 @@ def launch_grid(
     record
         Provenance of the command.
     work
-        What a trial is.
+        Functions that run a trial and prepare for it.
     say
-        Takes what there is to tell at the beginning and at the end.
+        Takes the summary lines at the beginning and at the end.
     stream
-        Where the progress goes, or None for none.
+        Destination of progress lines, or None for none.
     warn
-        Takes why the launch waits; by default ``say``.
+        Takes messages about delays; by default ``say``.
 
     Raises
     ------
@@ -76,16 +87,17 @@ def launch_grid(
     StoreError, InfrastructureError
         If the database or the workers fail; nothing that was committed is lost.
     """
-    check_executor(settings)
+    executor_factory(settings).check(settings)
+    announce = warn or say
     with Store.open(settings.store_url, lease_seconds=settings.lease) as store:
         launch = store.begin_launch(record)
         try:
             with Heartbeat(store, launch, settings.lease):
-                patient = PatientStore(store, launch, settings.patience, warn or say)
-                code = _interruptible(patient, grid, settings, work, say, stream)
+                patient = RetryingStore(store, launch, settings.patience, announce)
+                code = _interruptible(patient, grid, settings, work, Output(say, announce, stream))
                 patient.end(_STATES.get(code, "failed"), code)
         except BaseException as error:
-            # One more try to free the claims; what is wrong is said by the error that is raised.
+            # Try once more to release the claims; the error itself is reported by the caller.
             with suppress(StoreUnavailableError):
                 store.end_launch(launch, "failed", _code_of(error))
             raise
@@ -96,7 +108,7 @@ _STATES = {ExitCode.DONE: "done", ExitCode.INTERRUPTED: "interrupted"}
 
 
 def _code_of(error: BaseException) -> ExitCode | None:
-    """Return what the shell will be told, None where the process is told to end."""
+    """Return the exit code for an exception, None for an interrupt or exit."""
     if isinstance(error, StoreUnavailableError | InfrastructureError):
         return ExitCode.INFRASTRUCTURE
     if isinstance(error, DoptError):
@@ -105,27 +117,25 @@ def _code_of(error: BaseException) -> ExitCode | None:
 
 
 def _interruptible(
-    store: PatientStore,
+    store: RetryingStore,
     grid: Grid,
     settings: LaunchSettings,
     work: Work,
-    say: Say,
-    stream: TextIO | None,
+    output: Output,
 ) -> ExitCode:
     try:
-        return _run(store, grid, settings, work, say, stream)
+        return _run(store, grid, settings, work, output)
     except KeyboardInterrupt:
-        say("stopped: what was committed is kept, the same command goes on from here")
+        output.say("stopped: committed trials are kept; run the same command again to continue")
         return ExitCode.INTERRUPTED
 
 
 def _run(
-    store: PatientStore,
+    store: RetryingStore,
     grid: Grid,
     settings: LaunchSettings,
     work: Work,
-    say: Say,
-    stream: TextIO | None,
+    output: Output,
 ) -> ExitCode:
     store.recover()
     if settings.retry:
@@ -133,30 +143,32 @@ def _run(
     state = store.register(grid.trials)
     tally = Tally(state.total)
     _count(tally, state)
-    say(opening(grid, state, settings, store.safe_url))
+    output.say(opening(grid, state, settings, store.safe_url))
     if tally.left:
-        compiled = any(trial.cell.path == "kernel" for trial in grid.trials)
+        compiled = any(trial.config.path == "kernel" for trial in grid.trials)
         prepare = work.prepare if compiled else None
         if prepare:
-            with _said_if_slow("compiling the kernel, which is kept for later launches", say):
+            with _announced_if_slow(COMPILING, output.warn):
                 prepare()
         start = time.monotonic()
         with make_executor(settings, work.run, prepare) as executor, Interrupt() as stop:
             waiting = _waiting(grid, state)
             chunks = Chunks(waiting, settings.chunk_seconds, executor.slots, executor.batch)
-            driver = Driver(store, executor, chunks, tally, stop, settings.fail_fast)
-            driver.elsewhere = state.running_elsewhere
-            with Progress(tally, stream) as progress:
-                _drive(driver, grid, progress)
-        say(closing(tally, driver.failures, stop.draining, time.monotonic() - start))
-        if stop.draining and tally.left:
+            scheduler = Scheduler(store, executor, chunks, tally, stop, settings.fail_fast)
+            scheduler.owned_by_others = state.running_elsewhere
+            with Progress(tally, output.progress) as progress:
+                _drive(scheduler, grid, progress)
+        output.say(
+            closing(tally, scheduler.failures, stop.stop_requested, time.monotonic() - start)
+        )
+        if stop.stop_requested and tally.left:
             return ExitCode.INTERRUPTED
     return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
 
 
 @contextmanager
-def _said_if_slow(text: str, say: Say) -> Iterator[None]:
-    timer = threading.Timer(SILENT_SECONDS, say, [text])
+def _announced_if_slow(text: str, say: Say) -> Iterator[None]:
+    timer = threading.Timer(ANNOUNCE_AFTER_SECONDS, say, [text])
     timer.start()
     try:
         yield
@@ -164,35 +176,35 @@ def _said_if_slow(text: str, say: Say) -> Iterator[None]:
         timer.cancel()
 
 
-def _drive(driver: Driver, grid: Grid, progress: Progress) -> None:
-    """Run until every trial has an outcome, also those that another launch had taken."""
+def _drive(scheduler: Scheduler, grid: Grid, progress: Progress) -> None:
+    """Run until every trial has an outcome, including trials claimed by other launches."""
     pause = 0.0
     while True:
         worked = False
-        while driver.step():
+        while scheduler.step():
             worked = True
             progress.update()
-        if driver.ending or not driver.elsewhere:
+        if scheduler.ending or not scheduler.owned_by_others:
             return
         if not worked:
             time.sleep(pause)
-        pause = _look_at_others(driver, grid)
+        pause = _poll_other_launches(scheduler, grid)
         progress.update()
 
 
-def _look_at_others(driver: Driver, grid: Grid) -> float:
-    """Count what other launches have finished, and take the trials that they have given up.
+def _poll_other_launches(scheduler: Scheduler, grid: Grid) -> float:
+    """Count trials that other launches have finished, and queue those that they have released.
 
-    Returns the seconds before another look, where this one has found nothing to run.
+    Returns the seconds to wait before the next query if there was nothing to run.
     """
     start = time.monotonic()
-    driver.store.recover()
-    driver.store.release_forgotten()
-    state = driver.store.register(grid.trials)
-    _count(driver.tally, state)
-    driver.elsewhere = state.running_elsewhere
-    driver.chunks.add(_waiting(grid, state))
-    return max(OTHERS_SECONDS, 5 * (time.monotonic() - start))
+    scheduler.store.recover()
+    scheduler.store.release_all()
+    state = scheduler.store.register(grid.trials)
+    _count(scheduler.tally, state)
+    scheduler.owned_by_others = state.running_elsewhere
+    scheduler.chunks.add(_waiting(grid, state))
+    return max(POLL_OTHER_LAUNCHES_SECONDS, 5 * (time.monotonic() - start))
 
 
 def _waiting(grid: Grid, state: Registration) -> list[TrialSpec]:
@@ -201,6 +213,6 @@ def _waiting(grid: Grid, state: Registration) -> list[TrialSpec]:
 
 
 def _count(tally: Tally, state: Registration) -> None:
-    """Let the tally hold what the database says of the trials that are not of this launch."""
+    """Copy the counts of trials that other launches finished from the database to the tally."""
     tally.before = state.done + state.diverged + state.failed + state.cancelled - tally.over
     tally.failed_before = state.failed + state.cancelled - tally.failed

@@ -1,4 +1,4 @@
-"""The loop of a launch: claim, hand out, commit. The one place that writes outcomes."""
+"""Scheduler of a launch: claims trials, submits them, and commits their outcomes."""
 
 from __future__ import annotations
 
@@ -9,69 +9,70 @@ from datetime import UTC, datetime
 from typing import Protocol
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
-from orchestrate.chunks import Chunks
-from orchestrate.executors.base import Executor, Finished, Lost, Trouble
-from orchestrate.patience import PatientStore
-from orchestrate.progress import Tally
-from orchestrate.store import Claim, Failure, InvalidResultError, RunRecord
+from dopt.spec.trial import TrialSpec
+from orchestrate.executors.base import Executor, TaskDone, WorkerLost
+from orchestrate.records import Failure, RunRecord
+from orchestrate.runner.batching import Chunks
+from orchestrate.runner.progress import Tally
+from orchestrate.runner.retrying_store import RetryingStore
+from orchestrate.store import Claim, InvalidResultError
 
 POLL_SECONDS = 0.2
 
-ATTEMPTS = 2
-"""Times that a trial may end its worker while it runs alone."""
+MAX_WORKER_LOSSES = 2
+"""Worker deaths while a trial runs alone after which the trial fails."""
 
-NODE_LOSSES = 5
-"""Times that a trial may be lost together with a whole node."""
+MAX_NODE_LOSSES = 5
+"""Losses of a whole node after which a trial that ran there fails."""
 
 
 class Stop(Protocol):
-    """Says whether nothing more should start."""
+    """Request to start no further trials."""
 
     @property
-    def draining(self) -> bool: ...
+    def stop_requested(self) -> bool: ...
 
 
 @dataclass
-class Driver:
+class Scheduler:
     """Runs the waiting trials of one launch.
 
     Attributes
     ----------
-    elsewhere
-        Number of trials that turned out to be another launch's.
+    owned_by_others
+        Number of trials that other launches have claimed.
     failures
-        How often each cause of failure was met.
+        Number of failures by cause.
     """
 
-    store: PatientStore
+    store: RetryingStore
     executor: Executor
     chunks: Chunks
     tally: Tally
     stop: Stop
     fail_fast: bool = False
-    elsewhere: int = 0
+    owned_by_others: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     _running: dict[str, tuple[Claim, TrialSpec]] = field(default_factory=dict)
-    _strikes: Counter[str] = field(default_factory=Counter)
+    _crash_counts: Counter[str] = field(default_factory=Counter)
     _node_losses: Counter[str] = field(default_factory=Counter)
 
     def step(self) -> bool:
-        """Hand out what there is room for and commit what has ended; False when nothing is left."""
+        """Submit waiting trials and commit finished ones; return False when none is left."""
         self._fill()
         if not self.executor.pending:
             return False
         events = self.executor.wait(POLL_SECONDS)
-        self._commit([event for event in events if isinstance(event, Finished)])
+        self._commit([event for event in events if isinstance(event, TaskDone)])
         for event in events:
-            if isinstance(event, Lost):
+            if isinstance(event, WorkerLost):
                 self._recover(event)
         return True
 
     @property
     def ending(self) -> bool:
         """Whether no further trial starts."""
-        return self.stop.draining or (self.fail_fast and bool(self.failures))
+        return self.stop.stop_requested or (self.fail_fast and bool(self.failures))
 
     def _fill(self) -> None:
         self.chunks.slots = self.executor.slots
@@ -79,7 +80,7 @@ class Driver:
             tasks = self.chunks.next()
             claims = self.store.claim([task.key for task in tasks])
             held = {claim.trial_key: claim for claim in claims}
-            self.elsewhere += len(tasks) - len(held)
+            self.owned_by_others += len(tasks) - len(held)
             mine = [task for task in tasks if task.key in held]
             self._running |= {task.key: (held[task.key], task.spec) for task in mine}
             self.executor.submit(mine)
@@ -88,16 +89,15 @@ class Driver:
     def _window(self) -> int:
         return 2 * self.executor.slots
 
-    def _commit(self, events: Sequence[Finished]) -> None:
+    def _commit(self, events: Sequence[TaskDone]) -> None:
         results: list[tuple[Claim, TrialResult, RunRecord]] = []
         for event in events:
             claim, trial = self._running.pop(event.key)
-            self.chunks.observe(trial.config_key, event.usage.wall_seconds)
-            run = RunRecord(**vars(event.usage))
-            if isinstance(event.outcome, Trouble):
-                self._fail(claim, Failure(**vars(event.outcome)), run)
+            self.chunks.observe(trial.config_key, event.run.wall_seconds)
+            if isinstance(event.outcome, Failure):
+                self._fail(claim, event.outcome, event.run)
             else:
-                results.append((claim, event.outcome, run))
+                results.append((claim, event.outcome, event.run))
         if results:
             self._write(results)
 
@@ -112,7 +112,7 @@ class Driver:
             claim, _, run = results[0]
             self._fail(claim, Failure(type(error).__name__, str(error), "", "malformed"), run)
             return
-        self.elsewhere += written.count(False)
+        self.owned_by_others += written.count(False)
         for (_, result, _), accepted in zip(results, written, strict=True):
             self.tally.diverged += accepted and result.diverged
             self.tally.done += accepted and not result.diverged
@@ -120,51 +120,55 @@ class Driver:
     def _fail(self, claim: Claim, failure: Failure, run: RunRecord) -> None:
         if self.store.fail(claim, failure, run):
             self.tally.failed += 1
-            self.failures[_words(failure)] += 1
+            self.failures[_summary(failure)] += 1
         else:
-            self.elsewhere += 1
+            self.owned_by_others += 1
 
-    def _recover(self, lost: Lost) -> None:
-        """Let lost trials wait again, each alone, but for one that was lost too often."""
-        counts = self._node_losses if lost.blameless else self._strikes
-        if lost.blameless or len(lost.keys) == 1:
+    def _recover(self, lost: WorkerLost) -> None:
+        """Queue lost trials again, each alone; fail those that were lost too often."""
+        counts = self._node_losses if lost.node_lost else self._crash_counts
+        if lost.node_lost or len(lost.keys) == 1:
             counts.update(lost.keys)
-        limit = _limit(lost)
+        limit = _max_losses(lost)
         again = [key for key in lost.keys if counts[key] < limit]
         held = {key: self._running.pop(key) for key in lost.keys}
         if again:
             self.store.release(again, _cause(lost))
-            self.chunks.add((held[key][1] for key in again), alone=not lost.blameless)
+            self.chunks.add((held[key][1] for key in again), alone=not lost.node_lost)
         for key in held.keys() - again:
-            self._fail(held[key][0], _death(lost, limit), _last_run(lost))
+            self._fail(held[key][0], _loss_failure(lost, limit), _last_run(lost))
 
 
-def _limit(lost: Lost) -> int:
-    """Return how often a trial may be lost in this way."""
-    if lost.blameless:
-        return NODE_LOSSES
-    return 1 if lost.cause == "timeout" else ATTEMPTS
+def _max_losses(lost: WorkerLost) -> int:
+    """Return the number of losses of this kind after which a trial fails."""
+    if lost.node_lost:
+        return MAX_NODE_LOSSES
+    return 1 if lost.cause == "timeout" else MAX_WORKER_LOSSES
 
 
-def _cause(lost: Lost) -> str:
-    return "node lost" if lost.blameless else lost.cause
+def _cause(lost: WorkerLost) -> str:
+    return "node lost" if lost.node_lost else lost.cause
 
 
-def _death(lost: Lost, times: int) -> Failure:
+def _loss_failure(lost: WorkerLost, times: int) -> Failure:
     if lost.cause == "timeout":
         return Failure("TrialTimeoutError", lost.reason, lost.traceback, lost.cause)
-    place = "with its node" if lost.blameless else "alone on its worker"
-    message = f"lost {times} times {place}, which has {lost.reason} the last time"
+    lost_part = "node was lost" if lost.node_lost else "worker died"
+    message = f"{lost_part} {_times(times)} while running this trial (last: {lost.reason})"
     return Failure("WorkerLost", message, lost.traceback, _cause(lost))
 
 
-def _words(failure: Failure) -> str:
-    """Return the kind of a failure in one line."""
+def _times(count: int) -> str:
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+def _summary(failure: Failure) -> str:
+    """Return the type and the first line of a failure."""
     first = next(iter(failure.message.splitlines()), "")
     return first if failure.cause == "timeout" else f"{failure.type}: {first}"
 
 
-def _last_run(lost: Lost) -> RunRecord:
-    """Return what is known of a run that could not be measured."""
+def _last_run(lost: WorkerLost) -> RunRecord:
+    """Return the record of a run that was not measured."""
     now = datetime.now(UTC)
     return RunRecord(lost.node, lost.pid, 0.0, 0.0, 0, now, now)

@@ -1,4 +1,4 @@
-"""Ctrl-C: once lets what runs end, twice stops at once."""
+"""Signal handlers: the first Ctrl-C lets running trials finish, the second stops at once."""
 
 from __future__ import annotations
 
@@ -12,21 +12,23 @@ from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-IMPATIENT = 3
-"""Signals during one undisturbed block after which it is left all the same."""
+STOP_REQUESTED = "Ctrl-C: finishing running trials; press again to stop immediately"
+
+MAX_HELD_SIGNALS = 3
+"""Signals during one undisturbed block after which it is interrupted."""
 
 
 class Interrupt:
-    """While it is entered, the first signal sets ``draining`` and the second one interrupts.
+    """Context manager in which the first signal sets ``stop_requested``.
 
     Raises
     ------
     KeyboardInterrupt
-        At the second signal, wherever the program is.
+        At the second signal.
     """
 
     def __init__(self) -> None:
-        self.draining = False
+        self.stop_requested = False
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -40,24 +42,25 @@ class Interrupt:
             signal.signal(number, before)
 
     def _handle(self, _: int, __: FrameType | None) -> None:
-        if self.draining:
+        if self.stop_requested:
             raise KeyboardInterrupt
-        self.draining = True
-        with suppress(RuntimeError):  # the signal came while this very stream was written to
-            sys.stderr.write("\nending the trials that run; once more stops at once\n")
+        self.stop_requested = True
+        with suppress(RuntimeError):  # the signal arrived while this stream was being written
+            sys.stderr.write(
+                "\nCtrl-C: finishing running trials; press again to stop immediately\n"
+            )
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Hold signals back until the block is over.
+    """Delay signals until the end of the block.
 
-    An interrupt in the middle of a transaction could leave the connection open, and its locks to a
-    process that nobody can ask any more: this very one.
+    An interrupt in the middle of a transaction could leave the connection, and its locks, open.
 
     Raises
     ------
     KeyboardInterrupt
-        In the block, at the third signal: it hangs.
+        In the block, at the third signal.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -66,7 +69,7 @@ def undisturbed() -> Iterator[None]:
 
     def hold(number: int, _: FrameType | None) -> None:
         held.append(number)
-        if len(held) == IMPATIENT:
+        if len(held) == MAX_HELD_SIGNALS:
             raise KeyboardInterrupt
 
     before = {number: signal.signal(number, hold) for number in SIGNALS}

@@ -1,11 +1,16 @@
-"""The results database: SQLite or PostgreSQL behind one contract.
+"""Results database: SQLite or PostgreSQL behind one interface.
 
-:class:`Store` is the write side, used by launches; :class:`Reader` the read side, used by the
-analysis. A trial is registered, claimed by one launch, and committed whole or refused.
+:class:`Store` is the write side, used by launches; :class:`Reader` is the read side, used by the
+analysis. A trial is registered, claimed by one launch, and committed completely or rejected.
 """
 
 from __future__ import annotations
 
+from orchestrate.records import Failure, RunRecord
+from orchestrate.store.backends.open import LEASE_SECONDS
+from orchestrate.store.database_url import DEFAULT_URL, URL_VARIABLE, default_url
+from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor.findings import Finding
 from orchestrate.store.errors import (
     InvalidResultError,
     LaunchAliveError,
@@ -15,31 +20,37 @@ from orchestrate.store.errors import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.examining import examine
-from orchestrate.store.findings import Finding
-from orchestrate.store.merging import Merged, Named, merge
-from orchestrate.store.opening import LEASE_SECONDS
-from orchestrate.store.reader import Reader
+from orchestrate.store.merging.merge import Merged, TrialName, merge
+from orchestrate.store.migrations.upgrade import Upgrade, upgrade
+from orchestrate.store.read.reader import Reader
+from orchestrate.store.read.rows import (
+    Assessments,
+    ConfigRow,
+    Curves,
+    LaunchRow,
+    Table,
+    Trajectory,
+    TrialRow,
+)
 from orchestrate.store.records import (
     Claim,
-    Failure,
     LaunchRecord,
     Registrable,
     Registration,
     Result,
-    RunRecord,
 )
-from orchestrate.store.rows import Assessments, Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
-from orchestrate.store.schema import RETRIED
+from orchestrate.store.schema import FINISHED, RETRIED
 from orchestrate.store.store import Store
-from orchestrate.store.upgrading import Upgrade, upgrade
 
 __all__ = [
+    "DEFAULT_URL",
+    "FINISHED",
     "LEASE_SECONDS",
     "RETRIED",
+    "URL_VARIABLE",
     "Assessments",
-    "Cell",
     "Claim",
+    "ConfigRow",
     "Curves",
     "Failure",
     "Finding",
@@ -48,7 +59,6 @@ __all__ = [
     "LaunchRecord",
     "LaunchRow",
     "Merged",
-    "Named",
     "NoDatabaseError",
     "QueryError",
     "Reader",
@@ -62,8 +72,10 @@ __all__ = [
     "StoreUnavailableError",
     "Table",
     "Trajectory",
+    "TrialName",
     "TrialRow",
     "Upgrade",
+    "default_url",
     "examine",
     "merge",
     "upgrade",

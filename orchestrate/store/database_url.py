@@ -1,7 +1,8 @@
-"""Database URLs: read, made safe to print, refused with a sentence."""
+"""Parsing, checking and redaction of database URLs."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from sqlalchemy.engine import URL, make_url
@@ -9,14 +10,24 @@ from sqlalchemy.exc import ArgumentError
 
 from orchestrate.store.errors import StoreError
 
+DEFAULT_URL = "sqlite:///results/results.db"
+
+URL_VARIABLE = "DOPT_DB"
+"""Environment variable that names another default database; an empty one counts as unset."""
+
 _EXAMPLES = "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name"
 _SECRETS = ("password", "sslpassword", "passfile")
 
 
-def parse(url: str) -> URL:
-    """Return the URL with its driver; raise ``StoreError`` where it names no usable database.
+def default_url() -> str:
+    """Return the database that is used when none is given."""
+    return os.environ.get(URL_VARIABLE) or DEFAULT_URL
 
-    The message never repeats the URL, because a mistyped one may hold a password.
+
+def parse(url: str) -> URL:
+    """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
+
+    The message does not repeat the URL, because a mistyped one may hold a password.
     """
     try:
         parsed = make_url(url)
@@ -31,11 +42,16 @@ def parse(url: str) -> URL:
         raise StoreError(
             f"A database of kind '{parsed.drivername}' is not supported: give {_EXAMPLES}."
         )
+    if parsed.host is not None:
+        raise StoreError(
+            f"The database URL sqlite://{parsed.host}/... names a host, but SQLite has none: write "
+            f"three slashes, sqlite:///{parsed.host}/{parsed.database or 'results.db'}."
+        )
     return parsed.set(drivername="sqlite")
 
 
 def safe(url: URL) -> str:
-    """Return the URL without anything secret."""
+    """Return the URL without passwords."""
     public = {key: value for key, value in url.query.items() if key not in _SECRETS}
     return url.set(query=public).render_as_string(hide_password=True)
 
@@ -43,7 +59,7 @@ def safe(url: URL) -> str:
 def sqlite_path(url: URL) -> Path:
     """Return the absolute path of a SQLite database, links resolved.
 
-    The lock files lie beside the file itself, so that two names of one database share them.
+    The lock files are beside the file itself, so that two names of one database share them.
     """
     if url.database in (None, "", ":memory:"):
         raise StoreError(

@@ -1,4 +1,4 @@
-"""What can go wrong between a trial and the database; each message is a sentence with advice."""
+"""Errors of the results database; each message is one sentence with a remedy."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from dopt.errors import DoptError
 
 
 class StoreError(DoptError):
-    """Base of everything that the store raises on purpose."""
+    """Base of all errors of the results database."""
 
 
 class StoreUnavailableError(StoreError):
-    """The database cannot be reached, is full, locked or damaged: infrastructure, not a trial.
+    """Database that cannot be reached, or is full, locked or damaged.
 
-    ``transient`` is True where waiting may help: a server or a connection that went away, or a lock
-    that was held for too long.
+    ``transient`` is True if waiting may help: after a lost server or connection, or a lock that was
+    held for too long.
     """
 
     def __init__(self, message: str, *, transient: bool = False) -> None:
@@ -22,20 +22,20 @@ class StoreUnavailableError(StoreError):
 
 
 class NoDatabaseError(StoreError):
-    """There is nothing to read at the given URL."""
+    """No database at the given URL."""
 
 
 class SchemaVersionError(StoreError):
-    """The database was written by an older or a newer program."""
+    """Database of an older or a newer version of the program."""
 
 
 class LaunchAliveError(StoreError):
-    """A launch is running in a database that should hold still."""
+    """Running launch in a database that must not change."""
 
 
 class InvalidResultError(StoreError, ValueError):
-    """A trial's result has the wrong shape or contradicts itself; nothing of it was written."""
+    """Result of a trial with wrong shapes or contradictory values; nothing was written."""
 
 
 class QueryError(StoreError, ValueError):
-    """A question that the database cannot answer: unknown column, wrong SQL, missing trial."""
+    """Query that the database cannot answer: unknown column, invalid SQL, missing trial."""

@@ -1,10 +1,9 @@
-"""What a launch hands to the store, and what it gets back."""
+"""Values that a launch passes to the results database and gets back from it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,7 +13,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Registrable(Protocol):
-    """A trial before it runs; :class:`dopt.spec.TrialSpec` is one."""
+    """Trial before it runs, such as :class:`dopt.spec.trial.TrialSpec`."""
 
     @property
     def trial_key(self) -> str: ...
@@ -25,11 +24,11 @@ class Registrable(Protocol):
     @property
     def seed(self) -> int: ...
     def columns(self) -> Mapping[str, Any]:
-        """Values of env, policy, model, learner, width, depth, horizon, dt and gamma."""
+        """Values of env, policy, model, learner, width, depth, horizon, dt, gamma and label."""
 
 
 class Measured(Protocol):
-    """A number that says what a trial was worth after t steps."""
+    """Measure of a trial after t steps."""
 
     @property
     def t(self) -> int: ...
@@ -40,7 +39,7 @@ class Measured(Protocol):
 
 
 class Result(Protocol):
-    """A trial after it ran; :class:`dopt.result.TrialResult` is one and explains the fields."""
+    """Result of a trial; :class:`dopt.result.TrialResult` describes the fields."""
 
     @property
     def loss(self) -> Array: ...
@@ -72,15 +71,15 @@ class Result(Protocol):
 
 @dataclass(frozen=True)
 class LaunchRecord:
-    """Provenance of one command.
+    """Provenance of one launch.
 
     Attributes
     ----------
     argv, overrides
-        The command line, and the part of it that Hydra saw as overrides.
+        The command line, and its overrides.
     git_commit, git_dirty, git_diff_hash
-        Commit of the code, whether the working tree differed, and the hash of the difference;
-        None outside a repository.
+        Commit of the code, whether the working tree differs from it, and the hash of the
+        difference; None outside a repository.
     versions
         Version of the interpreter and of each library that can change a number.
     """
@@ -96,31 +95,8 @@ class LaunchRecord:
 
 
 @dataclass(frozen=True)
-class RunRecord:
-    """Where and how one attempt ran; ``started`` and ``ended`` carry a time zone."""
-
-    node: str
-    pid: int
-    wall_seconds: float
-    cpu_seconds: float
-    peak_memory_bytes: int
-    started: datetime
-    ended: datetime
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Why an attempt failed; ``cause`` is the kind, such as "exception", "killed", "timeout"."""
-
-    type: str
-    message: str
-    traceback: str
-    cause: str = "exception"
-
-
-@dataclass(frozen=True)
 class Claim:
-    """The right of one launch to write the outcome of one attempt of one trial."""
+    """Right of one launch to write the outcome of one attempt at one trial."""
 
     trial_key: str
     trial_id: int
@@ -135,9 +111,9 @@ class Registration:
     Attributes
     ----------
     total
-        Distinct trials of the grid; the sum of all the other numbers and of ``len(todo)``.
+        Distinct trials of the grid: the sum of the other numbers and of ``len(todo)``.
     todo
-        Keys of the trials that wait to be run, in the order in which they were given.
+        Keys of the trials to run, in the given order.
     """
 
     total: int

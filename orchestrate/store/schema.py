@@ -1,8 +1,8 @@
 """Tables of the results database: one definition for SQLite (STRICT) and PostgreSQL.
 
 Times are UTC text of fixed width (``2026-01-31T12:00:00.000000Z``) and flags are 0 or 1, so that
-the same SQL gives the same answer on both databases. A number that is not finite is NULL: SQLite
-would store NaN as NULL and PostgreSQL as NaN.
+the same SQL gives the same result on both databases. A number that is not finite is NULL: SQLite
+stores NaN as NULL, PostgreSQL as NaN.
 """
 
 from __future__ import annotations
@@ -26,10 +26,13 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-SCHEMA_VERSION = 3
-"""Number of the newest script in ``migrations/versions``, which leads from the one before it."""
+SCHEMA_VERSION = 4
+"""Number of the newest script in ``migrations/versions``."""
 
 STATUSES = ("pending", "running", "done", "diverged", "failed", "cancelled")
+FINISHED = ("done", "diverged")
+"""Statuses of a trial that has a result."""
+
 LAUNCH_STATES = ("running", "done", "failed", "interrupted", "lost")
 CONFIG_COLUMNS = (
     "env",
@@ -41,6 +44,7 @@ CONFIG_COLUMNS = (
     "horizon",
     "dt",
     "gamma",
+    "label",
 )
 OUTCOME_COLUMNS = (
     "n_steps",
@@ -52,7 +56,7 @@ OUTCOME_COLUMNS = (
     "peak_memory_bytes",
     "node",
 )
-"""Columns of a trial that its outcome fills, beside its status and what other rows it names."""
+"""Columns of a trial that its outcome fills, beside status and references."""
 
 RETRIED = {
     "failed": ("failed",),
@@ -60,7 +64,7 @@ RETRIED = {
     "cancelled": ("cancelled",),
     "all": ("failed", "diverged", "cancelled"),
 }
-"""What a user can ask to run again, and the statuses that it means."""
+"""Statuses that each argument of ``retry`` selects."""
 
 STEP_VALUES = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
@@ -88,13 +92,13 @@ def _trial_key(**options: Any) -> Column[int]:
     return Column("trial_id", _Long, ForeignKey("trial.trial_id"), **options)
 
 
-# As Alembic would make it, but STRICT, which does not know VARCHAR.
+# As Alembic creates it, but STRICT, which has no VARCHAR.
 alembic_version = _table("alembic_version", Column("version_num", Text, primary_key=True))
 
 launch = _table(
     "launch",
     Column("launch_id", _Long, primary_key=True),
-    _text("token"),  # names the lock file: a launch_id comes back when a database is made anew
+    _text("token"),  # name of the lock file; launch_id repeats when a database is created again
     _text("state"),
     _text("started"),
     _text("ended", nullable=True),
@@ -126,6 +130,7 @@ config = _table(
     Column("dt", _Real, nullable=False),
     Column("gamma", _Real, nullable=False),
     _text("config_json"),
+    _text("label"),
 )
 
 error = _table(

@@ -1,4 +1,4 @@
-"""Creation of a new database, and refusal of one that another program version wrote."""
+"""Creation of a new database, and version check of an existing one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from orchestrate.store import migrations
 from orchestrate.store.errors import SchemaVersionError
 from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, metadata
 
-# Where the program kept the version before it used Alembic.
+# Table of the version before the program used Alembic.
 _FIRST_TABLE = "schema_version"
 
 
 def create_or_check(connection: Connection, safe_url: str) -> None:
-    """Create everything in an empty database; else raise ``SchemaVersionError`` if it differs."""
+    """Create the tables of an empty database; raise ``SchemaVersionError`` for another version."""
     if is_empty(connection):
         create(connection)
     else:
@@ -27,14 +27,14 @@ def is_empty(connection: Connection) -> bool:
 
 
 def create(connection: Connection) -> None:
-    """Make the newest tables and views in an empty database."""
+    """Create the newest tables and views in an empty database."""
     metadata.create_all(connection, checkfirst=False)
     migrations.create_views(connection)
     migrations.stamp(connection, SCHEMA_VERSION)
 
 
 def check(connection: Connection, safe_url: str) -> int:
-    """Return the version of the schema; raise ``SchemaVersionError`` unless it is the program's."""
+    """Return the version of the schema; raise ``SchemaVersionError`` for another one."""
     version = version_of(connection, safe_url)
     if version < SCHEMA_VERSION:
         command = f"python -m orchestrate upgrade --db {shlex.quote(safe_url)}"
@@ -56,7 +56,7 @@ def check_not_newer(version: int, safe_url: str) -> None:
 
 
 def version_of(connection: Connection, safe_url: str) -> int:
-    """Return the version of any released schema; raise ``SchemaVersionError`` for other tables."""
+    """Return the version of a released schema; raise ``SchemaVersionError`` for other tables."""
     tables = inspect(connection).get_table_names()
     found = None
     if alembic_version.name in tables:

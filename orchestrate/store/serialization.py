@@ -1,7 +1,12 @@
-"""Plain values for the drivers: no NumPy scalars, no NaN, no local time, no text they refuse."""
+"""Conversion of Python and NumPy values to what the database drivers store, and back.
+
+The drivers accept no NumPy scalars, NaN, local times or text with zero bytes. Arrays are stored as
+little-endian bytes in row-major order, with their type and shape.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from datetime import UTC, datetime
 from typing import Any
@@ -10,9 +15,11 @@ import numpy as np
 
 from orchestrate.store.records import Array
 
+DTYPE = "<f8"
+
 
 def plain(value: Any) -> Any:
-    """Return a NumPy scalar as the Python number it stands for; sqlite3 would store its bytes."""
+    """Return a NumPy scalar as a Python number; sqlite3 would store its bytes."""
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -30,12 +37,12 @@ def finite_list(array: Array) -> list[float | None]:
 
 
 def storable(text: str) -> str:
-    """Return the text with what no database takes made visible: zeros and halves of characters."""
+    """Return the text with zero bytes and lone surrogates escaped, which databases reject."""
     return text.encode(errors="backslashreplace").decode().replace("\0", r"\x00")
 
 
 def utc_text(moment: datetime) -> str:
-    """Return UTC text of fixed width, which sorts like time; ValueError without a time zone."""
+    """Return UTC text of fixed width, which sorts by time; raise ValueError without a time zone."""
     if moment.tzinfo is None:
         raise ValueError(f"The time {moment.isoformat()} has no time zone: give one, such as UTC.")
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
@@ -43,3 +50,13 @@ def utc_text(moment: datetime) -> str:
 
 def now() -> str:
     return utc_text(datetime.now(UTC))
+
+
+def pack(array: Array) -> tuple[str, bytes]:
+    """Return the shape as JSON and the numbers as bytes of type ``DTYPE``."""
+    return json.dumps(array.shape), np.ascontiguousarray(array, dtype=DTYPE).tobytes()
+
+
+def unpack(dtype: str, shape: str, data: bytes) -> Array:
+    """Return the packed array in native byte order, writable."""
+    return np.frombuffer(data, dtype=dtype).reshape(json.loads(shape)).astype(np.float64)

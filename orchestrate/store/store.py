@@ -1,28 +1,28 @@
-"""The write side of the results database."""
+"""Write side of the results database."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from typing import Self
 
-from orchestrate.store import address, claims, launches, outcomes, registering, versioning
-from orchestrate.store.backend import Backend
-from orchestrate.store.opening import LEASE_SECONDS, make_backend
+from orchestrate.records import Failure, RunRecord
+from orchestrate.store import database_url, schema_version
+from orchestrate.store.backends.base import Backend
+from orchestrate.store.backends.open import LEASE_SECONDS, make_backend
 from orchestrate.store.records import (
     Claim,
-    Failure,
     LaunchRecord,
     Registrable,
     Registration,
     Result,
-    RunRecord,
 )
+from orchestrate.store.write import claims, launches, registration, results
 
 
 class Store:
-    """A results database to write to; every method is one transaction, whole or not at all.
+    """Writable results database; every method is one atomic transaction.
 
-    Every method raises ``StoreUnavailableError`` where the database itself fails.
+    Every method raises ``StoreUnavailableError`` if the database fails.
     """
 
     def __init__(self, backend: Backend) -> None:
@@ -30,15 +30,15 @@ class Store:
 
     @classmethod
     def open(cls, url: str, lease_seconds: float = LEASE_SECONDS) -> Self:
-        """Open a database, and create it where there is none.
+        """Open a database, and create it if there is none.
 
-        ``lease_seconds`` is how long a launch on PostgreSQL counts as alive after a sign of life;
-        on SQLite the kernel knows. Raises ``SchemaVersionError`` for a database of another version.
+        ``lease_seconds`` is the time after its last heartbeat for which a launch on PostgreSQL is
+        alive; on SQLite a file lock decides. Raises ``SchemaVersionError`` for another version.
         """
-        backend = make_backend(address.parse(url), lease_seconds)
+        backend = make_backend(database_url.parse(url), lease_seconds)
         try:
             with backend.creation() as connection:
-                versioning.create_or_check(connection, backend.safe_url)
+                schema_version.create_or_check(connection, backend.safe_url)
         except BaseException:
             backend.close()
             raise
@@ -56,93 +56,93 @@ class Store:
         return self._backend.safe_url
 
     def begin_launch(self, record: LaunchRecord) -> int:
-        """Write down a command that starts now and return its number."""
+        """Insert a launch that starts now and return its number."""
         with self._backend.transaction() as connection:
             return launches.begin(connection, self._backend, record)
 
     def end_launch(self, launch: int, state: str, exit_code: int | None = None) -> None:
-        """End a launch as "done", "failed", "interrupted" or "lost" and free its last claims."""
+        """End a launch as "done", "failed", "interrupted" or "lost" and release its claims."""
         with self._backend.transaction() as connection:
             token = launches.end(connection, launch, state, exit_code)
-        self._backend.let_go(token)
+        self._backend.forget(token)
 
     def heartbeat(self, launch: int) -> None:
-        """Show that the launch lives; on PostgreSQL, call it several times a lease."""
+        """Renew the lease of the launch; on PostgreSQL, call it several times in a lease."""
         with self._backend.transaction() as connection:
             launches.renew(connection, self._backend, launch)
 
     def recover(self) -> int:
-        """Put the trials of dead launches back to pending; return how many there were."""
+        """Put the trials of dead launches back to pending; return their number."""
         self._backend.evict()
         with self._backend.transaction() as connection:
             freed, tokens = launches.recover(connection, self._backend)
         for token in tokens:
-            self._backend.let_go(token)
+            self._backend.forget(token)
         return freed
 
     def register(self, launch: int, specs: Iterable[Registrable]) -> Registration:
-        """Write down a grid and return the state of each of its trials; again is harmless."""
-        grid = registering.Grid(specs)
+        """Register a grid and return the state of its trials; repeated calls are harmless."""
+        grid = registration.GridRows(specs)
         with self._backend.transaction() as connection:
-            return registering.register(connection, self._backend, launch, grid)
+            return registration.register(connection, self._backend, launch, grid)
 
     def claim(self, launch: int, trial_keys: Sequence[str]) -> list[Claim]:
-        """Take those of the trials that are pending, in the given order, and no others."""
+        """Claim those of the trials that are pending, in the given order."""
         with self._backend.transaction() as connection:
             launches.renew(connection, self._backend, launch)
             return claims.claim(connection, self._backend, launch, trial_keys)
 
     def commit(self, claim: Claim, result: Result, run: RunRecord) -> bool:
-        """Write a finished trial, summary, curve and trajectory; False where the claim is lost.
+        """Write a finished trial with its curve and trajectory; return False if the claim is lost.
 
-        Raises ``InvalidResultError``, with nothing written, where the result is malformed.
+        Raises ``InvalidResultError``, and writes nothing, for an invalid result.
         """
         return self.commit_many([(claim, result, run)])[0]
 
     def commit_many(self, items: Sequence[tuple[Claim, Result, RunRecord]]) -> list[bool]:
-        """Write finished trials in one transaction; False for each whose claim is lost.
+        """Write finished trials in one transaction; return False for each lost claim.
 
-        Raises ``InvalidResultError``, with nothing written, where one result is malformed.
+        Raises ``InvalidResultError``, and writes nothing, if one result is invalid.
         """
-        prepared = [outcomes.prepare(*item) for item in items]
+        prepared = [results.prepare(*item) for item in items]
         written = [False] * len(prepared)
-        # In one order for all launches, so that no two wait for each other's rows.
+        # All launches use one order, which avoids deadlocks.
         order = sorted(range(len(prepared)), key=lambda i: prepared[i].claim.trial_id)
         with self._backend.transaction() as connection:
             for i in order:
-                written[i] = outcomes.write(connection, self._backend, prepared[i])
+                written[i] = results.write(connection, self._backend, prepared[i])
         return written
 
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
-        """Write a failed trial with its error; False where the claim is lost."""
+        """Write a failed trial with its error; return False if the claim is lost."""
         with self._backend.transaction() as connection:
-            return outcomes.write_failure(connection, claim, failure, run)
+            return results.write_failure(connection, claim, failure, run)
 
     def written(self, claims: Sequence[Claim]) -> list[bool]:
-        """Tell of each claim whether its attempt has its outcome, as after a lost answer."""
+        """Return for each claim whether its attempt has an outcome."""
         with self._backend.transaction() as connection:
-            return [outcomes.is_written(connection, claim) for claim in claims]
+            return [results.is_written(connection, claim) for claim in claims]
 
     def release(
         self, launch: int, trial_keys: Sequence[str] | None = None, cause: str | None = None
     ) -> int:
         """Put running trials of the launch, all or those given, back to pending; count them.
 
-        ``cause`` says what ended their attempts, where something did.
+        ``cause`` is recorded in their attempts.
         """
         only = None if trial_keys is None else self._backend.members(trial_keys)
         with self._backend.transaction() as connection:
             return claims.free_claims(connection, [launch], "released", only, cause)
 
     def retry(self, status: str = "failed", trial_keys: Sequence[str] | None = None) -> int:
-        """Put finished trials of a status back to pending and return how many.
+        """Put finished trials of a status back to pending and return their number.
 
-        ``status`` is "failed", "diverged", "cancelled" or "all" of these; ``trial_keys`` narrows it
-        to a grid. What a diverged trial had written is deleted.
+        ``status`` is "failed", "diverged", "cancelled" or "all" of these; ``trial_keys`` restricts
+        them to a grid. The rows of a diverged trial are deleted.
         """
         with self._backend.transaction() as connection:
             return claims.retry(connection, self._backend, status, trial_keys)
 
     def close(self) -> None:
-        """Give everything back; a launch that has not ended counts as dead from here on."""
+        """Close connections and locks; a launch that has not ended counts as dead from now on."""
         self._backend.close()

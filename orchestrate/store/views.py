@@ -1,8 +1,8 @@
-"""Views for people who write SQL; one text that SQLite and PostgreSQL both read."""
+"""Views for SQL users, in SQL that SQLite and PostgreSQL both accept."""
 
 from __future__ import annotations
 
-_CONFIG = "c.config_key, c.env, c.policy, c.model, c.learner, c.width, c.depth"
+_CONFIG = "c.config_key, c.label, c.env, c.policy, c.model, c.learner, c.width, c.depth"
 
 _TRIAL = f"""
 SELECT {_CONFIG}, c.horizon, c.dt, c.gamma,
@@ -25,15 +25,15 @@ JOIN step s ON s.trial_id = r.trial_id
 # so cancellation in the variance costs less than 1e-3 of the error. The outer CASE keeps rounding
 # from making the variance of equal losses negative.
 _CURVE_STATS = """
-SELECT config_key, env, policy, model, learner, width, depth, t, n, n_finite, mean,
+SELECT config_key, label, env, policy, model, learner, width, depth, t, n, n_finite, mean,
        CASE WHEN n_finite < 2 THEN NULL
             WHEN squares <= n_finite * mean * mean THEN 0.0
             ELSE sqrt((squares - n_finite * mean * mean) / (n_finite - 1) / n_finite)
        END AS standard_error
-FROM (SELECT config_key, env, policy, model, learner, width, depth, t,
+FROM (SELECT config_key, label, env, policy, model, learner, width, depth, t,
              count(*) AS n, count(loss) AS n_finite, avg(loss) AS mean, sum(loss * loss) AS squares
       FROM v_curve
-      GROUP BY config_key, env, policy, model, learner, width, depth, t) AS sums
+      GROUP BY config_key, label, env, policy, model, learner, width, depth, t) AS sums
 """
 
 
@@ -69,7 +69,7 @@ JOIN trial r ON r.config_id = c.config_id
 JOIN assessment a ON a.trial_id = r.trial_id
 """
 
-# In the order in which they must be created.
+# In the order of creation.
 VIEWS = {
     "v_trial": _TRIAL,
     "v_curve": _CURVE,

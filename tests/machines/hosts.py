@@ -17,7 +17,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.paths import ROOT
+
 """The checkout, which every host sees, also where it lies below /tmp."""
 
 _FIRST_PROCESS = (

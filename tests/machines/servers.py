@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.machines.hosts import Host, Process
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
 LAUNCH = (str(ROOT / "orchestrate/launch.py"),)
 WITNESS = ("-m", "tests.machines.witness")
@@ -19,7 +19,7 @@ OBJECT_STORE_BYTES = 100_000_000
 
 def ray_settings() -> dict[str, str]:
     """Return the settings that users give to every node of a cluster."""
-    text = (ROOT / "orchestrate/executors/ray.env").read_text()
+    text = (ROOT / "orchestrate/executors/ray/ray.env").read_text()
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
     return dict(line.split("=", 1) for line in lines)
 

@@ -11,12 +11,12 @@ import sys
 import time
 from pathlib import Path
 
-from dopt.exploration import run_trial
 from dopt.kernel import warm_up
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
-from orchestrate import launch
-from orchestrate.campaign import Work
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+from orchestrate.runner import launch
+from orchestrate.runner.run_grid import Work
 
 PAUSE = "WITNESS_PAUSE"
 

@@ -21,16 +21,16 @@ import ray
 from ray.cluster_utils import Cluster
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
-from orchestrate.campaign import Work, launch_grid
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Run
-from orchestrate.grid import Grid
-from orchestrate.settings import LaunchSettings
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord
 from tests.orchestrate.standins import quick, specification
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
 ADDRESSES = [f"10.77.1.{number}" for number in range(1, 17)]
 LONG_SEED = 3
@@ -133,7 +133,7 @@ class Launches:
 
     def __call__(self, name: str, run: Run, fault: Callable[[], None] = lambda: None) -> None:
         """Launch, and report the exit code and the error."""
-        grid = Grid([specification(seed) for seed in range(40)], asked=40, left_out={})
+        grid = Grid([specification(seed) for seed in range(40)], n_jobs=40, left_out={})
         settings = LaunchSettings(
             executor="ray",
             store_url=f"sqlite:///{self.folder / name}.db",

@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 
-from orchestrate.campaign import Work, launch_grid
+from orchestrate.config.grid import Grid
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
-from orchestrate.grid import Grid
-from orchestrate.settings import LaunchSettings
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord, Reader
 from tests.orchestrate.standins import quick, specification
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
 
 sys.path.append(str(ROOT / "orchestrate"))  # where a launch finds the plugin of Hydra
@@ -34,7 +34,7 @@ class Launches:
     def __call__(
         self, run: Run = quick, seeds: int = 5, executor: str = "inprocess", **settings: Any
     ) -> ExitCode:
-        grid = Grid([specification(seed) for seed in range(seeds)], asked=seeds, left_out={})
+        grid = Grid([specification(seed) for seed in range(seeds)], n_jobs=seeds, left_out={})
         chosen = LaunchSettings(executor=executor, store_url=self.url, **{"workers": 2, **settings})
         work = Work(run, prepare=lambda: None)
         return launch_grid(grid, chosen, RECORD, work, self.said.append, stream=None)
@@ -59,7 +59,7 @@ def command_line(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str, str]]:
     """Return a function that runs ``launch.py`` in this process: exit code, output and errors."""
-    from orchestrate import launch
+    from orchestrate.runner import launch
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["launch.py", *arguments])

@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 
 from orchestrate.executors.local import LocalExecutor
+from tests.orchestrate.executors.test_executors import tasks
 from tests.orchestrate.standins import BROKEN_SEED
-from tests.orchestrate.test_executors import tasks
 from tests.orchestrate.unruly import deaf
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import time
 import numpy as np
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 
 BROKEN_SEED = 2
 

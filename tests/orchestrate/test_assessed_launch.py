@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from dopt.cell import without_versions
 from dopt.errors import SpecificationError
-from dopt.exploration import run_trial
-from dopt.spec import TrialSpec
-from orchestrate.campaign import Work, launch_grid
+from dopt.run import run_trial
+from dopt.spec.config import without_versions
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Combination, Grid, build_grid
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.grid import Combination, Grid, build_grid
-from orchestrate.settings import LaunchSettings
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import Reader, examine
 from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.standins import specification
@@ -38,7 +38,7 @@ def grid(task: object, seeds: int) -> Grid:
 def launched(folder: Path, executor: str, trials: Grid) -> str:
     """Run a grid of real trials into a database of its own; return its URL."""
     url = f"sqlite:///{folder / executor}.db"
-    settings = LaunchSettings(executor=executor, store_url=url, workers=2, device="cpu", batch=4)
+    settings = LaunchSettings(executor=executor, store_url=url, workers=2)
     work = Work(run_trial, prepare=lambda: None)
     code = launch_grid(trials, settings, RECORD, work, lambda _: None, stream=None)
     assert code is ExitCode.DONE
@@ -58,7 +58,7 @@ def test_the_rows_do_not_depend_on_the_executor(tmp_path: Path) -> None:
     assert rows(launched(tmp_path, "local", trials)) == rows(alone)
     assert [one for one in examine(alone) if one.severity == "error"] == []
     with Reader.open(alone) as reader:
-        (cell,) = reader.cells()
+        (cell,) = reader.configs()
     again = TrialSpec.from_mapping(without_versions(cell.config))
     assert [trial.trial_key for trial in trials.trials][:1] == [again.trial_key]
 

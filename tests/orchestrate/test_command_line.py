@@ -6,16 +6,19 @@ import re
 import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
-from orchestrate.campaign import Work
-from orchestrate.store import Reader
+from dopt.spec.trial import TrialSpec
+from orchestrate.runner.run_grid import Work
+from orchestrate.store import Reader, default_url
 from tests.orchestrate.conftest import ROOT
+from tests.orchestrate.standins import quick, raising
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -57,6 +60,7 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["store.url="], "store.url is '', but a text is expected"),
         (["store.url=postgresql://you:secret@host:port/db"], "The database URL cannot be read"),
         (["store.url=sqlite:////dev/null/results.db"], "cannot be made or opened"),
+        (["store.url=sqlite://results/x.db"], "names a host, .* sqlite:///results/x.db"),
         (["store.url=sqlite:////dev"], "/dev is a folder, but a file is expected"),
         (["--cfg", "jobs"], "--cfg 'jobs' is unknown.* did you mean 'job'"),
         (["--bogus"], "option '--bogus' is unknown"),
@@ -66,11 +70,14 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["--resolve"], "--resolve goes with --cfg or --help"),
         (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor, beyond/chain,"),
         (["env="], "env is empty, but one of arm"),
-        (["policy=5"], "choice of a group is a number, but the name of one of its options is"),
+        (["policy=5"], "the option of a group is a number, but one of its names is expected"),
         (["--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "add it with \\+env\\.mass="),
+        (["--config-dir", str(OPTIONS), "env=boat", "env.gama=3"], "did you mean 'gamma'"),
+        (["-m", "--config-dir", str(OPTIONS), "env=boat", "env.gama=3"], "did you mean 'gamma'"),
+        (["-m", "--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "\\+env\\.mass="),
         (["env=[arm,cartpole]"], "env is the list \\[arm,cartpole\\], .*-m env=a,b"),
         (["-m", "env=null,arm"], "env 'null' is unknown"),
-        (["pendulum"], "'pendulum' is no setting: write key=value"),
+        (["pendulum"], "'pendulum' is not an override: write key=value"),
         (["seed=abc"], "seed is 'abc', but a whole number"),
         (["seed=1.5"], "seed is 1.5, but a whole number"),
         (["seed=null"], "seed is null, but a whole number"),
@@ -99,7 +106,7 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["hydra/launcher=basci"], "hydra/launcher 'basci' is .* did you mean 'basic'"),
         (["policy=beyond/exact", "policy.form=dual"], "setting of policy 'form' is unknown"),
         (["policy=beyond/lookahead", "policy.stride=99"], "policy.stride is 99 steps, but"),
-        (["-m", "hydra/sweeper=basic", "seed=1,2"], "another hydra/sweeper was given"),
+        (["-m", "hydra/sweeper=basic", "seed=1,2"], "hydra/sweeper is set, but"),
         (["width=1000000"], "would need .* GiB of memory, .* make model.width smaller"),
         (["env.grid_points=[1000000,1000000]"], "make env.grid_points smaller"),
         (["env=beyond/chain", "env.grid_points=[1000]"], "a power of two .* set it to 512 or 1024"),
@@ -108,8 +115,13 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
     ],
 )
 def test_a_wrong_command_is_one_sentence_and_leaves_nothing(
-    command_line: Command, tmp_path: Path, arguments: list[str], words: str
+    command_line: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    arguments: list[str],
+    words: str,
 ) -> None:
+    monkeypatch.syspath_prepend(OPTIONS.parent)  # the module of env=boat
     code, output, errors = command_line(*arguments)
     assert code == 2, output + errors
     assert output == ""
@@ -126,7 +138,9 @@ def test_a_trial_prints_its_result_and_is_stored(command_line: Command, tmp_path
     assert re.match(
         r"env=arm policy=random model=mlp width=16 seed=3 · final loss \S+ · .*5 steps", output
     )
-    assert output == command_line(*arguments)[1]
+    again = command_line(*arguments)
+    head, result = output.split(" · ", 1)
+    assert again == (0, f"{head} · already done, nothing to run · {result}", "")
     assert [path.name for path in tmp_path.iterdir()] == ["results"]
 
 
@@ -161,6 +175,19 @@ def test_a_dry_run_shows_the_grid_and_makes_no_database(
     assert "8 trials, 6 done, 2 to run" in command_line(*grid, "launch.dry_run=true")[1]
 
 
+def test_a_dry_run_counts_trials_that_run_again(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Failed(dict[str, str]):
+        def get(self, _key: str, _default: object = None) -> str:  # type: ignore[override]
+            return "failed"
+
+    monkeypatch.setattr("orchestrate.runner.dry_run._statuses", lambda _: Failed())
+    grid = ("-m", "policy=random", "seed=range(4)", "launch.dry_run=true", *SHORT)
+    assert "4 trials, 0 done, 0 to run" in command_line(*grid)[1]
+    assert "4 trials, 0 done, 4 to run" in command_line(*grid, "launch.retry=failed")[1]
+
+
 def test_a_dry_run_tells_its_cells_apart(command_line: Command) -> None:
     _, output, _ = command_line(
         "-m", "env=arm,pendulum", "policy=random", "env.mass=2,3", "env.dt=0.01,0.02", "seed=0",
@@ -190,6 +217,40 @@ def test_the_database_of_the_environment(
     monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/mine.db")
     assert command_line(*SHORT)[0] == 0
     assert (tmp_path / "mine.db").exists()
+
+
+def test_an_empty_variable_counts_as_unset(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "")
+    code, output, errors = command_line(*SHORT)
+    assert (code, errors) == (0, "")
+    assert "sqlite:///results/results.db" in output
+    assert default_url() == "sqlite:///results/results.db"
+
+
+def test_a_failed_trial_says_how_to_run_it_again(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orchestrate.runner.launch.WORK", Work(raising, prepare=lambda: None))
+    code, output, _ = command_line("seed=2", *SHORT)
+    assert (code, "failed with ZeroDivisionError" in output) == (1, True)
+    assert "launch.retry" not in output
+    code, output, _ = command_line("seed=2", *SHORT)
+    assert code == 1
+    assert "already run (launch.retry=failed runs it again) · failed with Zero" in output
+    code, output, _ = command_line("seed=2", *SHORT, "launch.retry=failed")
+    assert "already run" not in output
+
+
+def test_a_slow_preparation_is_announced_also_for_a_single_trial(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orchestrate.runner.run_grid.ANNOUNCE_AFTER_SECONDS", 0.01)
+    prepare = partial(time.sleep, 0.5)
+    monkeypatch.setattr("orchestrate.runner.launch.WORK", Work(quick, prepare))
+    code, _, errors = command_line(*SHORT)
+    assert (code, errors.startswith("compiling the kernel")) == (0, True)
 
 
 def test_flags_may_stand_anywhere(command_line: Command) -> None:
@@ -260,7 +321,7 @@ def test_a_failure_may_say_what_no_terminal_shows(
     def unspeakable(_: TrialSpec) -> TrialResult:
         raise OSError("cannot read \udcff")
 
-    monkeypatch.setattr("orchestrate.launch.WORK", Work(unspeakable, prepare=lambda: None))
+    monkeypatch.setattr("orchestrate.runner.launch.WORK", Work(unspeakable, prepare=lambda: None))
     code, out, _ = command_line("-m", "seed=0", "env.horizon=5", "executor=inprocess")
     assert code == 1
     assert r"1 failed: OSError: cannot read \udcff" in out
@@ -272,7 +333,7 @@ def test_a_defect_of_the_program_is_not_taken_for_failed_trials(
     def broken(*_: object) -> None:
         raise AssertionError("nobody thought of postgresql://me:secret@host/db")
 
-    monkeypatch.setattr("orchestrate.campaign.Chunks", broken)
+    monkeypatch.setattr("orchestrate.runner.run_grid.Chunks", broken)
     url = f"sqlite:///{tmp_path}/results.db"
     code, _, errors = command_line("env=pendulum", f"store.url={url}")
     assert code == 70

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from orchestrate.store import Reader
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.paths import ROOT
 
 
 def losses(executor: str, folder: Path) -> list[float]:
@@ -27,7 +26,7 @@ def losses(executor: str, folder: Path) -> list[float]:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     with Reader.open(url) as reader:
-        cells = sorted(reader.cells(), key=lambda cell: cell.config_key)
+        cells = sorted(reader.configs(), key=lambda cell: cell.config_key)
         return [
             float(loss)
             for cell in cells

@@ -13,9 +13,9 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
-from orchestrate.passwords import without_password, without_password_in_word
-from orchestrate.provenance import launch_record
+from dopt.spec.trial import TrialSpec
+from orchestrate.redaction import without_password, without_password_in_word
+from orchestrate.runner.provenance import launch_record
 from tests.orchestrate.conftest import Launches
 
 

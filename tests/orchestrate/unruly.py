@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from tests.orchestrate.standins import BROKEN_SEED, quick
 
 FOR_EVER = 600

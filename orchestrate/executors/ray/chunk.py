@@ -1,25 +1,23 @@
-"""What a worker of Ray does with a chunk."""
+"""Execution of a chunk on a Ray worker."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
-from orchestrate.executors.base import Finished, Run, Task
+from orchestrate.executors.base import Prepare, Run, Task, TaskDone
 from orchestrate.executors.limits import Limits, ended_after, limit_memory
 from orchestrate.executors.task import run_task
-from orchestrate.surroundings import pin_threads
+from orchestrate.executors.worker_environment import pin_threads
 
-Prepare = Callable[[], None]
-
-_STDERR = 2  # Ray keeps it in a file of the worker, on the node
+_STDERR = 2  # Ray writes it to a log file of the worker on its node
 
 
 def run_chunk(
     run: Run, tasks: list[Task], limits: Limits, prepare: Prepare | None = None
-) -> Iterator[Finished | None]:
+) -> Iterator[TaskDone | None]:
     """Run tasks in order; yield None when the first begins, then each outcome as it ends.
 
-    ``prepare`` is called before, where the launch could not do it for this machine.
+    ``prepare`` is called first, on machines where the launch has not called it.
     """
     pin_threads()
     limit_memory(limits)

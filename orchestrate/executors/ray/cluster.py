@@ -1,4 +1,4 @@
-"""A Ray cluster that others have started, of any number of machines that come and go."""
+"""Connection to a running Ray cluster, whose machines may join and leave."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import ray
 from ray import cloudpickle
 
 from orchestrate.errors import LaunchError
-from orchestrate.executors import ray_node
-from orchestrate.executors.base import Run, Task
+from orchestrate.executors.base import Prepare, Run, Task
 from orchestrate.executors.limits import Limits
-from orchestrate.executors.ray_chunk import Prepare
-from orchestrate.executors.ray_connection import TASK_OPTIONS, Connection, unreachable
-from orchestrate.executors.ray_watch import ClusterWatch
-from orchestrate.surroundings import ONE_THREAD
+from orchestrate.executors.ray import fingerprint
+from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection, unreachable
+from orchestrate.executors.ray.health import ClusterWatch
+from orchestrate.executors.worker_environment import ONE_THREAD
 
 CONNECT_SECONDS = 5.0
 
@@ -25,7 +24,7 @@ SETTINGS_FILE = Path(__file__).with_name("ray.env")
 
 
 class Cluster(Connection):
-    """The cluster with its head at ``address``, of which ``workers`` cores are used, or all.
+    """Cluster with its head at ``address``; ``workers`` limits the cores that are used.
 
     ``prepare`` is called on every worker before its first trial.
     """
@@ -41,11 +40,11 @@ class Cluster(Connection):
         self._prepare = prepare
 
     def connect(self) -> None:
-        self._look_for_head()
+        self._check_head()
         self._init(self._address, runtime_env={"env_vars": ONE_THREAD})
-        cloudpickle.register_pickle_by_value(ray_node)  # type: ignore[no-untyped-call]
-        self._task = ray.remote(**TASK_OPTIONS)(ray_node.run_where_alike)
-        self._expected = ray_node.fingerprint(setting_names())
+        cloudpickle.register_pickle_by_value(fingerprint)  # type: ignore[no-untyped-call]
+        self._task = ray.remote(**TASK_OPTIONS)(fingerprint.run_where_alike)
+        self._expected = fingerprint.fingerprint(setting_names())
         self._watch = ClusterWatch(ray.get_runtime_context().gcs_address)
 
     @property
@@ -63,11 +62,11 @@ class Cluster(Connection):
 
     def disconnect(self, *, lost: bool) -> None:
         self._watch.stop()
-        if not lost:  # otherwise it takes seconds, in which the claims would not be free
+        if not lost:  # otherwise it takes seconds, in which the claims stay held
             ray.shutdown()
 
-    def _look_for_head(self) -> None:
-        """See that something listens there; Ray was seen to try for more than two minutes."""
+    def _check_head(self) -> None:
+        """Check that the port is open; Ray itself retries for more than two minutes."""
         host, _, port = self._address.rpartition(":")
         if not host:
             return
@@ -78,6 +77,6 @@ class Cluster(Connection):
 
 
 def setting_names() -> list[str]:
-    """Return the settings of Ray that are the same on all nodes."""
+    """Return the Ray settings that must be equal on all nodes."""
     lines = SETTINGS_FILE.read_text().splitlines()
     return [line.partition("=")[0] for line in lines if line and not line.startswith("#")]

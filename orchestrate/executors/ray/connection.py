@@ -1,4 +1,4 @@
-"""The two kinds of Ray that a launch can use, behind one interface."""
+"""Interface of a connection to Ray: an instance of our own, or a running cluster."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
 
 TASK_OPTIONS: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "num_returns": "streaming"}
-"""One core for a chunk, which Ray never repeats, and whose outcomes come as they end."""
+"""One core for each chunk; Ray never repeats it, and streams its outcomes."""
 
 _TOKEN = "RAY_AUTH_TOKEN"
 
 
 class Connection(ABC):
-    """A Ray to run chunks on."""
+    """Ray instance that runs chunks."""
 
     limit: int | None = None
-    """Chunks that may be with Ray at once, where it would run more of them than wanted."""
+    """Largest number of chunks submitted to Ray at once; None for no limit."""
 
     @abstractmethod
     def connect(self) -> None:
@@ -44,13 +44,13 @@ class Connection(ABC):
 
     @abstractmethod
     def disconnect(self, *, lost: bool) -> None:
-        """Leave Ray; nothing of it answers any more if it is ``lost``."""
+        """Disconnect from Ray, which does not answer any more if it is ``lost``."""
 
     @staticmethod
     def _init(address: str, **options: Any) -> None:
         if ray.is_initialized():
-            ray.shutdown()  # what is left of one that was lost
-        # Of a lost node Ray prints the memory map and a hundred lines more between ours.
+            ray.shutdown()  # the rest of a lost connection
+        # Ray prints more than a hundred lines, such as a memory map, for a lost node.
         ray._private.worker.print_to_stdstream = _print_nothing
         try:
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **options)
@@ -59,7 +59,7 @@ class Connection(ABC):
 
 
 def unreachable(address: str, error: Exception) -> InfrastructureError:
-    """Return the error for a Ray to which there is no connection."""
+    """Return the error for a failed connection to Ray."""
     return InfrastructureError(
         f"Ray cannot be reached at '{address}' ({first_line(error)}): check launch.ray.address, "
         "or use executor=local."
@@ -67,7 +67,7 @@ def unreachable(address: str, error: Exception) -> InfrastructureError:
 
 
 def first_line(error: Exception) -> str:
-    """Return the beginning of what Ray says, without the token that opens the cluster."""
+    """Return the first line of a Ray error, without the authentication token."""
     lines = str(error).strip().splitlines()
     line = lines[0] if lines else type(error).__name__
     token = os.environ.get(_TOKEN)

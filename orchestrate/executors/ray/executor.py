@@ -1,4 +1,4 @@
-"""Ray: the cores of this machine, or of a cluster by its address."""
+"""Executor on Ray: the cores of this machine, or of a cluster given by its address."""
 
 from __future__ import annotations
 
@@ -13,43 +13,42 @@ import ray
 from ray import exceptions
 
 from orchestrate.errors import InfrastructureError
-from orchestrate.executors.base import Event, Executor, Finished, Lost, Run, Task
+from orchestrate.executors.base import Event, Executor, Prepare, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.limits import NO_LIMITS, Limits
-from orchestrate.executors.ray_chunk import Prepare
-from orchestrate.executors.ray_cluster import Cluster
-from orchestrate.executors.ray_connection import Connection, first_line
-from orchestrate.executors.ray_own import OwnRay
+from orchestrate.executors.ray.cluster import Cluster
+from orchestrate.executors.ray.connection import Connection, first_line
+from orchestrate.executors.ray.local import OwnRay
 
 _WORKER_LOST = (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError)
 _NODE_LOST = (exceptions.NodeDiedError, exceptions.ObjectLostError)
 
 FETCH_SECONDS = 60.0
-"""Time in which an outcome that is ready crosses the network."""
+"""Time limit for fetching an outcome that is ready."""
 
 
 @dataclass
 class Chunk:
-    """What is left of a chunk, and when its worker was last heard, [s], None before its start."""
+    """Unfinished tasks of a chunk, and the time [s] of its last message; None before its start."""
 
     tasks: deque[Task]
-    heard: float | None = None
+    last_message: float | None = None
 
 
 class RayExecutor(Executor):
-    """Runs each chunk as one Ray task, which Ray itself never repeats.
+    """Runs each chunk as one Ray task, which Ray never repeats.
 
     Parameters
     ----------
     run
-        What is done with a trial.
+        Function that runs a trial.
     workers
-        Tasks at the same time; by default one on each core of the machine or cluster.
+        Number of simultaneous tasks; by default one on each core of the machine or cluster.
     address
-        ``"local"`` starts a Ray that nobody else uses; anything else joins a cluster.
+        ``"local"`` starts a private Ray instance; HOST:PORT joins a cluster.
     limits
-        What a trial and a worker may take.
+        Limits of a trial and of a worker.
     prepare
-        What each machine of a cluster does before its first trial.
+        Function that each machine of a cluster calls before its first trial.
     """
 
     def __init__(
@@ -119,50 +118,50 @@ class RayExecutor(Executor):
         self._ray.disconnect(lost=self._lost)
 
     def _take(self, stream: Any) -> list[Event]:
-        """Return the next outcome of a chunk, if it is not only a sign that it has begun."""
+        """Return the next outcome of a chunk; none if the message says that it has begun."""
         chunk = self._chunks[stream]
         try:
-            said: Finished | str | None = ray.get(next(stream), timeout=FETCH_SECONDS)
+            message: TaskDone | str | None = ray.get(next(stream), timeout=FETCH_SECONDS)
         except StopIteration:
             del self._chunks[stream]
             return []
         except _WORKER_LOST as error:
-            self._ray.check()  # workers end with their raylet, for which no trial is to blame
+            self._ray.check()  # workers die with their raylet, which no trial causes
             return self._lose(stream, error)
         except _NODE_LOST as error:
             keys = tuple(task.key for task in self._chunks.pop(stream).tasks)
-            return [Lost(keys, _loss(error), blameless=True)] if keys else []
+            return [WorkerLost(keys, _loss(error), node_lost=True)] if keys else []
         except exceptions.RayError as error:
             raise InfrastructureError(
-                f"Ray has failed ({first_line(error)}): run the same command again to go on."
+                f"Ray failed ({first_line(error)}): run the same command again to continue."
             ) from error
-        chunk.heard = time.monotonic()
-        if isinstance(said, Finished):
+        chunk.last_message = time.monotonic()
+        if isinstance(message, TaskDone):
             chunk.tasks.popleft()
-            return [said]
-        if said is not None:
+            return [message]
+        if message is not None:
             raise InfrastructureError(
-                f"A node of the Ray cluster would not compute the same: {said}; install one "
-                "version on all nodes, start each with orchestrate/executors/ray.env, and run "
+                f"A node of the Ray cluster would give different numbers: {message}; install one "
+                "version on all nodes, start each with orchestrate/executors/ray/ray.env, and run "
                 "the same command again."
             )
         return []
 
     def _lose(self, stream: Any, error: Exception) -> list[Event]:
-        """Give up a chunk whose worker ended, or only the task that took too long."""
+        """Give up the chunk of a dead worker, or only its task that exceeded the time limit."""
         chunk = self._chunks.pop(stream)
         keys = tuple(task.key for task in chunk.tasks)
-        limit, heard = self._limits.seconds, chunk.heard
-        if keys and limit and heard and time.monotonic() - heard > limit:
+        limit, begun = self._limits.seconds, chunk.last_message
+        if keys and limit and begun and time.monotonic() - begun > limit:
             self.submit([*chunk.tasks][1:])  # they have not begun
-            return [Lost(keys[:1], self._limits.sentence, cause="timeout")]
+            return [WorkerLost(keys[:1], self._limits.timeout_message, cause="timeout")]
         out_of_memory = isinstance(error, exceptions.OutOfMemoryError)
         cause = "out of memory" if out_of_memory else "killed"
         reason = f"ended unexpectedly ({first_line(error)})"
-        return [Lost(keys, reason, cause=cause)] if keys else []
+        return [WorkerLost(keys, reason, cause=cause)] if keys else []
 
 
 def _loss(error: Exception) -> str:
-    """Say of a node that it is gone, and which one, where Ray knows."""
+    """Return the description of a lost node, with its address if Ray knows it."""
     address = re.search(r"Node IP: ([\w.:]+)", str(error))
-    return f"been lost with its machine {address[1]}" if address else "been lost"
+    return f"lost with its machine {address[1]}" if address else "lost"

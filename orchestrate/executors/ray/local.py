@@ -1,4 +1,4 @@
-"""A Ray of our own on this machine, which nobody else uses and which ends with the launch."""
+"""Private Ray instance on this machine, which ends with the launch."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import ray
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
-from orchestrate.executors.ray_chunk import run_chunk
-from orchestrate.executors.ray_connection import TASK_OPTIONS, Connection
-from orchestrate.surroundings import ONE_THREAD, module_path
+from orchestrate.executors.ray.chunk import run_chunk
+from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection
+from orchestrate.executors.worker_environment import ONE_THREAD, module_path
 
 OBJECT_STORE_BYTES = 256 * 2**20
-"""Room for the outcomes in flight; Ray would take a third of the memory."""
+"""Size of the store for outcomes in transfer; by default Ray takes a third of the memory."""
 
 
 class OwnRay(Connection):
@@ -25,7 +25,7 @@ class OwnRay(Connection):
         self._workers = workers
 
     def connect(self) -> None:
-        # Workers inherit our environment, which is seconds faster than to be given one.
+        # Workers inherit this environment, which is seconds faster than a runtime environment.
         os.environ.update({**ONE_THREAD, **module_path()})
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         self._init(
@@ -46,7 +46,7 @@ class OwnRay(Connection):
         return self._task.remote(run, tasks, limits)
 
     def check(self) -> None:
-        """See that the processes run; by itself Ray takes a minute to notice."""
+        """Check that Ray's processes run; Ray itself notices after a minute."""
         node: Any = ray._private.worker._global_node
         if node is None:
             return
@@ -54,8 +54,8 @@ class OwnRay(Connection):
         if dead:
             raise InfrastructureError(
                 f"Ray's {' and '.join(sorted(dead))} has ended: run the same command again "
-                "to go on."
+                "to continue."
             )
 
-    def disconnect(self, *, lost: bool) -> None:  # noqa: ARG002  # there is always something to end
+    def disconnect(self, *, lost: bool) -> None:  # noqa: ARG002  # there is always a process to end
         ray.shutdown()

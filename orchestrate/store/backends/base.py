@@ -1,4 +1,4 @@
-"""What differs between the two databases, as one small interface."""
+"""Interface of a database backend: the operations that differ between SQLite and PostgreSQL."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Select
 
-from orchestrate.store.faults import translated
+from orchestrate.store.backends.driver_errors import translated
 from orchestrate.store.records import Array
 
-# What was asked of a connection that broke says so itself; the pool would add a traceback.
+# The operation on a broken connection raises an error; the pool would add a traceback.
 logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
 
 
 @dataclass(frozen=True)
 class LaunchLife:
-    """What decides whether a launch still lives."""
+    """Token and lease of a launch, which decide whether it is alive."""
 
     launch_id: int
     token: str
@@ -29,23 +29,23 @@ class LaunchLife:
 
 
 class Backend(ABC):
-    """A database to write to; methods that take a connection run in its transaction."""
+    """Writable database; methods with a connection run in its transaction."""
 
     def __init__(self, engine: Engine, safe_url: str) -> None:
         self.engine = engine
         self.safe_url = safe_url
-        self._answered = False
+        self._has_answered = False
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
-        """Run the block in one transaction that may write."""
-        with translated(self.safe_url, self._answered), self.engine.begin() as connection:
-            self._answered = True
+        """Run the block in one writing transaction."""
+        with translated(self.safe_url, self._has_answered), self.engine.begin() as connection:
+            self._has_answered = True
             yield connection
 
     @abstractmethod
     def creation(self) -> AbstractContextManager[Connection]:
-        """Open a transaction that no other process can hold at the same time."""
+        """Open a transaction that only one process can hold at a time."""
 
     @abstractmethod
     def rebuilding(self) -> AbstractContextManager[Connection]:
@@ -53,11 +53,11 @@ class Backend(ABC):
 
     @abstractmethod
     def back_up(self, connection: Connection, version: int) -> str:
-        """Copy everything, which has the given version, and return the name of the copy."""
+        """Copy the database of the given version and return the name of the copy."""
 
     @abstractmethod
     def discard_backup(self, name: str) -> None:
-        """Remove a copy whose transaction was rolled back."""
+        """Delete the copy of a transaction that was rolled back."""
 
     @abstractmethod
     def exclusive(self, connection: Connection) -> None:
@@ -73,28 +73,28 @@ class Backend(ABC):
 
     @abstractmethod
     def hold(self, connection: Connection, launch_id: int, token: str) -> None:
-        """Make the launch count as alive, before anybody else can see it."""
+        """Mark a new launch as alive, before others can see it."""
 
     @abstractmethod
     def renew(self, connection: Connection, launch_id: int) -> None:
-        """Make the launch count as alive for longer."""
+        """Extend the life of the launch."""
 
     @abstractmethod
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
-        """Return those of the launches whose process is gone."""
+        """Return the launches whose process is gone."""
 
     def token(self) -> str:
-        """Return a name for a launch of this process that no other launch has."""
+        """Return a unique name for a launch of this process."""
         return uuid.uuid4().hex
 
     @abstractmethod
     def evict(self) -> None:
-        """End the transactions of dead launches, which could keep their locks for ever."""
+        """End the transactions of dead launches, which could keep their locks forever."""
 
     @abstractmethod
-    def let_go(self, token: str) -> None:
-        """Forget a launch that has ended or died."""
+    def forget(self, token: str) -> None:
+        """Delete the lock of a launch that has ended or died."""
 
     @abstractmethod
     def close(self) -> None:
-        """Give back connections and locks; launches that did not end count as dead."""
+        """Close connections and locks; launches that did not end count as dead."""

@@ -1,4 +1,4 @@
-"""Translation of what a database driver raises into sentences."""
+"""Translation of database driver errors into errors of this package."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from contextlib import contextmanager
 
 from sqlalchemy.exc import DBAPIError
 
+from orchestrate.store.backends.transient_errors import is_transient
 from orchestrate.store.errors import QueryError, StoreError, StoreUnavailableError
-from orchestrate.store.transience import is_transient
 
 _SQLITE = {
-    "SQLITE_BUSY": "another process has kept it locked for too long; see what holds it open",
-    "SQLITE_CANTOPEN": "the file cannot be opened; check that its folder exists and is yours",
+    "SQLITE_BUSY": "another process has locked it for too long; find the process that has it open",
+    "SQLITE_CANTOPEN": "the file cannot be opened; check that its folder exists and is writable",
     "SQLITE_CORRUPT": "the file is damaged; restore a copy, or move it away and run again",
     "SQLITE_FULL": "the disk is full; make room and run the same command again",
     "SQLITE_IOERR": "reading or writing the disk failed; check the disk and run again",
@@ -22,10 +22,10 @@ _SQLITE = {
     "SQLITE_READONLY": "the file is read-only; make it writable or give another path",
 }
 _STATES = {
-    "28": "the server refuses this user; check the name and the password",
-    "2B": "a view of somebody else stands on one of the program's; drop it and make it again later",
+    "28": "the server rejects this user; check the name and the password",
+    "2B": "another view depends on a view of this program; drop it and create it again later",
     "3F": "its schema does not exist; create it or correct the search path",
-    "42501": "the user may not do this; ask for the right to create and write tables",
+    "42501": "the user lacks a permission; request the right to create and write tables",
     "25006": "the server is read-only, as a standby is; give the address of its primary",
     "53100": "the server's disk is full; make room and run the same command again",
     "58": "reading or writing the server's disk failed; check it and run again",
@@ -42,20 +42,20 @@ _WRONG_PLACE = (
 )
 _OUT_OF_TIME = ("SQLITE_INTERRUPT", "57014")
 _NOT_OF_THE_QUERY = (*(name for name in _SQLITE if name != "SQLITE_READONLY"), "08", "53", "57P")
-# What both drivers call what they raise, so that the one that is not installed is not imported.
+# Names instead of classes, so that a driver that is not installed is not imported.
 _DRIVERS = ("sqlite3", "psycopg")
 _KINDS = ("OperationalError", "InterfaceError", "InternalError")
 _NOT_YET_ALLOWED = ("42501", "3F000")
-_REFUSED = "its server answers but refuses; see the reason in brackets"
+_REFUSED = "its server refuses the connection; see the reason in brackets"
 _ELSEWHERE = "check that its server runs and answers, then run the same command again"
 
 
 @contextmanager
 def translated(safe_url: str, known_host: bool = False) -> Iterator[None]:
-    """Raise ``StoreUnavailableError`` for what the database, not the program, did wrong.
+    """Raise ``StoreUnavailableError`` for errors of the database, not of the program.
 
-    ``known_host`` says that the server has answered this process before. Errors come wrapped by
-    SQLAlchemy or, out of COPY and the backup, as the driver raised them.
+    ``known_host`` is True if the server has answered this process before. Errors are wrapped by
+    SQLAlchemy, or raised directly by the driver in COPY and in backups.
     """
     try:
         yield
@@ -72,9 +72,9 @@ def translated(safe_url: str, known_host: bool = False) -> Iterator[None]:
 
 @contextmanager
 def translated_file(safe_url: str) -> Iterator[None]:
-    """Raise ``StoreUnavailableError`` where a file beside the database cannot be used.
+    """Raise ``StoreUnavailableError`` if a file beside the database cannot be used.
 
-    Where no such file can ever be made, it is a ``StoreError``: the address is wrong.
+    If no such file can ever be created, the URL is wrong: a ``StoreError`` is raised.
     """
     try:
         yield
@@ -89,9 +89,9 @@ def translated_file(safe_url: str) -> Iterator[None]:
 
 @contextmanager
 def translated_query(safe_url: str, seconds: float | None = None) -> Iterator[None]:
-    """Raise ``QueryError`` for SQL that the user wrote and the database refused.
+    """Raise ``QueryError`` for an SQL query of the user that the database rejects.
 
-    ``seconds`` is the time that it was allowed.
+    ``seconds`` is its time limit.
     """
     with translated(safe_url):
         try:
@@ -100,13 +100,13 @@ def translated_query(safe_url: str, seconds: float | None = None) -> Iterator[No
             code = _code(error.orig)
             if code in _OUT_OF_TIME:
                 raise QueryError(
-                    f"The query took longer than {seconds:g} s and was ended: ask for less, or "
-                    f"allow it more time."
+                    f"The query took longer than {seconds:g} s and was cancelled: make it smaller, "
+                    f"or increase its time limit."
                 ) from error
             if code.startswith(_NOT_OF_THE_QUERY) or (not code and _is_infrastructure(error.orig)):
                 raise
             refused = code == "SQLITE_AUTH"
-            reason = "only a SELECT may be asked" if refused else _first_line(error.orig)
+            reason = "only a SELECT is allowed" if refused else _first_line(error.orig)
             raise QueryError(f"The query failed on {safe_url}: {reason}.") from error
 
 
@@ -118,7 +118,7 @@ def _code(original: BaseException | None) -> str:
 def _is_infrastructure(original: BaseException | None) -> bool:
     if getattr(original, "sqlstate", None) in _NOT_YET_ALLOWED:
         return True
-    # sqlite3 reports damage to the file with the base class and nothing else with it.
+    # sqlite3 raises the base class itself only for a damaged file.
     return type(original) is sqlite3.DatabaseError or any(
         base.__name__ in _KINDS and base.__module__.partition(".")[0] in _DRIVERS
         for base in type(original).__mro__

@@ -1,4 +1,4 @@
-"""Kernel locks on files: they end with the process that holds them, whatever ends it."""
+"""Kernel file locks, which end with the process that holds them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _held: weakref.WeakSet[LaunchLocks] = weakref.WeakSet()
 
 @contextmanager
 def file_lock(path: Path) -> Iterator[None]:
-    """Hold the lock of the file, made if needed, waiting for as long as somebody else has it."""
+    """Hold the lock of a file, which is created if needed; wait for other holders."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -24,7 +24,7 @@ def file_lock(path: Path) -> Iterator[None]:
 
 
 class LaunchLocks:
-    """One locked file for each living launch of a database."""
+    """Set of locked files, one for each living launch of a database."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -32,13 +32,13 @@ class LaunchLocks:
         _held.add(self)
 
     def acquire(self, token: str) -> None:
-        """Lock the file of a token that nobody else has seen yet."""
+        """Create and lock the file of a new token."""
         descriptor = os.open(self._path(token), os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._descriptors[token] = descriptor
 
     def is_held(self, token: str) -> bool:
-        """Tell whether a process, this one included, holds the lock."""
+        """Return whether a process, this one included, holds the lock."""
         try:
             descriptor = os.open(self._path(token), os.O_RDONLY)
         except FileNotFoundError:
@@ -52,14 +52,14 @@ class LaunchLocks:
         return False
 
     def release(self, token: str) -> None:
-        """Unlock and remove the file of a launch that has ended or died."""
+        """Unlock and delete the file of a launch that has ended or died."""
         self._path(token).unlink(missing_ok=True)
         descriptor = self._descriptors.pop(token, None)
         if descriptor is not None:
             os.close(descriptor)
 
     def close(self) -> None:
-        """Unlock everything; the files stay, for others to see that these launches died."""
+        """Release all locks; the files stay, so that other processes see the launches as dead."""
         for descriptor in self._descriptors.values():
             os.close(descriptor)
         self._descriptors.clear()
@@ -69,7 +69,7 @@ class LaunchLocks:
 
 
 def _close_in_child() -> None:
-    # A forked worker shares the lock and would keep it alive after the death of the launch.
+    # A forked worker shares the lock and would hold it after the death of the launch.
     for locks in _held:
         locks.close()
 

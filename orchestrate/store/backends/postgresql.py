@@ -1,4 +1,4 @@
-"""PostgreSQL: many writers, COPY for steps, liveness by a lease on the server's clock."""
+"""PostgreSQL backend: concurrent writers, COPY for steps, leases on the server's clock."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from sqlalchemy import (
     update,
 )
 
-from orchestrate.store import address
-from orchestrate.store.backend import Backend, LaunchLife
-from orchestrate.store.backup_schema import copy_schema
+from orchestrate.store import database_url
+from orchestrate.store.backends.base import Backend, LaunchLife
+from orchestrate.store.backends.postgresql_backup import copy_schema
 from orchestrate.store.errors import StoreError
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, launch
-from orchestrate.store.values import finite_list
+from orchestrate.store.serialization import finite_list
 
 if TYPE_CHECKING:
     import psycopg
 
-# Seconds, and number, of questions to a silent peer before the connection counts as lost.
+# Seconds and number of TCP keepalives before a connection counts as lost.
 _KEEPALIVES = {"keepalives_idle": "5", "keepalives_interval": "2", "keepalives_count": "3"}
 _CONNECTION = {
-    # A database of encoding SQL_ASCII, as a server without a locale makes it, would give bytes.
+    # A database with encoding SQL_ASCII (a server without a locale) would return bytes.
     "client_encoding": "utf8",
-    # Bounds on a silent cut of the network, after which the driver raises instead of waiting.
+    # Limits for a silent loss of the network, after which the driver raises an error.
     "connect_timeout": "5",
     "tcp_user_timeout": "10000",  # milliseconds
     **_KEEPALIVES,
@@ -51,14 +51,14 @@ _CONNECTION = {
 _NOW = text("SELECT extract(epoch FROM clock_timestamp())::double precision")
 _COPY_STEP = f"COPY step (trial_id, t, {', '.join(STEP_VALUES)}) FROM STDIN (FORMAT BINARY)"
 _COPY_TYPES = ["int8", "int4", *("float8" for _ in STEP_VALUES)]
-_IMPATIENCE = text("SET LOCAL lock_timeout = '30s'")
+_SET_LOCK_TIMEOUT = text("SET LOCAL lock_timeout = '30s'")
 _LOCK = text("SELECT pg_try_advisory_xact_lock(hashtext('dopt.store.' || current_schema()))")
-_LOCK_PAUSE = 0.05  # seconds between two tries
+_LOCK_PAUSE_SECONDS = 0.05
 _SESSION = "dopt launch"
 
-# A launch that is stopped while it sends, rows of a COPY or the statements of a pipeline, keeps its
-# locks: no timeout of the server ends a session that is in the middle of hearing from its client.
-# So whoever meets it ends it, where its lease is over and its role is the same.
+# A launch that is suspended while it sends rows of a COPY or statements of a pipeline keeps its
+# locks: no timeout of the server ends a session in the middle of a message from its client. Other
+# launches of the same role end such a session when its lease is over.
 _EVICT = text(
     f"""
     SELECT pg_terminate_backend(session.pid)
@@ -75,11 +75,11 @@ _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
 
 
 class PostgreSQLBackend(Backend):
-    """A schema of a PostgreSQL database: the first one of the connection's search path."""
+    """Schema of a PostgreSQL database: the first one of the connection's search path."""
 
     def __init__(self, url: URL, lease_seconds: float) -> None:
         self._session = uuid.uuid4().hex
-        super().__init__(_write_engine(url, lease_seconds, self._session), address.safe(url))
+        super().__init__(_write_engine(url, lease_seconds, self._session), database_url.safe(url))
         self._lease_seconds = lease_seconds
 
     @contextmanager
@@ -91,7 +91,7 @@ class PostgreSQLBackend(Backend):
     @contextmanager
     def rebuilding(self) -> Iterator[Connection]:
         with self.creation() as connection:
-            connection.execute(_IMPATIENCE)
+            connection.execute(_SET_LOCK_TIMEOUT)
             yield connection
 
     def back_up(self, connection: Connection, version: int) -> str:
@@ -103,7 +103,7 @@ class PostgreSQLBackend(Backend):
     def exclusive(self, connection: Connection) -> None:
         while not connection.execute(_LOCK).scalar_one():
             self.evict()
-            time.sleep(_LOCK_PAUSE)
+            time.sleep(_LOCK_PAUSE_SECONDS)
 
     def members(self, keys: Sequence[str]) -> Select[Any]:
         listed = bindparam("keys", list(keys), type_=ARRAY(Text), unique=True)
@@ -133,20 +133,20 @@ class PostgreSQLBackend(Backend):
         return f"{self._session}-{super().token()}"
 
     def evict(self) -> None:
-        # In a transaction of its own, over at once: it reads a table that an upgrade locks.
+        # In a short transaction of its own: it reads a table that an upgrade locks.
         with self.transaction() as connection:
             if connection.execute(_HAS_LAUNCHES).scalar_one():
                 connection.execute(_EVICT)
 
-    def let_go(self, token: str) -> None:
-        """Do nothing: a lease runs out by itself."""
+    def forget(self, token: str) -> None:
+        """Do nothing: a lease expires by itself."""
 
     def close(self) -> None:
         self.engine.dispose()
 
 
 def dead(_: URL, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
-    """Return those of the launches whose process is gone, for a reader."""
+    """Return the launches whose lease has expired, for a reader."""
     return _dead(connection, launches)
 
 
@@ -164,10 +164,10 @@ def _write_engine(url: URL, lease_seconds: float, session: str) -> Engine:
 
     @event.listens_for(engine, "connect")
     def _bound_silence(connection: psycopg.Connection, _: object) -> None:
-        # A launch that is stopped in a transaction would keep its rows from those that take over.
+        # A launch that is suspended in a transaction would keep its rows locked.
         milliseconds = max(1, round(1000 * lease_seconds))
         connection.execute(f"SET idle_in_transaction_session_timeout = {milliseconds}")
-        # So would one whose machine is gone while it sends steps: the server is to ask for it too.
+        # So would one whose machine is lost while it sends steps: the server sends keepalives too.
         connection.execute("; ".join(f"SET tcp_{key} = {n}" for key, n in _KEEPALIVES.items()))
         connection.commit()
 
@@ -189,12 +189,12 @@ def read_engine(url: URL) -> Engine:
 
 @contextmanager
 def reading(connection: Connection, seconds: float | None) -> Iterator[None]:
-    """End a statement of the block that takes longer.
+    """Limit the time of each statement of the block.
 
-    What a SELECT may reach beside the tables, such as ``pg_read_file``, is a right of the user that
-    the URL names: no session can give it up.
+    Access of a SELECT beside the tables, such as ``pg_read_file``, depends on the rights of the
+    database user; a session cannot drop them.
     """
-    # A query first: after that no statement can make the transaction one that writes.
+    # After a first query no statement can make the transaction writable.
     connection.exec_driver_sql("SELECT 1")
     milliseconds = 0 if seconds is None else max(1, round(1000 * seconds))
     connection.exec_driver_sql(f"SET LOCAL statement_timeout = {milliseconds}")

@@ -1,7 +1,7 @@
-"""A copy of a PostgreSQL schema beside it, made before something in it changes.
+"""Backup of a PostgreSQL schema as a second schema of the same database.
 
-It needs no program but the server and no place but the server's, and it is made in the transaction
-of the change: it holds exactly what was there before, and vanishes where the change fails.
+The backup needs no other program or disk. It is made in the transaction of the change, so that it
+holds exactly the previous state, and is rolled back if the change fails.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _HERE = text("SELECT current_schema(), current_setting('search_path')")
 _SEARCH = text("SELECT set_config('search_path', :path, true)")
 _SCHEMAS = text("SELECT nspname FROM pg_namespace")
 
-# Definitions come out without the name of the schema while that is the one being searched.
+# Definitions do not name the schema while it is the first one of the search path.
 _TABLES = text(
     "SELECT quote_ident(relname) FROM pg_class "
     "WHERE relkind = 'r' AND relnamespace = to_regnamespace(:here) ORDER BY oid"
@@ -48,8 +48,8 @@ _VIEWS = text(
 def copy_schema(connection: Connection, version: int, safe_url: str) -> str:
     """Copy all tables, sequences, keys, indexes and views; return the name of the new schema.
 
-    To go back, drop the schema and give the copy its name. Raises ``StoreError`` where the user may
-    not create a schema.
+    To restore, drop the schema and rename the copy. Raises ``StoreError`` if the user may not
+    create a schema.
     """
     if not connection.execute(_MAY_CREATE).scalar_one():
         raise StoreError(
@@ -69,7 +69,7 @@ def copy_schema(connection: Connection, version: int, safe_url: str) -> str:
 
 
 def _statements(connection: Connection, old: str, new: str) -> list[str]:
-    """Return what makes the copy while the new schema is searched."""
+    """Return the statements that make the copy while the new schema is first in the search path."""
     tables, keys, indexes, sequences, views = (
         connection.execute(query, {"here": old}).all()
         for query in (_TABLES, _KEYS, _INDEXES, _SEQUENCES, _VIEWS)

@@ -1,4 +1,4 @@
-"""SQLite: one writer at a time, write-ahead log, liveness by kernel file locks."""
+"""SQLite backend: one writer at a time, write-ahead log, liveness by kernel file locks."""
 
 from __future__ import annotations
 
@@ -13,15 +13,20 @@ from typing import Any
 
 from sqlalchemy import URL, Connection, Select, func, select
 
-from orchestrate.store import address
-from orchestrate.store.backend import Backend, LaunchLife
-from orchestrate.store.backup_file import copy_file
+from orchestrate.store import database_url
+from orchestrate.store.backends.base import Backend, LaunchLife
+from orchestrate.store.backends.driver_errors import translated, translated_file
+from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
+from orchestrate.store.backends.sqlite_backup import copy_file
+from orchestrate.store.backends.sqlite_engine import (
+    driver_of,
+    existing_path,
+    read_engine,
+    write_engine,
+)
 from orchestrate.store.errors import StoreError, StoreUnavailableError
-from orchestrate.store.faults import translated, translated_file
-from orchestrate.store.locks import LaunchLocks, file_lock
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES
-from orchestrate.store.sqlite_files import driver_of, existing_path, read_engine, write_engine
 
 __all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "reading"]
 
@@ -35,17 +40,17 @@ _READING = (
     sqlite3.SQLITE_RECURSIVE,
 )
 _SAFE_PRAGMAS = ("table_info", "table_xinfo", "table_list", "index_list", "index_xinfo")
-_LONGEST_VALUE = 2**26  # bytes; the parameters of a network of 2800 neurons in each layer fit
-_STEPS_BETWEEN_LOOKS = 10_000  # steps of SQLite's machine, well below a millisecond
+_MAX_VALUE_BYTES = 2**26  # holds the parameters of a network with 2,800 units in each layer
+_PROGRESS_STEPS = 10_000  # instructions of SQLite's virtual machine, well below a millisecond
 
 
 class SQLiteBackend(Backend):
-    """A SQLite file, with its locks in the folder ``<file>-locks`` beside it."""
+    """SQLite file, with its locks in the folder ``<file>-locks`` beside it."""
 
     def __init__(self, url: URL) -> None:
-        self._path = address.sqlite_path(url)
+        self._path = database_url.sqlite_path(url)
         self._folder = _locks_folder(self._path)
-        super().__init__(write_engine(self._path), address.safe(url))
+        super().__init__(write_engine(self._path), database_url.safe(url))
         with translated_file(self.safe_url):
             if self._path.is_dir():
                 raise StoreError(
@@ -57,7 +62,7 @@ class SQLiteBackend(Backend):
 
     @contextmanager
     def creation(self) -> Iterator[Connection]:
-        # The change to WAL happens outside transactions and fails when two processes try it.
+        # The change to WAL is outside transactions and fails if two processes attempt it.
         with self._creation_lock(), self.transaction() as connection:
             yield connection
 
@@ -68,8 +73,8 @@ class SQLiteBackend(Backend):
             translated(self.safe_url),
             self.engine.connect() as connection,
         ):
-            # Dropping a table that is written anew would count as deleting what refers to it. The
-            # switch has no effect within a transaction.
+            # Dropping a table to rebuild it would violate references. The setting has no effect
+            # within a transaction.
             driver_of(connection).execute("PRAGMA foreign_keys = OFF")
             with connection.begin():
                 yield connection
@@ -79,8 +84,8 @@ class SQLiteBackend(Backend):
         broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
         if broken:
             raise StoreUnavailableError(
-                f"{len(broken)} rows of {self.safe_url} refer to rows that are not there, the "
-                f"first of them in the table {broken[0][0]}: nothing was changed; restore a copy."
+                f"{len(broken)} rows of {self.safe_url} refer to missing rows, the first one in "
+                f"the table {broken[0][0]}: nothing was changed; restore a copy."
             )
 
     def back_up(self, connection: Connection, version: int) -> str:  # noqa: ARG002
@@ -113,15 +118,15 @@ class SQLiteBackend(Backend):
             self._locks.acquire(token)
 
     def renew(self, connection: Connection, launch_id: int) -> None:
-        """Do nothing: the kernel knows."""
+        """Do nothing: the file lock is held until the process ends."""
 
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:  # noqa: ARG002
         return [launch for launch in launches if not self._locks.is_held(launch.token)]
 
     def evict(self) -> None:
-        """Do nothing: the kernel has taken the locks of a dead process back."""
+        """Do nothing: the kernel releases the locks of a dead process."""
 
-    def let_go(self, token: str) -> None:
+    def forget(self, token: str) -> None:
         self._locks.release(token)
 
     def close(self) -> None:
@@ -160,24 +165,24 @@ def _insert_block(n: int) -> str:
 
 
 def dead(url: URL, _: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
-    """Return those of the launches whose process is gone, for a reader."""
-    locks = LaunchLocks(_locks_folder(address.sqlite_path(url)))
+    """Return the launches whose process is gone, for a reader."""
+    locks = LaunchLocks(_locks_folder(database_url.sqlite_path(url)))
     return [launch for launch in launches if not locks.is_held(launch.token)]
 
 
 @contextmanager
 def reading(connection: Connection, seconds: float | None) -> Iterator[None]:
-    """Refuse every statement of the block that does more than read the tables, and end slow ones.
+    """Reject statements of the block that do more than read tables, and cancel slow ones.
 
     The connection cannot write, attach or load anything; but a temporary table, a setting or the
-    end of the transaction would show in what is asked of it later.
+    end of the transaction would affect later queries.
     """
     driver = driver_of(connection)
     driver.set_authorizer(_may_read)
-    longest = driver.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+    longest = driver.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_VALUE_BYTES)
     if seconds is not None:
         end = time.monotonic() + seconds
-        driver.set_progress_handler(lambda: time.monotonic() > end, _STEPS_BETWEEN_LOOKS)
+        driver.set_progress_handler(lambda: time.monotonic() > end, _PROGRESS_STEPS)
     try:
         yield
     finally:
@@ -187,8 +192,8 @@ def reading(connection: Connection, seconds: float | None) -> Iterator[None]:
 
 
 def _may_read(action: int, name: str | None, *_: str | None) -> int:
-    looks = action == sqlite3.SQLITE_PRAGMA and name in _SAFE_PRAGMAS
-    # Functions that return tables, such as json_each, are declared as if the catalogue changed;
-    # SQLite itself refuses every statement that would change it.
+    reads = action == sqlite3.SQLITE_PRAGMA and name in _SAFE_PRAGMAS
+    # Table-valued functions, such as json_each, are declared like a change of the catalogue;
+    # SQLite itself rejects statements that would change it.
     declares = action == sqlite3.SQLITE_UPDATE and name == "sqlite_master"
-    return sqlite3.SQLITE_OK if action in _READING or looks or declares else sqlite3.SQLITE_DENY
+    return sqlite3.SQLITE_OK if action in _READING or reads or declares else sqlite3.SQLITE_DENY

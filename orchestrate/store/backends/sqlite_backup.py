@@ -1,4 +1,4 @@
-"""A copy of a whole SQLite database, made before something in it changes."""
+"""Backup of a SQLite database as a file beside it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from orchestrate.store.errors import StoreUnavailableError
 
 
 def copy_file(path: Path, version: int) -> Path:
-    """Copy a SQLite database, log included, to a file beside it and return that file's path.
+    """Copy a SQLite database with its log to a file beside it and return the path.
 
-    The copy is checked and on the disk before it gets its name; one that exists is never replaced.
+    The copy is checked and synchronised to disk before it gets its name; an existing file is never
+    replaced.
     """
     target = _free_name(f"{path}.v{version}-backup")
     partial = target.with_name(f"{target.name}.partial")

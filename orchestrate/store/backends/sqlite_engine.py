@@ -1,4 +1,4 @@
-"""SQLite files: opened to write with the log ahead, or to read without a trace."""
+"""Engines of SQLite files: writable with a write-ahead log, or read-only."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from urllib.parse import quote
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.pool import QueuePool
 
-from orchestrate.store import address
+from orchestrate.store import database_url
+from orchestrate.store.backends.driver_errors import translated_file
 from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
-from orchestrate.store.faults import translated_file
 
 BUSY_TIMEOUT_SECONDS = 30.0
 
-LOG_BYTES = 16 * 2**20
-"""A reader that stays long makes the log grow; afterwards it is cut back to this size."""
+MAX_LOG_BYTES = 16 * 2**20
+"""Size to which the log is truncated after a long read transaction."""
 
 
 def read_engine(url: URL) -> Engine:
-    """Return an engine that cannot write; raise ``NoDatabaseError`` where there is no file."""
+    """Return an engine that cannot write; raise ``NoDatabaseError`` if there is no file."""
     path = existing_path(url)
     return _engine(lambda: _connect(path, _read_mode(path)), "BEGIN")
 
 
 def existing_path(url: URL) -> Path:
-    """Return the path of a database; raise ``NoDatabaseError`` where there is no file."""
-    path = address.sqlite_path(url)
-    with translated_file(address.safe(url)):
+    """Return the path of a database; raise ``NoDatabaseError`` if there is no file."""
+    path = database_url.sqlite_path(url)
+    with translated_file(database_url.safe(url)):
         there = path.is_file()
     if not there:
         raise NoDatabaseError(
-            f"There is no results database at {address.safe(url)}: run a launch that writes it, "
-            "or give the URL of another one."
+            f"There is no results database at {database_url.safe(url)}: run a launch that writes "
+            "it, or give the URL of another one."
         )
     return path
 
 
 def write_engine(path: Path) -> Engine:
-    # A transaction that reads first and then writes fails under load unless it locks at once.
+    # A transaction that reads before it writes fails under load unless it locks at its beginning.
     return _engine(lambda: _writer(path), "BEGIN IMMEDIATE")
 
 
@@ -71,20 +71,20 @@ def _writer(path: Path) -> sqlite3.Connection:
     _refuse_read_only(path)
     connection = _connect(path, "mode=rwc")
     tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master")]
-    if not tables or "trial" in tables:  # a file of another program stays as it is
+    if not tables or "trial" in tables:  # a file of another program is not changed
         connection.execute("PRAGMA journal_mode = WAL")
     # A committed trial survives a power cut. Measured against NORMAL, with trials of 300 rows: 1.4
     # instead of 1.1 ms for one alone, 388,000 instead of 397,000 rows/s for twenty together.
     connection.execute("PRAGMA synchronous = FULL")
-    connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
+    connection.execute(f"PRAGMA journal_size_limit = {MAX_LOG_BYTES}")
     connection.execute("PRAGMA foreign_keys = ON")
     return connection
 
 
 def _refuse_read_only(path: Path) -> None:
-    """Raise ``StoreUnavailableError`` before SQLite makes read-only files beside a read-only one.
+    """Raise ``StoreUnavailableError`` before SQLite creates read-only files beside a read-only one.
 
-    They would stay read-only when the file itself no longer is.
+    They would stay read-only after the file itself becomes writable.
     """
     for suffix in ("", "-wal", "-shm"):
         file = path.with_name(path.name + suffix)
@@ -97,7 +97,7 @@ def _refuse_read_only(path: Path) -> None:
 
 def _read_mode(path: Path) -> str:
     # A database in WAL mode is read through two files beside it. On a medium where they cannot be
-    # made, nobody writes either, and the file may be taken as it is.
+    # created, there are no writers, and the file is read as immutable.
     wal = path.with_name(path.name + "-wal")
     if not wal.exists() and not os.access(path.parent, os.W_OK):
         return "mode=ro&immutable=1"

@@ -1,8 +1,8 @@
-"""Whether waiting may help against a fault of the database."""
+"""Classification of database errors: transient ones, after which waiting may help."""
 
 from __future__ import annotations
 
-# A lock held for too long, and a race between processes that open the file.
+# A lock held for too long, or a race between processes that open the file.
 _SQLITE = ("SQLITE_BUSY", "SQLITE_LOCKED", "SQLITE_PROTOCOL")
 
 # Classes and codes of the SQL standard and of PostgreSQL's appendix A.
@@ -20,9 +20,9 @@ _STATES = (
     "25P03",  # an idle transaction was ended
 )
 
-# While a connection is made, the driver has no code, and only the server's text tells a login that
-# it refuses for ever from one that it refuses now.
-_REFUSED_NOW = (
+# During a connection attempt the driver has no code; only the text of the server distinguishes a
+# permanent refusal from a temporary one.
+_TEMPORARY_REFUSALS = (
     "starting up",
     "shutting down",
     "recovery mode",
@@ -36,10 +36,10 @@ _UNKNOWN_HOST = ("failed to resolve host", "could not translate host name")
 
 
 def is_transient(error: BaseException | None, known_host: bool) -> bool:
-    """Tell whether the same request may succeed later, with nobody doing anything about it.
+    """Return whether the same request may succeed later without any intervention.
 
-    ``known_host`` says that the server has answered before: its name is right, then, and when it
-    cannot be resolved, as while a container restarts, it will be again.
+    ``known_host`` is True if the server has answered before: its name is valid then, and may be
+    unresolvable only for a while, such as during the restart of a container.
     """
     name = getattr(error, "sqlite_errorname", None)
     if name is not None:
@@ -47,14 +47,14 @@ def is_transient(error: BaseException | None, known_host: bool) -> bool:
     state = getattr(error, "sqlstate", None)
     if state is not None:
         return str(state).startswith(_STATES)
-    return _is_no_driver_of_sqlite(error) and _text_is_transient(str(error), known_host)
+    return _is_psycopg_error(error) and _text_is_transient(str(error), known_host)
 
 
-def _is_no_driver_of_sqlite(error: BaseException | None) -> bool:
+def _is_psycopg_error(error: BaseException | None) -> bool:
     return type(error).__module__.partition(".")[0] == "psycopg"
 
 
 def _text_is_transient(text: str, known_host: bool) -> bool:
     if any(words in text for words in _UNKNOWN_HOST):
         return known_host
-    return "FATAL:" not in text or any(words in text for words in _REFUSED_NOW)
+    return "FATAL:" not in text or any(words in text for words in _TEMPORARY_REFUSALS)

@@ -1,28 +1,32 @@
-"""What an examination of a database finds."""
+"""Finding of a consistency check."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-Severity = Literal["error", "warning", "note"]
+Severity = Literal["error", "note"]
+
+REBUILD = (
+    "merge this database into a new one, which leaves such trials out (python -m orchestrate merge "
+    "THIS --db NEW), and run the same launch into that one"
+)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is not as it should be.
+    """Result of a consistency check.
 
     Attributes
     ----------
     severity
-        "error" where results cannot be trusted, "warning" where an analysis may mislead, "note"
-        where nothing is lost.
+        "error" if results cannot be trusted, "note" if nothing is lost.
     sentence
-        What was found.
+        Description.
     count
-        How often.
+        Number of occurrences.
     advice
-        What to do about it.
+        Remedy.
     """
 
     severity: Severity
@@ -32,5 +36,5 @@ class Finding:
 
 
 def found(severity: Severity, what: str, count: int, first: object, advice: str) -> Finding:
-    """Return a finding of several things of a kind, of which one is named."""
+    """Return a finding of several objects of a kind, with the name of the first."""
     return Finding(severity, f"{what}: {count:,} (the first is {first})", count, advice)

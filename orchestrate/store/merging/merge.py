@@ -1,8 +1,8 @@
-"""Trials of another results database come into this one: whole, once, and never over a result.
+"""Merge of another results database into this one, without overwriting any result.
 
-Every page of them is one transaction, and a trial is known by its key, an attempt by its launch and
-time, a launch by its token: a merge that was killed is completed by another one, and one more
-changes nothing.
+Each page of trials is one transaction. A trial is identified by its key, an attempt by its launch
+and time, a launch by its token, so that a merge that was killed can be repeated, and repeating a
+finished merge changes nothing.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from typing import Any
 
 from sqlalchemy import Row
 
-from orchestrate.store import address, sqlite
+from orchestrate.store import database_url
+from orchestrate.store.backends import sqlite
 from orchestrate.store.errors import StoreError
-from orchestrate.store.merge_source import Source
-from orchestrate.store.merge_target import Target, add_launches
-from orchestrate.store.reader import Reader
+from orchestrate.store.merging.source import Source
+from orchestrate.store.merging.target import Target, add_launches
+from orchestrate.store.read.reader import Reader
+from orchestrate.store.schema import FINISHED
 from orchestrate.store.store import Store
-
-RESULTS = ("done", "diverged")
 
 
 @dataclass(frozen=True)
-class Named:
-    """A trial that needs a look."""
+class TrialName:
+    """Trial with a conflict or with missing rows."""
 
     trial_key: str
     env: str
@@ -35,32 +35,32 @@ class Named:
 
 @dataclass
 class Merged:
-    """What a merge found in the other database.
+    """Result of a merge.
 
     Attributes
     ----------
     added
-        Trials that were brought, by status.
+        Copied trials, by status.
     identical
-        Trials that both had finished, with the same numbers.
+        Trials finished in both databases with equal numbers.
     kept
         Trials that failed or were cancelled there and have an outcome here.
     running
-        Trials that a launch runs here; they were left to it.
+        Trials that a launch is running here, which were not copied.
     conflicts
-        Trials that both had finished, with different numbers; those of here were kept.
-    broken
-        Trials that are not whole there; they were not brought.
+        Trials finished in both databases with different numbers, which were not copied.
+    incomplete
+        Trials with missing rows there, which were not copied.
     launches
-        Launches that were not known here.
+        New launches.
     """
 
     added: dict[str, int] = field(default_factory=dict)
     identical: int = 0
     kept: int = 0
     running: int = 0
-    conflicts: list[Named] = field(default_factory=list)
-    broken: list[Named] = field(default_factory=list)
+    conflicts: list[TrialName] = field(default_factory=list)
+    incomplete: list[TrialName] = field(default_factory=list)
     launches: int = 0
 
     @property
@@ -100,20 +100,20 @@ def _merge_page(target: Target, source: Source, page: list[dict[str, Any]]) -> F
 
 
 def _merge_trial(target: Target, source: Source, row: dict[str, Any], here: Row[Any] | None) -> str:
-    """Bring one trial if it has its place here; return what became of it."""
-    finished = row["status"] in RESULTS
+    """Copy one trial if it is new here; return the outcome as a field of :class:`Merged`."""
+    finished = row["status"] in FINISHED
     if here is not None and here.status == "running":
         return "running"
     if here is not None and not finished and here.status != "pending":
         return "kept"
     curve = source.curve(row) if finished else None
     if finished and curve is None:
-        return "broken"
-    if curve is not None and here is not None and here.status in RESULTS:
+        return "incomplete"
+    if curve is not None and here is not None and here.status in FINISHED:
         return "identical" if target.is_same(here, row, curve) else "conflict"
     attempts = target.new_attempts(row, here)
     if here is not None and not finished and not attempts:
-        return "kept"  # it came before, and somebody here has asked for a new run since
+        return "kept"  # it was merged before, and a new run was requested here since
     target.add(row, here, attempts, curve)
     return "added"
 
@@ -124,23 +124,23 @@ def _count(merged: Merged, found: Found) -> None:
             merged.added[row["status"]] = merged.added.get(row["status"], 0) + 1
         elif fate == "conflict":
             merged.conflicts.append(_named(row))
-        elif fate == "broken":
-            merged.broken.append(_named(row))
+        elif fate == "incomplete":
+            merged.incomplete.append(_named(row))
         else:
             setattr(merged, fate, getattr(merged, fate) + 1)
 
 
-def _named(row: Mapping[str, Any]) -> Named:
-    return Named(row["trial_key"], row["env"], row["policy"], row["seed"])
+def _named(row: Mapping[str, Any]) -> TrialName:
+    return TrialName(row["trial_key"], row["env"], row["policy"], row["seed"])
 
 
 def _refuse_itself(url: str, other_url: str) -> None:
-    one, other = address.parse(url), address.parse(other_url)
+    one, other = database_url.parse(url), database_url.parse(other_url)
     if one.get_backend_name() == other.get_backend_name() == "sqlite":
-        same = address.sqlite_path(one) == sqlite.existing_path(other)
+        same = database_url.sqlite_path(one) == sqlite.existing_path(other)
     else:
         same = one == other
     if same:
         raise StoreError(
-            f"Both databases are {address.safe(one)}: give another one to merge into it."
+            f"Both databases are {database_url.safe(one)}: give another one to merge into it."
         )

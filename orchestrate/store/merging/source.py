@@ -1,4 +1,4 @@
-"""The other database of a merge: its whole trials, a page at a time, as one moment shows them."""
+"""Source database of a merge: its complete trials in pages, read from one snapshot."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from orchestrate.store.reader import Reader
+from orchestrate.store.read.reader import Reader
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES
 
 PAGE = 50
-"""Trials in one transaction: a launch that writes meanwhile waits for less than a second."""
+"""Trials in one transaction, so that a concurrent launch waits for less than a second."""
 
 _TRIALS = (
     "SELECT r.*, c.config_key, c.horizon, c.env, c.policy, e.hash AS error_hash FROM trial r "
@@ -32,7 +32,7 @@ _STEPS = f"SELECT t, {', '.join(STEP_VALUES)} FROM step WHERE trial_id = :trial_
 _ASSESSMENTS = (
     "SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure"
 )
-# The trials of a configuration are assessed alike: one with fewer numbers has lost some.
+# All trials of a configuration have the same number of assessments.
 _EXPECTED = (
     "SELECT max(n) FROM (SELECT count(*) AS n FROM assessment a "
     "JOIN trial r ON r.trial_id = a.trial_id JOIN trial o ON o.config_id = r.config_id "
@@ -43,15 +43,15 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class Curve:
-    """What a trial that ran to its end left behind.
+    """Steps, trajectory and assessments of a finished trial.
 
     Attributes
     ----------
     steps : (T, number of STEP_VALUES)
     trajectory
-        The row of the table, without the number of the trial.
+        Row of the table, without the trial_id.
     assessments
-        Rows of the table, each a step, a measure and its value.
+        Rows of the table: step, measure, value.
     """
 
     steps: Array
@@ -60,7 +60,7 @@ class Curve:
 
 
 class Source:
-    """Questions to a moment of the other database."""
+    """Queries to a snapshot of the source database."""
 
     def __init__(self, moment: Reader) -> None:
         self._moment = moment
@@ -84,11 +84,11 @@ class Source:
         return row
 
     def attempts(self, trial_id: int) -> list[dict[str, Any]]:
-        """Return the attempts that ended, the first one first."""
+        """Return the finished attempts, the oldest first."""
         return self._dicts(_ATTEMPTS, trial_id=trial_id)
 
     def curve(self, row: dict[str, Any]) -> Curve | None:
-        """Return the steps and arrays of a trial, or None where some of them are missing."""
+        """Return the rows of a trial, or None if some are missing."""
         return curve(self._moment, row["trial_id"], row["horizon"])
 
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
@@ -97,7 +97,7 @@ class Source:
 
 
 def curve(moment: Reader, trial_id: int, horizon: int) -> Curve | None:
-    """Return what a trial left behind, or None where it is not whole."""
+    """Return the rows of a finished trial, or None if some are missing."""
     steps = np.array(list(moment.rows(_STEPS, trial_id=trial_id)), dtype=np.float64)
     arrays = moment.rows("SELECT * FROM trajectory WHERE trial_id = :id", id=trial_id)
     if (

@@ -1,4 +1,4 @@
-"""The database that a merge writes to: rows of another one find their place and new numbers."""
+"""Target database of a merge: inserts rows of the source with new ids."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, insert, select, update
 
-from orchestrate.store.backend import Backend
-from orchestrate.store.merge_source import Curve, Source
+from orchestrate.store.backends.base import Backend
+from orchestrate.store.merging.source import Curve, Source
 from orchestrate.store.schema import (
     OUTCOME_COLUMNS,
     STEP_VALUES,
@@ -32,7 +32,7 @@ _STEPS = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_tab
 
 
 class Target:
-    """One transaction of a merge."""
+    """Transaction of a merge."""
 
     def __init__(
         self, connection: Connection, backend: Backend, source: Source, launches: Mapping[int, int]
@@ -43,15 +43,15 @@ class Target:
         self._launches = launches
 
     def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
-        """Return the trials with these keys; nobody claims one before the transaction ends."""
+        """Return the trials with these keys, locked until the end of the transaction."""
         statement = select(trial).where(trial.c.trial_key.in_(self._backend.members(keys)))
-        # In the order in which a commit locks them, so that the two cannot wait for each other.
+        # Locked in the order of a commit, which avoids deadlocks.
         statement = statement.order_by(trial.c.trial_id).with_for_update()
         rows = self._connection.execute(statement)
         return {row.trial_key: row for row in rows}
 
     def new_attempts(self, row: Mapping[str, Any], here: Row[Any] | None) -> list[dict[str, Any]]:
-        """Return the attempts at a trial of the source that this database does not know."""
+        """Return the attempts at a trial of the source that are new in this database."""
         there = self._source.attempts(row["trial_id"])
         if here is None:
             return there
@@ -71,7 +71,7 @@ class Target:
         attempts: Sequence[Mapping[str, Any]],
         curve: Curve | None,
     ) -> None:
-        """Write a trial with its outcome, whole."""
+        """Write a trial with its outcome."""
         trial_id = self._write_trial(row, here, attempts)
         self._write_attempts(trial_id, 0 if here is None else here.attempt, attempts)
         if curve is not None:
@@ -82,7 +82,7 @@ class Target:
             self._write_assessments(trial_id, curve)
 
     def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
-        """Tell whether both databases hold the same numbers; times may differ."""
+        """Return whether both databases hold equal numbers; times may differ."""
         if any(getattr(here, name) != row[name] for name in ("status", "n_steps", "diverged_at")):
             return False
         where = here.trial_id
@@ -161,9 +161,9 @@ class Target:
 def add_launches(
     connection: Connection, rows: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[int, int], int]:
-    """Write down the launches of the source; return their numbers here, and how many are new.
+    """Insert the launches of the source; return their ids here, and the number of new ones.
 
-    One that runs there does not run here: it counts as lost until a later merge sees its end.
+    A launch that is running there is inserted as lost; a later merge updates it.
     """
     known = {row.token: row for row in connection.execute(select(launch))}
     numbers, added = {}, 0

@@ -1,7 +1,7 @@
-"""From any released schema to the newest one, by Alembic, on a connection of the program.
+"""Alembic migrations from any released schema to the newest one.
 
-A new database is made from :mod:`orchestrate.store.schema` and stamped; only an older one passes
-through the scripts in ``versions/``. Each has the number of the schema that it leads to.
+A new database is created from :mod:`orchestrate.store.schema` and stamped; only an older one runs
+the scripts in ``versions/``. Each script has the number of the schema that it creates.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ LOCATION = Path(__file__).parent
 
 
 def stamp(connection: Connection, version: int) -> None:
-    """Note the version of a database that has none yet in Alembic's table, which is made."""
+    """Create Alembic's table with the version of the database."""
     alembic_version.create(connection, checkfirst=True)
     connection.execute(alembic_version.insert().values(version_num=str(version)))
 
 
 def migrate(connection: Connection, version: int) -> None:
-    """Bring a database from ``version`` to the newest one, in the transaction of the caller.
+    """Migrate a database from ``version`` to the newest one, in the transaction of the caller.
 
-    The views stand aside meanwhile: a table below a view cannot be changed everywhere.
+    The views are dropped and created again: not every database can change a table below a view.
     """
     drop_views(connection)
     if not inspect(connection).has_table(alembic_version.name):
@@ -42,16 +42,16 @@ def create_views(connection: Connection) -> None:
 
 
 def drop_views(connection: Connection) -> None:
-    """Drop the program's views; those that somebody else made stay."""
-    there = set(inspect(connection).get_view_names())
+    """Drop the views of this program, and no others."""
+    existing = set(inspect(connection).get_view_names())
     for name in reversed(VIEWS):
-        if name in there:
+        if name in existing:
             connection.execute(text(f"DROP VIEW {name}"))
 
 
 def _configuration(connection: Connection) -> Config:
     configuration = Config()
-    # The parser of the configuration would take a % in the path for a reference.
+    # The configuration parser interpolates %.
     configuration.set_main_option("script_location", str(LOCATION).replace("%", "%%"))
     configuration.attributes["connection"] = connection
     return configuration

@@ -1,4 +1,4 @@
-"""What Alembic runs: the scripts, on the connection and in the transaction that it was given."""
+"""Alembic environment: runs the scripts on the given connection, in its transaction."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Changes that SQLite makes only by writing a table anew."""
+"""Table changes that SQLite supports only by rebuilding the table."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _OPTIONS = text("SELECT strict, wr FROM pragma_table_list WHERE schema = 'main' 
 
 @contextmanager
 def rebuilt(table: str) -> Iterator[BatchOperations]:
-    """Change a table by whatever Alembic's batch offers; on SQLite write it anew.
+    """Open a batch of changes to a table, which is rebuilt on SQLite.
 
-    STRICT, WITHOUT ROWID and the checks are handed on here, because not every version of the
-    libraries sees them in an existing table.
+    STRICT, WITHOUT ROWID and the checks are passed explicitly, because not every version of the
+    libraries reads them from an existing table.
     """
     connection = op.get_bind()
     if connection.dialect.name != "sqlite":

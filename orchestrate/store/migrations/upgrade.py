@@ -1,7 +1,6 @@
-"""An older database becomes one of the newest schema, whole or not at all, with a copy beside it.
+"""Upgrade of an older database to the newest schema, atomic and with a backup.
 
-Everything happens in one transaction that no other writer can enter: the look for living launches,
-the copy, the change of the tables.
+The check for running launches, the backup and the migration are one exclusive transaction.
 """
 
 from __future__ import annotations
@@ -10,24 +9,26 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, select
 
-from orchestrate.store import address, launches, migrations, sqlite, versioning
-from orchestrate.store.backend import Backend
+from orchestrate.store import database_url, migrations, schema_version
+from orchestrate.store.backends import sqlite
+from orchestrate.store.backends.base import Backend
+from orchestrate.store.backends.open import make_backend
 from orchestrate.store.errors import LaunchAliveError
-from orchestrate.store.opening import make_backend
 from orchestrate.store.schema import SCHEMA_VERSION, launch
+from orchestrate.store.write import launches
 
 
 @dataclass(frozen=True)
 class Upgrade:
-    """What an upgrade did.
+    """Result of an upgrade.
 
     Attributes
     ----------
     before, after
-        Version of the schema; ``before`` is None where the database was empty and was created.
+        Version of the schema; ``before`` is None if the database was empty.
     backup
-        Name of the copy, or None where none was made: a file beside a SQLite database, a schema
-        beside that of a PostgreSQL database.
+        Name of the backup, a file beside a SQLite database or a schema beside the PostgreSQL
+        one; None without a backup.
     """
 
     safe_url: str
@@ -41,20 +42,20 @@ class Upgrade:
 
 
 def upgrade(url: str, backup: bool = True) -> Upgrade:
-    """Bring a results database to the newest schema; one that has it already is left alone.
+    """Migrate a results database to the newest schema, if it has an older one.
 
     Raises
     ------
     NoDatabaseError
         If there is no file.
     SchemaVersionError
-        If the database is not one of this program, or of a newer one.
+        If the database is not a results database, or one of a newer program.
     LaunchAliveError
         If a launch is running in it.
     StoreUnavailableError
-        If the database fails; it is then as it was before.
+        If the database fails; it is then unchanged.
     """
-    parsed = address.parse(url)
+    parsed = database_url.parse(url)
     if parsed.get_backend_name() == "sqlite":
         sqlite.existing_path(parsed)
     backend = make_backend(parsed)
@@ -68,11 +69,11 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
     name = None
     try:
         with backend.rebuilding() as connection:
-            if versioning.is_empty(connection):
-                versioning.create(connection)
+            if schema_version.is_empty(connection):
+                schema_version.create(connection)
                 return Upgrade(backend.safe_url, None, SCHEMA_VERSION, None)
-            before = versioning.version_of(connection, backend.safe_url)
-            versioning.check_not_newer(before, backend.safe_url)
+            before = schema_version.version_of(connection, backend.safe_url)
+            schema_version.check_not_newer(before, backend.safe_url)
             if before < SCHEMA_VERSION:
                 _refuse_living(connection, backend)
                 name = backend.back_up(connection, before) if backup else None
@@ -85,7 +86,7 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
 
 
 def _refuse_living(connection: Connection, backend: Backend) -> None:
-    """Raise ``LaunchAliveError`` where a launch runs."""
+    """Raise ``LaunchAliveError`` if a launch is running."""
     candidates = launches.maybe_alive(connection)
     dead = {one.launch_id for one in backend.dead(connection, candidates)}
     alive = [one.launch_id for one in candidates if one.launch_id not in dead]

@@ -1,4 +1,4 @@
-"""Launches as a reader sees them: where they came from, and which of them live."""
+"""Launches with their provenance and liveness."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 from sqlalchemy import Connection, select
 
-from orchestrate.store.backend import LaunchLife
-from orchestrate.store.rows import LaunchRow
+from orchestrate.store.backends.base import LaunchLife
+from orchestrate.store.read.rows import LaunchRow
 from orchestrate.store.schema import launch
 
 Dead = Callable[[Connection, Sequence[LaunchLife]], list[LaunchLife]]
@@ -18,7 +18,7 @@ _ROWS = select(launch).order_by(launch.c.launch_id)
 
 
 def launches(connection: Connection, dead: Dead) -> list[LaunchRow]:
-    """Return every launch, the first one first; ``dead`` tells which of the running ones are."""
+    """Return all launches, the oldest first; ``dead`` selects the dead ones among the running."""
     rows = [row._asdict() for row in connection.execute(_ROWS)]
     running = [
         LaunchLife(row["launch_id"], row["token"], row["lease_until"])

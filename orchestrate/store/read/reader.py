@@ -1,4 +1,4 @@
-"""The read side of the results database; it never creates and cannot write."""
+"""Read side of the results database, which cannot write or create anything."""
 
 from __future__ import annotations
 
@@ -14,19 +14,37 @@ from typing import Any, Self, cast
 import numpy as np
 from sqlalchemy import URL, Connection, CursorResult, Engine, select, text
 
-from orchestrate.store import address, living, postgresql, sqlite, versioning
+from orchestrate.store import database_url, schema_version
+from orchestrate.store.backends import postgresql, sqlite
+from orchestrate.store.backends.driver_errors import translated, translated_query
 from orchestrate.store.errors import QueryError, StoreUnavailableError
-from orchestrate.store.faults import translated, translated_query
-from orchestrate.store.packing import unpack
-from orchestrate.store.questions import ask
+from orchestrate.store.read import liveness
+from orchestrate.store.read.rows import (
+    Assessments,
+    ConfigRow,
+    Curves,
+    LaunchRow,
+    Table,
+    Trajectory,
+    TrialRow,
+)
+from orchestrate.store.read.user_query import run_select
 from orchestrate.store.records import Array
-from orchestrate.store.rows import Assessments, Cell, Curves, LaunchRow, Table, Trajectory, TrialRow
-from orchestrate.store.schema import STEP_VALUES, assessment, config, step, trajectory, trial
+from orchestrate.store.schema import (
+    FINISHED,
+    STEP_VALUES,
+    assessment,
+    config,
+    step,
+    trajectory,
+    trial,
+)
+from orchestrate.store.serialization import unpack
 
 _CELLS = text(
     "SELECT p.config_key, p.env, p.policy, p.model, p.learner, p.width, p.depth, p.horizon, p.dt, "
-    "p.gamma, p.n_done, p.n_diverged, p.n_failed, p.n_cancelled, p.n_pending, p.n_running, "
-    "c.config_json "
+    "p.gamma, p.label, p.n_done, p.n_diverged, p.n_failed, p.n_cancelled, p.n_pending, "
+    "p.n_running, c.config_json "
     "FROM v_progress p JOIN config c ON c.config_key = p.config_key"
 )
 _TRIALS = text(
@@ -41,9 +59,9 @@ _MEASURES = (
 
 
 class Reader:
-    """A results database to read from; each method sees one moment of it.
+    """Read-only results database; each method reads one snapshot.
 
-    Every method raises ``StoreUnavailableError`` where the database itself fails.
+    Every method raises ``StoreUnavailableError`` if the database fails.
     """
 
     def __init__(self, url: URL, engine: Engine, moment: Connection | None = None) -> None:
@@ -51,12 +69,12 @@ class Reader:
         self._engine = engine
         self._moment = moment
         self._kind = _kind(url)
-        self.safe_url = address.safe(url)
+        self.safe_url = database_url.safe(url)
 
     @classmethod
     def open(cls, url: str) -> Self:
-        """Open a database; raise ``NoDatabaseError`` or ``SchemaVersionError`` where it cannot."""
-        parsed = address.parse(url)
+        """Open a database; raise ``NoDatabaseError`` or ``SchemaVersionError`` if that fails."""
+        parsed = database_url.parse(url)
         reader = cls(parsed, _kind(parsed).read_engine(parsed))
         try:
             reader.schema_version()
@@ -72,33 +90,33 @@ class Reader:
         self.close()
 
     def close(self) -> None:
-        """Give back the connections."""
+        """Close the connections."""
         self._engine.dispose()
 
     @contextmanager
     def moment(self) -> Iterator[Self]:
-        """Open a reader whose methods all see the same moment; for one thread, and not for long."""
+        """Open a reader whose methods all read one snapshot, for one thread and a short time."""
         with self._snapshot() as connection:
             yield type(self)(self._url, self._engine, connection)
 
     def schema_version(self) -> str:
         """Return the version of the database's schema."""
         with self._snapshot() as connection:
-            return str(versioning.check(connection, self.safe_url))
+            return str(schema_version.check(connection, self.safe_url))
 
-    def cells(self) -> list[Cell]:
-        """Return every configuration, sorted by its names, with the state of its trials."""
+    def configs(self) -> list[ConfigRow]:
+        """Return all configurations, sorted by name, with the counts of their trials."""
         with self._snapshot() as connection:
             cells = [_cell(*row) for row in connection.execute(_CELLS)]
         return sorted(cells, key=_names)
 
     def launches(self) -> list[LaunchRow]:
-        """Return every command that wrote to the database, the first one first."""
+        """Return all launches that wrote to the database, the oldest first."""
         with self._snapshot() as connection:
-            return living.launches(connection, partial(self._kind.dead, self._url))
+            return liveness.launches(connection, partial(self._kind.dead, self._url))
 
     def trials(self, config_key: str) -> list[TrialRow]:
-        """Return the trials of a configuration by seed; none where it is unknown."""
+        """Return the trials of a configuration by seed; none if it is unknown."""
         with self._snapshot() as connection:
             rows = connection.execute(_TRIALS, {"config_key": config_key})
             return [TrialRow(*row) for row in rows]
@@ -106,13 +124,13 @@ class Reader:
     def curves(self, config_key: str, column: str = "loss") -> Curves:
         """Return a column of the steps of all done and diverged trials of a configuration.
 
-        Raises ``QueryError`` where the column or the configuration is unknown, and
-        ``StoreUnavailableError`` where a step is missing.
+        Raises ``QueryError`` if the column or the configuration is unknown, and
+        ``StoreUnavailableError`` if a step is missing.
         """
         _check_column(column)
         with self._snapshot() as connection:
             config_id, horizon = _config(connection, config_key)
-            finished = (trial.c.config_id == config_id) & trial.c.status.in_(("done", "diverged"))
+            finished = (trial.c.config_id == config_id) & trial.c.status.in_(FINISHED)
             trials = connection.execute(
                 select(trial.c.seed, trial.c.status).where(finished).order_by(trial.c.seed)
             ).all()
@@ -125,9 +143,9 @@ class Reader:
             numbers = _numbers(rows)
         if numbers.size != len(trials) * horizon:
             raise StoreUnavailableError(
-                f"The curves of configuration {config_key[:12]} in {self.safe_url} are not whole "
+                f"The curves of configuration {config_key[:12]} in {self.safe_url} are incomplete "
                 f"({numbers.size:,} steps instead of {len(trials) * horizon:,}): the database is "
-                "damaged; see what python -m orchestrate doctor says of it."
+                "damaged; run python -m orchestrate doctor."
             )
         return Curves(
             seeds=np.array([seed for seed, _ in trials], dtype=np.int64),
@@ -137,13 +155,13 @@ class Reader:
         )
 
     def assessments(self, config_key: str, measure: str) -> Assessments:
-        """Return one measure of all done and diverged trials; none where nothing was assessed.
+        """Return one measure of all done and diverged trials; empty if nothing was assessed.
 
-        Raises ``QueryError`` where the configuration is unknown.
+        Raises ``QueryError`` if the configuration is unknown.
         """
         with self._snapshot() as connection:
             config_id, _ = _config(connection, config_key)
-            finished = (trial.c.config_id == config_id) & trial.c.status.in_(("done", "diverged"))
+            finished = (trial.c.config_id == config_id) & trial.c.status.in_(FINISHED)
             columns = (trial.c.seed, trial.c.status, assessment.c.t, assessment.c.value)
             rows = connection.execute(
                 select(*columns)
@@ -154,11 +172,11 @@ class Reader:
         return _assessments(rows)
 
     def measures(self, config_key: str) -> list[str]:
-        """Return the names of what the trials of a configuration were assessed by."""
+        """Return the names of the measures of a configuration."""
         return [row.measure for row in self.rows(_MEASURES, config_key=config_key)]
 
     def trajectory(self, config_key: str, seed: int) -> Trajectory:
-        """Return the arrays of one trial; raise ``QueryError`` where it has none."""
+        """Return the arrays of one trial; raise ``QueryError`` if it has none."""
         names = ("states", "inputs", "parameters")
         columns = chain.from_iterable((trajectory.c[f"{n}_shape"], trajectory.c[n]) for n in names)
         statement = (
@@ -178,26 +196,26 @@ class Reader:
         return Trajectory(*(unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)))
 
     def query(self, sql: str, limit: int | None = None, timeout: float | None = None) -> Table:
-        """Return the rows of one SELECT, each with its values by place and by name of column.
+        """Return the rows of one SELECT, with values by position and by column name.
 
-        Only the first ``limit`` rows are read; ``cut`` of the table says whether there were more.
-        Raises ``QueryError`` where the database refuses the statement, as it does any that writes
-        or is not alone, and where it takes longer than ``timeout`` seconds.
+        Only the first ``limit`` rows are read; ``cut`` of the table is True if there are more.
+        Raises ``QueryError`` if the database rejects the statement, such as one that writes or
+        several in one text, or if it takes longer than ``timeout`` seconds.
         """
         with translated_query(self.safe_url, timeout):
-            return ask(self._engine, self._kind.reading, sql, limit, timeout)
+            return run_select(self._engine, self._kind.reading, sql, limit, timeout)
 
     def rows(self, sql: str, /, **values: object) -> Table:
-        """Return the rows of a SELECT of the program's own, each ``:name`` in it bound to a value.
+        """Return the rows of a trusted SELECT, with each ``:name`` in it bound to a value.
 
-        A value never becomes part of the statement, so it may come from anybody.
+        Values are never part of the statement, so that they may come from users.
         """
         with self._snapshot() as connection:
             result = connection.execute(text(sql), values)
             return Table(result.keys(), result)
 
     def batches(self, size: int, sql: str, /, **values: object) -> Iterator[list[Sequence[Any]]]:
-        """Yield the rows of such a SELECT, ``size`` at a time, without holding them all."""
+        """Yield the rows of a trusted SELECT in batches of ``size``."""
         with self._snapshot() as connection:
             options = {"yield_per": size}
             with connection.execute(text(sql), values, execution_options=options) as result:
@@ -218,12 +236,12 @@ def _kind(url: URL) -> ModuleType:
     return sqlite if url.get_backend_name() == "sqlite" else postgresql
 
 
-def _cell(*values: Any) -> Cell:
-    return Cell(*values[:-1], json.loads(values[-1]))  # type: ignore[call-arg]
+def _cell(*values: Any) -> ConfigRow:
+    return ConfigRow(*values[:-1], json.loads(values[-1]))  # type: ignore[call-arg]
 
 
-def _names(cell: Cell) -> tuple[str | int, ...]:
-    """Return what to sort by; not in SQL, where databases order letters and NULL differently."""
+def _names(cell: ConfigRow) -> tuple[str | int, ...]:
+    """Return the sort key; not in SQL, where databases order letters and NULL differently."""
     sizes = (-1 if size is None else size for size in (cell.width, cell.depth))
     return (cell.env, cell.policy, cell.model, cell.learner, *sizes, cell.config_key)
 
@@ -231,7 +249,7 @@ def _names(cell: Cell) -> tuple[str | int, ...]:
 def _numbers(result: CursorResult[Any]) -> Array:
     """Return the only column of a result, NULL as NaN.
 
-    It comes from the driver's cursor, because a SQLAlchemy row for each number doubles the time.
+    The driver's cursor is read directly, because a SQLAlchemy row for each number doubles the time.
     """
     rows = cast("Iterable[tuple[float | None]]", result.cursor)
     return np.fromiter(chain.from_iterable(rows), np.float64)

@@ -1,4 +1,4 @@
-"""What a reader of the database gets."""
+"""Rows and arrays that a reader returns."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from orchestrate.store.records import Array
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One configuration of the grid and how far its trials are.
+class ConfigRow:
+    """Configuration with the counts of its trials.
 
     Attributes
     ----------
     width, depth
-        Hidden layers of the model; None where the model has none.
+        Hidden layers of the model; None for a model without.
     horizon
         Steps T of each trial.
     dt
         Seconds between steps.
     gamma
-        Bound of the input, in the input's unit.
+        Bound of the input, in its unit.
+    label
+        The policy's title and what is not the default, such as ``D-optimal, γ=3``.
     config
-        The whole configuration without the seed.
+        The configuration without the seed.
     """
 
     config_key: str
@@ -41,6 +43,7 @@ class Cell:
     horizon: int
     dt: float
     gamma: float
+    label: str
     n_done: int
     n_diverged: int
     n_failed: int
@@ -58,7 +61,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Curves:
-    """One column of the steps of all n finished trials of a configuration.
+    """Column of the steps of all n finished trials of a configuration.
 
     Attributes
     ----------
@@ -76,7 +79,7 @@ class Curves:
 
 @dataclass(frozen=True)
 class Assessments:
-    """One measure of all n finished trials of a configuration, after k numbers of steps.
+    """Measure of all n finished trials of a configuration, after k numbers of steps.
 
     Attributes
     ----------
@@ -94,7 +97,7 @@ class Assessments:
 
 @dataclass(frozen=True)
 class TrialRow:
-    """Summary of one trial; None where it has not got that far."""
+    """Summary of one trial; None for values that it does not have yet."""
 
     seed: int
     trial_key: str
@@ -115,12 +118,12 @@ class TrialRow:
 
 @dataclass(frozen=True)
 class LaunchRow:
-    """One command that wrote to the database, and whether its process lives.
+    """Launch that wrote to the database, and whether its process is alive.
 
     Attributes
     ----------
     state
-        As the launch wrote it; one that was killed says "running" until another one notices.
+        State written by the launch; a killed one is "running" until another launch notices.
     started, ended
         UTC, as text.
     """
@@ -141,11 +144,11 @@ class LaunchRow:
 
 
 class Table(list[Any]):
-    """Rows of a query, each a tuple that knows its columns by name too.
+    """Rows of a query as named tuples.
 
-    ``columns`` are the names as the database gave them, also where there is no row. In a row, a
-    name that Python cannot use, such as ``count(*)``, is its place with an underscore: ``_0``.
-    ``cut`` says that there were more rows than the limit of the query.
+    ``columns`` are the names given by the database, also for an empty result. A name that is no
+    Python identifier, such as ``count(*)``, is replaced by its position: ``_0``. ``cut`` is True if
+    there were more rows than the limit of the query.
     """
 
     def __init__(

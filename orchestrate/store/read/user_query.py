@@ -1,4 +1,4 @@
-"""One SELECT that somebody typed: it can only read, and ends within its limits."""
+"""Execution of one SELECT of a user, read-only and with limits of rows and time."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Any
 from sqlalchemy import Connection, Engine
 
 from orchestrate.store.errors import QueryError
-from orchestrate.store.rows import Table
+from orchestrate.store.read.rows import Table
 
 Guard = Callable[[Connection, float | None], AbstractContextManager[None]]
 
 
-def ask(
+def run_select(
     engine: Engine, guard: Guard, sql: str, limit: int | None = None, timeout: float | None = None
 ) -> Table:
-    """Return the rows of the statement, the first ``limit`` of them.
+    """Return the first ``limit`` rows of the statement.
 
-    ``guard`` refuses what does not read and ends what takes longer than ``timeout`` seconds; the
-    transaction is rolled back, so that nothing of the statement outlives it. A cursor on the side
-    of the server takes one SELECT, where a statement sent as it is may be several.
+    ``guard`` rejects statements that do not only read, and cancels them after ``timeout`` seconds;
+    the transaction is rolled back. A server-side cursor accepts one SELECT only, whereas a plain
+    statement may be several.
     """
     # Without parameters, so that a % in the statement needs no escape.
     options: dict[str, Any] = {"no_parameters": True, "stream_results": True}
@@ -33,7 +33,7 @@ def ask(
             connection.exec_driver_sql(sql, execution_options=options) as result,
         ):
             if not result.returns_rows:
-                raise QueryError("The query asks for nothing: give one SELECT.")
+                raise QueryError("The query returns no rows: give one SELECT.")
             rows = result.fetchall() if limit is None else result.fetchmany(limit + 1)
             columns = result.keys()
         transaction.rollback()

@@ -1,4 +1,4 @@
-"""Trials change hands: pending to a launch, back to pending, and again after a failure."""
+"""Claims of trials: from pending to a launch, and back to pending."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Select, delete, insert, select, update
 
-from orchestrate.store.backend import Backend
+from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Claim
 from orchestrate.store.schema import (
     OUTCOME_COLUMNS,
@@ -18,13 +18,13 @@ from orchestrate.store.schema import (
     trajectory,
     trial,
 )
-from orchestrate.store.values import now
+from orchestrate.store.serialization import now
 
 
 def claim(
     connection: Connection, backend: Backend, launch_id: int, trial_keys: Sequence[str]
 ) -> list[Claim]:
-    """Take those of the trials that are pending, in the given order."""
+    """Claim those of the trials that are pending, in the given order."""
     free = (
         select(trial.c.trial_id)
         .where(trial.c.trial_key.in_(backend.members(trial_keys)), trial.c.status == "pending")
@@ -67,7 +67,7 @@ def free_claims(
 ) -> int:
     """Put running trials of the launches back to pending, those with a key in ``only`` if given.
 
-    ``skip_locked`` leaves alone those that a transaction is just writing, however long it takes.
+    ``skip_locked`` leaves out rows that another transaction has locked.
     """
     if not launch_ids:
         return 0

@@ -1,4 +1,4 @@
-"""Launches begin, show that they live, end, or are found dead."""
+"""Launches: beginning, heartbeat, end, and recovery of dead ones."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import json
 
 from sqlalchemy import Connection, insert, or_, select, update
 
-from orchestrate.store.backend import Backend, LaunchLife
-from orchestrate.store.claims import free_claims
+from orchestrate.store.backends.base import Backend, LaunchLife
 from orchestrate.store.records import LaunchRecord
 from orchestrate.store.schema import LAUNCH_STATES, launch, trial
-from orchestrate.store.values import now
+from orchestrate.store.serialization import now
+from orchestrate.store.write.claims import free_claims
 
 
 def begin(connection: Connection, backend: Backend, record: LaunchRecord) -> int:
@@ -35,7 +35,7 @@ def begin(connection: Connection, backend: Backend, record: LaunchRecord) -> int
 
 
 def end(connection: Connection, launch_id: int, state: str, exit_code: int | None) -> str:
-    """Write the last state, free the claims that are left and return the token of the launch."""
+    """Write the last state, release the remaining claims and return the token of the launch."""
     if state not in LAUNCH_STATES[1:]:
         raise ValueError(f"A launch cannot end as '{state}': give {', '.join(LAUNCH_STATES[1:])}.")
     statement = (
@@ -57,7 +57,7 @@ def end(connection: Connection, launch_id: int, state: str, exit_code: int | Non
 
 
 def renew(connection: Connection, backend: Backend, launch_id: int) -> None:
-    """Extend the life of the launch; one that was given up for lost is back again."""
+    """Extend the life of the launch, also after it was marked as lost."""
     connection.execute(
         update(launch)
         .where(launch.c.launch_id == launch_id, launch.c.state == "lost")

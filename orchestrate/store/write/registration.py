@@ -8,16 +8,16 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, select
 
-from orchestrate.store.backend import Backend
+from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Registrable, Registration
 from orchestrate.store.schema import CONFIG_COLUMNS, config, trial
-from orchestrate.store.values import plain
+from orchestrate.store.serialization import plain
 
-_CHUNK = 10_000
+_BATCH_ROWS = 10_000
 
 
-class Grid:
-    """The distinct trials of a grid, reduced to what the database needs."""
+class GridRows:
+    """Distinct trials of a grid, as rows of the database."""
 
     def __init__(self, specs: Iterable[Registrable]) -> None:
         self.trials: dict[str, tuple[str, int]] = {}  # trial_key -> config_key, seed
@@ -30,7 +30,7 @@ class Grid:
         known = self.configs.get(config_key)
         if known is None:
             known = self.configs[config_key] = _config_row(spec)
-        # The row's own string, so that 100,000 trials share it.
+        # The string of the row is shared by all trials of the configuration.
         self.trials.setdefault(spec.trial_key, (known["config_key"], int(plain(spec.seed))))
 
 
@@ -45,8 +45,10 @@ def _config_row(spec: Registrable) -> dict[str, Any]:
     return {"config_key": spec.config_key, "config_json": spec.config_json, **values}
 
 
-def register(connection: Connection, backend: Backend, launch_id: int, grid: Grid) -> Registration:
-    """Insert what is new and return the state of every trial of the grid."""
+def register(
+    connection: Connection, backend: Backend, launch_id: int, grid: GridRows
+) -> Registration:
+    """Insert new configurations and trials, and return the state of the grid."""
     backend.exclusive(connection)
     config_ids = _insert_configs(connection, backend, grid.configs)
     found: dict[str, tuple[str, int | None]] = {}
@@ -86,7 +88,7 @@ def _known_trials(
 
 
 def _insert_trials(
-    connection: Connection, grid: Grid, keys: Sequence[str], config_ids: Mapping[str, int]
+    connection: Connection, grid: GridRows, keys: Sequence[str], config_ids: Mapping[str, int]
 ) -> None:
     rows = [
         {
@@ -118,5 +120,5 @@ def _summary(found: Mapping[str, tuple[str, int | None]], launch_id: int) -> Reg
 
 def _chunks(keys: Iterable[str]) -> Iterator[list[str]]:
     iterator = iter(keys)
-    while chunk := list(islice(iterator, _CHUNK)):
+    while chunk := list(islice(iterator, _BATCH_ROWS)):
         yield chunk

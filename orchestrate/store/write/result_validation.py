@@ -1,4 +1,4 @@
-"""A result is checked before anything of it is written."""
+"""Validation of a result before it is written."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from orchestrate.store.schema import STEP_VALUES
 
 
 def check_result(trial_key: str, result: Result) -> None:
-    """Raise ``InvalidResultError`` where the arrays of a result do not fit together."""
+    """Raise ``InvalidResultError`` if the arrays of a result are inconsistent."""
     n = len(result.loss)
     for name in STEP_VALUES:
         _expect_shape(trial_key, result, name, (n,))
@@ -57,7 +57,7 @@ def _check_assessments(trial_key: str, result: Result) -> None:
                 f"'{row.measure}' is of step {row.t}, expected one from 0 to {result.n_steps}",
             )
         if (row.t, row.measure) in seen:
-            raise _refusal(trial_key, f"'{row.measure}' of step {row.t} is there twice")
+            raise _refusal(trial_key, f"'{row.measure}' of step {row.t} is given twice")
         seen.add((row.t, row.measure))
 
 

@@ -1,4 +1,4 @@
-"""The outcome of an attempt: written whole, in one transaction, by the launch that owns it."""
+"""Outcome of an attempt, written in one transaction by the launch that holds its claim."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from sqlalchemy import (
     update,
 )
 
-from orchestrate.passwords import without_password
-from orchestrate.store.backend import Backend
-from orchestrate.store.checking import check_horizon, check_result
-from orchestrate.store.packing import DTYPE, pack
-from orchestrate.store.records import Array, Claim, Failure, Result, RunRecord
+from orchestrate.records import Failure, RunRecord
+from orchestrate.redaction import without_password
+from orchestrate.store.backends.base import Backend
+from orchestrate.store.records import Array, Claim, Result
 from orchestrate.store.schema import (
+    FINISHED,
     STEP_VALUES,
     assessment,
     attempt,
@@ -32,17 +32,18 @@ from orchestrate.store.schema import (
     trajectory,
     trial,
 )
-from orchestrate.store.values import finite, plain, storable, utc_text
+from orchestrate.store.serialization import DTYPE, finite, pack, plain, storable, utc_text
+from orchestrate.store.write.result_validation import check_horizon, check_result
 
 _RUN_COLUMNS = ("node", "wall_seconds", "cpu_seconds", "peak_memory_bytes")
 
-# As text, because SQLAlchemy leaves table names out of RETURNING on SQLite, and a bare config_id
-# would be that of the inner table.
+# As text: SQLAlchemy omits table names in RETURNING on SQLite, and a bare config_id would be the
+# one of the inner table.
 _HORIZON = literal_column(
     "(SELECT config.horizon FROM config WHERE config.config_id = trial.config_id)", Integer
 )
 
-# The fence: only the launch that still owns this very attempt may write.
+# Fencing: only the launch that still holds the claim of this attempt may write.
 _FENCED = (
     update(trial)
     .where(
@@ -92,8 +93,8 @@ _ERROR_ID = select(error.c.error_id).where(error.c.hash == bindparam("hash"))
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Rows of a finished trial, made before the transaction to keep that one short."""
+class PreparedRows:
+    """Rows of a finished trial, prepared before the transaction to keep it short."""
 
     claim: Claim
     summary: dict[str, Any]
@@ -102,8 +103,8 @@ class Outcome:
     assessments: list[dict[str, Any]]
 
 
-def prepare(claim: Claim, result: Result, run: RunRecord) -> Outcome:
-    """Check a result and turn it into rows; raise ``InvalidResultError`` where it is malformed."""
+def prepare(claim: Claim, result: Result, run: RunRecord) -> PreparedRows:
+    """Check a result and return its rows; raise ``InvalidResultError`` if it is invalid."""
     check_result(claim.trial_key, result)
     steps = np.column_stack([getattr(result, name) for name in STEP_VALUES]).astype(np.float64)
     steps[~np.isfinite(steps)] = np.nan
@@ -117,7 +118,7 @@ def prepare(claim: Claim, result: Result, run: RunRecord) -> Outcome:
         "cause": None,
         **_run_row(run),
     }
-    return Outcome(
+    return PreparedRows(
         claim, summary, steps, _trajectory_row(claim, result), _assessment_rows(claim, result)
     )
 
@@ -153,22 +154,22 @@ def _run_row(run: RunRecord) -> dict[str, Any]:
     }
 
 
-def write(connection: Connection, backend: Backend, outcome: Outcome) -> bool:
-    """Write a finished trial; False, and nothing written, where the claim is no longer held."""
-    horizon = _pass_fence(connection, outcome.claim, outcome.summary)
+def write(connection: Connection, backend: Backend, rows: PreparedRows) -> bool:
+    """Write a finished trial; return False, and write nothing, if the claim is lost."""
+    horizon = _pass_fence(connection, rows.claim, rows.summary)
     if horizon is None:
         return False
-    check_horizon(outcome.claim.trial_key, len(outcome.steps), horizon)
-    backend.insert_steps(connection, outcome.claim.trial_id, outcome.steps)
-    connection.execute(_INSERT_TRAJECTORY, outcome.trajectory)
-    if outcome.assessments:
-        connection.execute(_INSERT_ASSESSMENT, outcome.assessments)
-    _end_attempt(connection, outcome.claim, outcome.summary)
+    check_horizon(rows.claim.trial_key, len(rows.steps), horizon)
+    backend.insert_steps(connection, rows.claim.trial_id, rows.steps)
+    connection.execute(_INSERT_TRAJECTORY, rows.trajectory)
+    if rows.assessments:
+        connection.execute(_INSERT_ASSESSMENT, rows.assessments)
+    _end_attempt(connection, rows.claim, rows.summary)
     return True
 
 
 def write_failure(connection: Connection, claim: Claim, failure: Failure, run: RunRecord) -> bool:
-    """Write a failed trial; False, and nothing written, where the claim is no longer held."""
+    """Write a failed trial; return False, and write nothing, if the claim is lost."""
     values = {
         "status": "failed",
         "n_steps": None,
@@ -187,15 +188,15 @@ def write_failure(connection: Connection, claim: Claim, failure: Failure, run: R
 
 
 def is_written(connection: Connection, claim: Claim) -> bool:
-    """Tell whether this very attempt has an outcome, whoever still knows of it."""
+    """Return whether the attempt of a claim has an outcome."""
     statement = select(attempt.c.outcome).where(
         attempt.c.trial_id == claim.trial_id, attempt.c.attempt == claim.attempt
     )
-    return connection.execute(statement).scalar_one_or_none() in ("done", "diverged", "failed")
+    return connection.execute(statement).scalar_one_or_none() in (*FINISHED, "failed")
 
 
 def _pass_fence(connection: Connection, claim: Claim, values: Mapping[str, Any]) -> int | None:
-    """Return the horizon of the trial, or None where the claim is no longer held."""
+    """Return the horizon of the trial, or None if the claim is lost."""
     fence = {"fence_owner": claim.launch, **_attempt_key(claim)}
     return connection.execute(_FENCED, {**fence, **values}).scalar_one_or_none()
 

@@ -19,9 +19,9 @@ from orchestrate.export import streams, tables
 from orchestrate.store import Claim, Store
 from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, run_now
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, assessed, diverged, result
+from tests.paths import ROOT
 
 Run = Callable[..., Answer]
-ROOT = Path(__file__).resolve().parents[3]
 FORMATS = ("csv", "parquet", "npz")
 NO_ROOM = """
 import resource, sys

@@ -15,14 +15,14 @@ from pathlib import Path
 import pytest
 
 from orchestrate.__main__ import main
+from orchestrate.cli_parser import Parser
 from orchestrate.commands import COMMANDS
 from orchestrate.commands.command import Command
-from orchestrate.commands.parser import Parser
 from orchestrate.errors import ExitCode
 from orchestrate.store import Store
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 READING = [
     ["status"],
     ["show", "--seed", "1"],
@@ -70,7 +70,7 @@ def test_every_command_has_help_and_the_common_options(command: Command, capsys:
         (["status", "--evn", "pendulum"], "did you mean '--env'?"),
         (["retry", "faild"], "did you mean 'failed'?"),
         (["retry"], "see python -m orchestrate retry --help"),
-        (["status", "more"], "a word too many, 'more'"),
+        (["status", "more"], "unexpected argument 'more'"),
         (["query", "SELECT 1", "--limit", "0"], "a whole number above 0 is expected"),
         (["query", "SELECT 1", "--timeout", "nan"], "a number above 0 is expected"),
         (["status", "--watch", "soon"], "a number above 0 is expected"),
@@ -147,10 +147,17 @@ def test_the_database_comes_from_the_environment(
     assert f"{sqlite_url} holds no trials yet" in capsys.readouterr().out
 
 
-def test_the_entry_point_is_the_same_program() -> None:
+def test_the_entry_point_is_the_same_program(monkeypatch: pytest.MonkeyPatch) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     module, _, function = project["scripts"]["dopt"].partition(":")
-    assert getattr(importlib.import_module(module), function) is main
+    packages = {name: one for name, one in sys.modules.items() if name == "orchestrate"}
+    monkeypatch.setattr("orchestrate.__main__.main", lambda: 7)
+    try:
+        with pytest.raises(SystemExit) as ended:
+            getattr(importlib.import_module(module), function)()
+    finally:
+        sys.modules.update(packages)
+    assert ended.value.code == 7
 
 
 def test_an_option_is_not_abbreviated() -> None:

@@ -11,10 +11,11 @@ from sqlalchemy.engine import make_url
 
 from orchestrate.commands.doctor import trial_key
 from orchestrate.store import Reader, Store, merge
+from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import Answer
 from tests.orchestrate.standins import specification
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
-from tests.orchestrate.store.released import restore
+from tests.orchestrate.store.migrations.released import restore
 
 Run = Callable[..., Answer]
 
@@ -47,7 +48,8 @@ class TestUpgrade:
         assert f"run 'python -m orchestrate upgrade --db {url}'" in refused.err
         answer = command("upgrade")
         assert answer.code == 0
-        assert f"went from schema 1 to 3; a backup is in the file {_path(url)}.v1-b" in answer.out
+        backup = f"a backup is in the file {_path(url)}.v1-b"
+        assert f"went from schema 1 to {SCHEMA_VERSION}; {backup}" in answer.out
         assert command("status").code == 0
         assert "there is nothing to do" in command("upgrade").out
 
@@ -55,7 +57,7 @@ class TestUpgrade:
         restore(1, url)
         document = command("upgrade", "--no-backup", "--json").document
         assert document == {
-            "safe_url": url, "before": 1, "after": 3, "backup": None, "changed": True
+            "safe_url": url, "before": 1, "after": SCHEMA_VERSION, "backup": None, "changed": True
         }  # fmt: skip
         assert not list(_path(url).parent.glob("*backup*"))
 
@@ -67,7 +69,7 @@ class TestUpgrade:
     def test_of_an_empty_file(self, command: Run, url: str) -> None:
         _path(url).parent.mkdir()
         _path(url).touch()
-        assert "was empty and has schema 3 now" in command("upgrade").out
+        assert f"was empty and has schema {SCHEMA_VERSION} now" in command("upgrade").out
 
 
 def _path(url: str) -> Path:
@@ -80,8 +82,8 @@ class TestMerge:
         run_trials(f"sqlite:///{other}", 1, 2, 3)
         answer = command("merge", str(other))
         assert answer.code == 0
-        assert "brought 2 trials (2 done)" in answer.out
-        assert "1 were here already, with the same numbers" in answer.out
+        assert "copied 2 trials (2 done)" in answer.out
+        assert "1 exist here with equal numbers" in answer.out
         document = command("merge", f"sqlite:///{other}", "--json").document
         assert (document["identical"], document["changed"]) == (3, False)
 
@@ -90,7 +92,7 @@ class TestMerge:
         run_trials(f"sqlite:///{other}", *range(12), offset=50)
         answer = command("merge", str(other))
         assert answer.code == 1
-        assert "12 have other numbers here, which were kept:" in answer.out
+        assert "12 have different numbers here and were not copied:" in answer.out
         assert "pendulum random seed 3" in answer.out
         assert "and 2 more" in answer.out
         assert len(command("merge", str(other), "--json").document["conflicts"]) == 12
@@ -107,8 +109,8 @@ class TestDoctor:
         command("upgrade", "--no-backup")
         answer = command("doctor")
         assert answer.code == 0
-        assert "1 warning, 2 notes" in answer.out
-        assert "with a seed that not every policy has: 2" in answer.out
+        assert "2 notes" in answer.out
+        assert "error" not in answer.out
 
     def test_names_what_is_wrong(self, command: Run, url: str) -> None:
         restore(1, url)
@@ -133,9 +135,9 @@ class TestDoctor:
             connection.exec_driver_sql("DELETE FROM trajectory WHERE trial_id = 1")
         engine.dispose()
         new = f"sqlite:///{tmp_path}/new.db"
-        assert len(merge(new, url).broken) == 1
+        assert len(merge(new, url).incomplete) == 1
         with Reader.open(new) as reader:
-            assert sum(cell.n_done for cell in reader.cells()) == 3
+            assert sum(cell.n_done for cell in reader.configs()) == 3
 
     def test_knows_the_key_of_a_trial(self) -> None:
         trial = specification(seed=12345678901)

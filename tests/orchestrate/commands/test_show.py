@@ -10,7 +10,7 @@ import pytest
 from orchestrate.commands.sparkline import sparkline
 from orchestrate.store import Store
 from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, Answer, failure, run_now
-from tests.orchestrate.store.fakes import HORIZON, Spec, result
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, result
 
 Run = Callable[..., Answer]
 pytestmark = pytest.mark.usefixtures("grid")
@@ -20,7 +20,10 @@ def test_a_done_trial(command: Run) -> None:
     spec = DONE[1]
     out = command("show", spec.trial_key[:8]).out
     loss = result(spec.seed).loss
-    assert out.startswith(f"{spec.trial_key[:12]} (env=pendulum policy=random width=16 seed=1)\n")
+    assert out.startswith(
+        f"{spec.trial_key[:12]} (env=pendulum policy=random model=mlp learner=adam_window "
+        "width=16 depth=2 horizon=7 dt=0.01 gamma=1.5 seed=1)\n"
+    )
     assert f"done · final loss {loss[-1]:.6g} · best loss {loss.min():.6g}" in out
     assert "horizon=7" in out
     assert "commit   0000000000000000000000000000000000000000, with changes (diff 1111" in out
@@ -81,9 +84,18 @@ def test_names_instead_of_a_key(command: Run) -> None:
 def test_what_is_ambiguous_is_refused_with_the_choices(command: Run) -> None:
     answer = command("show", "--env", "cartpole", "--seed", "0")
     assert answer.code == 2
-    assert "2 trials have these names, one is expected: say which of" in answer.err
+    assert "2 trials have these names, one is expected: give the key of one of" in answer.err
     assert RUNNING.trial_key[:12] in answer.err
     assert "env=cartpole policy=random width=8 seed=0" in answer.err
+
+
+def test_choices_name_the_columns_in_which_they_differ(command: Run, store: Store) -> None:
+    number = store.begin_launch(LAUNCH)
+    others = [Spec(9, gamma=0.5), Spec(9, gamma=3.0, task="control")]
+    store.register(number, others)
+    error = command("show", "--seed", "9").err
+    assert "(env=pendulum policy=random width=16 gamma=0.5 seed=9)" in error
+    assert "(env=pendulum policy=random width=16 gamma=3.0 task=control seed=9)" in error
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,11 @@ import pytest
 from rich.console import Console
 
 from orchestrate.commands import watching
-from orchestrate.commands.cells_table import grid_table
+from orchestrate.commands.configs_table import grid_table
 from orchestrate.commands.display import plain
 from orchestrate.commands.watching import watch
-from orchestrate.status import Status, gather
-from orchestrate.store import Cell, Claim, Reader, Store, StoreUnavailableError
+from orchestrate.queries.status import Status, gather
+from orchestrate.store import Claim, ConfigRow, Reader, Store, StoreUnavailableError
 from tests.orchestrate.commands.conftest import WAITING, Answer, failure, run_now
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 
@@ -61,7 +61,7 @@ class TestOnce:
         assert document["complete"] is False
         assert document["per_second"] > 0
         assert document["seconds_left"] == pytest.approx(3 / document["per_second"])
-        assert [cell["n"] for cell in document["cells"]] == [2, 1, 3, 3]
+        assert [cell["n"] for cell in document["configs"]] == [2, 1, 3, 3]
         (kind,) = document["failures"]
         assert (kind["cause"], kind["trials"], kind["attempts"]) == ("exception", 2, 2)
         assert kind["last_line"].startswith("ZeroDivisionError: seed")
@@ -70,7 +70,7 @@ class TestOnce:
 
     def test_filters(self, command: Run) -> None:
         document = command("status", "--json", "--env", "cartpole").document
-        assert {cell["env"] for cell in document["cells"]} == {"cartpole"}
+        assert {cell["env"] for cell in document["configs"]} == {"cartpole"}
         assert document["failures"] == []
         assert document["per_second"] == 0
         both = command("status", "--json", "--env", "pendulum", "cartpole", "--policy", "random")
@@ -94,7 +94,7 @@ def test_a_dead_launch_is_called_dead(open_store: Callable[..., Store], command:
     dead.close()
     with open_store()._backend.transaction() as connection:
         connection.exec_driver_sql("UPDATE launch SET lease_until = 0")  # long ago, on PostgreSQL
-    assert ": dead; the same command goes on with its trials" in command("status").out
+    assert ": dead; run the same launch command again to continue" in command("status").out
     assert command("status", "--json").document["launches"][0]["alive"] is False
 
 
@@ -102,7 +102,7 @@ def test_without_a_launch_it_says_how_to_go_on(store: Store, command: Run) -> No
     launch = store.begin_launch(LAUNCH)
     store.register(launch, [Spec()])
     store.end_launch(launch, "interrupted")
-    assert "the same command as before goes on" in command("status").out
+    assert "run the same launch command again to continue" in command("status").out
 
 
 def test_attempts_that_were_made_good_are_no_failed_trials(
@@ -121,16 +121,16 @@ def test_the_rate_is_that_of_the_living(store: Store, take: Take, reader: Reader
     long_ago = replace(RUN, ended=datetime(2026, 1, 1, tzinfo=UTC))
     for i, claim in enumerate(take(*(Spec(seed) for seed in range(4)))):
         store.commit(claim, result(), run_now() if i < 3 else long_ago)
-    status = gather(reader, reader.cells())
+    status = gather(reader, reader.configs())
     assert 3 / 120 < status.rate <= 3
     store.end_launch(1, "done")
-    assert gather(reader, reader.cells()).rate == 0
+    assert gather(reader, reader.configs()).rate == 0
 
 
 class TestTable:
-    def cells(self, reader: Reader, store: Store, specs: Sequence[Spec]) -> list[Cell]:
+    def cells(self, reader: Reader, store: Store, specs: Sequence[Spec]) -> list[ConfigRow]:
         store.register(store.begin_launch(LAUNCH), specs)
-        return reader.cells()
+        return reader.configs()
 
     def test_many_configurations_are_counted_together(self, reader: Reader, store: Store) -> None:
         specs = [
@@ -149,7 +149,7 @@ class TestTable:
         cells = self.cells(reader, store, [Spec(horizon=5), Spec(horizon=6)])
         assert self.shown(cells, 10)[0][:4] == ["env", "policy", "width", "horizon"]
 
-    def shown(self, cells: list[Cell], most: int) -> list[list[str]]:
+    def shown(self, cells: list[ConfigRow], most: int) -> list[list[str]]:
         console = Console(file=io.StringIO(), width=200)
         console.print(grid_table(cells, most))
         return rows(console.file.getvalue())  # type: ignore[attr-defined]
@@ -218,7 +218,7 @@ def _complete() -> Status:
     numbers = {"width": 1, "depth": 1, "horizon": 1, "dt": 0.1, "gamma": 1.0}
     states = dict.fromkeys(("diverged", "failed", "cancelled", "pending", "running"), 0)
     counted = {f"n_{state}": number for state, number in {"done": 1, **states}.items()}
-    return Status([Cell(**names, **numbers, **counted, config={})], [], [], 0.0)  # type: ignore[arg-type]
+    return Status([ConfigRow(**names, **numbers, **counted, label="", config={})], [], [], 0.0)  # type: ignore[arg-type]
 
 
 def test_control_characters_are_shown_as_text() -> None:

@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 
 from dopt.errors import SpecificationError
-from orchestrate.hydra_plugins.dopt_grid import _composer
-from orchestrate.hydra_plugins.dopt_grid._expansion import expand
+from orchestrate.config import fast_compose
+from orchestrate.config.expand import expand
 
 SAMPLE = Path(__file__).parent / "sample"
 SECTIONS = (
@@ -125,14 +125,14 @@ def test_each_choice_of_groups_is_composed_once(
     sample: Sample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     composed: list[Sequence[str]] = []
-    quick = _composer.Composer._quick
+    quick = fast_compose.Composer._quick
 
     def counted(self: Any, files: Any, words: Sequence[str]) -> DictConfig:
         composed.append(words)
         return quick(self, files, words)
 
-    monkeypatch.setattr(_composer.Composer, "_quick", counted)
-    monkeypatch.setattr(_composer.Composer, "like_hydra", None)
+    monkeypatch.setattr(fast_compose.Composer, "_quick", counted)
+    monkeypatch.setattr(fast_compose.Composer, "like_hydra", None)
     jobs = by_us(sample, ["env=glob(*)", "model=mlp,linear", "scale=range(50)", "seed=range(9)"])
     assert len(composed) == 4
     assert sum(jobs.values()) == 4 * 50 * 9
@@ -154,8 +154,8 @@ def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> No
         ("seed=range(5,5)", "has no values"),
         ("seed=range(5,1)", "has no values"),
         ("scale=interval(0,1)", "no finite list"),
-        ("width=glob(*)", "is no group"),
-        ("launch.workers=1,2", "whole launch"),
+        ("width=glob(*)", "is not a group"),
+        ("launch.workers=1,2", "setting of the launch"),
     ],
 )
 def test_sweeps_without_values_are_errors(sample: Sample, override: str, words: str) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
-from orchestrate.grid import Combination, build_grid
+from orchestrate.config.grid import Combination, build_grid
 
 SETTINGS: dict[str, Any] = {
     "env": {"name": "pendulum"},
@@ -31,7 +31,7 @@ def test_every_cell_gets_its_first_seed_before_any_gets_its_second() -> None:
 def test_a_trial_that_is_named_twice_is_one_trial() -> None:
     grid = build_grid([combination((0, 1, 1)), combination(None, env={"name": "pendulum"})])
     assert [trial.seed for trial in grid.trials] == [0, 1]
-    assert (grid.asked, grid.repeats) == (4, 2)
+    assert (grid.n_jobs, grid.repeats) == (4, 2)
 
 
 def test_an_integer_and_an_equal_float_name_one_trial() -> None:
@@ -55,7 +55,7 @@ def test_a_pair_that_makes_no_sense_is_left_out_with_the_reason() -> None:
 def test_alone_such_a_pair_is_an_error_and_so_is_a_grid_of_nothing_else() -> None:
     pair = combination(env={"name": "quadrotor"}, policy={"name": "periodic"})
     with pytest.raises(IncompatibleError):
-        build_grid([pair], alone=True)
+        build_grid([pair], single=True)
     with pytest.raises(SpecificationError, match="the grid is empty: env=quadrotor"):
         build_grid([pair])
 
@@ -66,14 +66,14 @@ def test_a_seed_is_a_whole_number_of_at_least_zero(seeds: Any) -> None:
         build_grid([combination(seeds)])
 
 
-OWN = {"_target_": "tests.dopt.own_parts.Coin"}
+OWN = {"_target_": "tests.dopt.custom_plugins.Coin"}
 
 
 def test_a_grid_holds_trials_of_both_paths() -> None:
     grid = build_grid([combination(), combination(policy=OWN)])
-    paths = {(trial.policy.name, trial.cell.path) for trial in grid.trials}
+    paths = {(trial.policy.name, trial.config.path) for trial in grid.trials}
     assert paths == {("random", "kernel"), ("coin", "reference")}
     together = grid.on_path("reference")
-    assert {trial.cell.path for trial in together.trials} == {"reference"}
+    assert {trial.config.path for trial in together.trials} == {"reference"}
     same = [trial.trial_key for trial in together.trials if trial.policy.name == "coin"]
     assert same == [trial.trial_key for trial in grid.trials if trial.policy.name == "coin"]

@@ -14,14 +14,17 @@ import numpy as np
 import pytest
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from orchestrate.errors import InfrastructureError
-from orchestrate.executors.base import Event, Executor, Finished, Lost, Run, Task, Trouble
+from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.executors.local import LocalExecutor
+from orchestrate.records import Failure
 from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
 
 Make = Callable[[Run], Executor]
+
+pytestmark = pytest.mark.xdist_group("executors")  # one Ray for all of them
 
 
 def tasks(seeds: Sequence[int]) -> list[Task]:
@@ -48,7 +51,7 @@ def report_threads(_: TrialSpec) -> TrialResult:
 
 @pytest.fixture(scope="module")
 def ray_executor() -> Iterator[Executor]:
-    from orchestrate.executors.ray import RayExecutor
+    from orchestrate.executors.ray.executor import RayExecutor
 
     with RayExecutor(quick, workers=2) as executor:
         yield executor
@@ -79,25 +82,25 @@ def test_every_task_gets_its_result(make: Make) -> None:
     for seeds in ([0, 1, 2], [3], [], [4, 5]):
         executor.submit(tasks(seeds))
     events = drain(executor)
-    assert sorted(seed_of(event.key) for event in events if isinstance(event, Finished)) == [
+    assert sorted(seed_of(event.key) for event in events if isinstance(event, TaskDone)) == [
         *range(6)
     ]
     for event in events:
-        assert isinstance(event, Finished)
+        assert isinstance(event, TaskDone)
         assert isinstance(event.outcome, TrialResult)
         expected = quick(specification(seed_of(event.key)))
         np.testing.assert_array_equal(event.outcome.states, expected.states)
-        assert event.usage.wall_seconds >= 0.0
-        assert event.usage.peak_memory_bytes > 2**20
-        assert event.usage.started <= event.usage.ended
+        assert event.run.wall_seconds >= 0.0
+        assert event.run.peak_memory_bytes > 2**20
+        assert event.run.started <= event.run.ended
 
 
 def test_an_exception_comes_back_with_its_traceback_and_the_rest_runs(make: Make) -> None:
     executor = make(raising)
     executor.submit(tasks(range(5)))
-    outcomes = {seed_of(e.key): e.outcome for e in drain(executor) if isinstance(e, Finished)}
+    outcomes = {seed_of(e.key): e.outcome for e in drain(executor) if isinstance(e, TaskDone)}
     trouble = outcomes.pop(BROKEN_SEED)
-    assert isinstance(trouble, Trouble)
+    assert isinstance(trouble, Failure)
     assert (trouble.type, trouble.message) == ("ZeroDivisionError", "the seed is broken")
     assert "in raising" in trouble.traceback
     assert sorted(outcomes) == [0, 1, 3, 4]
@@ -113,8 +116,8 @@ def test_one_thread_for_each_worker(make: Make) -> None:
     executor = make(report_threads)
     executor.submit(tasks([0]))
     [event] = drain(executor)
-    assert isinstance(event, Finished)
-    assert isinstance(event.outcome, Trouble)
+    assert isinstance(event, TaskDone)
+    assert isinstance(event.outcome, Failure)
     assert event.outcome.message == "1"
 
 
@@ -124,11 +127,11 @@ def test_the_chunk_of_a_killed_worker_is_lost_and_the_others_are_not(make: Make)
     for seeds in ([0, 1], [BROKEN_SEED, 3], [4, 5], [6, 7]):
         executor.submit(tasks(seeds))
     events = drain(executor)
-    lost = {seed_of(key) for event in events if isinstance(event, Lost) for key in event.keys}
-    finished = {seed_of(event.key) for event in events if isinstance(event, Finished)}
+    lost = {seed_of(key) for event in events if isinstance(event, WorkerLost) for key in event.keys}
+    finished = {seed_of(event.key) for event in events if isinstance(event, TaskDone)}
     assert lost == {BROKEN_SEED, 3}
     assert finished == {0, 1, 4, 5, 6, 7}
-    assert not any(event.blameless for event in events if isinstance(event, Lost))
+    assert not any(event.node_lost for event in events if isinstance(event, WorkerLost))
 
 
 def test_workers_that_cannot_even_start_are_no_fault_of_a_trial() -> None:

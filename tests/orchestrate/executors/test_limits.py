@@ -14,18 +14,19 @@ from pathlib import Path
 
 import pytest
 
-from dopt.exploration import run_trial
 from dopt.result import TrialResult
+from dopt.run import run_trial
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Executor, Finished, Lost, Task, Trouble
-from orchestrate.executors.ending import LastWords
+from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
+from orchestrate.executors.exit_status import CrashReport
 from orchestrate.executors.limits import Limits, TrialTimeoutError, interrupted_after
 from orchestrate.executors.local import LocalExecutor
 from orchestrate.executors.task import run_task
+from orchestrate.records import Failure
 from tests.dopt.trials import trial
 from tests.orchestrate.conftest import ROOT, Launches
+from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.standins import BROKEN_SEED, quick
-from tests.orchestrate.test_executors import drain, seed_of, tasks
 from tests.orchestrate.unruly import deaf, empty, faulty, greedy, greedy_in_a_group, hanging
 
 SEEDS = 6
@@ -78,16 +79,16 @@ def test_the_rest_of_its_chunk_runs_without_being_charged(executor: str) -> None
     if executor == "local":
         kind = LocalExecutor(deaf, 1, limits)
     else:
-        kind = importlib.import_module("orchestrate.executors.ray").RayExecutor(
+        kind = importlib.import_module("orchestrate.executors.ray.executor").RayExecutor(
             deaf, 1, limits=limits
         )
     with kind:
         kind.submit(tasks([0, 1, BROKEN_SEED, 3, 4]))
         events = drain(kind)
-    [lost] = [event for event in events if isinstance(event, Lost)]
+    [lost] = [event for event in events if isinstance(event, WorkerLost)]
     assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED]
-    assert (lost.cause, lost.reason, lost.blameless) == ("timeout", "timeout after 1 s", False)
-    finished = [event for event in events if isinstance(event, Finished)]
+    assert (lost.cause, lost.reason, lost.node_lost) == ("timeout", "timeout after 1 s", False)
+    finished = [event for event in events if isinstance(event, TaskDone)]
     assert [seed_of(event.key) for event in finished] == [0, 1, 3, 4]
     assert all(isinstance(event.outcome, TrialResult) for event in finished)
 
@@ -103,7 +104,7 @@ def test_a_long_trial_of_the_kernel_heeds_its_limit(launches: Launches) -> None:
     spec = trial("quadrotor", "d_optimal", env={"horizon": 4000}, model={"width": 64})
     launches(run_trial, seeds=1)  # what is compiled on first use is not part of the limit
     finished = run_task(run_trial, Task(spec.trial_key, spec), Limits(seconds=2.0))
-    assert isinstance(finished.outcome, Trouble)
+    assert isinstance(finished.outcome, Failure)
     assert finished.outcome.cause == "timeout"
     assert "in advance" in finished.outcome.traceback
 
@@ -164,7 +165,7 @@ def test_a_trial_that_the_kernel_kills_for_want_of_memory_fails_after_two_attemp
     assert only_the_broken_one_failed(launches)
     [(_, cause, kind, message, attempt)] = failures(launches)
     assert (cause, kind, attempt) == ("out of memory", "WorkerLost", 2)
-    assert "killed by the kernel for want of memory" in str(message)
+    assert "killed by the kernel: out of memory" in str(message)
 
 
 def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
@@ -172,12 +173,12 @@ def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
 ) -> None:
     monkeypatch.setenv("RAY_memory_usage_threshold", "0.0001")
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
-    ray = importlib.import_module("orchestrate.executors.ray")
+    ray = importlib.import_module("orchestrate.executors.ray.executor")
     with ray.RayExecutor(hanging, 1) as executor:
         executor.submit(tasks([BROKEN_SEED, 3]))
         [lost] = drain(executor)
-    assert isinstance(lost, Lost)
-    assert (lost.cause, lost.blameless) == ("out of memory", False)
+    assert isinstance(lost, WorkerLost)
+    assert (lost.cause, lost.node_lost) == ("out of memory", False)
     assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED, 3]
 
 
@@ -217,9 +218,9 @@ def test_the_cause_of_an_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     counts = tmp_path / "vmstat"
-    monkeypatch.setattr("orchestrate.executors.ending._COUNTS", counts)
+    monkeypatch.setattr("orchestrate.executors.exit_status._KERNEL_COUNTERS", counts)
     counts.write_text(f"nr_free_pages 7\noom_kill {before}\n")
-    words = LastWords()
+    words = CrashReport()
     os.write(words.descriptor, said.encode())
     counts.write_text(f"nr_free_pages 7\noom_kill {after}\n")
     assert words.explain(code).cause == cause

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from dopt.exploration import run_trial
 from dopt.result import TrialResult
+from dopt.run import run_trial
 from orchestrate.errors import LaunchError
-from orchestrate.executors.base import Finished, Task, Trouble
+from orchestrate.executors.base import Task, TaskDone
 from orchestrate.executors.lockstep import LockstepExecutor
+from orchestrate.records import Failure
 from orchestrate.store import Reader
 from tests.dopt.trials import trial
 
@@ -23,11 +24,11 @@ def test_a_chunk_is_run_as_one_batch() -> None:
         executor.submit([Task(spec.trial_key, spec) for spec in TRIALS])
         events = executor.wait(0.1)
         assert executor.pending == 0
-    assert [event.key for event in events if isinstance(event, Finished)] == [
+    assert [event.key for event in events if isinstance(event, TaskDone)] == [
         spec.trial_key for spec in TRIALS
     ]
     for event, spec in zip(events, TRIALS, strict=True):
-        assert isinstance(event, Finished)
+        assert isinstance(event, TaskDone)
         assert isinstance(event.outcome, TrialResult)
         alone = run_trial(spec, "reference")
         assert event.outcome.loss == pytest.approx(alone.loss, rel=1e-9)
@@ -38,8 +39,8 @@ def test_what_cannot_run_together_is_every_trials_trouble() -> None:
     mixed = [TRIALS[0], trial("pendulum", "random", 1, env={"horizon": 8})]
     with LockstepExecutor("cpu", batch=2) as executor:
         executor.submit([Task(spec.trial_key, spec) for spec in mixed])
-        outcomes = [event.outcome for event in executor.wait(0.1) if isinstance(event, Finished)]
-    assert [isinstance(outcome, Trouble) for outcome in outcomes] == [True, True]
+        outcomes = [event.outcome for event in executor.wait(0.1) if isinstance(event, TaskDone)]
+    assert [isinstance(outcome, Failure) for outcome in outcomes] == [True, True]
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "banana", "meta"])
@@ -70,7 +71,7 @@ def test_a_grid_runs_in_lockstep(
     )
     assert code == 0, errors
     with Reader.open(url) as reader:
-        assert [cell.n_done for cell in reader.cells()] == [4, 4]
+        assert [cell.n_done for cell in reader.configs()] == [4, 4]
 
 
 def test_lockstep_and_the_kernel_keep_their_trials_apart(
@@ -82,7 +83,7 @@ def test_lockstep_and_the_kernel_keep_their_trials_apart(
     assert command_line(*one, "executor=lockstep")[0] == 0
     assert command_line(*one, "executor=inprocess")[0] == 0
     with Reader.open(url) as reader:
-        assert sorted(str(cell.config["path"]) for cell in reader.cells()) == [
+        assert sorted(str(cell.config["path"]) for cell in reader.configs()) == [
             "kernel",
             "reference",
         ]

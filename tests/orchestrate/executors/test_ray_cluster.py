@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 from orchestrate.errors import InfrastructureError, LaunchError
-from orchestrate.executors.ray import RayExecutor
-from orchestrate.executors.ray_cluster import SETTINGS_FILE
-from orchestrate.executors.ray_connection import first_line
+from orchestrate.executors.ray.cluster import SETTINGS_FILE
+from orchestrate.executors.ray.connection import first_line
+from orchestrate.executors.ray.executor import RayExecutor
 from orchestrate.store import Reader
 from tests.orchestrate.clustered_launches import ADDRESSES, LONG_SEED, LOSSES, ROOT
 from tests.orchestrate.conftest import Launches

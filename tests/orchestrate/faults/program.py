@@ -20,13 +20,13 @@ from typing import Any
 
 import psycopg
 
-from orchestrate import launch
-from orchestrate.campaign import Work
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.settings import LaunchSettings
+from orchestrate.runner import launch
+from orchestrate.runner.run_grid import Work
 from orchestrate.store import Store
-from orchestrate.store.postgresql import PostgreSQLBackend
-from orchestrate.store.sqlite import SQLiteBackend
+from orchestrate.store.backends.postgresql import PostgreSQLBackend
+from orchestrate.store.backends.sqlite import SQLiteBackend
 from tests.orchestrate.faults.trials import Standin, grid_of, rest
 
 

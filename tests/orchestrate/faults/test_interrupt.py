@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
-from orchestrate.interrupt import Interrupt, undisturbed
+from orchestrate.runner.signals import Interrupt, undisturbed
 from tests.orchestrate.faults.laboratory import Laboratory, alive
 
 
@@ -22,7 +22,7 @@ def test_one_interrupt_ends_what_runs_and_frees_the_rest(
         launched.until(lambda: laboratory.count() >= 5)
         launched.send(number)
         assert launched.end() == 130, launched.errors
-    assert "the same command goes on from here" in launched.said
+    assert "run the same command again to continue" in launched.said
     assert "Traceback" not in launched.errors
     left = laboratory.order.trials - laboratory.count()
     assert left > 0
@@ -75,7 +75,7 @@ def interrupted(times: int, rest: float = 0.0) -> None:
 def test_an_interrupt_waits_for_the_end_of_a_transaction() -> None:
     with Interrupt() as stop:
         interrupted(1)
-        assert stop.draining
+        assert stop.stop_requested
         start = time.monotonic()
         with pytest.raises(KeyboardInterrupt):
             interrupted(1, rest=0.3)

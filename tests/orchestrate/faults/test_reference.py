@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from dopt.cell import without_versions
-from dopt.spec import TrialSpec
+from dopt.spec.config import without_versions
+from dopt.spec.trial import TrialSpec
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.faults.outcome import Rows, flaws, results
@@ -88,7 +88,7 @@ def test_what_was_stored_is_read_back_as_the_trial_that_it_was(
     said, _ = process.communicate(timeout=PATIENCE_SECONDS)
     assert process.returncode == 0, said
     with Reader.open(url) as reader:
-        cells = reader.cells()
+        cells = reader.configs()
     assert {cell.config["path"] for cell in cells} == {"reference"}
     assert {cell.config["model"]["width"] for cell in cells} == {16}
     monkeypatch.syspath_prepend(str(EXAMPLE))

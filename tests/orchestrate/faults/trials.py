@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dopt.result import Assessment, TrialResult
-from dopt.spec import TrialSpec
-from orchestrate.grid import Grid
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
 from tests.orchestrate.standins import diverged, quick, specification
 
 BROKEN_SEED = 7
@@ -56,7 +56,7 @@ def grid_of(trials: int) -> Grid:
     """Return trials that differ in their seed, from 0 on."""
     first = specification(0, horizon=HORIZON)
     seeds = [first.with_seed(seed) for seed in range(trials)]
-    return Grid(seeds, asked=trials, left_out={})
+    return Grid(seeds, n_jobs=trials, left_out={})
 
 
 def _kill() -> None:

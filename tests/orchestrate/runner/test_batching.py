@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dopt.spec import TrialSpec
-from orchestrate.chunks import LARGEST, Chunks
+from dopt.spec.trial import TrialSpec
+from orchestrate.runner.batching import MAX_CHUNK_TRIALS, Chunks
 from tests.orchestrate.standins import specification
 
 TRIALS = [specification(seed) for seed in range(1000)]
@@ -41,7 +41,7 @@ def test_cheap_trials_are_bounded_and_get_fewer_towards_the_end() -> None:
     known.observe(TRIALS[0].config_key, 1e-6)
     given = sizes(known)
     assert sum(given) == len(TRIALS)
-    assert max(given) == LARGEST
+    assert max(given) == MAX_CHUNK_TRIALS
     assert given == sorted(given, reverse=True)
     assert given[-1] == 1
 

@@ -7,14 +7,14 @@ from collections.abc import Callable
 
 import pytest
 
-from orchestrate.progress import Progress, Tally, duration
+from orchestrate.runner.progress import Progress, Tally, duration
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Return a function that lets time pass."""
     now = [0.0]
-    monkeypatch.setattr("orchestrate.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("orchestrate.runner.progress.time.monotonic", lambda: now[0])
 
     def passes(seconds: float) -> None:
         now[0] += seconds

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrate.provenance import launch_record
+from orchestrate.runner.provenance import launch_record
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -69,3 +69,18 @@ def test_the_processor_and_what_compiles_for_it_are_named(tmp_path: Path) -> Non
     versions = launch_record([], [], tmp_path).versions
     assert {"llvmlite", "cpu", "cpu_model", "cpu_features", "platform"} <= set(versions)
     assert all(versions.values())
+
+
+def test_untracked_results_and_builds_leave_the_code_clean(tmp_path: Path) -> None:
+    git(tmp_path, "init")
+    (tmp_path / "code.py").write_text("a = 1\n")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-m", "Add code")
+    for name in ("exported/curves.csv", "build/lib/code.py", "dist/dopt.whl", "notes.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("output\n")
+    record = launch_record([], [], tmp_path)
+    assert (record.git_dirty, record.git_diff_hash) == (False, None)
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "boat.yaml").write_text("mass: 1\n")
+    assert launch_record([], [], tmp_path).git_dirty

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.spec import TrialSpec
-from orchestrate.campaign import Work, launch_grid
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.grid import Grid
-from orchestrate.settings import LaunchSettings
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import NoDatabaseError, Reader, Store
 from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.standins import (
@@ -163,13 +163,16 @@ def test_the_kernel_is_made_ready_where_a_trial_needs_it(
     tmp_path: Path, policies: tuple[str, ...], prepared: int
 ) -> None:
     calls: list[None] = []
-    sections = {"coin": {"_target_": "tests.dopt.own_parts.Coin"}, "random": {"name": "random"}}
+    sections = {
+        "coin": {"_target_": "tests.dopt.custom_plugins.Coin"},
+        "random": {"name": "random"},
+    }
     usual = specification().to_mapping()
     trials = [
         TrialSpec.from_mapping({k: v for k, v in usual.items() if k != "path"} | {"policy": chosen})
         for chosen in (sections[name] for name in policies)
     ]
-    grid = Grid(trials, asked=len(trials), left_out={})
+    grid = Grid(trials, n_jobs=len(trials), left_out={})
     settings = LaunchSettings("inprocess", f"sqlite:///{tmp_path / 'results.db'}")
     work = Work(quick, prepare=lambda: calls.append(None))
     assert launch_grid(grid, settings, RECORD, work, lambda _: None, stream=None) == ExitCode.DONE

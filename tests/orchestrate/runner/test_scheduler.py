@@ -1,4 +1,4 @@
-"""The driver under an executor that does what the test says, loses and dies included."""
+"""The scheduler under an executor that does what the test says, loses and dies included."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from orchestrate.driver import ATTEMPTS, NODE_LOSSES
 from orchestrate.errors import ExitCode, InfrastructureError
-from orchestrate.executors.base import Event, Executor, Lost, Task
+from orchestrate.executors.base import Event, Executor, Task, WorkerLost
 from orchestrate.executors.task import run_task
+from orchestrate.runner.scheduler import MAX_NODE_LOSSES, MAX_WORKER_LOSSES
 from orchestrate.store import Claim, Store, StoreUnavailableError
 from tests.orchestrate.conftest import Launches
 from tests.orchestrate.losses import lose
@@ -61,7 +61,7 @@ def scripted(
 
     def launch(fate: Fate, seeds: int = 5, **settings: object) -> tuple[ExitCode, Scripted]:
         executor = Scripted(fate)
-        monkeypatch.setattr("orchestrate.campaign.make_executor", lambda *_: executor)
+        monkeypatch.setattr("orchestrate.runner.run_grid.make_executor", lambda *_: executor)
         return launches(seeds=seeds, **settings), executor  # type: ignore[arg-type]
 
     return launch
@@ -86,8 +86,8 @@ def test_a_trial_whose_node_is_lost_runs_again_free_of_charge(
     scripted: Launch, launches: Launches
 ) -> None:
     def fate(chunk: Sequence[Task], time: int) -> list[Event]:
-        if has_broken(chunk) and time < NODE_LOSSES:
-            return [Lost(keys(chunk), "lost its power", blameless=True)]
+        if has_broken(chunk) and time < MAX_NODE_LOSSES:
+            return [WorkerLost(keys(chunk), "lost its power", node_lost=True)]
         return finish(chunk)
 
     assert scripted(fate)[0] == ExitCode.DONE
@@ -96,7 +96,7 @@ def test_a_trial_whose_node_is_lost_runs_again_free_of_charge(
         "SELECT outcome, count(*) FROM attempt JOIN trial USING (trial_id) "
         f"WHERE seed = {BROKEN_SEED} GROUP BY outcome ORDER BY outcome"
     )
-    assert outcomes == [("done", 1), ("released", NODE_LOSSES - 1)]
+    assert outcomes == [("done", 1), ("released", MAX_NODE_LOSSES - 1)]
 
 
 def test_a_trial_that_is_lost_with_every_node_is_given_up(
@@ -104,7 +104,7 @@ def test_a_trial_that_is_lost_with_every_node_is_given_up(
 ) -> None:
     def fate(chunk: Sequence[Task], _: int) -> list[Event]:
         if has_broken(chunk):
-            return [Lost(keys(chunk), "lost its power", blameless=True)]
+            return [WorkerLost(keys(chunk), "lost its power", node_lost=True)]
         return finish(chunk)
 
     assert scripted(fate)[0] == ExitCode.SOME_FAILED
@@ -112,9 +112,9 @@ def test_a_trial_that_is_lost_with_every_node_is_given_up(
     assert statuses.pop(BROKEN_SEED) == "failed"
     assert set(statuses.values()) == {"done"}
     [(cause, message, attempt)] = launches.query("SELECT cause, message, attempt FROM v_failures")
-    assert (cause, attempt) == ("node lost", NODE_LOSSES)
+    assert (cause, attempt) == ("node lost", MAX_NODE_LOSSES)
     assert message == (
-        f"lost {NODE_LOSSES} times with its node, which has lost its power the last time"
+        f"node was lost {MAX_NODE_LOSSES} times while running this trial (last: lost its power)"
     )
 
 
@@ -122,8 +122,8 @@ def test_the_loss_of_nodes_does_not_count_against_the_attempts(
     scripted: Launch, launches: Launches
 ) -> None:
     def fate(chunk: Sequence[Task], time: int) -> list[Event]:
-        if has_broken(chunk) and time <= NODE_LOSSES:
-            return [Lost(keys(chunk), "gone", blameless=time != 2)]
+        if has_broken(chunk) and time <= MAX_NODE_LOSSES:
+            return [WorkerLost(keys(chunk), "gone", node_lost=time != 2)]
         return finish(chunk)
 
     assert scripted(fate)[0] == ExitCode.DONE
@@ -135,21 +135,21 @@ def test_a_lost_chunk_is_split_and_only_the_one_to_blame_fails(
 ) -> None:
     def fate(chunk: Sequence[Task], _: int) -> list[Event]:
         if has_broken(chunk):
-            return [Lost(keys(chunk), "been killed", cause="out of memory")]
+            return [WorkerLost(keys(chunk), "killed", cause="out of memory")]
         return finish(chunk)
 
     code, executor = scripted(fate, seeds=200)
     assert code == ExitCode.SOME_FAILED
     [(cause, kind)] = launches.query("SELECT cause, type FROM v_failures")
     assert (cause, kind) == ("out of memory", "WorkerLost")
-    assert executor.given.count([BROKEN_SEED]) >= ATTEMPTS
+    assert executor.given.count([BROKEN_SEED]) >= MAX_WORKER_LOSSES
     assert set(Counter(launches.statuses().values()).items()) == {("done", 199), ("failed", 1)}
 
 
 def test_a_timeout_is_final(scripted: Launch, launches: Launches) -> None:
     def fate(chunk: Sequence[Task], _: int) -> list[Event]:
         if has_broken(chunk):
-            return [Lost(keys(chunk), "timeout after 5 s", cause="timeout", traceback="in C")]
+            return [WorkerLost(keys(chunk), "timeout after 5 s", cause="timeout", traceback="in C")]
         return finish(chunk)
 
     code, executor = scripted(fate)
@@ -164,7 +164,7 @@ def test_a_timeout_is_final(scripted: Launch, launches: Launches) -> None:
 def test_fail_fast_heeds_every_cause(scripted: Launch, launches: Launches) -> None:
     def fate(chunk: Sequence[Task], _: int) -> list[Event]:
         if has_broken(chunk):
-            return [Lost(keys(chunk), "timeout after 5 s", cause="timeout")]
+            return [WorkerLost(keys(chunk), "timeout after 5 s", cause="timeout")]
         return finish(chunk)
 
     assert scripted(fate, seeds=300, fail_fast=True)[0] == ExitCode.SOME_FAILED

@@ -47,6 +47,8 @@ class Spec:
     policy: str = "random"
     width: int | None = 16
     horizon: int = HORIZON
+    gamma: float = 1.5
+    task: str | None = None
 
     def columns(self) -> Mapping[str, Any]:
         return {
@@ -58,12 +60,14 @@ class Spec:
             "depth": 2,
             "horizon": self.horizon,
             "dt": 0.01,
-            "gamma": 1.5,
+            "gamma": self.gamma,
+            "label": self.policy,
         }
 
     @property
     def config_json(self) -> str:
-        return json.dumps(self.columns(), sort_keys=True, default=int)
+        task = {} if self.task is None else {"task": {"name": self.task}}
+        return json.dumps({**self.columns(), **task}, sort_keys=True, default=int)
 
     @property
     def config_key(self) -> str:

@@ -14,12 +14,14 @@ from typing import Any
 
 import sqlalchemy
 
-from orchestrate.store import Claim, Store, merge, merge_source, merging, migrations, upgrade
+from orchestrate.store import Claim, Store, merge, migrations, upgrade
+from orchestrate.store.merging import merge as merging
+from orchestrate.store.merging import source as merge_source
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
 
 # Forked from a process that has imported everything and opened nothing: starts in milliseconds.
 CLEAN = multiprocessing.get_context("forkserver")
-CLEAN.set_forkserver_preload(["pytest", "psycopg", "orchestrate.launch", __name__])
+CLEAN.set_forkserver_preload(["pytest", "psycopg", "orchestrate.runner.launch", __name__])
 PATIENCE_SECONDS = 60.0
 NOBODY = 65534
 

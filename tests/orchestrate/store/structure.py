@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from sqlalchemy import Connection, create_engine, inspect, text
+from sqlalchemy import Connection, create_engine, text
 
 _POSTGRESQL = {
     "columns": "SELECT c.relname, a.attnum, a.attname, format_type(a.atttypid, a.atttypmod), "
@@ -21,6 +21,16 @@ _POSTGRESQL = {
     "views": "SELECT viewname, definition FROM pg_views WHERE schemaname = current_schema()",
     "sequences": "SELECT sequencename, last_value, data_type::text FROM pg_sequences "
     "WHERE schemaname = current_schema()",
+}
+
+# One query, because the reflection of SQLAlchemy asks several for each table.
+_COLUMNS = {
+    "sqlite": "SELECT m.name, c.name FROM sqlite_master m, pragma_table_info(m.name) c "
+    "WHERE m.type = 'table' AND m.name NOT LIKE 'sqlite\\_%' ESCAPE '\\' ORDER BY m.name, c.cid",
+    "postgresql": "SELECT c.relname, a.attname FROM pg_attribute a "
+    "JOIN pg_class c ON c.oid = a.attrelid AND c.relkind = 'r' "
+    "WHERE a.attnum > 0 AND NOT a.attisdropped "
+    "AND c.relnamespace = to_regnamespace(current_schema()) ORDER BY c.relname, a.attnum",
 }
 
 
@@ -82,11 +92,11 @@ def contents(url: str, columns: dict[str, tuple[str, ...]]) -> dict[str, list[st
 def columns(url: str) -> dict[str, tuple[str, ...]]:
     """Return the names of the columns of each table, without that of the version."""
     engine = create_engine(url)
-    inspector = inspect(engine)
-    found = {
-        table: tuple(column["name"] for column in inspector.get_columns(table))
-        for table in inspector.get_table_names()
-        if table not in ("schema_version", "alembic_version")
-    }
+    with engine.begin() as connection:
+        pairs = connection.execute(text(_COLUMNS[engine.name])).all()
     engine.dispose()
+    found: dict[str, tuple[str, ...]] = {}
+    for table, column in pairs:
+        if table not in ("schema_version", "alembic_version"):
+            found[table] = (*found.get(table, ()), column)
     return found

@@ -9,11 +9,11 @@ from multiprocessing.connection import Connection as Pipe
 
 import pytest
 
-from dopt.exploration import run_trial
+from dopt.run import run_trial
 from orchestrate.executors.base import Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.task import run_task
-from orchestrate.heartbeat import Heartbeat
+from orchestrate.runner.heartbeat import Heartbeat
 from orchestrate.store import Store
 from tests.dopt.trials import trial
 from tests.orchestrate.losses import lose
@@ -83,5 +83,5 @@ def test_a_trial_in_compiled_code_does_not_silence_it(
         ran = run_task(run_trial, Task(spec.trial_key, spec), limits)
         pipe.send("stop")
         assert hear(pipe) == 0
-    assert ran.usage.wall_seconds >= 1.5 * LONG_LEASE
+    assert ran.run.wall_seconds >= 1.5 * LONG_LEASE
     assert store.commit(claim, result(), RUN)

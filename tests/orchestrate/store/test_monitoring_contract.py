@@ -41,12 +41,12 @@ def test_all_reads_of_a_moment_agree(store: Store, take: Take, reader: Reader) -
     early, late = take(Spec(0), Spec(1))
     store.commit(early, result(0), RUN)
     with reader.moment() as moment:
-        assert moment.cells()[0].n_done == 1
+        assert moment.configs()[0].n_done == 1
         store.commit(late, result(1), RUN)
-        assert moment.cells()[0].n_done == 1
+        assert moment.configs()[0].n_done == 1
         assert len(moment.curves(Spec().config_key).values) == 1
         assert len(moment.rows("SELECT t FROM step")) == HORIZON
-    assert reader.cells()[0].n_done == 2
+    assert reader.configs()[0].n_done == 2
 
 
 def test_rows_come_in_batches(store: Store, take: Take, reader: Reader) -> None:

@@ -56,7 +56,7 @@ class TestCommit:
         ("row", "words"),
         [
             (Assessment(8, "cost", 1.0), "'cost' is of step 8, expected one from 0 to 7"),
-            (Assessment(3, "cost", 1.0), "'cost' of step 3 is there twice"),
+            (Assessment(3, "cost", 1.0), "'cost' of step 3 is given twice"),
         ],
     )
     def test_refuses_assessments_that_do_not_fit(

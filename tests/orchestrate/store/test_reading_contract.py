@@ -43,7 +43,7 @@ def grid(store: Store, launch: int, take: Take) -> list[Spec]:
 @pytest.mark.usefixtures("grid")
 class TestReader:
     def test_counts_the_trials_of_each_cell(self, reader: Reader) -> None:
-        first, second = reader.cells()
+        first, second = reader.configs()
         assert (first.policy, first.width, first.n, first.n_pending) == ("d_optimal", None, 1, 1)
         assert (second.policy, second.config_key, second.n) == ("random", KEY, 4)
         assert (second.n_done, second.n_diverged, second.n_failed) == (2, 1, 1)
@@ -206,7 +206,7 @@ class TestOpening:
                 side.open(url)
 
     def test_shows_the_version(self, reader: Reader) -> None:
-        assert reader.schema_version() == "3"
+        assert reader.schema_version() == "4"
 
     @pytest.mark.parametrize("side", [Store, Reader])
     @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from orchestrate.patience import PatientStore
+from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
 from orchestrate.store import StoreUnavailableError as UnavailableError
 from tests.orchestrate.losses import lose
@@ -33,13 +33,13 @@ def said() -> list[str]:
 
 
 @pytest.fixture
-def patient(store: Store, launch: int, said: list[str]) -> PatientStore:
-    return PatientStore(store, launch, 10.0, said.append)
+def patient(store: Store, launch: int, said: list[str]) -> RetryingStore:
+    return RetryingStore(store, launch, 10.0, said.append)
 
 
 @losses
 def test_a_claim(
-    patient: PatientStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+    patient: RetryingStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
 ) -> None:
     todo = patient.register(SPECS).todo
     lose(monkeypatch, lost)
@@ -51,7 +51,7 @@ def test_a_claim(
 
 @losses
 def test_a_claim_takes_nothing_from_others(
-    patient: PatientStore, store: Store, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+    patient: RetryingStore, store: Store, monkeypatch: pytest.MonkeyPatch, lost: list[str]
 ) -> None:
     todo = patient.register(SPECS).todo
     [held] = patient.claim(todo[:1])
@@ -64,7 +64,7 @@ def test_a_claim_takes_nothing_from_others(
 
 @losses
 def test_a_commit(
-    patient: PatientStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+    patient: RetryingStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
 ) -> None:
     claims = patient.claim(patient.register(SPECS).todo)
     lose(monkeypatch, lost)
@@ -75,7 +75,7 @@ def test_a_commit(
 
 @losses
 def test_a_commit_that_comes_too_late(
-    patient: PatientStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch,
+    patient: RetryingStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch,
     lost: list[str],
 ) -> None:  # fmt: skip
     todo = patient.register(SPECS[:2]).todo
@@ -90,7 +90,7 @@ def test_a_commit_that_comes_too_late(
 
 @losses
 def test_a_failure(
-    patient: PatientStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+    patient: RetryingStore, reader: Reader, monkeypatch: pytest.MonkeyPatch, lost: list[str]
 ) -> None:
     [claim] = patient.claim(patient.register(SPECS[:1]).todo)
     lose(monkeypatch, lost)
@@ -99,7 +99,7 @@ def test_a_failure(
 
 
 def test_a_failure_that_comes_too_late(
-    patient: PatientStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch
+    patient: RetryingStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     [claim] = patient.claim(patient.register(SPECS[:1]).todo)
     store.release(launch)
@@ -108,7 +108,7 @@ def test_a_failure_that_comes_too_late(
 
 
 def test_a_malformed_result_is_not_waited_for(
-    patient: PatientStore, take: Callable[..., list[Claim]], said: list[str]
+    patient: RetryingStore, take: Callable[..., list[Claim]], said: list[str]
 ) -> None:
     [claim] = take(Spec(0))
     with pytest.raises(InvalidResultError):
@@ -117,7 +117,7 @@ def test_a_malformed_result_is_not_waited_for(
 
 
 def test_it_says_once_that_it_waits_and_for_how_long(
-    patient: PatientStore, said: list[str], monkeypatch: pytest.MonkeyPatch
+    patient: RetryingStore, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lose(monkeypatch, ["question"] * 3)
     patient.recover()
@@ -132,12 +132,12 @@ def test_patience_ends(
     lose(monkeypatch, ["question"] * 1000)
     start = time.monotonic()
     with pytest.raises(UnavailableError, match="recover was lost"):
-        PatientStore(store, launch, 0.5, said.append).recover()
+        RetryingStore(store, launch, 0.5, said.append).recover()
     assert time.monotonic() - start >= 0.5
 
 
 def test_what_waiting_cannot_help_is_raised_at_once(
-    patient: PatientStore, said: list[str], monkeypatch: pytest.MonkeyPatch
+    patient: RetryingStore, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lose(monkeypatch, ["question", "", ""], transient=False)
     with pytest.raises(UnavailableError, match="recover was lost"):

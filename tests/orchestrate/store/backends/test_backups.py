@@ -9,8 +9,8 @@ import pytest
 from sqlalchemy import Engine
 
 from orchestrate.store import StoreError, StoreUnavailableError, upgrade
+from tests.orchestrate.store.migrations.released import restore
 from tests.orchestrate.store.places import backups, execute, file_of, schema_of
-from tests.orchestrate.store.released import restore
 from tests.orchestrate.store.structure import columns, contents, structure
 
 
@@ -64,7 +64,7 @@ def test_a_full_disk_refuses_the_backup(sqlite_url: str, monkeypatch: pytest.Mon
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("orchestrate.store.backup_file.os.fsync", full)
+    monkeypatch.setattr("orchestrate.store.backends.sqlite_backup.os.fsync", full)
     with pytest.raises(StoreUnavailableError, match=r"No space left.*--no-backup"):
         upgrade(sqlite_url)
     assert structure(sqlite_url) == before

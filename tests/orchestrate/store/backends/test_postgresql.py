@@ -122,7 +122,7 @@ def test_a_sleeper_that_sends_its_steps_is_ended(
             wakes.wait(DEADLINE)
         yield from column.tolist()
 
-    monkeypatch.setattr("orchestrate.store.postgresql.finite_list", asleep)
+    monkeypatch.setattr("orchestrate.store.backends.postgresql.finite_list", asleep)
     with ThreadPoolExecutor(1) as pool:
         committed = pool.submit(late.commit, sent, result(), RUN)
         assert sends.wait(DEADLINE)

@@ -19,7 +19,7 @@ from orchestrate.store import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.sqlite_files import _read_mode
+from orchestrate.store.backends.sqlite_engine import _read_mode
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import eight_open
 
@@ -134,7 +134,7 @@ def test_two_names_of_one_file_share_their_locks(store: Store, path: Path) -> No
 def test_a_path_may_hold_any_character(tmp_path: Path) -> None:
     path = tmp_path / "50% of #1 & a b.db"
     with Store.open(f"sqlite:///{path}"), Reader.open(f"sqlite:///{path}") as reader:
-        assert reader.cells() == []
+        assert reader.configs() == []
     assert path.is_file()
 
 

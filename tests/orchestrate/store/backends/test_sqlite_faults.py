@@ -13,15 +13,8 @@ import numpy as np
 import pytest
 from sqlalchemy.engine import make_url
 
-from orchestrate.store import (
-    Claim,
-    Reader,
-    Store,
-    StoreError,
-    StoreUnavailableError,
-    examine,
-    sqlite_files,
-)
+from orchestrate.store import Claim, Reader, Store, StoreError, StoreUnavailableError, examine
+from orchestrate.store.backends import sqlite_engine
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import hear, kill, run_and_stop, running, without_rights
 
@@ -272,7 +265,7 @@ def test_a_long_reader_holds_up_nobody_and_the_log_shrinks_afterwards(
     url: str, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limit = 2**18
-    monkeypatch.setattr(sqlite_files, "LOG_BYTES", limit)
+    monkeypatch.setattr(sqlite_engine, "MAX_LOG_BYTES", limit)
     wal = path.with_name("results.db-wal")
     specs = [Spec(seed, horizon=300) for seed in range(120)]
     with Store.open(url) as store, Reader.open(url) as reader:

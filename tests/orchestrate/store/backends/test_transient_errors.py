@@ -11,7 +11,7 @@ import pytest
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import Store, StoreUnavailableError
-from orchestrate.store.transience import is_transient
+from orchestrate.store.backends.transient_errors import is_transient
 from tests.orchestrate.store.fakes import LAUNCH
 
 psycopg = pytest.importorskip("psycopg")
@@ -42,7 +42,7 @@ def test_an_unknown_host_is_a_mistake_unless_it_has_answered_before() -> None:
 )
 def test_a_refused_login(postgresql_url: str, wrong: str, reason: str) -> None:
     url = make_url(postgresql_url).set(**{wrong: "nobody_knows"})  # type: ignore[arg-type]
-    with pytest.raises(StoreUnavailableError, match=f"answers but refuses.*{reason}") as caught:
+    with pytest.raises(StoreUnavailableError, match=f"refuses the connection.*{reason}") as caught:
         Store.open(url.render_as_string(hide_password=False))
     assert not caught.value.transient
 
@@ -100,7 +100,7 @@ def test_words_of_the_server_while_a_connection_is_made(text: str, expected: boo
 
 
 def test_a_lock_that_another_process_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("orchestrate.store.sqlite_files.BUSY_TIMEOUT_SECONDS", 0.1)
+    monkeypatch.setattr("orchestrate.store.backends.sqlite_engine.BUSY_TIMEOUT_SECONDS", 0.1)
     path = tmp_path / "results.db"
     with Store.open(f"sqlite:///{path}") as store:
         other = sqlite3.connect(path, isolation_level=None)

@@ -20,8 +20,8 @@ from orchestrate.store import (
     Store,
     StoreError,
     merge,
-    merge_source,
 )
+from orchestrate.store.merging import source
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
 from tests.orchestrate.store.processes import hear, kill, merge_and_tell, running
@@ -204,7 +204,7 @@ def test_only_whole_trials_come(url: str, other: str, damage: str) -> None:
         connection.execute(text(damage))
     engine.dispose()
     found = merge(url, other)
-    assert [one.trial_key for one in found.broken] == [Spec(0).trial_key]
+    assert [one.trial_key for one in found.incomplete] == [Spec(0).trial_key]
     with Reader.open(url) as reader:
         assert reader.query("SELECT * FROM trial") == []
 
@@ -212,7 +212,7 @@ def test_only_whole_trials_come(url: str, other: str, damage: str) -> None:
 def test_a_merge_that_was_killed_is_completed(
     url: str, other: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(merge_source, "PAGE", 3)
+    monkeypatch.setattr(source, "PAGE", 3)
     fill(other, *seeds(*range(12)), Spec(99))
     with running(merge_and_tell, url, other, 7) as (process, pipe):
         assert hear(pipe) == "in the middle"

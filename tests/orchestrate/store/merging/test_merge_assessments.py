@@ -39,7 +39,7 @@ def test_a_trial_that_lost_assessments_does_not_come(url: str, other: str, damag
         connection.execute(text(f"{damage} {joint} trial_id = {first}"))
     engine.dispose()
     found = merge(url, other)
-    assert [one.trial_key for one in found.broken] == [Spec(0).trial_key]
+    assert [one.trial_key for one in found.incomplete] == [Spec(0).trial_key]
     assert found.added == {"done": 1}
 
 

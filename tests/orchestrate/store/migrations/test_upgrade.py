@@ -18,17 +18,17 @@ from orchestrate.store import (
     SchemaVersionError,
     Store,
     StoreUnavailableError,
-    address,
+    database_url,
     migrations,
     upgrade,
 )
-from orchestrate.store.locks import LaunchLocks
-from orchestrate.store.opening import make_backend
+from orchestrate.store.backends.file_locks import LaunchLocks
+from orchestrate.store.backends.open import make_backend
 from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.store.fakes import LAUNCH, Spec
+from tests.orchestrate.store.migrations.released import VERSIONS
 from tests.orchestrate.store.places import backups, execute, file_of
 from tests.orchestrate.store.processes import CLEAN, hear, kill, running, upgrade_and_tell
-from tests.orchestrate.store.released import VERSIONS
 from tests.orchestrate.store.structure import columns, contents, structure
 
 FAILING = '''
@@ -117,7 +117,20 @@ def test_every_row_stays_as_it_was(old: str, version: int) -> None:
     assert contents(old, kept) == before
     with Reader.open(old) as reader:
         assert reader.schema_version() == str(SCHEMA_VERSION)
-        assert sum(cell.n_done for cell in reader.cells()) == 4
+        assert sum(cell.n_done for cell in reader.configs()) == 4
+
+
+def test_every_configuration_gets_its_label(old: str) -> None:
+    upgrade(old)
+    with Reader.open(old) as reader:
+        found = [row[0] for row in reader.query("SELECT label FROM config ORDER BY config_id")]
+        shown = {row[0] for row in reader.query("SELECT label FROM v_curve_stats")}
+    assert found == [
+        "random, adam, horizon 25, depth 1, width 2",
+        "random, adam, γ=30, horizon 25, state_limit=5, depth 1, width 2",
+        "uniform, adam, horizon 25, depth 1, width 2",
+    ]
+    assert shown == set(found)
 
 
 def test_a_launch_goes_on_after_it(old: str) -> None:
@@ -188,7 +201,7 @@ def _checks(found: dict[str, list[tuple[str, ...]]]) -> list[str]:
 
 
 def _migrate(url: str) -> None:
-    backend = make_backend(address.parse(url))
+    backend = make_backend(database_url.parse(url))
     with backend.rebuilding() as connection:
         migrations.migrate(connection, SCHEMA_VERSION)
     backend.close()

@@ -1,0 +1,1 @@
+"""Hydra plugin with a sweeper that composes each choice of groups once."""

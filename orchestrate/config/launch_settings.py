@@ -1,0 +1,99 @@
+"""Settings of a launch as checked values; none of them is part of a trial."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast
+
+from dopt.errors import unknown_name
+from orchestrate.config.value_checks import amount, count, flag, limit, section, text, wrong
+
+RETRY = ("failed", "diverged", "all")
+
+Retry = Literal["failed", "diverged", "all"]
+
+
+@dataclass(frozen=True)
+class LaunchSettings:
+    """Settings of one launch.
+
+    Attributes
+    ----------
+    executor
+        Name in :data:`orchestrate.executors.registry.EXECUTORS`.
+    store_url
+        SQLAlchemy URL of the results database.
+    retry
+        Finished trials of the grid that are run again.
+    workers
+        Processes, or None for one on each core.
+    chunk_seconds
+        Work that a worker gets at once.
+    timeout
+        Seconds of wall time that one trial may take, or None for no limit.
+    memory_gib
+        Memory that one worker process may take, or None for no limit.
+    lease
+        Seconds after its last heartbeat for which a launch on PostgreSQL keeps its trials.
+    patience
+        Seconds that a launch waits for a database that cannot be reached.
+    ray_address
+        "local" for a Ray of its own, or HOST:PORT of the head of a cluster.
+    executor_options
+        Section ``executor`` without its name; the executor checks it.
+    """
+
+    executor: str
+    store_url: str
+    dry_run: bool = False
+    fail_fast: bool = False
+    retry: Retry | None = None
+    workers: int | None = None
+    chunk_seconds: float = 1.0
+    timeout: float | None = 3600.0
+    memory_gib: float | None = None
+    lease: float = 60.0
+    patience: float = 30.0
+    ray_address: str = "local"
+    executor_options: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, Any]) -> LaunchSettings:
+        """Check the sections ``launch``, ``store`` and ``executor`` of a configuration.
+
+        Raises
+        ------
+        LaunchError
+            If a value has the wrong type or is out of bounds.
+        """
+        launch = section("launch", given["launch"])
+        executor = section("executor", given["executor"])
+        retry = launch["retry"]
+        if retry is not None and retry not in RETRY:
+            raise unknown_name("launch.retry", retry, RETRY)
+        return cls(
+            executor=text("executor.name", executor["name"]),
+            store_url=text("store.url", section("store", given["store"])["url"]),
+            dry_run=flag("launch.dry_run", launch["dry_run"]),
+            fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
+            retry=cast("Retry | None", retry),
+            workers=count("launch.workers", launch["workers"]),
+            chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
+            timeout=limit("launch.timeout", launch["timeout"], "seconds"),
+            memory_gib=limit("launch.memory_gib", launch["memory_gib"], "GiB"),
+            **_lease_and_patience(launch["lease"], launch["patience"]),
+            ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
+            executor_options={key: value for key, value in executor.items() if key != "name"},
+        )
+
+
+def _lease_and_patience(lease: object, patience: object) -> dict[str, float]:
+    """Check that a launch gives up waiting for its database before its lease ends."""
+    seconds = {
+        "lease": amount("launch.lease", lease, "seconds"),
+        "patience": amount("launch.patience", patience, "seconds"),
+    }
+    if seconds["patience"] >= seconds["lease"]:
+        raise wrong("launch.patience", patience, f"less than launch.lease={lease}")
+    return seconds

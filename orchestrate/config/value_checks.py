@@ -1,0 +1,56 @@
+"""Type and range checks of single settings; each refusal names the key, the value and the range."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from orchestrate.errors import LaunchError
+
+LARGEST = 1_000_000_000
+"""Bound of seconds and GiB: system timers and limits overflow above it."""
+
+
+def section(key: str, value: object) -> Mapping[str, Any]:
+    """Return a mapping of settings."""
+    if isinstance(value, Mapping):
+        return value
+    raise wrong(key, value, "a section with settings of its own")
+
+
+def flag(key: str, value: object) -> bool:
+    """Return a boolean."""
+    if isinstance(value, bool):
+        return value
+    raise wrong(key, value, "true or false")
+
+
+def text(key: str, value: object) -> str:
+    """Return a non-empty text."""
+    if isinstance(value, str) and value:
+        return value
+    raise wrong(key, value, "a text")
+
+
+def count(key: str, value: object) -> int | None:
+    """Return a positive whole number, or None."""
+    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
+        return value
+    raise wrong(key, value, "null or a whole number above 0")
+
+
+def limit(key: str, value: object, unit: str) -> float | None:
+    """Return a positive number, or None for no limit."""
+    return None if value is None else amount(key, value, unit, "null or a number")
+
+
+def amount(key: str, value: object, unit: str, kind: str = "a number") -> float:
+    """Return a positive number below :data:`LARGEST`."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < LARGEST:
+        return float(value)
+    raise wrong(key, value, f"{kind} of {unit} above 0 and below {LARGEST:,}")
+
+
+def wrong(key: str, value: object, expected: str) -> LaunchError:
+    """Return the error for a setting with an invalid value."""
+    return LaunchError(f"{key} is {value!r}, but {expected} is expected: set it so.")

@@ -1,0 +1,1 @@
+"""Executor on Ray: one machine or a cluster."""

@@ -1,0 +1,1 @@
+"""Answers about a results database: progress of a grid, one trial."""

@@ -1,0 +1,1 @@
+"""Runs of grids and single trials: scheduling, retries, signals, progress."""

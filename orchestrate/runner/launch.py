@@ -1,0 +1,98 @@
+"""Execution of a launch, from its command line to its exit code."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+import traceback
+from pathlib import Path
+
+from dopt.kernel import warm_up
+from dopt.run import run_trial
+from orchestrate.config.argv import normalize
+from orchestrate.config.error_messages import format_error
+from orchestrate.config.grid import Grid, build_grid
+from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config.request import CONFIGURATION, Request, read_command_line
+from orchestrate.config.unknown_keys import check_launch
+from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
+from orchestrate.executors.registry import executor_factory
+from orchestrate.redaction import without_password
+from orchestrate.runner.dry_run import preview
+from orchestrate.runner.memory_check import check_memory
+from orchestrate.runner.provenance import launch_record
+from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.run_single import launch_trial
+from orchestrate.store import URL_VARIABLE, StoreError, StoreUnavailableError
+
+ROOT = Path(__file__).resolve().parents[2]
+WORK = Work(run_trial, warm_up)
+
+
+def main() -> int:
+    """Run the command line and return the exit code."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # An exception message may hold characters that the terminal cannot encode.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    debug = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    if not os.environ.get(URL_VARIABLE):
+        os.environ.pop(URL_VARIABLE, None)  # oc.env of the configuration takes "" as a URL
+    try:
+        sys.argv[1:] = normalize(sys.argv[1:], CONFIGURATION)
+        request = read_command_line()
+        if request is None:
+            return ExitCode.DONE
+        grid, settings = _checked(request)
+    except Exception as error:
+        if debug:
+            raise
+        return _refuse(format_error(error), ExitCode.BAD_REQUEST)
+    return run(request, grid, settings)
+
+
+def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
+    """Return the checked grid and settings of a launch, or raise ``DoptError``."""
+    grid = build_grid(request.combinations, single=request.single)
+    settings = LaunchSettings.from_mapping(request.launch)
+    check_launch(request.launch, CONFIGURATION)
+    path = executor_factory(settings).path
+    if path != "kernel":
+        grid = grid.on_path(path)
+    check_memory(grid, settings)
+    return grid, settings
+
+
+def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
+    """Run a checked grid and return the exit code."""
+    try:
+        for note in grid.notes:
+            say(note)
+        if settings.dry_run:
+            say(preview(grid, settings.store_url, settings.retry))
+            return ExitCode.DONE
+        record = launch_record(sys.argv, request.overrides, ROOT)
+        if not request.single:
+            return launch_grid(grid, settings, record, WORK, say=say)
+        code, line = launch_trial(grid.trials[0], settings, record, WORK)
+        say(line)
+        return code
+    except (StoreUnavailableError, InfrastructureError) as error:
+        return _refuse(str(error), ExitCode.INFRASTRUCTURE)
+    except (StoreError, LaunchError) as error:
+        return _refuse(str(error), ExitCode.BAD_REQUEST)
+    except Exception:
+        sys.stderr.write(without_password(traceback.format_exc()))
+        sentence = "this is a defect of the program (traceback above); committed trials are kept"
+        return _refuse(f"{sentence}: report it, and run the same command again.", ExitCode.DEFECT)
+
+
+def say(text: str) -> None:
+    """Print a line and flush it."""
+    sys.stdout.write(f"{without_password(text)}\n")
+    sys.stdout.flush()
+
+
+def _refuse(sentence: str, code: ExitCode) -> ExitCode:
+    sys.stderr.write(f"error: {without_password(sentence)}\n")
+    return code

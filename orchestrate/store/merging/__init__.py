@@ -1,0 +1,1 @@
+"""Merging of one results database into another."""

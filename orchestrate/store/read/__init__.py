@@ -1,0 +1,1 @@
+"""Read side of the results database: typed rows, queries of users, which launches live."""

@@ -1,0 +1,1 @@
+"""Write side of the results database: registration, claims, results, launches."""
