@@ -1,12 +1,11 @@
-"""From the results database to numbers, from numbers to tables and pictures.
+"""Analysis of a results database: data, statistics, tables, figures, reports and a browser.
 
-Reading (``selection``, ``reading``), numbers (``statistics``, ``paired``, ``spectrum``, ``phase``,
-``coverage``) and ink (``figures``) are strictly apart: what is drawn is saved as CSV beside it.
-Notebooks begin with :func:`load`.
+``data`` reads, ``stats`` computes, ``tables`` and ``figures`` show. What a figure draws is saved as
+CSV beside it. Notebooks begin with :func:`load`.
 """
 
 from __future__ import annotations
 
-from analysis.loading import Results, load
+from analysis.data.frames import Results, load
 
 __all__ = ["Results", "load"]

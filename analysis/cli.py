@@ -7,7 +7,6 @@ missing and ``--allow-partial`` was not given.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,24 +14,23 @@ from pathlib import Path
 import pandas as pd
 
 from analysis.animation import command as film
-from analysis.choice import Filter, read_condition
-from analysis.divergence import DivergenceRule
+from analysis.data.config_matching import REFERENCE, Filter, read_condition
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
-from analysis.figures.registry import NAMES, build, partial_warning
-from analysis.loss_curves import Axis
-from analysis.measures import Measure
+from analysis.figures.loss_curves.data import Axis
+from analysis.outputs.registry import NAMES, build, partial_warning
+from analysis.plot_options import PlotOptions, Spread
 from analysis.report import command as report
-from analysis.request import Request, Spread
-from analysis.selection import Selection, select
 from analysis.serve import command as browser
-from analysis.sheets import Sheet, gaps_sheet
-from analysis.statistics import Statistic
-from analysis.tables import TABLES, TableKind, comparison
+from analysis.stats.intervals import Statistic
+from analysis.stats.trial_scores import Measure
+from analysis.tables.registry import TABLES, TableKind, comparison
+from analysis.tables.rendering import TextTable, gaps_table
 from dopt.errors import DoptError
-from orchestrate.store import Reader
-from orchestrate.usage import Parser
+from orchestrate.cli_parser import Parser
+from orchestrate.store import DEFAULT_URL, Reader, default_url
 
-DEFAULT_URL = "sqlite:///results/results.db"
 COLUMNS = ("loss", "reachable_loss")
 FORMATS = ("markdown", "latex", "csv")
 
@@ -76,7 +74,7 @@ def parser() -> Parser:
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
     summary = _command(commands, "summary", _summary, "mean final losses ± 2 SE, n")
-    compare = _command(commands, "compare", _compare, "D-optimal against every baseline, paired")
+    compare = _command(commands, "compare", _compare, "every variant against the reference, paired")
     compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
     compare.add_argument(
         "--measure", choices=list(Measure), default=Measure.FINAL, help="what a trial is judged by"
@@ -88,6 +86,24 @@ def parser() -> Parser:
             "--epsilon", type=float, help="loss to reach (median final loss of random inputs)"
         )
     compared = _command(commands, "report", None, report.HELP)
+    for command in (figures, compare, compared):
+        command.add_argument(
+            "--reference",
+            default=REFERENCE,
+            metavar="POLICY",
+            help=f"what all others are compared with ({REFERENCE}); with --group-by a value",
+        )
+    for command in (figures, summary, compare):
+        command.add_argument(
+            "--group-by",
+            nargs="+",
+            default=("policy",),
+            metavar="KEY",
+            help="settings of which each value is shown once, such as width or env.gamma (policy)",
+        )
+    figures.add_argument(
+        "--color-by", metavar="KEY", help="setting that colours figure 1 (the first of --group-by)"
+    )
     report.add_arguments(compared)
     compared.set_defaults(alone=lambda options: report.run(options, _filter(options)))
     animate = commands.add_parser("animate", help=film.HELP, description=film.HELP)
@@ -130,13 +146,14 @@ def _command(
 
 
 def _add_database(command: Parser) -> None:
-    url = os.environ.get("DOPT_DB", DEFAULT_URL)
-    command.add_argument("--db", default=url, help=f"database (DOPT_DB, {DEFAULT_URL})")
+    command.add_argument("--db", default=default_url(), help=f"database (DOPT_DB, {DEFAULT_URL})")
 
 
 def _filter(options: argparse.Namespace) -> Filter:
     where = dict(_condition(text) for text in options.where)
-    return Filter(tuple(options.env), tuple(options.policy), where)
+    reference = getattr(options, "reference", REFERENCE)
+    group_by = tuple(getattr(options, "group_by", ("policy",)))
+    return Filter(tuple(options.env), tuple(options.policy), where, reference, group_by)
 
 
 def _condition(text: str) -> tuple[str, object]:
@@ -152,7 +169,7 @@ def _condition(text: str) -> tuple[str, object]:
 def _check_complete(selection: Selection, allow_partial: bool) -> None:
     if selection.gaps and not allow_partial:
         missing = sum(len(gap.seeds) for gap in selection.gaps)
-        table = gaps_sheet(selection.gaps).markdown()
+        table = gaps_table(selection.gaps).markdown()
         raise IncompleteError(
             f"{table}\n\nerror: {missing} trials are missing, a complete "
             f"grid is expected: run the launch again, narrow the request by --env and --policy, "
@@ -161,46 +178,47 @@ def _check_complete(selection: Selection, allow_partial: bool) -> None:
 
 
 def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    request = Request(
+    plot_options = PlotOptions(
         DivergenceRule(options.diverged),
         Axis(options.x),
         Statistic(options.statistic),
         Spread(options.style),
         options.epsilon,
+        options.color_by,
     )
     names = tuple(options.only or NAMES)
     empty = 0
-    for outcome in build(reader, selection, request, options.out, names, force=options.force):
+    for outcome in build(reader, selection, plot_options, options.out, names, force=options.force):
         say(f"{options.out / outcome.name}: {outcome.state}")
         empty += bool(options.only) and outcome.state.startswith("not drawn")
     return 1 if empty else 0
 
 
 def _summary(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    request = Request(DivergenceRule(options.diverged))
-    return _print_table(TABLES["summary"], reader, selection, request, options.format)
+    plot_options = PlotOptions(DivergenceRule(options.diverged))
+    return _print_table(TABLES["summary"], reader, selection, plot_options, options.format)
 
 
 def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
     kind = comparison(options.column, Measure(options.measure))
-    request = Request(DivergenceRule(options.diverged), epsilon=options.epsilon)
-    return _print_table(kind, reader, selection, request, options.format)
+    plot_options = PlotOptions(DivergenceRule(options.diverged), epsilon=options.epsilon)
+    return _print_table(kind, reader, selection, plot_options, options.format)
 
 
 def _print_table(
-    kind: TableKind, reader: Reader, selection: Selection, request: Request, form: str
+    kind: TableKind, reader: Reader, selection: Selection, plot_options: PlotOptions, form: str
 ) -> int:
-    table = kind.measure(reader, selection, request)
+    table = kind.measure(reader, selection, plot_options)
     if selection.gaps:
         sys.stderr.write(f"{partial_warning(selection)}\n")
-    sys.stdout.write(_text(kind.sheet(table, request), table, form))
+    sys.stdout.write(_text(kind.render(table, plot_options), table, form))
     return 0
 
 
-def _text(sheet: Sheet, table: pd.DataFrame, form: str) -> str:
+def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:
     if form == "csv":
         return table.to_csv(index=False)
-    return sheet.latex() if form == "latex" else sheet.markdown()
+    return text_table.latex() if form == "latex" else text_table.markdown()
 
 
 def say(text: str) -> None:

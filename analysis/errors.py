@@ -1,4 +1,4 @@
-"""What can go wrong between the database and a picture; each message is a sentence that helps."""
+"""Errors of the analysis; each message is one sentence that says what to do."""
 
 from __future__ import annotations
 

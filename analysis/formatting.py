@@ -1,8 +1,10 @@
-"""Numbers as a person reads them; the CSV beside a table has all digits."""
+"""Formatting of numbers and counts for people; the CSV beside a table has all digits."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Mapping
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -60,3 +62,16 @@ def within(value: float, low: float, high: float) -> str:
 def but_lost(text: str, lost: int) -> str:
     """Return what is said of some episodes, and how many are not in it: ``1.3, 2 lost``."""
     return f"{text}, {lost} lost" if lost else text
+
+
+def count_text(counts: Mapping[str, str]) -> str:
+    """Return the counts by policy as a text: the commonest one, then those that differ from it.
+
+    ``{"a": "100", "b": "100", "c": "98/100, 2 diverged"}`` gives
+    ``n = 100; c: 98/100, 2 diverged``.
+    """
+    if not counts:
+        return "n = 0"
+    common, _ = Counter(counts.values()).most_common(1)[0]
+    others = [f"{name}: {count}" for name, count in counts.items() if count != common]
+    return "; ".join([f"n = {common}", *others])

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
-from analysis.divergence import DivergenceRule
-from analysis.loss_curves import Axis
-from analysis.statistics import Statistic
+from analysis.data.divergence import DivergenceRule
+from analysis.figures.loss_curves.data import Axis
+from analysis.stats.intervals import Statistic
 
 
 class Spread(StrEnum):
@@ -18,10 +18,11 @@ class Spread(StrEnum):
 
 
 @dataclass(frozen=True)
-class Request:
+class PlotOptions:
     """What a user asks for; ``epsilon`` is the loss of the comparison of steps, None the default's.
 
-    ``axis``, ``statistic`` and ``spread`` are those of the loss curves.
+    ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
+    each, are those of the loss curves.
     """
 
     rule: DivergenceRule = DivergenceRule.EXCLUDE
@@ -29,6 +30,7 @@ class Request:
     statistic: Statistic = Statistic.MEAN
     spread: Spread = Spread.BAND
     epsilon: float | None = None
+    color_by: str | None = None
 
     def as_dict(self) -> dict[str, str]:
         return {key: str(value) for key, value in asdict(self).items()}

@@ -12,10 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from analysis.animation.story import Story, extent
+from analysis.animation.replay_data import Story, extent
 from analysis.figures.axes import angle_ticks, log_limits, log_ticks
-from analysis.figures.loss_curves import NORM
-from analysis.figures.style import BLACK, GREY, environment_title, mathematical, policy_style
+from analysis.figures.loss_curves.plot import loss_label
+from analysis.figures.style import mathematical
+from analysis.line_styles import BLACK, GREY, environment_title, policy_style
+from analysis.units import loss_unit
 from dopt.geometry import Body
 
 Array = npt.NDArray[np.float64]
@@ -203,7 +205,12 @@ def _acceleration(label: str) -> str:
 def _loss(axes: Axes, story: Story) -> Move:
     times = story.system.dt * (1 + np.arange(len(story.loss)))
     low, high = log_limits(story.loss)
-    axes.set(title="loss", xlabel="time [s]", ylabel=NORM["loss"], yscale="log")
+    axes.set(
+        title="loss",
+        xlabel="time [s]",
+        ylabel=loss_label("loss", loss_unit(story.system)),
+        yscale="log",
+    )
     axes.set(xlim=(0, times[-1] if len(times) else 1.0), ylim=(low, high))
     log_ticks(axes.yaxis, low, high)
     line = axes.plot([], [], color=policy_style(story.policy).colour, animated=True)[0]

@@ -6,12 +6,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from analysis.animation.film import shoot
-from analysis.animation.story import tell
-from analysis.choice import Filter
+from analysis.animation.replay_data import tell
+from analysis.animation.writers import shoot
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import Entry, select
 from analysis.errors import AnalysisError
-from analysis.portraits import median_seed
-from analysis.selection import Entry, select
+from analysis.figures.phase_portraits.data import median_seed
 from orchestrate.store import Reader
 
 HELP = "a film of one stored trial: system, phase trace, learned and true force, loss"

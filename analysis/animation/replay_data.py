@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from analysis.data.trial_selection import Entry
 from analysis.errors import AnalysisError
-from analysis.portraits import DrawnPlane
-from analysis.selection import Entry
-from dopt.cell import without_versions
+from analysis.figures.phase_portraits.data import DrawnPlane
 from dopt.geometry import Body, body
-from dopt.replay import replay
-from dopt.spec import TrialSpec
+from dopt.rerun import rerun
+from dopt.spec.config import without_versions
+from dopt.spec.trial import TrialSpec
 from dopt.systems import System
 from orchestrate.store import Reader
 
@@ -76,7 +76,7 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
             f"so that there is nothing to show: choose another with --seed."
         )
     steps = np.unique(np.linspace(0, end, frames).round().astype(np.int64))
-    seen = replay(spec, steps.tolist())
+    seen = rerun(spec, steps.tolist())
     _check_same(seen.states[: end + 1], stored.states[: end + 1], entry, seed)
     states = stored.states[: end + 1]
     learned = [spec.model.predict(spec.system, theta, states) for theta in seen.parameters]

@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 from PIL.Image import Dither
 
-from analysis.animation.stage import Stage, build
-from analysis.animation.story import Story
+from analysis.animation.axes import Stage, build
+from analysis.animation.replay_data import Story
 from analysis.errors import AnalysisError
 from analysis.figures.style import styled
 

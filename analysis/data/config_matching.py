@@ -19,14 +19,18 @@ from typing import Any
 
 from analysis.errors import AnalysisError
 from dopt.errors import SpecificationError
-from dopt.spec import TrialSpec
-from orchestrate.store import Cell
+from dopt.spec.label import flatten
+from dopt.spec.trial import TrialSpec
+from orchestrate.store import ConfigRow
 
 REFERENCE = "d_optimal"
-"""The policy that all others are compared with."""
+"""The policy that all others are compared with, unless another one is asked for."""
 
 USUAL = {"model": "mlp", "learner": "adam_window"}
 """Names of what a launch takes by itself."""
+
+CONFIG_COLUMNS = ("policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
+"""Settings that have a column of their own."""
 
 Setting = tuple[str, str, str]
 """JSON of the sections env, model and learner."""
@@ -36,7 +40,7 @@ Setting = tuple[str, str, str]
 class Candidate:
     """A configuration and the number of its registered trials."""
 
-    cell: Cell
+    cell: ConfigRow
     n_trials: int
 
 
@@ -46,13 +50,17 @@ class Filter:
 
     ``where`` maps a dotted path of the configuration, such as ``model.width``, to a value; it says
     nothing of a configuration that has no such path, such as the linear model of the oracle.
+    ``group_by`` are the settings of which each combination of values is shown once; ``reference``
+    is the policy, or the value of the setting, that all others are compared with.
     """
 
     environments: tuple[str, ...] = ()
     policies: tuple[str, ...] = ()
     where: Mapping[str, object] = field(default_factory=dict)
+    reference: str = REFERENCE
+    group_by: tuple[str, ...] = ("policy",)
 
-    def accepts(self, cell: Cell) -> bool:
+    def accepts(self, cell: ConfigRow) -> bool:
         return (
             (not self.environments or cell.env in self.environments)
             and (not self.policies or cell.policy in self.policies)
@@ -61,7 +69,7 @@ class Filter:
             )
         )
 
-    def check_where(self, cells: Sequence[Cell]) -> None:
+    def check_where(self, cells: Sequence[ConfigRow]) -> None:
         """Raise AnalysisError for a condition that no stored configuration meets."""
         flat = [flatten(cell.config) for cell in cells]
         for path, value in self.where.items():
@@ -90,16 +98,53 @@ def read_condition(text: str) -> tuple[str, object] | None:
         return path, value
 
 
-def choose(candidates: Iterable[Candidate]) -> list[Cell]:
+def choose(candidates: Iterable[Candidate], reference: str = REFERENCE) -> list[ConfigRow]:
     """Return one configuration for each (environment, policy); raise AnalysisError on a tie."""
-    by_environment: dict[str, list[Candidate]] = {}
+    groups: dict[str, list[Candidate]] = {}
     for candidate in candidates:
-        by_environment.setdefault(candidate.cell.env, []).append(candidate)
-    return [cell for group in by_environment.values() for cell in _choose_policies(group)]
+        groups.setdefault(candidate.cell.env, []).append(candidate)
+    return [cell for group in groups.values() for cell in _choose_policies(group, reference)]
 
 
-def _choose_policies(group: Sequence[Candidate]) -> list[Cell]:
-    setting = _setting(_reference(group).cell)
+def choose_by(
+    candidates: Iterable[Candidate], keys: Sequence[str], reference: str = REFERENCE
+) -> list[ConfigRow]:
+    """Return one configuration for each environment and combination of values of some settings.
+
+    Where a combination has several policies it is the reference's, if there is one, else the first
+    by name. Configurations without one of the settings are left out.
+    """
+    groups: dict[tuple[object, ...], list[Candidate]] = {}
+    for candidate in candidates:
+        values = [setting_value(candidate.cell, key) for key in keys]
+        if None not in values:
+            groups.setdefault((candidate.cell.env, *map(repr, values)), []).append(candidate)
+    chosen = [_choose_policies(group, reference) for group in groups.values()]
+    return [min(cells, key=lambda one: (one.policy != reference, one.policy)) for cells in chosen]
+
+
+def setting_value(cell: ConfigRow, key: str) -> object:
+    """Return a value by column (``width``) or by dotted path (``env.gamma``), None without one."""
+    if key in CONFIG_COLUMNS:
+        return getattr(cell, key)
+    return flatten(cell.config).get(key)
+
+
+def check_keys(keys: Sequence[str], cells: Sequence[ConfigRow]) -> None:
+    """Raise AnalysisError for a setting that no configuration has."""
+    for key in keys:
+        if all(setting_value(cell, key) is None for cell in cells):
+            known = {*CONFIG_COLUMNS, *(path for cell in cells for path in flatten(cell.config))}
+            near = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.4)
+            raise AnalysisError(
+                f"'{key}' is no setting of a stored configuration, but a column or a dotted path "
+                f"is expected: choose for instance one of "
+                f"{', '.join(near) or 'policy, learner, width, env.gamma'}."
+            )
+
+
+def _choose_policies(group: Sequence[Candidate], reference: str) -> list[ConfigRow]:
+    setting = _setting(_reference(group, reference).cell)
     chosen = []
     for policy in sorted({candidate.cell.policy for candidate in group}):
         own = [candidate for candidate in group if candidate.cell.policy == policy]
@@ -110,9 +155,9 @@ def _choose_policies(group: Sequence[Candidate]) -> list[Cell]:
     return chosen
 
 
-def _reference(group: Sequence[Candidate]) -> Candidate:
+def _reference(group: Sequence[Candidate], reference: str) -> Candidate:
     """Return the candidate that fixes the setting; see the top of this file for the order."""
-    pool = [candidate for candidate in group if candidate.cell.policy == REFERENCE] or group
+    pool = [candidate for candidate in group if candidate.cell.policy == reference] or group
     totals: Counter[Setting] = Counter()
     policies: dict[Setting, set[str]] = {}
     for candidate in group:
@@ -146,7 +191,7 @@ def _first(
     return [candidate for candidate in candidates if rank(candidate) == top]
 
 
-def nearness(cell: Cell) -> tuple[int, int, int]:
+def nearness(cell: ConfigRow) -> tuple[int, int, int]:
     """Return a key by which the configuration that is nearest to the defaults is the largest.
 
     The model and the learner that a launch takes by itself come first, then fewer values that are
@@ -159,7 +204,7 @@ def nearness(cell: Cell) -> tuple[int, int, int]:
     return -sum(names), -sum(usual.get(path) != value for path, value in own.items()), -task
 
 
-def defaults(cell: Cell) -> dict[str, object]:
+def defaults(cell: ConfigRow) -> dict[str, object]:
     """Return the defaults of what a configuration names, without a task, as dotted paths.
 
     There are none where it holds a system or policy of a user's own, which is not registered here.
@@ -172,7 +217,7 @@ def defaults(cell: Cell) -> dict[str, object]:
         return {}
 
 
-def _sections(cell: Cell) -> dict[str, Mapping[str, Any]]:
+def _sections(cell: ConfigRow) -> dict[str, Mapping[str, Any]]:
     return {key: value for key, value in cell.config.items() if isinstance(value, Mapping)}
 
 
@@ -187,7 +232,7 @@ def _tie(pool: Sequence[Candidate]) -> AnalysisError:
     )
 
 
-def _setting(cell: Cell) -> Setting:
+def _setting(cell: ConfigRow) -> Setting:
     env, model, learner = (
         json.dumps(cell.config.get(section), sort_keys=True)
         for section in ("env", "model", "learner")
@@ -207,12 +252,3 @@ def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]
         if any(value != values[0] for value in values):
             return path, values
     return "config_key", [None for _ in configs]
-
-
-def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, object]:
-    """Return a nested mapping as dotted paths."""
-    flat: dict[str, object] = {}
-    for key, value in config.items():
-        path = f"{prefix}{key}"
-        flat.update(flatten(value, f"{path}.") if isinstance(value, Mapping) else {path: value})
-    return flat

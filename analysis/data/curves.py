@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from analysis.divergence import DivergenceRule, Sample, apply_rule
-from analysis.selection import Entry
+from analysis.data.divergence import DivergenceRule, Sample, apply_rule
+from analysis.data.trial_selection import Entry
 from orchestrate.store import Curves, Reader
 
 

@@ -1,4 +1,4 @@
-"""What a diverged trial does to a mean: it never only shortens its curve."""
+"""Rules for diverged trials: left out whole, or counted as the worst or the median."""
 
 from __future__ import annotations
 

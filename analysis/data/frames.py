@@ -7,29 +7,40 @@ results.trials()                       # one row for each trial
 results.curves("loss")                 # one row for each trial and step
 results.matrix("pendulum", "random")   # losses (seed, t)
 results.assessments("control_cost")    # one row for each trial and assessed step
+results.model(trial).predict(states)   # learned accelerations (N, r) of a row of trials()
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.choice import Candidate, Filter, choose
+from analysis.data.config_matching import Candidate, Filter, choose
+from analysis.data.learned_model import LearnedModel, learned_model
+from analysis.data.trial_selection import environment_rank, newest, policy_rank
 from analysis.errors import AnalysisError
-from analysis.selection import environment_rank, newest, policy_rank
-from orchestrate.store import Cell, Curves, Reader
+from orchestrate.store import ConfigRow, Curves, Reader, default_url
 
-DEFAULT_URL = "sqlite:///results/results.db"
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 _MEASURED = ("seed", "t", "measure", "value", "diverged")
-_OF_CELL = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
+_OF_CELL = (
+    "env",
+    "policy",
+    "model",
+    "learner",
+    "width",
+    "depth",
+    "horizon",
+    "dt",
+    "gamma",
+    "label",
+)
 
 
 @dataclass(frozen=True)
@@ -76,7 +87,7 @@ def load(
     AnalysisError
         If nothing stored fits.
     """
-    url = db or os.environ.get("DOPT_DB", DEFAULT_URL)
+    url = db or default_url()
     wanted = Filter(_names(env), _names(policy), where or {})
     return Results(Reader.open(url), wanted)
 
@@ -106,6 +117,15 @@ class Results:
         table = pd.DataFrame([asdict(cell) for cell in self._cells()])
         return table.set_index("config_key")
 
+    def shown(self) -> pd.DataFrame:
+        """Return the configurations that figures show: one for each environment and policy.
+
+        The rows are those of :meth:`configurations`. Raises ``AnalysisError`` where two
+        configurations fit equally well.
+        """
+        chosen = choose(Candidate(cell, cell.n) for cell in self._cells())
+        return self.configurations().loc[[cell.config_key for cell in chosen]]
+
     def trials(self) -> pd.DataFrame:
         """Return one row for each registered trial: configuration, status, losses, cost, node."""
         return pd.concat(
@@ -126,7 +146,7 @@ class Results:
             ignore_index=True,
         )
 
-    def _tidy(self, cell: Cell, columns: tuple[str, ...]) -> pd.DataFrame:
+    def _tidy(self, cell: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
         read = {name: self.reader.curves(cell.config_key, name) for name in columns}
         first = next(iter(read.values()))
         n, steps = first.values.shape
@@ -157,7 +177,7 @@ class Results:
             return pd.DataFrame(columns=[*_OF_CELL, "config_key", *_MEASURED])
         return pd.concat(parts, ignore_index=True)
 
-    def _measured(self, cell: Cell, measure: str) -> pd.DataFrame:
+    def _measured(self, cell: ConfigRow, measure: str) -> pd.DataFrame:
         found = self.reader.assessments(cell.config_key, measure)
         n, steps = found.values.shape
         columns = (
@@ -191,7 +211,31 @@ class Results:
             inputs=np.stack([path.inputs for path in paths]),
         )
 
-    def _one(self, env: str, policy: str) -> Cell:
+    def model(self, trial: str | Mapping[str, object] | pd.Series[Any]) -> LearnedModel:
+        """Return the model that a finished trial learned, with ``predict(states, inputs=None)``.
+
+        Parameters
+        ----------
+        trial
+            A row of :meth:`trials`, such as ``results.trials().iloc[0]``, or a trial key.
+
+        Raises
+        ------
+        AnalysisError
+            If no trial of the request has that key.
+        QueryError
+            If the trial is not finished.
+        """
+        key = trial if isinstance(trial, str) else str(trial["trial_key"])
+        for cell in self._cells():
+            for row in self.reader.trials(cell.config_key):
+                if row.trial_key == key:
+                    return learned_model(self.reader, cell, row.seed)
+        raise AnalysisError(
+            f"No trial of the request has the key '{key}': take one of results.trials()."
+        )
+
+    def _one(self, env: str, policy: str) -> ConfigRow:
         fitting = [cell for cell in self._cells() if cell.env == env]
         chosen = choose(Candidate(cell, cell.n) for cell in fitting)
         found = [cell for cell in chosen if cell.policy == policy]
@@ -203,8 +247,8 @@ class Results:
             )
         return found[0]
 
-    def _cells(self) -> list[Cell]:
-        cells = self.reader.cells()
+    def _cells(self) -> list[ConfigRow]:
+        cells = self.reader.configs()
         self._wanted.check_where(cells)
         fitting = newest([cell for cell in cells if self._wanted.accepts(cell)])
         if not fitting:
@@ -215,7 +259,7 @@ class Results:
         return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
 
 
-def _labelled(frame: pd.DataFrame, cell: Cell) -> pd.DataFrame:
+def _labelled(frame: pd.DataFrame, cell: ConfigRow) -> pd.DataFrame:
     """Put what tells the configuration in front."""
     for place, name in enumerate(_OF_CELL):
         frame.insert(place, name, getattr(cell, name))

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from orchestrate.store import Cell
+from orchestrate.store import ConfigRow
 
-Compatible = Callable[[Cell, Cell], bool]
+Compatible = Callable[[ConfigRow, ConfigRow], bool]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def ranges(seeds: Iterable[int]) -> str:
     return ", ".join(str(low) if low == high else f"{low}-{high}" for low, high in runs)
 
 
-def is_possible(policy: Cell, environment: Cell) -> bool:
+def is_possible(policy: ConfigRow, environment: ConfigRow) -> bool:
     """Whether a policy's configuration makes sense with another environment's section."""
     config = {key: value for key, value in policy.config.items() if key in _SECTIONS}
     try:
@@ -66,7 +66,7 @@ _SECTIONS = ("env", "policy", "model", "learner")
 
 
 def absent_cells(
-    cells: Sequence[Cell], compatible: Compatible = is_possible
+    cells: Sequence[ConfigRow], compatible: Compatible = is_possible
 ) -> list[tuple[str, str]]:
     """Return the (environment, policy) pairs of which nothing is stored though they make sense."""
     stored = {(cell.env, cell.policy) for cell in cells}

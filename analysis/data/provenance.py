@@ -1,4 +1,4 @@
-"""Where the numbers of a figure or a table come from; no clock, so that bytes are the same."""
+"""Provenance of figures and tables, without times, so that equal data give equal bytes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from analysis.selection import Selection
+from analysis.data.trial_selection import Selection
 from orchestrate.store import Reader
 
 LIBRARIES = ("dopt", "matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")

@@ -5,13 +5,24 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
-from analysis.choice import REFERENCE, Candidate, Filter, choose
+from analysis.data.config_matching import (
+    REFERENCE,
+    Candidate,
+    Filter,
+    check_keys,
+    choose,
+    choose_by,
+    nearness,
+    setting_value,
+)
+from analysis.data.missing_trials import Compatible, Gap, absent_cells, is_possible
 from analysis.errors import AnalysisError
-from analysis.gaps import Compatible, Gap, absent_cells, is_possible
-from orchestrate.store import Cell, Reader, TrialRow
+from dopt.policies.titles import TITLES
+from dopt.spec.label import labels, value_label
+from orchestrate.store import ConfigRow, Reader, TrialRow
 
 FINISHED = ("done", "diverged")
 
@@ -21,21 +32,21 @@ ENVIRONMENTS = (
 )
 """The paper's order; other environments follow by name."""
 
-POLICIES = (
-    *(REFERENCE, "oracle", "uniform", "periodic", "random", "random_held", "random_sphere"),
-    *("prbs", "multisine", "chirp"),
-    *("max", "gaussian_process", "gradient", "linear"),
-    *("lookahead", "exact", "trace", "trace_linearized", "a_optimal", "e_optimal", "task"),
-)
-"""Order of legends and tables; other policies follow by name."""
+_POLICIES = tuple(TITLES)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One configuration with its registered trials, ordered by seed."""
+    """One configuration with its registered trials, ordered by seed.
 
-    cell: Cell
+    ``label`` says what differs among the entries shown, and ``group`` the values of the settings by
+    which they are told apart.
+    """
+
+    cell: ConfigRow
     trials: tuple[TrialRow, ...]
+    label: str = ""
+    group: tuple[object, ...] = ()
 
     @property
     def finished(self) -> tuple[TrialRow, ...]:
@@ -54,13 +65,16 @@ class Entry:
 class Selection:
     """Entries in the order in which they are drawn, gaps, and sentences on what was left out.
 
-    ``stored`` are all entries that the request allows, other widths and variants included.
+    ``stored`` are all entries that the request allows, other widths and variants included;
+    ``reference`` is the policy, or the value of a setting, that the others are compared with.
     """
 
     entries: tuple[Entry, ...]
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
     stored: tuple[Entry, ...] = ()
+    reference: str = REFERENCE
+    group_by: tuple[str, ...] = ("policy",)
 
     @property
     def environments(self) -> tuple[str, ...]:
@@ -81,20 +95,35 @@ class Selection:
         def kept(env: str, policy: str) -> bool:
             return env in envs and (not names or policy in names)
 
-        return Selection(
-            tuple(entry for entry in self.entries if kept(entry.cell.env, entry.cell.policy)),
-            tuple(gap for gap in self.gaps if kept(gap.env, gap.policy)),
-            self.notes,
-            tuple(entry for entry in self.stored if kept(entry.cell.env, entry.cell.policy)),
+        return replace(
+            self,
+            entries=tuple(e for e in self.entries if kept(e.cell.env, e.cell.policy)),
+            gaps=tuple(gap for gap in self.gaps if kept(gap.env, gap.policy)),
+            stored=tuple(e for e in self.stored if kept(e.cell.env, e.cell.policy)),
         )
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(entry.label for entry in self.entries))
+
+    def reference_of(self, environment: str) -> Entry | None:
+        """Return the entry that the others of an environment are compared with, None without one.
+
+        Where entries differ in something else than the policy, it is the one with the value that
+        was asked for, else the one nearest to the defaults.
+        """
+        entries = self.of(environment)
+        if self.group_by == ("policy",):
+            return next((one for one in entries if one.cell.policy == self.reference), None)
+        texts = [{one.label, one.cell.policy, *map(str, one.group)} for one in entries]
+        named = [one for one, text in zip(entries, texts, strict=True) if self.reference in text]
+        pool = named or (list(entries) if self.reference == REFERENCE else [])
+        return max(pool, key=lambda one: nearness(one.cell)) if pool else None
+
     def compared(self) -> Selection:
-        """Return the environments in which the reference policy has a final loss."""
-        return self.only(
-            entry.cell.env
-            for entry in self.entries
-            if entry.cell.policy == REFERENCE and entry.final_losses()
-        )
+        """Return the environments in which the reference has a final loss."""
+        references = [self.reference_of(env) for env in self.environments]
+        return self.only(one.cell.env for one in references if one and one.final_losses())
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the selected trials, their outcome and what is missing."""
@@ -107,8 +136,8 @@ class Selection:
 
 
 def policy_rank(policy: str) -> tuple[int, str]:
-    """Return the sorting key of a policy."""
-    return (POLICIES.index(policy) if policy in POLICIES else len(POLICIES), policy)
+    """Return the sorting key of a policy: the order of the titles, other policies by name."""
+    return (_POLICIES.index(policy) if policy in TITLES else len(_POLICIES), policy)
 
 
 def environment_rank(environment: str) -> tuple[int, str]:
@@ -125,7 +154,7 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     AnalysisError
         When nothing fits, a name is unknown, or several configurations fit equally well.
     """
-    cells = list(reader.cells())
+    cells = list(reader.configs())
     _check_names("environment", wanted.environments, {cell.env for cell in cells})
     _check_names("policy", wanted.policies, {cell.policy for cell in cells})
     wanted.check_where(cells)
@@ -135,19 +164,68 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
             f"No configuration in {reader.safe_url} fits the request, "
             f"it holds {len(cells)} in all: run the grid first, or ask for less."
         )
+    check_keys(wanted.group_by, accepted)
     trials = {cell.config_key: tuple(reader.trials(cell.config_key)) for cell in accepted}
-    chosen = choose(Candidate(cell, len(trials[cell.config_key])) for cell in accepted)
-    chosen.sort(key=lambda cell: (environment_rank(cell.env), policy_rank(cell.policy)))
-    entries = tuple(Entry(cell, trials[cell.config_key]) for cell in chosen)
+    candidates = [Candidate(cell, len(trials[cell.config_key])) for cell in accepted]
+    by_policy = wanted.group_by == ("policy",)
+    chosen = (
+        choose(candidates, wanted.reference)
+        if by_policy
+        else choose_by(candidates, wanted.group_by, wanted.reference)
+    )
+    entries = tuple(
+        labelled((Entry(cell, trials[cell.config_key]) for cell in chosen), wanted.group_by)
+    )
     return Selection(
         entries,
-        tuple(_gaps(entries, compatible)),
+        tuple(_gaps(entries, compatible if by_policy else None)),
         tuple(_notes(accepted, chosen)),
-        tuple(Entry(cell, trials[cell.config_key]) for cell in accepted),
+        tuple(labelled(Entry(cell, trials[cell.config_key]) for cell in accepted)),
+        wanted.reference,
+        wanted.group_by,
     )
 
 
-def newest(cells: list[Cell]) -> list[Cell]:
+def labelled(entries: Iterable[Entry], group_by: Sequence[str] = ("policy",)) -> list[Entry]:
+    """Return entries in the order in which they are drawn, with their labels.
+
+    They are those of :func:`dopt.spec.label.labels`, or where they are grouped by other settings
+    than the policy, those of the values.
+    """
+    found = list(entries)
+    words = labels_of([entry.cell for entry in found])
+    rows = []
+    for entry, label in zip(found, words, strict=True):
+        group = tuple(setting_value(entry.cell, key) for key in group_by)
+        texts = [value_label(key, value) for key, value in zip(group_by, group, strict=True)]
+        own = label if tuple(group_by) == ("policy",) else ", ".join(texts)
+        rows.append(replace(entry, label=own, group=group))
+    return sorted(
+        rows, key=lambda one: (environment_rank(one.cell.env), _group_rank(one, group_by))
+    )
+
+
+def labels_of(cells: Iterable[ConfigRow]) -> list[str]:
+    """Return what differs among configurations; a task does not: it changes no loss."""
+    hidden = ("task", "assessment_version")
+    return labels([{k: v for k, v in cell.config.items() if k not in hidden} for cell in cells])
+
+
+def _group_rank(entry: Entry, group_by: Sequence[str]) -> list[tuple[float, int, str]]:
+    """Return the sorting key of the values: policies in their order, numbers, then texts."""
+    ranks = []
+    for key, value in zip(group_by, entry.group, strict=True):
+        if key == "policy":
+            place, name = policy_rank(str(value))
+            ranks.append((0.0, place, name))
+        elif isinstance(value, int | float):
+            ranks.append((float(value), 0, ""))
+        else:
+            ranks.append((0.0, 0, str(value)))
+    return ranks
+
+
+def newest(cells: list[ConfigRow]) -> list[ConfigRow]:
     """Return the cells of the newest code version: numbers of different versions do not mix.
 
     Of those with a task, whose assessments have a version of their own, the newest of these.
@@ -162,7 +240,7 @@ def newest(cells: list[Cell]) -> list[Cell]:
     ]
 
 
-def _assessment_version(cell: Cell) -> int | None:
+def _assessment_version(cell: ConfigRow) -> int | None:
     return int(cell.config.get("assessment_version", 1)) if cell.config.get("task") else None
 
 
@@ -175,7 +253,8 @@ def _check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
             )
 
 
-def _gaps(entries: tuple[Entry, ...], compatible: Compatible) -> Iterable[Gap]:
+def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable[Gap]:
+    """Yield what entries lack; policies without any trial where it is known which are possible."""
     seeds: dict[str, set[int]] = {}
     for entry in entries:
         seeds.setdefault(entry.cell.env, set()).update(trial.seed for trial in entry.trials)
@@ -187,12 +266,14 @@ def _gaps(entries: tuple[Entry, ...], compatible: Compatible) -> Iterable[Gap]:
             states = Counter(state.get(seed, "not registered") for seed in missing)
             text = ", ".join(f"{count} {name}" for name, count in sorted(states.items()))
             yield Gap(entry.cell.env, entry.cell.policy, tuple(sorted(missing)), text)
+    if compatible is None:
+        return
     for env, policy in absent_cells([entry.cell for entry in entries], compatible):
         expected = seeds[env]
         yield Gap(env, policy, tuple(sorted(expected)), f"{len(expected)} not registered")
 
 
-def _notes(accepted: list[Cell], chosen: list[Cell]) -> Iterable[str]:
+def _notes(accepted: list[ConfigRow], chosen: list[ConfigRow]) -> Iterable[str]:
     kept = {cell.config_key for cell in chosen}
     left = Counter(cell.env for cell in accepted if cell.config_key not in kept)
     for env, count in sorted(left.items()):

@@ -1,4 +1,4 @@
-"""Where a logarithmic axis is broken, so that one far lower curve does not flatten the others."""
+"""Break of a logarithmic axis, so that one far lower curve does not flatten the others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from analysis.figures.axes import log_limits
-from analysis.statistics import Band
+from analysis.stats.intervals import Band
 
 Array = npt.NDArray[np.float64]
 Limits = tuple[float, float]

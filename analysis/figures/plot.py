@@ -9,8 +9,8 @@ from typing import Generic, TypeVar
 import pandas as pd
 from matplotlib.figure import Figure
 
-from analysis.request import Request
-from analysis.selection import Selection
+from analysis.data.trial_selection import Selection
+from analysis.plot_options import PlotOptions
 from orchestrate.store import Reader
 
 N = TypeVar("N")
@@ -31,7 +31,7 @@ class Plot(Generic[N]):
 
     ``part`` cuts the selection down to what this figure shows; without entries it is not drawn.
     ``statistic`` and ``band`` say in words what is drawn; ``{centre}`` and ``{interval}`` in them
-    stand for what the request asks for.
+    stand for what the options ask for.
     """
 
     name: str
@@ -39,21 +39,21 @@ class Plot(Generic[N]):
     statistic: str
     band: str
     part: Callable[[Selection], Selection]
-    measure: Callable[[Reader, Selection, Request], N]
+    measure: Callable[[Reader, Selection, PlotOptions], N]
     tabulate: Callable[[N], pd.DataFrame]
     draw: Callable[[N], Figure]
     caption: Callable[[N], str]
 
-    def words(self, request: Request) -> dict[str, str]:
-        """Return the title, the statistic and the band of a request, for the provenance."""
-        names = {"centre": request.statistic.label, "interval": request.statistic.band}
+    def words(self, options: PlotOptions) -> dict[str, str]:
+        """Return the title, the statistic and the band of some options, for the provenance."""
+        names = {"centre": options.statistic.label, "interval": options.statistic.band}
         return {
             "title": self.title,
             "statistic": self.statistic.format(**names),
             "band": self.band.format(**names),
         }
 
-    def make(self, reader: Reader, selection: Selection, request: Request) -> Drawing:
+    def make(self, reader: Reader, selection: Selection, options: PlotOptions) -> Drawing:
         """Read, measure, then draw."""
-        numbers = self.measure(reader, selection, request)
+        numbers = self.measure(reader, selection, options)
         return Drawing(self.draw(numbers), self.tabulate(numbers), self.caption(numbers))

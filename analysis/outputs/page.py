@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from analysis.figures import publish
+from analysis.outputs import publish
 
 NAME = "README.md"
 

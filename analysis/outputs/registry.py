@@ -7,20 +7,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from analysis import provenance
-from analysis.figures import publish
-from analysis.figures.control import control_plot
-from analysis.figures.input_spectrum import spectrum_plot
-from analysis.figures.loss_curves import loss_plot
-from analysis.figures.page import NAME as PAGE
-from analysis.figures.page import write_page
-from analysis.figures.phase_portraits import phase_plot
+from analysis.data import provenance
+from analysis.data.trial_selection import Selection
+from analysis.figures.control.plot import control_plot
+from analysis.figures.input_spectrum.plot import spectrum_plot
+from analysis.figures.loss_curves.plot import loss_plot
+from analysis.figures.phase_portraits.plot import phase_plot
 from analysis.figures.plot import Plot
 from analysis.figures.style import styled
-from analysis.figures.width import cost_plot, loss_against_width_plot
-from analysis.request import Request
-from analysis.selection import Selection
-from analysis.tables import TABLES, TableKind
+from analysis.figures.width.plot import cost_plot, loss_against_width_plot
+from analysis.outputs import publish
+from analysis.outputs.page import NAME as PAGE
+from analysis.outputs.page import write_page
+from analysis.plot_options import PlotOptions
+from analysis.tables.registry import TABLES, TableKind
 from orchestrate.store import Reader
 
 PLOTS: dict[str, Plot[Any]] = {
@@ -51,7 +51,7 @@ class Outcome:
 def build(
     reader: Reader,
     selection: Selection,
-    request: Request,
+    options: PlotOptions,
     folder: Path,
     names: tuple[str, ...] = NAMES,
     *,
@@ -60,30 +60,30 @@ def build(
     """Write the named outputs and the page of all into a folder; say of each what happened."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        part = _part(name, selection, request)
+        part = _part(name, selection, options)
         if not part.entries:
             yield Outcome(name, "not drawn, nothing is stored for it")
             continue
-        facts = provenance.describe(reader, part) | {"request": request.as_dict(), "name": name}
+        facts = provenance.describe(reader, part) | {"request": options.as_dict(), "name": name}
         mark = _mark(facts)
         endings = (*publish.PICTURES, "csv", "txt") if name in PLOTS else TABLE_FILES
         if not force and publish.is_current(folder, name, endings, mark):
             yield Outcome(name, "unchanged")
             continue
         if name in PLOTS:
-            facts |= _draw(PLOTS[name], reader, part, request, folder, mark)
+            facts |= _draw(PLOTS[name], reader, part, options, folder, mark)
         else:
-            facts |= _tabulate(name, TABLES[name], reader, part, request, folder)
+            facts |= _tabulate(name, TABLES[name], reader, part, options, folder)
         publish.write_provenance(facts | {"fingerprint": mark}, folder, name)
         yield Outcome(name, "written")
     if write_page(folder, PLOTS, TABLES):
         yield Outcome(PAGE, "written")
 
 
-def _part(name: str, selection: Selection, request: Request) -> Selection:
+def _part(name: str, selection: Selection, options: PlotOptions) -> Selection:
     if name in PLOTS:
         return PLOTS[name].part(selection)
-    return TABLES[name].part(selection, request)
+    return TABLES[name].part(selection, options)
 
 
 def _mark(facts: dict[str, Any]) -> str:
@@ -97,12 +97,12 @@ def _draw(
     plot: Plot[Any],
     reader: Reader,
     selection: Selection,
-    request: Request,
+    options: PlotOptions,
     folder: Path,
     mark: str,
 ) -> dict[str, str]:
     with styled():
-        drawing = plot.make(reader, selection, request)
+        drawing = plot.make(reader, selection, options)
         caption = drawing.caption
         if selection.gaps:
             warning = partial_warning(selection)
@@ -111,7 +111,7 @@ def _draw(
         publish.write_pictures(drawing.figure, folder, plot.name, plot.title, mark)
     publish.write_table(drawing.table, folder, plot.name)
     publish.write_text(caption + "\n", folder / f"{plot.name}.txt")
-    return plot.words(request) | {"caption": caption}
+    return plot.words(options) | {"caption": caption}
 
 
 def _tabulate(
@@ -119,16 +119,16 @@ def _tabulate(
     kind: TableKind,
     reader: Reader,
     selection: Selection,
-    request: Request,
+    options: PlotOptions,
     folder: Path,
 ) -> dict[str, str]:
-    table = kind.measure(reader, selection, request)
-    sheet = kind.sheet(table, request)
+    table = kind.measure(reader, selection, options)
+    text_table = kind.render(table, options)
     warning = f"{partial_warning(selection)}\n\n" if selection.gaps else ""
     publish.write_table(table, folder, name)
-    publish.write_text(warning + sheet.markdown(), folder / f"{name}.md")
-    publish.write_text(_commented(warning) + sheet.latex(), folder / f"{name}.tex")
-    return {"title": kind.title, "caption": warning + sheet.note}
+    publish.write_text(warning + text_table.markdown(), folder / f"{name}.md")
+    publish.write_text(_commented(warning) + text_table.latex(), folder / f"{name}.tex")
+    return {"title": kind.title, "caption": warning + text_table.note}
 
 
 def _commented(warning: str) -> str:

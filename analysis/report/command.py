@@ -7,19 +7,19 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from analysis import provenance
-from analysis.choice import Filter
+from analysis.data import provenance
+from analysis.data.config_matching import Filter
+from analysis.data.missing_trials import Gap
+from analysis.data.trial_selection import Selection
 from analysis.errors import IncompleteError
-from analysis.figures import publish
 from analysis.figures.style import styled
-from analysis.gaps import Gap
-from analysis.report import control, numbers, page, picture
-from analysis.report.variants import Field, fields
-from analysis.selection import Selection
-from analysis.sheets import gaps_sheet
+from analysis.outputs import publish
+from analysis.report import control, forest_plot, page, variant_table
+from analysis.report.variants import VariantGroup, variant_groups
+from analysis.tables.rendering import gaps_table
 from orchestrate.store import Reader
 
-HELP = "compare every policy, model and learner with D-optimal inputs, on one page"
+HELP = "compare every policy, model and learner with the reference, on one page"
 NAME = "report"
 CONTROL = f"{NAME}_control"
 PAGE = "README.md"
@@ -31,17 +31,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, wanted: Filter) -> int:
-    """Write the page, the picture, the CSV and the provenance; 0."""
+    """Write the page, the pictures, the CSV and the provenance; 0."""
     with Reader.open(options.db) as reader, reader.moment() as moment:
-        found = fields(moment, wanted)
-        gaps = [gap for field in found for gap in _gaps(field)]
+        found = variant_groups(moment, wanted)
+        gaps = [gap for group in found for gap in _gaps(group)]
         if gaps and not options.allow_partial:
             raise IncompleteError(_refusal(gaps))
-        table = numbers.adjust(
-            [numbers.tabulate_field(moment, field, options.diverged) for field in found]
+        table = variant_table.adjust(
+            [variant_table.tabulate_group(moment, group, options.diverged) for group in found]
         )
         controlled = control.tabulate(moment, found)
-        selection = Selection(tuple(one.entry for field in found for one in field.variants))
+        selection = Selection(tuple(one for group in found for one in group.variants))
         facts = provenance.describe(moment, selection)
     options.out.mkdir(parents=True, exist_ok=True)
     pictures = {}
@@ -50,11 +50,13 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         for env, rows in table.groupby("env", sort=False):
             pictures[str(env)] = f"{NAME}_{env}"
             title = f"Ratios of final losses: {env}"
-            publish.write_pictures(picture.draw(rows), options.out, pictures[str(env)], title, mark)
+            publish.write_pictures(
+                forest_plot.draw(rows), options.out, pictures[str(env)], title, mark
+            )
     publish.write_table(table, options.out, NAME)
     if controlled is not None:
         publish.write_table(controlled, options.out, CONTROL)
-    notes = [f"{field.env}: {note}" for field in found for note in field.notes]
+    notes = [f"{group.env}: {note}" for group in found for note in group.notes]
     if gaps:
         notes.insert(0, f"PARTIAL: {sum(len(gap.seeds) for gap in gaps)} trials are missing")
     text = page.write(
@@ -84,19 +86,19 @@ def _origin(facts: dict[str, object], *, controlled: bool) -> str:
     )
 
 
-def _gaps(field: Field) -> Iterable[Gap]:
+def _gaps(group: VariantGroup) -> Iterable[Gap]:
     """Yield what a variant lacks of the seeds that any other of the environment has."""
-    seeds = {trial.seed for one in field.variants for trial in one.entry.trials}
-    for one in field.variants:
-        missing = seeds - {trial.seed for trial in one.entry.finished}
+    seeds = {trial.seed for one in group.variants for trial in one.trials}
+    for one in group.variants:
+        missing = seeds - {trial.seed for trial in one.finished}
         if missing:
-            yield Gap(field.env, one.label, tuple(sorted(missing)), f"{len(missing)} not finished")
+            yield Gap(group.env, one.label, tuple(sorted(missing)), f"{len(missing)} not finished")
 
 
 def _refusal(gaps: list[Gap]) -> str:
     missing = sum(len(gap.seeds) for gap in gaps)
     return (
-        f"{gaps_sheet(gaps).markdown()}\n\nerror: {missing} trials are missing, the same seeds of "
+        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, the same seeds of "
         f"every variant are expected: run the launch again, narrow the request by --env, --policy "
         f"and --where, or give --allow-partial to go on with what there is."
     )

@@ -9,23 +9,24 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.control import TrueModel, measure_control
-from analysis.figures.style import environment_title
-from analysis.numbers import but_lost, number, within
-from analysis.paired import benjamini_hochberg, mcnemar
-from analysis.reading import read_curves
-from analysis.report.numbers import LEVEL
-from analysis.report.variants import Field
-from analysis.selection import Selection
-from analysis.sheets import Sheet
+from analysis.data.curves import read_curves
+from analysis.data.trial_selection import Selection
+from analysis.formatting import but_lost, number, within
+from analysis.line_styles import environment_title
+from analysis.report.variant_table import SIGNIFICANCE
+from analysis.report.variants import VariantGroup
+from analysis.stats.control import TrueModel, measure_control
+from analysis.stats.paired_tests import benjamini_hochberg, mcnemar
+from analysis.tables.rendering import TextTable
 from orchestrate.store import Assessments, Reader
 
 NOTE = (
     "Success: share of trials whose planned episode reached its goal, with the Wilson interval; "
-    f"with a star where the adjusted p is below {LEVEL}: exact McNemar test against the first row, "
-    "paired over seeds, the false discovery rate of all variants and numbers of steps of the "
-    "report (Benjamini-Hochberg). Cost: geometric mean of the episode's cost by that of the true "
-    "model under the same planner, noise and draws, with Student's interval. True model: what the "
+    f"with a star where the adjusted p is below {SIGNIFICANCE}: exact McNemar test against the "
+    "first row, paired over seeds, the false discovery rate of all variants and numbers of steps "
+    "of the report (Benjamini-Hochberg). Cost: geometric mean of the episode's cost by that of the "
+    "true model under the same planner, noise and draws, with Student's interval. True "
+    "model: what the "
     "same planner achieves that predicts with the true system, on the same seeds; no explored step "
     "changes it, and its cost is the unit. Lost: episodes in no mean of costs, as theirs or that "
     "of the true model is not finite; they are in the success. Loss: that on the grid after as "
@@ -41,9 +42,9 @@ Array = npt.NDArray[np.float64]
 Row = Mapping[str, object]
 
 
-def tabulate(reader: Reader, fields: Sequence[Field]) -> pd.DataFrame | None:
+def tabulate(reader: Reader, groups: Sequence[VariantGroup]) -> pd.DataFrame | None:
     """Return one row for each environment, variant and number of steps, None without a task."""
-    rows = [row for field in fields if field.assessed for row in _rows(reader, field)]
+    rows = [row for group in groups if group.assessed for row in _rows(reader, group)]
     if not rows:
         return None
     table = pd.DataFrame(rows)
@@ -51,17 +52,17 @@ def tabulate(reader: Reader, fields: Sequence[Field]) -> pd.DataFrame | None:
     return table
 
 
-def _rows(reader: Reader, field: Field) -> Iterator[dict[str, object]]:
-    assessed = field.assessed
-    curves = measure_control(reader, Selection(tuple(one.entry for one in assessed)))
-    successes = [reader.assessments(one.entry.cell.config_key, SUCCESS) for one in assessed]
-    reference = successes[0] if assessed[0] is field.reference else None
+def _rows(reader: Reader, group: VariantGroup) -> Iterator[dict[str, object]]:
+    assessed = group.assessed
+    curves = measure_control(reader, Selection(assessed))
+    successes = [reader.assessments(one.cell.config_key, SUCCESS) for one in assessed]
+    reference = successes[0] if assessed[0] is group.reference else None
     for one, curve, own in zip(assessed, curves, successes, strict=True):
-        losses = read_curves(reader, one.entry, "loss").values
-        free_runs = reader.assessments(one.entry.cell.config_key, FREE_RUN)
+        losses = read_curves(reader, one, "loss").values
+        free_runs = reader.assessments(one.cell.config_key, FREE_RUN)
         for k, t in enumerate(curve.t.tolist()):
             yield {
-                "env": field.env,
+                "env": group.env,
                 "variant": one.label,
                 "t": t,
                 "n": int(curve.n[k]),
@@ -73,7 +74,7 @@ def _rows(reader: Reader, field: Field) -> Iterator[dict[str, object]]:
                 "described": curve.described,
             }
     steps = sorted({int(t) for curve in curves for t in curve.t})
-    yield from (_truth(field.env, curves[0].truth, t) for t in steps)
+    yield from (_truth(group.env, curves[0].truth, t) for t in steps)
 
 
 def _truth(env: str, truth: TrueModel, t: int) -> dict[str, object]:
@@ -133,14 +134,14 @@ def _part(env: str, table: pd.DataFrame) -> str:
             str(key): value for key, value in row.items()
         }
     steps = sorted({t for found in rows.values() for t in found})
-    success = Sheet(
+    success = TextTable(
         ["variant", *(f"success after {t}" for t in steps), "n"],
         [
-            [label, *(_cell(found, t, _success) for t in steps), _last(found)["described"]]
+            [label, *(_entry_text(found, t, _success) for t in steps), _last(found)["described"]]
             for label, found in rows.items()
         ],
     )
-    worth = Sheet(
+    worth = TextTable(
         [
             "variant",
             *(f"cost after {t}" for t in steps),
@@ -150,9 +151,13 @@ def _part(env: str, table: pd.DataFrame) -> str:
         [
             [
                 label,
-                *(_cell(found, t, _cost) for t in steps),
-                *(_cell(found, t, lambda row: number(_float(row, "loss"))) for t in steps if t),
-                _cell(found, steps[-1], _free_run_text),
+                *(_entry_text(found, t, _cost) for t in steps),
+                *(
+                    _entry_text(found, t, lambda row: number(_float(row, "loss")))
+                    for t in steps
+                    if t
+                ),
+                _entry_text(found, steps[-1], _free_run_text),
             ]
             for label, found in rows.items()
         ],
@@ -164,15 +169,19 @@ def _last(found: Mapping[int, Row]) -> Row:
     return found[max(found)]
 
 
-def _cell(found: Mapping[int, Row], t: int, text: Callable[[Row], str]) -> str:
+def _entry_text(found: Mapping[int, Row], t: int, text: Callable[[Row], str]) -> str:
     """Return the text of a number of steps, a dash where there is none."""
     return text(found[t]) if t in found else "–"
 
 
 def _success(row: Row) -> str:
     centre, low, high = (_float(row, f"success{end}") for end in ("", "_low", "_high"))
-    star = "*" if _float(row, "success_p_adjusted") < LEVEL else ""
+    star = "*" if _float(row, "success_p_adjusted") < SIGNIFICANCE else ""
     return number(math.nan) if math.isnan(low) else f"{centre:.2f}{star} [{low:.2f}, {high:.2f}]"
+
+
+def _loss(row: Row) -> str:
+    return number(_float(row, "loss"))
 
 
 def _cost(row: Row) -> str:

@@ -1,4 +1,4 @@
-"""The picture of a system in a report: ratios of the final loss to the reference's."""
+"""Forest plot of one system in a report: ratios of the final loss to the reference's."""
 
 from __future__ import annotations
 
@@ -7,33 +7,34 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.figures.axes import log_ticks
-from analysis.figures.style import BLUE, GREY, TEXT_WIDTH, VERMILLION
-from analysis.report.numbers import LEVEL, verdict
+from analysis.figures.style import TEXT_WIDTH
+from analysis.line_styles import BLUE, GREY, VERMILLION
+from analysis.report.variant_table import SIGNIFICANCE, verdict
 
 _LOOK = {"better": (BLUE, "o"), "worse": (VERMILLION, "s"), "open": (GREY, "D")}
 _INCHES_PER_ROW = 0.16
 _INCHES_AROUND = 0.62
 
 CAPTION = (
-    "Ratio of final losses, variant / D-optimal inputs: left of the line, below 1, the variant is "
+    "Ratio of final losses, variant / reference: left of the line, below 1, the variant is "
     "better. Geometric mean over shared seeds with its 95 % interval, the best at the top. "
     "Circles: better, squares: worse, diamonds: not told apart, as the adjusted p is not below "
-    f"{LEVEL} or the interval holds 1. The oracle, which knows the form of the physics and is "
-    "orders of magnitude below, is in the tables alone."
+    f"{SIGNIFICANCE} or the interval holds 1. The oracle, which knows the form of the physics and "
+    "is orders of magnitude below, is in the tables alone."
 )
 APART = "oracle"
 """The policy that would leave no room for the others."""
 
 
 def draw(part: pd.DataFrame) -> Figure:
-    """Return the figure of one system's rows of :func:`analysis.report.numbers.adjust`."""
+    """Return the figure of one system's rows of :func:`analysis.report.variant_table.adjust`."""
     known = part[part["loss_ratio"].notna() & (part["policy"] != APART)]
     rows = known.sort_values("loss_ratio", ascending=False, kind="stable")
     height = _INCHES_AROUND + _INCHES_PER_ROW * len(rows)
     figure = Figure(figsize=(TEXT_WIDTH, height), layout="constrained")
     axes = figure.subplots()
     _fill(axes, rows)
-    axes.set_xlabel("final loss / final loss of D-optimal inputs")
+    axes.set_xlabel(f"final loss / final loss of {part['variant'].iloc[0]}")
     return figure
 
 

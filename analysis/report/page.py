@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from analysis.figures.style import environment_title
-from analysis.numbers import but_lost, number, p_text, plus_minus, share, steps_text, within
-from analysis.paired import FEW
-from analysis.report.numbers import LEVEL, verdict
-from analysis.report.picture import CAPTION
-from analysis.sheets import Sheet
+from analysis.formatting import but_lost, number, p_text, plus_minus, share, steps_text, within
+from analysis.line_styles import environment_title
+from analysis.report.forest_plot import CAPTION
+from analysis.report.variant_table import SIGNIFICANCE, verdict
+from analysis.stats.paired_tests import FEWEST_BOOTSTRAP_PAIRS
+from analysis.tables.rendering import TextTable
 from dopt.policies import POLICIES
 
 LOSSES = (
@@ -27,12 +27,12 @@ EFFORT = (
 EXPLAINED = (
     "Final loss: root mean square error of the learned accelerations over the evaluation grid "
     "after the last step, in their units, mean ± 2 standard errors.",
-    "Ratio: variant / D-optimal inputs (the first row of a table), below 1 the variant is better; "
-    "the comparison tables of the figures have it the other way, D-optimal / baseline. It is the "
+    "Ratio: variant / reference (the first row of a table), below 1 the variant is better: the "
     "geometric mean over shared seeds, of losses and of control costs alike, with its unadjusted "
-    f"95 % interval: paired BCa bootstrap of the log ratio, Student's below {FEW} pairs. Reachable "
-    "set: of the final loss over states that the true system visits under strong inputs; where it "
-    "and the grid disagree, the order of two variants depends on where a model is judged. Curve: "
+    "95 % interval: paired BCa bootstrap of the log ratio, Student's below "
+    f"{FEWEST_BOOTSTRAP_PAIRS} pairs. Reachable set: of the final loss over states that the true "
+    "system visits under strong inputs; where it and the grid disagree, the order of two variants "
+    "depends on where a model is judged. Curve: "
     "of the loss over all steps (geometric mean).",
     "Adjusted p: two-sided Wilcoxon signed-rank test of the final losses, sign test of the steps; "
     "the false discovery rate over all rows of the report, for each measure (Benjamini-Hochberg). "
@@ -62,14 +62,14 @@ def write(
     pictures: Mapping[str, str],
     more: Sequence[str] = (),
 ) -> str:
-    """Return the page of a table of :func:`analysis.report.numbers.adjust`.
+    """Return the page of a table of :func:`analysis.report.variant_table.adjust`.
 
     ``pictures`` are files, without their ending, by environment, and ``more`` further sections,
     already in Markdown.
     """
     parts = {str(env): _rows(part) for env, part in table.groupby("env", sort=False)}
     sections = [
-        "# Every variant against D-optimal inputs",
+        f"# Every variant against {table['variant'].iloc[0]}",
         origin,
         "## What was found",
         "\n".join(_finding(env, rows) for env, rows in parts.items()),
@@ -104,7 +104,7 @@ def _finding(env: str, rows: Sequence[Row]) -> str:
     ]
     if turned:
         said.append(f"  - the other way round on the reachable set: {'; '.join(turned)}")
-    return "\n".join([f"- **{environment_title(env)}** (ratio, p < {LEVEL})", *said])
+    return "\n".join([f"- **{environment_title(env)}** (ratio, p < {SIGNIFICANCE})", *said])
 
 
 def _described(table: pd.DataFrame) -> str:
@@ -131,8 +131,8 @@ def _section(env: str, rows: Sequence[Row], picture: str | None) -> str:
     parts = [f"## {title}", facts]
     if picture is not None:
         parts.append(f"![Ratios of final losses: {title}]({picture}.png)")
-    parts.append(Sheet(LOSSES, [_losses(row) for row in rows]).markdown())
-    parts.append(Sheet(EFFORT, [_effort(row) for row in rows]).markdown())
+    parts.append(TextTable(LOSSES, [_losses(row) for row in rows]).markdown())
+    parts.append(TextTable(EFFORT, [_effort(row) for row in rows]).markdown())
     return "\n\n".join(parts)
 
 

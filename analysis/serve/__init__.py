@@ -1,6 +1,6 @@
-"""The results browser: pages over the database, read-only, on this machine alone.
+"""Results browser: read-only web pages over a results database, served on the local machine.
 
-``app`` puts the parts together: ``guard`` refuses what no page sends, ``source`` opens the
-database, ``asked`` reads a request, one module for each page makes its numbers, and ``answers``
-turns these into a page or into JSON. The numbers come from the functions that feed the figures.
+``app`` defines the routes, ``security`` checks every request, ``database`` opens the database and
+``query_params`` parses the query string. Each page has a module that computes its content with the
+functions behind the figures; ``responses`` renders the content as HTML, JSON or CSV.
 """

@@ -1,4 +1,4 @@
-"""The addresses of the browser: each page beside the JSON of the same numbers."""
+"""Routes of the results browser: pages, the JSON behind each page, and CSV tables."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from analysis.errors import AnalysisError
-from analysis.serve import compare, curves, gallery, grid, sql, trial, trials
-from analysis.serve.answers import FOLDER, as_csv, as_json, as_page
-from analysis.serve.asked import Asked
+from analysis.serve import compare, control, curves, gallery, grid, sql, trial, trials
+from analysis.serve.database import Database
 from analysis.serve.errors import BusyError, NotFoundError
-from analysis.serve.guard import Guard
-from analysis.serve.progress import measure
-from analysis.serve.site import Site
-from analysis.serve.source import Source
+from analysis.serve.progress import read_progress
+from analysis.serve.query_params import QueryParams
+from analysis.serve.responses import FOLDER, as_csv, as_json, as_page
+from analysis.serve.security import SecurityMiddleware
+from analysis.serve.state import ServerState
 from dopt.errors import DoptError
 from orchestrate.store.errors import (
     NoDatabaseError,
@@ -33,7 +33,7 @@ from orchestrate.store.errors import (
     StoreUnavailableError,
 )
 
-Numbers = Callable[[Site, Asked], Mapping[str, Any]]
+Numbers = Callable[[ServerState, QueryParams], Mapping[str, Any]]
 
 PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/", "grid", grid.grid),
@@ -41,23 +41,26 @@ PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/trials", "trials", trials.trials),
     ("/trials/{trial_key}", "trial", trial.trial),
     ("/compare", "compare", compare.compare),
+    ("/control", "control", control.control),
     ("/figures", "figures", gallery.gallery),
     ("/sql", "sql", sql.sql),
 )
 DATA: tuple[tuple[str, Numbers], ...] = (
-    ("/api/progress", lambda site, _: measure(site.source.reader())),
+    ("/api/progress", lambda state, _: read_progress(state.database.reader())),
     ("/api/grid", grid.grid),
     ("/api/curves", curves.curves),
     ("/api/trials", trials.trials),
     ("/api/trials/{trial_key}", trial.trial),
     ("/api/trials/{trial_key}/arrays", trial.arrays),
     ("/api/compare", compare.compare),
+    ("/api/control", control.control),
     ("/api/figures", gallery.gallery),
     ("/api/sql", sql.sql),
 )
-TABLES: dict[str, Callable[[Site, Asked], str]] = {
-    "curves": lambda site, asked: curves.table(site, asked).to_csv(index=False),
-    "compare": lambda site, asked: compare.table(site, asked).to_csv(index=False),
+TABLES: dict[str, Callable[[ServerState, QueryParams], str]] = {
+    "curves": lambda state, params: curves.table(state, params).to_csv(index=False),
+    "compare": lambda state, params: compare.table(state, params).to_csv(index=False),
+    "control": lambda state, params: control.table(state, params).to_csv(index=False),
     "sql": sql.table,
 }
 STATES = (
@@ -71,95 +74,100 @@ STATES = (
 def create_app(url: str, figures: Path, host: str = "127.0.0.1") -> Starlette:
     """Return the application for a database and a folder of figures.
 
-    ``host`` is the address that it is served at. Raises ``StoreError`` for a URL that names no
-    database; one that is not there yet is shown as such.
+    ``host`` is the address that the server listens at. Raises ``StoreError`` for an invalid
+    database URL. A database that does not exist yet gives an error page until it is created.
     """
-    site = Site(Source(url), figures)
+    state = ServerState(Database(url), figures)
     static = StaticFiles(directory=FOLDER / "static")
     routes = [
-        *(Route(path, partial(_page, site, name, numbers)) for path, name, numbers in PAGES),
-        *(Route(path, partial(_data, site, numbers)) for path, numbers in DATA),
-        *(Route(f"/api/{name}.csv", partial(_table, site, name)) for name in TABLES),
-        Route("/figures/{name}", partial(_file, site)),
+        *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
+        *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
+        *(Route(f"/api/{name}.csv", partial(_table, state, name)) for name in TABLES),
+        Route("/figures/{name}", partial(_file, state)),
         Mount("/static", static),
     ]
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
-        site.source.close()
+        state.database.close()
 
     return Starlette(
         routes=routes,
-        middleware=[Middleware(Guard, host=host)],
+        middleware=[Middleware(SecurityMiddleware, host=host)],
         exception_handlers={
-            AnalysisError: partial(_refused, site),
-            DoptError: partial(_refused, site),
-            HTTPException: partial(_refused, site),
-            Exception: partial(_broken, site),
+            AnalysisError: partial(_error_response, state),
+            DoptError: partial(_error_response, state),
+            HTTPException: partial(_error_response, state),
+            Exception: partial(_server_error, state),
         },
         lifespan=lifespan,
     )
 
 
-def _asked(request: Request) -> Asked:
-    return Asked({**dict(request.query_params), **request.path_params})
+def _query_params(request: Request) -> QueryParams:
+    return QueryParams({**dict(request.query_params), **request.path_params})
 
 
-def _page(site: Site, name: str, numbers: Numbers, request: Request) -> Response:
-    content = numbers(site, _asked(request))
+def _page(state: ServerState, name: str, numbers: Numbers, request: Request) -> Response:
+    content = numbers(state, _query_params(request))
     status = 400 if content.get("error") else 200
-    return as_page(f"{name}.html", _frame(site, name, request) | dict(content), status)
+    return as_page(f"{name}.html", _page_context(state, name, request) | dict(content), status)
 
 
-def _data(site: Site, numbers: Numbers, request: Request) -> Response:
-    content = numbers(site, _asked(request))
+def _data(state: ServerState, numbers: Numbers, request: Request) -> Response:
+    content = numbers(state, _query_params(request))
     return as_json(content, 400 if content.get("error") else 200)
 
 
-def _table(site: Site, name: str, request: Request) -> Response:
-    return as_csv(TABLES[name](site, _asked(request)), name)
+def _table(state: ServerState, name: str, request: Request) -> Response:
+    return as_csv(TABLES[name](state, _query_params(request)), name)
 
 
-def _file(site: Site, request: Request) -> Response:
-    path = gallery.find(site, request.path_params["name"])
+def _file(state: ServerState, request: Request) -> Response:
+    path = gallery.find(state, request.path_params["name"])
     return FileResponse(path, media_type=gallery.TYPES[path.suffix[1:]])
 
 
-class Given(dict[str, str]):
-    """What the address asks for, empty where it does not say."""
+class QueryText(dict[str, str]):
+    """Query parameters as text; a missing parameter is the empty string."""
 
     def __missing__(self, key: str) -> str:
         return ""
 
 
-def _frame(site: Site, name: str, request: Request) -> dict[str, Any]:
-    """Return what every page shows around its numbers."""
-    asked = Given({key: value for key, value in request.query_params.items() if value})
-    return {"page": name, "asked": asked, "database": site.source.safe_url}
+def _page_context(state: ServerState, name: str, request: Request) -> dict[str, Any]:
+    """Return the content that every page shows beside its own."""
+    query = QueryText({key: value for key, value in request.query_params.items() if value})
+    return {"page": name, "query": query, "database": state.database.safe_url}
 
 
-def _refused(site: Site, request: Request, error: Exception) -> Response:
+def _error_response(state: ServerState, request: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException):
         sentence = (
-            "There is no such page: choose one above."
+            "This page does not exist: choose a page from the menu above."
             if error.status_code == 404
             else (f"{error.detail}.")
         )
-        return _message(site, request, error.status_code, sentence)
+        return _message(state, request, error.status_code, sentence)
     status = next(code for kinds, code in STATES if isinstance(error, kinds))
-    return _message(site, request, status, str(error))
+    return _message(state, request, status, str(error))
 
 
-def _broken(site: Site, request: Request, error: Exception) -> Response:
+def _server_error(state: ServerState, request: Request, error: Exception) -> Response:
     logging.getLogger(__name__).error("%s failed", request.scope["path"], exc_info=error)
-    return _message(site, request, 500, "This page failed: the terminal of the server says why.")
+    return _message(
+        state,
+        request,
+        500,
+        "This page failed: the server's terminal shows the traceback.",
+    )
 
 
-def _message(site: Site, request: Request, status: int, sentence: str) -> Response:
+def _message(state: ServerState, request: Request, status: int, sentence: str) -> Response:
     path = request.scope["path"]
     if path.startswith("/api/"):
         return as_json({"error": sentence}, status)
     name = path.split("/")[1] or "grid"
-    content = {"sentence": sentence, "status": status, "page": name, "asked": Given()}
-    return as_page("message.html", content | {"database": site.source.safe_url}, status)
+    content = {"sentence": sentence, "status": status, "page": name, "query": QueryText()}
+    return as_page("message.html", content | {"database": state.database.safe_url}, status)

@@ -1,4 +1,4 @@
-"""What was computed once and cannot change is not computed again."""
+"""Cache of computed values with a bounded number of entries."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import TypeVar, cast
 T = TypeVar("T")
 
 
-class Memory:
-    """Keeps the values that were asked for last.
+class Cache:
+    """Thread-safe cache that drops the least recently used entry beyond ``size`` entries.
 
-    A key holds everything that its value depends on, such as the trials of a configuration that
-    have ended, so that a kept value is never stale. Two threads may compute one value at once.
+    A key contains everything that its value depends on, such as the finished trials of a
+    configuration, so a cached value is never stale. Two threads may compute one value concurrently.
     """
 
     def __init__(self, size: int = 1024) -> None:
@@ -22,8 +22,8 @@ class Memory:
         self._lock = threading.Lock()
         self._values: OrderedDict[Hashable, object] = OrderedDict()
 
-    def recall(self, key: Hashable, compute: Callable[[], T]) -> T:
-        """Return the value of a key, computed where it is not kept."""
+    def get_or_compute(self, key: Hashable, compute: Callable[[], T]) -> T:
+        """Return the value of a key; compute it when it is not cached."""
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)

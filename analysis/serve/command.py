@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from analysis.errors import AnalysisError
-from analysis.serve.guard import is_loopback
+from analysis.serve.addresses import is_loopback
 
 HELP = "show the results in a browser, read-only, while a launch writes"
 PORT = 8000

@@ -1,4 +1,4 @@
-"""Loss curves of one environment, the numbers of figure 1."""
+"""Curves page: loss curves of one environment with the numbers of figure 1."""
 
 from __future__ import annotations
 
@@ -7,48 +7,49 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.divergence import DivergenceRule
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import Selection, environment_rank, newest
 from analysis.errors import AnalysisError
 from analysis.figures.axis_break import axis_parts
-from analysis.loss_curves import Axis, LossCurve, measure_curves, tabulate_curves
-from analysis.selection import Selection, environment_rank, newest
-from analysis.serve.asked import Asked
-from analysis.serve.naming import look
-from analysis.serve.site import Site
-from orchestrate.store import Cell, Reader
+from analysis.figures.loss_curves.data import Axis, LossCurve, measure_curves, tabulate_curves
+from analysis.serve.policy_labels import legend_entry
+from analysis.serve.query_params import QueryParams
+from analysis.serve.state import ServerState
+from orchestrate.store import ConfigRow, Reader
 
 COLUMNS = ("loss", "reachable_loss")
 
 
-def choices(site: Site, asked: Asked) -> dict[str, Any]:
-    """Return the environments that are stored, each with its widths."""
-    stored = by_environment(site.source.reader())
+def choices(state: ServerState, params: QueryParams) -> dict[str, Any]:
+    """Return the stored environments, each with its widths."""
+    stored = by_environment(state.database.reader())
     return {
-        "env": asked.one_of("env", stored, next(iter(stored), "")),
+        "env": params.choice("env", stored, next(iter(stored), "")),
         "environments": [{"env": env, "widths": widths(cells)} for env, cells in stored.items()],
         "columns": COLUMNS,
         "rules": list(DivergenceRule),
     }
 
 
-def by_environment(reader: Reader) -> dict[str, list[Cell]]:
+def by_environment(reader: Reader) -> dict[str, list[ConfigRow]]:
     """Return the stored configurations by environment, in the paper's order."""
-    cells = newest(reader.cells())
+    cells = newest(reader.configs())
     names = sorted({cell.env for cell in cells}, key=environment_rank)
     return {env: [cell for cell in cells if cell.env == env] for env in names}
 
 
-def widths(cells: list[Cell]) -> list[int]:
+def widths(cells: list[ConfigRow]) -> list[int]:
     """Return the widths of some configurations, ascending."""
     return sorted({cell.width for cell in cells if cell.width is not None})
 
 
-def curves(site: Site, asked: Asked) -> dict[str, Any]:
-    """Return the curve and the interval of every policy in one environment, and what is missing.
+def curves(state: ServerState, params: QueryParams) -> dict[str, Any]:
+    """Return the curve and interval of every policy in one environment, and the missing trials.
 
-    ``main`` are the limits of the upper part of an axis that the figure would break, else None.
+    ``main`` holds the limits of the upper part of the axis where figure 1 has an axis break, else
+    None.
     """
-    selection, found = _measured(site, asked)
+    selection, found = _measured(state, params)
     parts = axis_parts([curve.band for curve in found])
     longest = max(found, key=lambda curve: len(curve.x))
     return {
@@ -68,25 +69,27 @@ def curves(site: Site, asked: Asked) -> dict[str, Any]:
     }
 
 
-def table(site: Site, asked: Asked) -> pd.DataFrame:
-    """Return the same as a table, in the columns of the CSV beside figure 1."""
-    return tabulate_curves(_measured(site, asked)[1])
+def table(state: ServerState, params: QueryParams) -> pd.DataFrame:
+    """Return the curves as a table with the columns of figure 1's CSV file."""
+    return tabulate_curves(_measured(state, params)[1])
 
 
-def _measured(site: Site, asked: Asked) -> tuple[Selection, tuple[LossCurve, ...]]:
-    reader = site.source.reader()
-    env = asked.text("env") or next(iter(by_environment(reader)), "")
+def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple[LossCurve, ...]]:
+    reader = state.database.reader()
+    env = params.text("env") or next(iter(by_environment(reader)), "")
     if not env:
-        raise AnalysisError("The database holds no trial yet: curves appear once one has ended.")
-    selection = site.select(reader, asked.wanted(env))
-    column = asked.one_of("column", COLUMNS, "loss")
-    rule = asked.member("diverged", DivergenceRule, DivergenceRule.EXCLUDE)
-    axis = asked.member("x", Axis, Axis.STEPS)
+        raise AnalysisError(
+            "The database has no trials yet: curves appear when the first trial has ended."
+        )
+    selection = state.select(reader, params.filter(env))
+    column = params.choice("column", COLUMNS, "loss")
+    rule = params.member("diverged", DivergenceRule, DivergenceRule.EXCLUDE)
+    axis = params.member("x", Axis, Axis.STEPS)
     parts = [replace(selection, entries=(entry,), gaps=()) for entry in selection.entries]
 
     def curve(part: Selection) -> LossCurve:
         key = ("curve", reader, part.fingerprint(), column, rule, axis)
-        return site.memory.recall(
+        return state.cache.get_or_compute(
             key, lambda: _light(measure_curves(reader, part, column, rule, axis)[0])
         )
 
@@ -94,26 +97,26 @@ def _measured(site: Site, asked: Asked) -> tuple[Selection, tuple[LossCurve, ...
 
 
 def width_text(selection: Selection) -> str:
-    """Return which width is shown, as the end of a heading; empty where it is not one."""
+    """Return the end of a heading that names the width; empty for none or several widths."""
     found = widths([entry.cell for entry in selection.entries])
     return f", width {found[0]}" if len(found) == 1 else ""
 
 
 def notes(selection: Selection) -> list[str]:
-    """Return the sentences on what was left out, with the advice of a page."""
+    """Return the sentences on omitted configurations, worded for a page."""
     return [
         note.replace("see --where", "choose a width or a condition") for note in selection.notes
     ]
 
 
 def _light(curve: LossCurve) -> LossCurve:
-    """Return a curve without the values of its trials, of which the count alone is still needed."""
+    """Return a curve without the values of its trials, which the pages do not show."""
     return replace(curve, sample=replace(curve.sample, values=curve.sample.values[:, :0].copy()))
 
 
 def _curve(curve: LossCurve) -> dict[str, Any]:
     return {
-        **look(curve.policy),
+        **legend_entry(curve.policy),
         "centre": curve.band.centre,
         "low": curve.band.low,
         "high": curve.band.high,

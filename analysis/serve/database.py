@@ -1,17 +1,17 @@
-"""The database that is shown: opened when it is there, opened anew when it was made anew."""
+"""Connection to the displayed database, reopened when the database file is replaced."""
 
 from __future__ import annotations
 
 import threading
 
 from orchestrate.store import Reader
-from orchestrate.store.address import parse, safe, sqlite_path
+from orchestrate.store.database_url import parse, safe, sqlite_path
 
 Identity = tuple[int, int] | None
 
 
-class Source:
-    """Gives a reader of the database at a URL, in whatever state that database is."""
+class Database:
+    """Access to the database at a URL, which may be missing, created later or replaced."""
 
     def __init__(self, url: str) -> None:
         parsed = parse(url)
@@ -28,7 +28,7 @@ class Source:
         return self._path is not None
 
     def reader(self) -> Reader:
-        """Return a reader; raise ``StoreError`` where there is none, or one of another schema."""
+        """Return a reader; raise ``StoreError`` for a missing database or another schema."""
         with self._lock:
             identity = self._file()
             if self._reader is None or identity != self._identity:
@@ -38,13 +38,13 @@ class Source:
             return self._reader
 
     def close(self) -> None:
-        """Give back the connections."""
+        """Close the connections."""
         if self._reader is not None:
             self._reader.close()
             self._reader = None
 
     def _file(self) -> Identity:
-        """Return which file lies at the path now: a database may be moved away under a server."""
+        """Return device and inode of the database file; None without one or on PostgreSQL."""
         if self._path is None:
             return None
         try:

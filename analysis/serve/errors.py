@@ -1,4 +1,4 @@
-"""What a request can get wrong."""
+"""Errors of a request."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from analysis.errors import AnalysisError
 
 
 class RequestError(AnalysisError):
-    """A request that cannot be understood: a bad value of a parameter."""
+    """A query parameter has an invalid value."""
 
 
 class NotFoundError(AnalysisError):
-    """A trial or a file that is not there."""
+    """The trial or file does not exist."""
 
 
 class BusyError(AnalysisError):
-    """Too many queries run already."""
+    """Too many queries are running."""

@@ -1,7 +1,6 @@
-"""The folder of figures as a page: pictures with their captions, tables, and where they are from.
+"""Figures page: pictures, captions, tables and provenance from the folder of figures.
 
-A file is served only if its plain name is in the listing of the folder, so that no address leads
-out of it.
+A file is served only if the folder's listing contains its name, so no URL can leave the folder.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from analysis.serve.asked import Asked, short
 from analysis.serve.errors import NotFoundError
-from analysis.serve.site import Site
+from analysis.serve.query_params import QueryParams, truncated
+from analysis.serve.state import ServerState
 
 PICTURES = ("svg", "png", "gif")
 FILMS = ("mp4", "webm")
@@ -34,19 +33,19 @@ LONGEST_TABLE = 60
 FACTS = ("statistic", "band", "database", "schema", "selection", "fingerprint", "git", "versions")
 
 
-def gallery(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # the signature is that of every page
-    """Return what lies in the folder, one item for each name, figures before tables."""
+def gallery(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa: ARG001  # the signature is that of every page
+    """Return the content of the folder, one item per file stem, figures before tables."""
     groups: dict[str, dict[str, Path]] = {}
-    for path in files(site.figures).values():
+    for path in files(state.figures).values():
         groups.setdefault(path.stem, {})[path.suffix[1:]] = path
     items = [_item(name, paths) for name, paths in sorted(groups.items()) if name != "README"]
     shown = [item for item in items if item["picture"] or item["film"] or item["table"]]
     shown.sort(key=lambda item: (not (item["picture"] or item["film"]), item["name"]))
-    return {"folder": site.figures.name, "exists": site.figures.is_dir(), "items": shown}
+    return {"folder": state.figures.name, "exists": state.figures.is_dir(), "items": shown}
 
 
 def files(folder: Path) -> dict[str, Path]:
-    """Return the files that may be served, by name: plain ones of known types, no links."""
+    """Return the files that may be served, by name: regular files of known types, no links."""
     if not folder.is_dir():
         return {}
     return {
@@ -59,11 +58,13 @@ def files(folder: Path) -> dict[str, Path]:
     }
 
 
-def find(site: Site, name: str) -> Path:
+def find(state: ServerState, name: str) -> Path:
     """Return a file of the folder; raise ``NotFoundError`` for any other name."""
-    found = files(site.figures).get(name)
+    found = files(state.figures).get(name)
     if found is None:
-        raise NotFoundError(f"There is no figure file '{short(name)}': see the page of figures.")
+        raise NotFoundError(
+            f"There is no figure file '{truncated(name)}': choose one of the figures page."
+        )
     return found
 
 
@@ -95,7 +96,7 @@ def _facts(path: Path | None) -> dict[str, Any]:
 
 
 def _text(path: Path | None) -> str:
-    """Return a file's text; none where a figure is just being written anew."""
+    """Return a file's text; empty while the file is being rewritten."""
     try:
         return path.read_text(encoding="utf-8").strip() if path else ""
     except (OSError, ValueError):
@@ -103,6 +104,6 @@ def _text(path: Path | None) -> str:
 
 
 def _rows(path: Path | None) -> list[list[str]] | None:
-    """Return the first rows of a CSV; None where there is none."""
+    """Return the first rows of a CSV file; None without one."""
     text = _text(path)
     return list(csv.reader(text.splitlines()[: LONGEST_TABLE + 1])) if text else None

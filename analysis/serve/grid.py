@@ -1,4 +1,4 @@
-"""The grid as a table: a row for each environment and width, a column for each policy."""
+"""Grid page: a row for each environment and width, a column for each policy."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.choice import flatten
-from analysis.gaps import absent_cells
-from analysis.selection import environment_rank, newest, policy_rank
-from analysis.serve.asked import Asked
-from analysis.serve.naming import look
-from analysis.serve.progress import measure
-from analysis.serve.site import Site
-from analysis.statistics import mean, standard_error
-from orchestrate.store import Cell, Reader
+from analysis.data.missing_trials import absent_cells
+from analysis.data.trial_selection import environment_rank, newest, policy_rank
+from analysis.serve.policy_labels import legend_entry
+from analysis.serve.progress import read_progress
+from analysis.serve.query_params import QueryParams
+from analysis.serve.state import ServerState
+from analysis.stats.intervals import mean, standard_error
+from dopt.spec.label import labels
+from orchestrate.store import ConfigRow, Reader
 
 _FINAL = """
 SELECT config_key, final_loss FROM v_trial
@@ -27,14 +27,16 @@ SHADES = 9
 """Steps of the heat scale."""
 
 
-def grid(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # the signature is that of every page
-    """Return every configuration with its final loss and the state of its trials."""
-    reader = site.source.reader()
-    state = measure(reader)
-    stored = reader.cells()
+def grid(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa: ARG001  # the signature is that of every page
+    """Return every configuration with its final loss and the status of its trials."""
+    reader = state.database.reader()
+    progress = read_progress(reader)
+    stored = reader.configs()
     cells = newest(stored)
     policies = sorted({cell.policy for cell in cells}, key=policy_rank)
-    finals = site.memory.recall(("final", reader, state["token"]), lambda: _finals(reader))
+    finals = state.cache.get_or_compute(
+        ("final", reader, progress["token"]), lambda: _finals(reader)
+    )
     slots = _slots(cells, finals)
     absent = absent_cells(cells)
     environments = [
@@ -42,8 +44,8 @@ def grid(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # the sig
         for env in sorted({cell.env for cell in cells}, key=environment_rank)
     ]
     return {
-        "progress": state,
-        "policies": [look(policy) for policy in policies],
+        "progress": progress,
+        "policies": [legend_entry(policy) for policy in policies],
         "environments": environments,
         "older": len(stored) - len(cells),
     }
@@ -52,8 +54,8 @@ def grid(site: Site, asked: Asked) -> dict[str, Any]:  # noqa: ARG001  # the sig
 Slots = dict[tuple[str, int | None, str], list[dict[str, Any]]]
 
 
-def _slots(cells: Sequence[Cell], finals: dict[str, dict[str, Any]]) -> Slots:
-    """Return the configurations of each (environment, width, policy), shaded and told apart."""
+def _slots(cells: Sequence[ConfigRow], finals: dict[str, dict[str, Any]]) -> Slots:
+    """Return the configurations of each (environment, width, policy), with shades and labels."""
     slots: Slots = {}
     nothing = _final(np.empty(0))
     for env in {cell.env for cell in cells}:
@@ -65,11 +67,11 @@ def _slots(cells: Sequence[Cell], finals: dict[str, dict[str, Any]]) -> Slots:
         for cell, one in zip(own, found, strict=True):
             slots.setdefault((env, cell.width or only, cell.policy), []).append(one)
     for group in slots.values():
-        _tell_apart(group)
+        _label(group)
     return slots
 
 
-def _configuration(cell: Cell, final: dict[str, Any]) -> dict[str, Any]:
+def _configuration(cell: ConfigRow, final: dict[str, Any]) -> dict[str, Any]:
     counts = {
         "done": cell.n_done,
         "diverged": cell.n_diverged,
@@ -84,7 +86,7 @@ def _configuration(cell: Cell, final: dict[str, Any]) -> dict[str, Any]:
         "n": cell.n,
         "ended": cell.n - cell.n_pending - cell.n_running,
         "counts": {status: count for status, count in counts.items() if count},
-        "config": flatten(cell.config),
+        "config": cell.config,
         **final,
     }
 
@@ -115,16 +117,12 @@ def _shade(found: Sequence[dict[str, Any]]) -> None:
         one["shade"] = round((SHADES - 1) * place / max(len(ranked) - 1, 1))
 
 
-def _tell_apart(group: Sequence[dict[str, Any]]) -> None:
-    """Replace the configuration by the values in which those of one place of the table differ."""
-    flat = [one.pop("config") for one in group]
-    paths = sorted(
-        path
-        for path in set().union(*flat)
-        if len({repr(config.get(path)) for config in flat}) > 1 and path != "config_key"
-    )
-    for one, config in zip(group, flat, strict=True):
-        one["differs"] = ", ".join(f"{path}={config.get(path)}" for path in paths[:3])
+def _label(group: Sequence[dict[str, Any]]) -> None:
+    """Replace the configuration by a label that says how it differs from the others of its cell."""
+    configs = [one.pop("config") for one in group]
+    found = labels(configs) if len(configs) > 1 else [""]
+    for one, label in zip(group, found, strict=True):
+        one["label"] = label
 
 
 def _rows(

@@ -1,14 +1,14 @@
-"""Names and colours of policies as the figures have them, for a page that draws them itself."""
+"""Labels and line styles of policies, the same as in the figures."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from analysis.figures.style import policy_style
+from analysis.line_styles import policy_style
 
 
-def look(policy: str) -> dict[str, Any]:
-    """Return how a policy is named and drawn: dashes in units of the line's width."""
+def legend_entry(policy: str) -> dict[str, Any]:
+    """Return label, colour, dashes (in units of the line width) and line width of a policy."""
     style = policy_style(policy)
     dash = [] if isinstance(style.line, str) else list(style.line[1])
     return {

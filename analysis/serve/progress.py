@@ -1,4 +1,4 @@
-"""How far the grid is, and whether anything changed since a page was made."""
+"""Progress of the grid and a token that changes with every change of a trial."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ FROM launch
 """
 
 
-def measure(reader: Reader) -> dict[str, Any]:
-    """Return the counts of trials by status, and a token that changes whenever they do.
+def read_progress(reader: Reader) -> dict[str, Any]:
+    """Return the counts of trials by status, and a token that changes when a trial changes.
 
-    It takes one pass over the trials, never over their steps.
+    The query reads the table of trials once and no steps.
     """
     trials = [(row.status, int(row.n), int(row.attempts)) for row in reader.rows(_TRIALS)]
     (launches,) = reader.rows(_LAUNCHES)

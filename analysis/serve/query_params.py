@@ -1,4 +1,4 @@
-"""The values that come with a request, read strictly: a wrong one is a sentence, never a crash."""
+"""Parser of query parameters; an invalid value raises ``RequestError`` with one sentence."""
 
 from __future__ import annotations
 
@@ -9,46 +9,46 @@ from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import TypeVar
 
-from analysis.choice import Filter, read_condition
+from analysis.data.config_matching import Filter, read_condition
 from analysis.serve.errors import RequestError
 
 E = TypeVar("E", bound=StrEnum)
 
 LARGEST = 2**31 - 1
-"""Bound of whole numbers: both databases take it for every column."""
+"""Largest integer; both databases accept it for every integer column."""
 
 
-class Asked:
-    """The parameters of a request by name; an empty one counts as not given."""
+class QueryParams:
+    """Query parameters by name; an empty value counts as not given."""
 
     def __init__(self, values: Mapping[str, str]) -> None:
         self._values = values
 
     def text(self, name: str, default: str = "") -> str:
-        """Return a text; no database takes one with a zero character."""
+        """Return a text; zero characters are refused because no database accepts them."""
         value = self._values.get(name, "").strip()
         if "\0" in value:
             raise RequestError(f"'{name}' holds a zero character, a text is expected: leave it.")
         return value or default
 
-    def one_of(self, name: str, choices: Iterable[str], default: str = "") -> str:
+    def choice(self, name: str, choices: Iterable[str], default: str = "") -> str:
         """Return one of several texts."""
         value, known = self.text(name, default), list(choices)
         if value and value not in known:
             near = difflib.get_close_matches(value, known, n=1)
             hint = f"did you mean '{near[0]}'?" if near else "choose one of these."
             raise RequestError(
-                f"'{name}' is '{short(value)}', expected is one of "
+                f"'{name}' is '{truncated(value)}', expected is one of "
                 f"{', '.join(known) or 'nothing: there is none'}: {hint}"
             )
         return value
 
     def member(self, name: str, kind: type[E], default: E) -> E:
         """Return a member of an enumeration."""
-        return kind(self.one_of(name, list(kind), default))
+        return kind(self.choice(name, list(kind), default))
 
-    def whole(self, name: str, low: int = 0, high: int = LARGEST) -> int | None:
-        """Return a whole number within bounds, None where it is not given."""
+    def integer(self, name: str, low: int = 0, high: int = LARGEST) -> int | None:
+        """Return an integer within bounds, None if it is not given."""
         value = self.text(name)
         if not value:
             return None
@@ -56,14 +56,14 @@ class Asked:
         if digits.isascii() and digits.isdigit() and len(digits) < 20 and low <= int(value) <= high:
             return int(value)
         raise RequestError(
-            f"'{name}' is '{short(value)}', expected is a whole number of {low} to {high}: "
+            f"'{name}' is '{truncated(value)}', expected is a whole number of {low} to {high}: "
             f"write one."
         )
 
-    def place(self, name: str, text: bool) -> tuple[float | str | None, int] | None:
-        """Return the place in a sorted list after or before which a page starts.
+    def position(self, name: str, text: bool) -> tuple[float | str | None, int] | None:
+        """Return the position (sort value, row id) after or before which a page starts.
 
-        ``text`` says whether the list is sorted by texts or by numbers.
+        ``text`` says whether the sort column contains text or numbers.
         """
         value = self.text(name)
         if not value:
@@ -81,11 +81,11 @@ class Asked:
     def conditions(self) -> dict[str, object]:
         """Return the conditions of ``where`` and ``width``, such as model.width=32."""
         found = dict(_condition(word) for word in self.text("where").split())
-        width = self.whole("width", low=1)
+        width = self.integer("width", low=1)
         return found if width is None else {**found, "model.width": width}
 
-    def wanted(self, *environments: str) -> Filter:
-        """Return the filter of the configurations that are asked for."""
+    def filter(self, *environments: str) -> Filter:
+        """Return the filter of the requested configurations."""
         return Filter(environments, (), self.conditions())
 
 
@@ -99,13 +99,13 @@ def _condition(word: str) -> tuple[str, object]:
     found = read_condition(word)
     if found is None:
         raise RequestError(
-            f"'where' holds '{short(word)}', conditions PATH=VALUE are expected: "
+            f"'where' holds '{truncated(word)}', conditions PATH=VALUE are expected: "
             f"write for instance policy.form=dual."
         )
     return found
 
 
-def short(text: str, length: int = 60) -> str:
-    """Return the beginning of a text, fit for a sentence."""
+def truncated(text: str, length: int = 60) -> str:
+    """Return the start of a text with unprintable characters replaced."""
     shown = "".join(letter if letter.isprintable() else "?" for letter in text)
     return shown if len(shown) <= length else f"{shown[: length - 1]}…"

@@ -1,4 +1,4 @@
-"""Numbers as JSON, as CSV or as a page."""
+"""Responses: content rendered as JSON, CSV or an HTML page, and the number formats of pages."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.responses import HTMLResponse, Response
 
-from analysis.figures.style import environment_title
-from analysis.numbers import number, plus_minus
+from analysis.formatting import number, plus_minus
+from analysis.line_styles import environment_title
 
 FOLDER = Path(__file__).parent
 
@@ -24,7 +24,7 @@ RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON knows it: what is not finite is null, arrays are lists."""
+    """Return a value that JSON can represent: non-finite numbers as None, arrays as lists."""
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, np.generic):
@@ -41,24 +41,24 @@ def plain(value: Any) -> Any:
 
 
 def as_json(content: Mapping[str, Any], status: int = 200) -> Response:
-    """Return the answer of an address under /api."""
+    """Return a JSON response."""
     text = json.dumps(plain(content), allow_nan=False, separators=(",", ":"))
     return Response(text, status, media_type="application/json")
 
 
 def as_csv(text: str, name: str) -> Response:
-    """Return a CSV to be saved."""
+    """Return a CSV response that the browser saves as a file."""
     headers = {"content-disposition": f'attachment; filename="{name}.csv"'}
     return Response(text, media_type="text/csv", headers=headers)
 
 
 def as_page(template: str, content: Mapping[str, Any], status: int = 200) -> Response:
-    """Return a page."""
+    """Return an HTML page."""
     return HTMLResponse(_pages.get_template(template).render(content), status)
 
 
 def numeral(value: Any, digits: int = 4) -> str:
-    """Return a number as a person reads it, a dash for none, other values as text."""
+    """Return a number with few digits, a dash for None, other values as text."""
     if value is None:
         return "–"
     if isinstance(value, bool | int):
@@ -67,7 +67,7 @@ def numeral(value: Any, digits: int = 4) -> str:
 
 
 def loss_text(loss: float | None, error: float | None) -> str:
-    """Return ``mean ± 2 SE`` of a loss, a dash where there is none."""
+    """Return ``mean ± 2 SE`` of a loss, a dash without a loss."""
     if loss is None or not math.isfinite(loss):
         return "–"
     if 0 < loss < 1e-3:
@@ -86,7 +86,7 @@ def moment(value: str | None) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """Return seconds with a unit that suits them."""
+    """Return a duration in ms, s, min or h."""
     if seconds is None or not math.isfinite(seconds):
         return "–"
     if seconds < 1:
@@ -97,7 +97,7 @@ def duration(seconds: float | None) -> str:
 
 
 def size(count: float | None) -> str:
-    """Return bytes with a unit that suits them."""
+    """Return a number of bytes in B, KiB, MiB or GiB."""
     if count is None:
         return "–"
     for unit in ("B", "KiB", "MiB"):
@@ -113,7 +113,7 @@ def named(environments: list[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def shortened(text: str) -> str:
-    """Return a number of a CSV with few digits, any other text as it is."""
+    """Return a number of a CSV file with few digits, any other text unchanged."""
     try:
         return numeral(float(text)) if not text.lstrip("-").isdigit() else text
     except ValueError:

@@ -1,8 +1,8 @@
-"""What stands before every page: only reading, only from this machine, only for its own pages.
+"""Security checks of every request: read-only methods, own Host header, no cross-site requests.
 
-A web site that the user visits elsewhere may point a name of its own at 127.0.0.1 (DNS rebinding)
-or load addresses of this server. The first is refused by the Host header, the second by
-Sec-Fetch-Site; the headers of each answer keep pages from running or loading anything foreign.
+A foreign web site may point a DNS name at 127.0.0.1 (DNS rebinding) or embed URLs of this server.
+The Host header reveals the first, Sec-Fetch-Site the second; the response headers keep pages from
+running or loading foreign content.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import ipaddress
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from analysis.serve.addresses import is_loopback
 
 METHODS = ("GET", "HEAD")
 LONGEST_QUERY = 16_000
@@ -31,7 +33,7 @@ HEADERS = {
 }
 
 
-class Guard:
+class SecurityMiddleware:
     """Refuses requests before any page sees them, and sets the headers of every answer.
 
     ``host`` is the address that the server listens at.
@@ -104,14 +106,6 @@ def is_own(hosts: list[str], listening: str) -> bool:
     except ValueError:
         return False
     return address.is_loopback or not is_loopback(listening)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address to listen at is reached from this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
 
 
 def _name(host: str) -> str | None:

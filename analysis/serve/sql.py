@@ -1,7 +1,7 @@
-"""A SELECT that the user types, bounded in rows and time.
+"""SQL page: read-only SELECT statements with a limit on rows and time.
 
-The database itself refuses everything that does not read its tables (see ``Reader.query``). On
-PostgreSQL, functions such as ``pg_read_file`` are a matter of the role that the URL names.
+The database connection refuses every statement that writes (see ``Reader.query``). On PostgreSQL,
+the role in the database URL decides about functions such as ``pg_read_file``.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from analysis.serve.asked import Asked
 from analysis.serve.errors import BusyError
-from analysis.serve.site import Site
+from analysis.serve.query_params import QueryParams
+from analysis.serve.state import ServerState
 from orchestrate.store import Table
 from orchestrate.store.errors import QueryError
 
-ROWS = 1000
-CSV_ROWS = 100_000
-SECONDS = 10.0
-AT_ONCE = 2
+MAX_ROWS = 1000
+MAX_CSV_ROWS = 100_000
+TIMEOUT_SECONDS = 10.0
+MAX_CONCURRENT = 2
 
 EXAMPLES = (
     ("Where the grid stands", "SELECT env, policy, width, n_done, n_diverged, n_failed, n_pending\n"
@@ -40,21 +40,35 @@ EXAMPLES = (
     ("Time and memory", "SELECT env, policy, width, avg(wall_seconds) AS wall_s,\n"
      "       max(peak_memory_bytes) / 1048576 AS peak_mib\n"
      "FROM v_trial WHERE status = 'done'\nGROUP BY env, policy, width ORDER BY wall_s DESC"),
+    ("Control results", "SELECT env, policy, t, count(*) AS n, avg(value) AS success_rate\n"
+     "FROM v_assessment WHERE measure = 'control_success'\n"
+     "GROUP BY env, policy, t ORDER BY env, policy, t"),
     ("Launches", "SELECT launch_id, state, started, ended, host, git_commit\n"
      "FROM launch ORDER BY launch_id DESC"),
 )  # fmt: skip
 
-_places = threading.BoundedSemaphore(AT_ONCE)
+VIEWS = {
+    "v_trial": "one row per trial: configuration, status, losses, times, error",
+    "v_curve": "one row per trial and step: loss and reachable loss",
+    "v_curve_stats": "one row per configuration and step: mean loss and its standard error",
+    "v_progress": "one row per configuration: number of trials by status",
+    "v_failures": "one row per failed attempt: cause, error message and traceback",
+    "v_assessment": "one row per assessed trial, number of explored steps t and measure: value",
+}
+"""Views of the database with a sentence on each."""
+
+_slots = threading.BoundedSemaphore(MAX_CONCURRENT)
 
 
-def sql(site: Site, asked: Asked) -> dict[str, Any]:
-    """Return the rows of the statement ``q``, its error, or nothing where none is given."""
-    statement = asked.text("q")
+def sql(state: ServerState, params: QueryParams) -> dict[str, Any]:
+    """Return the rows or the error of the statement ``q``, if one is given."""
+    statement = params.text("q")
     answer: dict[str, Any] = {
         "q": statement,
         "examples": [{"title": title, "q": text} for title, text in EXAMPLES],
-        "limits": {"rows": ROWS, "csv_rows": CSV_ROWS, "seconds": SECONDS},
-        "is_file": site.source.is_file,
+        "limits": {"rows": MAX_ROWS, "csv_rows": MAX_CSV_ROWS, "seconds": TIMEOUT_SECONDS},
+        "is_file": state.database.is_file,
+        "views": _views(state),
         "error": None,
         "columns": None,
     }
@@ -62,44 +76,60 @@ def sql(site: Site, asked: Asked) -> dict[str, Any]:
         return answer
     start = time.monotonic()
     try:
-        found = _ask(site, statement, ROWS)
+        found = _run_query(state, statement, MAX_ROWS)
     except QueryError as error:
         return answer | {"error": str(error)}
     return answer | {
         "columns": found.columns,
-        "rows": [[_shown(value) for value in row] for row in found],
+        "rows": [[_displayed(value) for value in row] for row in found],
         "cut": found.cut,
         "seconds": time.monotonic() - start,
     }
 
 
-def table(site: Site, asked: Asked) -> str:
-    """Return the rows as CSV, with a last line that says so where rows are cut."""
-    found = _ask(site, asked.text("q"), CSV_ROWS)
+def _views(state: ServerState) -> list[dict[str, Any]]:
+    """Return name, description and columns of every view."""
+    reader = state.database.reader()
+
+    def columns() -> list[list[str]]:
+        return [list(reader.rows(f"SELECT * FROM {view} LIMIT 0").columns) for view in VIEWS]
+
+    found = state.cache.get_or_compute(("views", reader), columns)
+    return [
+        {"name": name, "description": text, "columns": names}
+        for (name, text), names in zip(VIEWS.items(), found, strict=True)
+    ]
+
+
+def table(state: ServerState, params: QueryParams) -> str:
+    """Return the rows as CSV; a last line says when the rows were cut."""
+    found = _run_query(state, params.text("q"), MAX_CSV_ROWS)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(found.columns)
-    writer.writerows([_shown(value) for value in row] for row in found)
+    writer.writerows([_displayed(value) for value in row] for row in found)
     if found.cut:
-        writer.writerow([f"# cut after {CSV_ROWS} rows"])
+        writer.writerow([f"# cut after {MAX_CSV_ROWS} rows"])
     return text.getvalue()
 
 
-def _ask(site: Site, statement: str, rows: int) -> Table:
-    with _place():
-        return site.source.reader().query(statement, limit=rows, timeout=SECONDS)
+def _run_query(state: ServerState, statement: str, rows: int) -> Table:
+    with _slot():
+        return state.database.reader().query(statement, limit=rows, timeout=TIMEOUT_SECONDS)
 
 
 @contextmanager
-def _place() -> Iterator[None]:
-    if not _places.acquire(timeout=SECONDS):
-        raise BusyError(f"{AT_ONCE} queries run already: wait for them to end, then try again.")
+def _slot() -> Iterator[None]:
+    if not _slots.acquire(timeout=TIMEOUT_SECONDS):
+        raise BusyError(
+            f"{MAX_CONCURRENT} queries are running: wait until one ends, then try again."
+        )
     try:
         yield
     finally:
-        _places.release()
+        _slots.release()
 
 
-def _shown(value: object) -> object:
-    """Return a value for people: of bytes their number alone."""
+def _displayed(value: object) -> object:
+    """Return a value to display; for binary data its length."""
     return f"{len(value)} bytes" if isinstance(value, bytes | memoryview) else value

@@ -1,4 +1,4 @@
-"""One trial: what was asked for, what came out, and every attempt at it."""
+"""Trial page: configuration, outcome, provenance, attempts and charts of one trial."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from analysis.choice import flatten
-from analysis.portraits import DrawnPlane
-from analysis.serve.asked import Asked, short
+from analysis.figures.phase_portraits.data import DrawnPlane
 from analysis.serve.errors import NotFoundError
-from analysis.serve.naming import look
-from analysis.serve.progress import measure
-from analysis.serve.site import Site
-from analysis.spectrum import periodogram
+from analysis.serve.policy_labels import legend_entry
+from analysis.serve.progress import read_progress
+from analysis.serve.query_params import QueryParams, truncated
+from analysis.serve.state import ServerState
+from analysis.stats.spectrum import periodogram
 from dopt.errors import SpecificationError
+from dopt.spec.label import flatten
 from dopt.systems import System, system_from_mapping
 from dopt.systems.equilibrium import eigenmode
 from orchestrate.store import Reader, Trajectory
@@ -45,13 +45,13 @@ _STEPS = "SELECT t, loss, reachable_loss FROM step WHERE trial_id = :trial_id OR
 _TEXTS = ("argv", "overrides", "versions")
 
 
-def trial(site: Site, asked: Asked) -> dict[str, Any]:
-    """Return everything that is stored of a trial but its arrays, see ``arrays``."""
-    reader = site.source.reader()
-    row = _row(reader, asked)
+def trial(state: ServerState, params: QueryParams) -> dict[str, Any]:
+    """Return everything that is stored of a trial except its arrays, see ``arrays``."""
+    reader = state.database.reader()
+    row = _row(reader, params)
     config = json.loads(row.pop("config_json"))
     return {
-        "progress": measure(reader),
+        "progress": read_progress(reader),
         "trial": row,
         "config": flatten(config),
         "attempts": _table(reader, _ATTEMPTS, row["trial_id"]),
@@ -61,14 +61,14 @@ def trial(site: Site, asked: Asked) -> dict[str, Any]:
         ],
         "has_arrays": row["status"] in ("done", "diverged"),
         "system_is_known": _system(config) is not None,
-        "look": look(row["policy"]),
+        "legend_entry": legend_entry(row["policy"]),
     }
 
 
-def arrays(site: Site, asked: Asked) -> dict[str, Any]:
-    """Return loss, path in the phase plane, inputs and their spectrum, ready to draw."""
-    reader = site.source.reader()
-    row = _row(reader, asked)
+def arrays(state: ServerState, params: QueryParams) -> dict[str, Any]:
+    """Return loss, phase-plane path, inputs and their spectrum for the charts."""
+    reader = state.database.reader()
+    row = _row(reader, params)
     steps = _table(reader, _STEPS, row["trial_id"])
     try:
         trajectory = reader.trajectory(row["config_key"], row["seed"])
@@ -85,7 +85,7 @@ def arrays(site: Site, asked: Asked) -> dict[str, Any]:
         "diverged_at": row["diverged_at"],
         "dt": row["dt"],
         "gamma": row["gamma"],
-        "look": look(row["policy"]),
+        "legend_entry": legend_entry(row["policy"]),
         "inputs": [
             {"label": label, "values": values}
             for label, values in zip(labels, trajectory.inputs.T, strict=True)
@@ -95,12 +95,13 @@ def arrays(site: Site, asked: Asked) -> dict[str, Any]:
     }
 
 
-def _row(reader: Reader, asked: Asked) -> dict[str, Any]:
-    key = asked.text("trial_key")
+def _row(reader: Reader, params: QueryParams) -> dict[str, Any]:
+    key = params.text("trial_key")
     found = reader.rows(_TRIAL, trial_key=key)
     if not found:
         raise NotFoundError(
-            f"There is no trial '{short(key, 20)}' in {reader.safe_url}: choose one of the list."
+            f"There is no trial '{truncated(key, 20)}' in {reader.safe_url}: "
+            f"choose one of the trials page."
         )
     return dict(zip(found.columns, found[0], strict=True))
 
@@ -111,7 +112,7 @@ def _table(reader: Reader, sql: str, trial_id: int) -> list[dict[str, Any]]:
 
 
 def _system(config: dict[str, Any]) -> System | None:
-    """Return the system of a configuration, None where it is a user's own and not known here."""
+    """Return the system of a configuration, None for a custom system that is not registered."""
     try:
         return system_from_mapping(config["env"])
     except (SpecificationError, KeyError):
@@ -138,7 +139,7 @@ def _phase(trajectory: Trajectory, system: System) -> dict[str, Any]:
 
 
 def _spectrum(trajectory: Trajectory, dt: float, system: System | None) -> dict[str, Any]:
-    """Return the one-sided periodogram without its ends, whose density counts once."""
+    """Return the one-sided periodogram without its first and last frequency."""
     inputs = trajectory.inputs
     inputs = inputs[np.isfinite(inputs).all(axis=1)]
     mode = eigenmode(system) if system else None

@@ -11,18 +11,24 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 from scipy import stats
 
-from analysis.choice import Candidate, choose
-from analysis.measures import Scores
-from analysis.numbers import but_lost
-from analysis.selection import Entry, Selection, environment_rank, policy_rank
-from analysis.statistics import LEVEL, band
+from analysis.data.config_matching import Candidate, choose
+from analysis.data.trial_selection import (
+    Entry,
+    Selection,
+    environment_rank,
+    labelled,
+    policy_rank,
+)
+from analysis.formatting import but_lost
+from analysis.stats.intervals import CONFIDENCE, band
+from analysis.stats.trial_scores import Scores
 from orchestrate.store import Assessments, Reader
 
 Array = npt.NDArray[np.float64]
@@ -94,16 +100,19 @@ def control_part(selection: Selection) -> Selection:
     asked = [entry for entry in selection.stored if task_of(entry)]
     chosen: list[Entry] = []
     for env in dict.fromkeys(entry.cell.env for entry in asked):
-        chosen += _of_one_task([entry for entry in asked if entry.cell.env == env])
+        chosen += _of_one_task(
+            [entry for entry in asked if entry.cell.env == env], selection.reference
+        )
     chosen.sort(key=lambda e: (environment_rank(e.cell.env), policy_rank(e.cell.policy)))
-    return Selection(tuple(chosen), notes=tuple(_unfinished(chosen)), stored=tuple(chosen))
+    entries, notes = tuple(labelled(chosen)), tuple(_unfinished(chosen))
+    return replace(selection, entries=entries, gaps=(), notes=notes, stored=entries)
 
 
-def _of_one_task(entries: list[Entry]) -> list[Entry]:
+def _of_one_task(entries: list[Entry], reference: str) -> list[Entry]:
     most = common_task(entries)
     same = {entry.cell.config_key: entry for entry in entries if task_of(entry) == most}
-    cells = choose(Candidate(entry.cell, len(entry.trials)) for entry in same.values())
-    return [same[cell.config_key] for cell in cells]
+    candidates = [Candidate(entry.cell, len(entry.trials)) for entry in same.values()]
+    return [same[cell.config_key] for cell in choose(candidates, reference)]
 
 
 def common_task(entries: Iterable[Entry]) -> str | None:
@@ -213,7 +222,7 @@ def _rate(successes: Array) -> Interval:
     if not len(known):
         return np.nan, np.nan, np.nan
     test = stats.binomtest(int(np.sum(known)), len(known))
-    interval = test.proportion_ci(confidence_level=LEVEL, method="wilson")
+    interval = test.proportion_ci(confidence_level=CONFIDENCE, method="wilson")
     return float(np.mean(known)), float(interval.low), float(interval.high)
 
 
@@ -241,9 +250,8 @@ def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
     seeds = costs.seeds[reached[:, at].any(axis=1)]
     column = costs.values[reached & at]
     by_seed = dict(zip(seeds.tolist(), column.tolist(), strict=True))
-    return Scores(
-        entry.cell.env, entry.cell.policy, by_seed, len(costs.seeds), int(np.sum(costs.diverged))
-    )
+    names = entry.cell.env, entry.cell.policy, entry.label
+    return Scores(*names, by_seed, len(costs.seeds), int(np.sum(costs.diverged)))
 
 
 def tabulate_control(curves: Iterable[ControlCurve]) -> pd.DataFrame:

@@ -8,6 +8,7 @@ with a percentile bootstrap that draws whole trials.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -17,14 +18,13 @@ import numpy.typing as npt
 from scipy import stats
 
 Array = npt.NDArray[np.float64]
+Counts = npt.NDArray[np.integer[Any]]
 
-LEVEL = 0.95
+CONFIDENCE = 0.95
 """Confidence level of every interval."""
 
 RESAMPLES = 1999
 """Draws of a bootstrap band: the 2.5 % quantile is then the 50th smallest."""
-
-_BATCH = 100  # draws at once, which bounds the memory of a curve of 10,000 steps
 
 
 class Statistic(StrEnum):
@@ -92,24 +92,63 @@ def band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
         nothing = np.full_like(middle, np.nan)
         return Band(middle, nothing, nothing, n)
     if statistic is Statistic.MEAN:
-        half = stats.t.ppf(0.5 + LEVEL / 2, n - 1) * standard_error(values)
+        half = stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1) * standard_error(values)
         return Band(middle, middle - half, middle + half, n)
     low, high = _bootstrap(values, statistic)
     return Band(middle, low, high, n)
 
 
 def _bootstrap(values: Array, statistic: Statistic) -> tuple[Array, Array]:
-    """Return the percentile interval of trials (n, T), each end (T,)."""
-    found = stats.bootstrap(
-        (values,),  # along the first axis: a draw takes the same trials at every step
-        _CENTRES[statistic],
-        n_resamples=RESAMPLES,
-        batch=_BATCH,
-        confidence_level=LEVEL,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return np.asarray(found.low), np.asarray(found.high)
+    """Return the percentile interval of trials (n, T), each end (T,).
+
+    A draw takes the same trials at every step. Median and IQM are means of the middle of a sorted
+    sample: with the trials sorted once at each step, how often a draw has each of them says what
+    its middle is, so that no draw is sorted.
+    """
+    n, steps = values.shape
+    first, last = _middle(n, statistic)
+    counts = _draws(n)
+    order = np.argsort(values, axis=0, kind="stable")
+    ranked = np.take_along_axis(values, order, axis=0)
+    found = np.empty((RESAMPLES, steps))
+    for t in range(steps):
+        weights = _middle_counts(counts[order[:, t]], first, last)
+        found[:, t] = ranked[:, t] @ weights.astype(float) / (last - first)
+    tail = 100 * (1 - CONFIDENCE) / 2
+    low, high = np.percentile(found, [tail, 100 - tail], axis=0)
+    return low, high
+
+
+def _middle_counts(counts: Counts, first: int, last: int) -> Counts:
+    """Return how often each trial is in the middle of each draw, trials (n, ...) by rising value.
+
+    The sums are made row by row: numpy's own along the first axis takes three times as long.
+    """
+    below = np.empty_like(counts)
+    total = np.zeros_like(counts[0])
+    for place, count in enumerate(counts):
+        total += count
+        below[place] = total
+    np.clip(below, first, last, out=below)
+    below[1:] -= below[:-1].copy()
+    below[0] -= first
+    return below
+
+
+def _middle(n: int, statistic: Statistic) -> tuple[int, int]:
+    """Return the half-open range of places in a sorted sample of n whose mean is the statistic."""
+    if statistic is Statistic.MEDIAN:
+        return (n - 1) // 2, n // 2 + 1
+    return n // 4, n - n // 4
+
+
+@functools.lru_cache(maxsize=8)
+def _draws(n: int) -> Counts:
+    """Return how often each trial of n is in each draw of n, (n, RESAMPLES)."""
+    drawn = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
+    counts: Counts = np.zeros((n, RESAMPLES), np.int16 if n < 2**15 else np.int32)
+    np.add.at(counts, (drawn, np.arange(RESAMPLES)[:, None]), 1)
+    return counts
 
 
 def _interquartile_mean(values: Array, axis: int) -> Array:

@@ -9,28 +9,28 @@ import numpy as np
 import numpy.typing as npt
 from scipy import stats
 
-from analysis.statistics import LEVEL, standard_error
+from analysis.stats.intervals import CONFIDENCE, standard_error
 
 Array = npt.NDArray[np.float64]
 
 RESAMPLES = 9999
 
-FEW = 30
+FEWEST_BOOTSTRAP_PAIRS = 30
 """Pairs below which a bootstrap is too narrow (95 % meant, of normal differences: 82 % for 5 pairs,
 93.8 % for 20; of exponential ones 89 % for 20); Student's is nearer (91 % of exponential ones)."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """How the losses of one policy compare with those of a baseline over shared seeds.
+    """How the losses of a variant compare with those of a reference over shared seeds.
 
     Attributes
     ----------
     n_pairs : int
         Seeds on which neither diverged.
     ratio, low, high : float
-        Geometric mean of loss / baseline loss over the pairs of which both are finite, and its
-        paired interval; below 1 the policy is better. NaN, as the p-value is, where a loss is 0
+        Geometric mean of loss / reference loss over the pairs of which both are finite, and its
+        paired interval; below 1 the variant is better. NaN, as the p-value is, where a loss is 0
         and has no logarithm.
     improvement : float
         Probability of improvement: share of pairs with the lower loss, ties counted half.
@@ -46,24 +46,24 @@ class Comparison:
     p_value: float
 
 
-def compare(loss: Array, baseline: Array, rng: np.random.Generator) -> Comparison:
+def compare(loss: Array, reference: Array, rng: np.random.Generator) -> Comparison:
     """Compare losses, both (n,) and paired by position; NaN where n is too small.
 
     A loss may be inf, worse than every finite one: it has no ratio, but counts in the probability
     of improvement and as the largest difference in the test; two of a pair are equal. A pair with a
     NaN is left out.
     """
-    known = ~(np.isnan(loss) | np.isnan(baseline))
-    loss, baseline = loss[known], baseline[known]
+    known = ~(np.isnan(loss) | np.isnan(reference))
+    loss, reference = loss[known], reference[known]
     n, unknown = len(loss), float("nan")
     if not n:
         return Comparison(0, *[unknown] * 5)
-    wins = float(np.mean(loss < baseline) + np.mean(loss == baseline) / 2)
-    if np.min(loss) <= 0 or np.min(baseline) <= 0:
+    wins = float(np.mean(loss < reference) + np.mean(loss == reference) / 2)
+    if np.min(loss) <= 0 or np.min(reference) <= 0:
         return Comparison(n, unknown, unknown, unknown, wins, unknown)
-    both_lost = np.isinf(loss) & np.isinf(baseline)
-    ours, theirs = (np.log(np.where(both_lost, 1.0, one)) for one in (loss, baseline))
-    finite = np.isfinite(loss) & np.isfinite(baseline)
+    both_lost = np.isinf(loss) & np.isinf(reference)
+    ours, theirs = (np.log(np.where(both_lost, 1.0, one)) for one in (loss, reference))
+    finite = np.isfinite(loss) & np.isfinite(reference)
     difference = ours - theirs
     p_value = signed_rank(difference)
     if not finite.any():
@@ -73,9 +73,9 @@ def compare(loss: Array, baseline: Array, rng: np.random.Generator) -> Compariso
     return Comparison(n, ratio, float(low), float(high), wins, p_value)
 
 
-def without_ratio(loss: Array, baseline: Array) -> int:
+def without_ratio(loss: Array, reference: Array) -> int:
     """Return how many pairs of (n,) are in no ratio, as one of the two is not finite."""
-    return int(np.sum(~(np.isfinite(loss) & np.isfinite(baseline))))
+    return int(np.sum(~(np.isfinite(loss) & np.isfinite(reference))))
 
 
 def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, float]:
@@ -84,11 +84,11 @@ def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, fl
         return float("nan"), float("nan")
     if np.ptp(values) == 0:
         return float(values[0]), float(values[0])
-    if len(values) < FEW:
-        half = stats.t.ppf(0.5 + LEVEL / 2, len(values) - 1) * float(standard_error(values))
+    if len(values) < FEWEST_BOOTSTRAP_PAIRS:
+        half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1) * float(standard_error(values))
         return float(np.mean(values)) - half, float(np.mean(values)) + half
     found = stats.bootstrap(
-        (values,), np.mean, n_resamples=RESAMPLES, confidence_level=LEVEL, rng=rng
+        (values,), np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, rng=rng
     ).confidence_interval
     return float(found.low), float(found.high)
 
@@ -111,8 +111,8 @@ def benjamini_hochberg(p_values: Sequence[float]) -> list[float]:
 
 
 @dataclass(frozen=True)
-class Race:
-    """Which of two policies reaches a loss in fewer steps, over shared seeds.
+class HittingTimes:
+    """Whether a variant reaches a loss in fewer steps than a reference, over shared seeds.
 
     A trial that never reaches it is censored at the end of the trial: it lost to any that did, and
     two such trials are a tie.
@@ -121,46 +121,46 @@ class Race:
     ----------
     n_pairs : int
         Seeds on which neither diverged.
-    reached, reached_baseline : int
+    reached, reached_reference : int
         Trials that reached it.
-    median, median_baseline : float
+    median, median_reference : float
         Median number of steps, the upper one of two; inf unless more than half reached it.
     improvement : float
-        Share of pairs in which the policy was earlier, ties counted half.
+        Share of pairs in which the variant was earlier, ties counted half.
     p_value : float
         Two-sided sign test of the pairs that are no tie.
     """
 
     n_pairs: int
     reached: int
-    reached_baseline: int
+    reached_reference: int
     median: float
-    median_baseline: float
+    median_reference: float
     improvement: float
     p_value: float
 
 
-def race(steps: Array, baseline: Array) -> Race:
+def compare_hitting_times(steps: Array, reference: Array) -> HittingTimes:
     """Compare steps, both (n,) and paired by position, inf where the loss was never reached."""
-    earlier, later = int(np.sum(steps < baseline)), int(np.sum(steps > baseline))
+    earlier, later = int(np.sum(steps < reference)), int(np.sum(steps > reference))
     n = len(steps)
-    return Race(
+    return HittingTimes(
         n_pairs=n,
         reached=int(np.isfinite(steps).sum()),
-        reached_baseline=int(np.isfinite(baseline).sum()),
+        reached_reference=int(np.isfinite(reference).sum()),
         median=censored_median(steps),
-        median_baseline=censored_median(baseline),
+        median_reference=censored_median(reference),
         improvement=(earlier + (n - earlier - later) / 2) / n if n else float("nan"),
         p_value=sign_test(earlier, later) if n else float("nan"),
     )
 
 
-def mcnemar(successes: Array, baseline: Array) -> float:
+def mcnemar(successes: Array, reference: Array) -> float:
     """Return the exact two-sided McNemar p of successes, 0 or 1, both (n,) and paired by position.
 
     It is the sign test of the pairs of which one succeeded alone.
     """
-    return sign_test(int(np.sum(successes > baseline)), int(np.sum(successes < baseline)))
+    return sign_test(int(np.sum(successes > reference)), int(np.sum(successes < reference)))
 
 
 def censored_median(steps: Array) -> float:

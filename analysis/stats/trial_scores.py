@@ -9,9 +9,9 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from analysis.divergence import DivergenceRule
-from analysis.reading import read_sample
-from analysis.selection import Entry
+from analysis.data.curves import read_sample
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import Entry
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]
@@ -36,6 +36,7 @@ class Scores:
 
     env: str
     policy: str
+    label: str
     by_seed: Mapping[int, float]
     n_finished: int
     n_diverged: int
@@ -120,4 +121,5 @@ def _scores(
 
 def _counted(entry: Entry, by_seed: Mapping[int, float]) -> Scores:
     diverged = sum(trial.status == "diverged" for trial in entry.trials)
-    return Scores(entry.cell.env, entry.cell.policy, by_seed, len(entry.finished), diverged)
+    names = entry.cell.env, entry.cell.policy, entry.label
+    return Scores(*names, by_seed, len(entry.finished), diverged)

@@ -9,20 +9,31 @@ from typing import Protocol
 
 import pandas as pd
 
-from analysis.comparisons import YARDSTICK, compare_control, compare_policies, compare_steps
-from analysis.control import control_part
-from analysis.measures import Measure
-from analysis.request import Request
-from analysis.selection import Selection
-from analysis.sheets import Sheet, comparison_sheet, control_sheet, race_sheet, summary_sheet
-from analysis.summary import summarise
+from analysis.data.trial_selection import Selection
+from analysis.plot_options import PlotOptions
+from analysis.stats.control import control_part
+from analysis.stats.trial_scores import Measure
+from analysis.tables.comparisons import (
+    EPSILON_POLICY,
+    compare_control,
+    compare_policies,
+    compare_steps,
+)
+from analysis.tables.rendering import (
+    TextTable,
+    comparison_table,
+    control_table,
+    hitting_times_table,
+    summary_table,
+)
+from analysis.tables.summary import summarise
 from orchestrate.store import Reader
 
 
 class Part(Protocol):
     """Cuts a selection down to what a table shows."""
 
-    def __call__(self, selection: Selection, request: Request = ..., /) -> Selection: ...
+    def __call__(self, selection: Selection, options: PlotOptions = ..., /) -> Selection: ...
 
 
 @dataclass(frozen=True)
@@ -31,8 +42,8 @@ class TableKind:
 
     title: str
     part: Part
-    measure: Callable[[Reader, Selection, Request], pd.DataFrame]
-    sheet: Callable[[pd.DataFrame, Request], Sheet]
+    measure: Callable[[Reader, Selection, PlotOptions], pd.DataFrame]
+    render: Callable[[pd.DataFrame, PlotOptions], TextTable]
 
 
 def comparison(column: str, measure: Measure) -> TableKind:
@@ -44,78 +55,78 @@ def comparison(column: str, measure: Measure) -> TableKind:
         )
     title = "Final loss" if measure is Measure.FINAL else "Loss over the whole curve"
     return TableKind(
-        f"{title} against every baseline, {where}",
+        f"{title} against the reference, {where}",
         _compared,
         partial(_measure_ratios, column=column, measure=measure),
         partial(_ratios, measure=measure),
     )
 
 
-_DEFAULT = Request()
+_DEFAULT = PlotOptions()
 
 
-def _whole(selection: Selection, _: Request = _DEFAULT) -> Selection:
+def _whole(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
     return selection
 
 
-def _compared(selection: Selection, _: Request = _DEFAULT) -> Selection:
+def _compared(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
     compared = selection.compared()
-    return compared if len(compared.policies) > 1 else Selection(())
+    return compared if len(compared.labels) > 1 else Selection(())
 
 
-def _raced(selection: Selection, request: Request = _DEFAULT) -> Selection:
+def _raced(selection: Selection, options: PlotOptions = _DEFAULT) -> Selection:
     """Return the environments that have the yardstick's trials too, if these give the loss."""
     compared = _compared(selection)
-    if request.epsilon is not None:
+    if options.epsilon is not None:
         return compared
     return compared.only(
         entry.cell.env
         for entry in compared.entries
-        if entry.cell.policy == YARDSTICK and entry.final_losses()
+        if entry.cell.policy == EPSILON_POLICY and entry.final_losses()
     )
 
 
-def _controlled(selection: Selection, _: Request = _DEFAULT) -> Selection:
-    """Return the environments with a task in which the reference has a baseline."""
+def _controlled(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
+    """Return the environments with a task in which the reference and a variant were assessed."""
     controlled = control_part(selection).compared()
-    return controlled if len(controlled.policies) > 1 else Selection(())
+    return controlled if len(controlled.labels) > 1 else Selection(())
 
 
 def _measure_ratios(
-    reader: Reader, selection: Selection, request: Request, column: str, measure: Measure
+    reader: Reader, selection: Selection, options: PlotOptions, column: str, measure: Measure
 ) -> pd.DataFrame:
-    return compare_policies(reader, selection, column, request.rule, measure)
+    return compare_policies(reader, selection, column, options.rule, measure)
 
 
-def _ratios(table: pd.DataFrame, request: Request, measure: Measure) -> Sheet:
-    return comparison_sheet(table, request.rule, measure)
+def _ratios(table: pd.DataFrame, options: PlotOptions, measure: Measure) -> TextTable:
+    return comparison_table(table, options.rule, measure)
 
 
 def _measure_steps(
-    reader: Reader, selection: Selection, request: Request, column: str
+    reader: Reader, selection: Selection, options: PlotOptions, column: str
 ) -> pd.DataFrame:
-    return compare_steps(reader, selection, column, request.rule, request.epsilon)
+    return compare_steps(reader, selection, column, options.rule, options.epsilon)
 
 
-def _race(table: pd.DataFrame, request: Request) -> Sheet:
-    return race_sheet(table, request.rule)
+def _race(table: pd.DataFrame, options: PlotOptions) -> TextTable:
+    return hitting_times_table(table, options.rule)
 
 
 TABLES = {
     "summary": TableKind(
         "Final losses",
         _whole,
-        lambda reader, selection, request: summarise(reader, selection, request.rule),
-        lambda table, request: summary_sheet(table, request.rule),
+        lambda reader, selection, options: summarise(reader, selection, options.rule),
+        lambda table, options: summary_table(table, options.rule),
     ),
     "comparison": comparison("loss", Measure.FINAL),
     "comparison_auc": comparison("loss", Measure.AUC),
     "comparison_steps": comparison("loss", Measure.STEPS),
     "comparison_reachable": comparison("reachable_loss", Measure.FINAL),
     "comparison_control": TableKind(
-        "Cost of control against every baseline",
+        "Cost of control against the reference",
         _controlled,
         lambda reader, selection, _: compare_control(reader, selection),
-        lambda table, _: control_sheet(table),
+        lambda table, _: control_table(table),
     ),
 }

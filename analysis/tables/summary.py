@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pandas as pd
 
-from analysis.divergence import DivergenceRule
-from analysis.measures import Scores, final_losses
-from analysis.selection import Entry, Selection
-from analysis.statistics import Statistic, centre, standard_error
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import Entry, Selection
+from analysis.stats.intervals import Statistic, centre, standard_error
+from analysis.stats.trial_scores import Scores, final_losses
 from orchestrate.store import Reader
 
 
@@ -27,6 +27,7 @@ def _summary(reader: Reader, entry: Entry, rule: DivergenceRule) -> dict[str, ob
     return {
         "env": grid.env,
         "policy": grid.policy,
+        "label": grid.label,
         **_centres("loss", grid),
         **_centres("reachable_loss", reachable),
         "n": len(grid.by_seed),

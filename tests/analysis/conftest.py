@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import pytest
 
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fill, make_grid
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy.typing as npt
 from dopt.errors import IncompatibleError
 from dopt.models import MLP
 from dopt.result import Assessment, TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from dopt.systems import System
 from dopt.systems.equilibrium import eigenmode
 from orchestrate.store import LaunchRecord, RunRecord, Store
@@ -57,10 +58,40 @@ def make_grid(
 
 def fake_result(spec: TrialSpec, diverged_at: int | None = None) -> TrialResult:
     """Simulate the true system under a stand-in for the policy; the losses fall exponentially."""
+    [result] = fake_results([spec], {spec.trial_key: diverged_at} if diverged_at else {})
+    return result
+
+
+def fake_results(specs: Sequence[TrialSpec], diverged: Mapping[str, int]) -> list[TrialResult]:
+    """Return results of trials; those of one system are simulated together, which takes less."""
+    draws = [np.random.default_rng(_entropy(spec)) for spec in specs]
+    inputs = [_inputs(s.system, s.policy.name, rng) for s, rng in zip(specs, draws, strict=True)]
+    members: dict[System, list[int]] = defaultdict(list)
+    for i, spec in enumerate(specs):
+        members[spec.system].append(i)
+    states: dict[int, Array] = {}
+    for system, group in members.items():
+        together = np.stack([inputs[i] for i in group], axis=1)
+        paths = _simulate(system, together, [specs[i].seed for i in group])
+        states.update(zip(group, np.moveaxis(paths, 1, 0), strict=True))
+    return [
+        _result(spec, inputs[i], states[i], draws[i], diverged.get(spec.trial_key))
+        for i, spec in enumerate(specs)
+    ]
+
+
+def _entropy(spec: TrialSpec) -> list[int]:
+    return [spec.seed, *spec.policy.name.encode(), *spec.system.name.encode()]
+
+
+def _result(
+    spec: TrialSpec,
+    inputs: Array,
+    states: Array,
+    rng: np.random.Generator,
+    diverged_at: int | None,
+) -> TrialResult:
     system, policy = spec.system, spec.policy.name
-    rng = np.random.default_rng([spec.seed, *policy.encode(), *system.name.encode()])
-    inputs = _inputs(system, policy, rng)
-    states = _simulate(system, inputs, np.random.default_rng(spec.seed))
     loss = _losses(system.horizon, RATES.get(policy, 2.0), rng)
     columns = {
         "loss": loss,
@@ -119,12 +150,19 @@ def _inputs(system: System, policy: str, rng: np.random.Generator) -> Array:
     return inputs
 
 
-def _simulate(system: System, inputs: Array, rng: np.random.Generator) -> Array:
-    states = np.empty((system.horizon + 1, system.n_states))
+def _simulate(system: System, inputs: Array, seeds: Sequence[int]) -> Array:
+    """Return the states, (T + 1, n, d), under inputs, (T, n, m), and each seed's noise."""
+    states = np.empty((system.horizon + 1, len(seeds), system.n_states))
     states[0] = system.initial_state
-    noise = np.sqrt(system.dt) * system.noise * rng.normal(size=(system.horizon, system.n_states))
+    shape = (system.horizon, system.n_states)
+    drawn = [np.random.default_rng(seed).normal(size=shape) for seed in seeds]
+    noise = np.sqrt(system.dt) * system.noise * np.stack(drawn, axis=1)
+    rows = list(system.learned_rows)
     for t, u in enumerate(inputs):
-        states[t + 1] = states[t] + system.dt * system.derivative(states[t], u) + noise[t]
+        known = system.known(tuple(states[t].T), tuple(u.T), system.parameters)
+        flow = np.stack(np.broadcast_arrays(*known), axis=-1)
+        flow[:, rows] += system.learned(states[t])
+        states[t + 1] = states[t] + system.dt * flow + noise[t]
     return states
 
 
@@ -158,10 +196,10 @@ def fill(
         now = datetime(2026, 1, 1, tzinfo=UTC)
         run = RunRecord("h", 1, 0.1, 0.1, 1, now, now)
         lost = diverged or {}
+        mine = [spec for spec in todo if spec.trial_key in claims]
         items = [
-            (claims[spec.trial_key], edit(spec, fake_result(spec, lost.get(spec.trial_key))), run)
-            for spec in todo
-            if spec.trial_key in claims
+            (claims[spec.trial_key], edit(spec, result), run)
+            for spec, result in zip(mine, fake_results(mine, lost), strict=True)
         ]
         assert all(store.commit_many(items))
         store.end_launch(launch, "done")

@@ -10,22 +10,24 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from analysis.animation.film import pictures, shoot
-from analysis.animation.stage import build
-from analysis.animation.story import Story, tell
-from analysis.choice import Filter
+from analysis.animation.axes import build
+from analysis.animation.replay_data import Story, tell
+from analysis.animation.writers import pictures, shoot
 from analysis.cli import main
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError
 from analysis.figures.style import styled
-from analysis.selection import select
-from dopt.exploration import run_trial
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from orchestrate.store import LaunchRecord, Reader, Store
 from tests.analysis.synthetic import make_spec
 from tests.orchestrate.store.fakes import RUN
 
 HORIZON = 30
+
+pytestmark = pytest.mark.xdist_group("films")  # the trials are run once for all of them
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,13 @@ import pytest
 from scipy import stats
 
 from analysis.__main__ import main
-from analysis.choice import Filter
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError
-from analysis.report import numbers, page
-from analysis.report.variants import Field, fields
+from analysis.report import page
+from analysis.report.variant_table import MEASURES, adjust, tabulate_group, verdict
+from analysis.report.variants import VariantGroup, variant_groups
+from analysis.tables.comparisons import compare_policies
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec
 
@@ -46,13 +50,13 @@ def reader(url: str) -> Iterator[Reader]:
 
 
 @pytest.fixture
-def pendulum(reader: Reader) -> Field:
-    return fields(reader, Filter(("pendulum",)))[0]
+def pendulum(reader: Reader) -> VariantGroup:
+    return variant_groups(reader, Filter(("pendulum",)))[0]
 
 
-def test_every_variant_has_a_label_of_its_own(pendulum: Field) -> None:
+def test_every_variant_has_a_label_of_its_own(pendulum: VariantGroup) -> None:
     assert pendulum.reference.label == "D-optimal"
-    assert [one.label for one in pendulum.others] == [
+    assert [one.label for one in pendulum.variants[1:]] == [
         "D-optimal, adam",
         "D-optimal, form=dual",
         "oracle",
@@ -62,8 +66,8 @@ def test_every_variant_has_a_label_of_its_own(pendulum: Field) -> None:
     ]
 
 
-def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Field) -> None:
-    table = numbers.adjust([numbers.tabulate_field(reader, pendulum)]).set_index("variant")
+def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: VariantGroup) -> None:
+    table = adjust([tabulate_group(reader, pendulum)]).set_index("variant")
     finals = {
         name: np.log([fake_result(make_spec("pendulum", name, s, **SHORT)).loss[-1] for s in SEEDS])
         for name in ("d_optimal", "uniform")
@@ -80,9 +84,9 @@ def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Field
 
 
 def test_steps_until_the_loss_stays_at_that_of_random_inputs_are_counted(
-    reader: Reader, pendulum: Field
+    reader: Reader, pendulum: VariantGroup
 ) -> None:
-    table = numbers.tabulate_field(reader, pendulum).set_index("variant")
+    table = tabulate_group(reader, pendulum).set_index("variant")
     curves = {
         name: [fake_result(make_spec("pendulum", name, s, **SHORT)).loss for s in SEEDS]
         for name in ("random", "d_optimal")
@@ -102,17 +106,15 @@ def test_without_random_inputs_there_is_no_loss_to_reach(tmp_path: Path) -> None
     url = f"sqlite:///{tmp_path}/uniform.db"
     fill(url, make_grid(("pendulum",), ("d_optimal", "uniform"), range(3), **SHORT))
     with Reader.open(url) as opened:
-        table = numbers.adjust(
-            [numbers.tabulate_field(opened, field) for field in fields(opened, Filter())]
+        table = adjust(
+            [tabulate_group(opened, group) for group in variant_groups(opened, Filter())]
         )
     assert table[["epsilon", "steps", "reached"]].isna().all(axis=None)
     assert "ε =" not in page.write(table, [], "origin", {})
 
 
 def test_p_values_are_adjusted_over_the_whole_report(reader: Reader) -> None:
-    table = numbers.adjust(
-        [numbers.tabulate_field(reader, field) for field in fields(reader, Filter())]
-    )
+    table = adjust([tabulate_group(reader, group) for group in variant_groups(reader, Filter())])
     tested = table["loss_p"].dropna()
     assert len(tested) == 9  # but for the two references
     expected = stats.false_discovery_control(tested)
@@ -136,12 +138,12 @@ def test_a_verdict_needs_the_adjusted_test_and_the_interval(
 ) -> None:
     row = {f"{measure}_ratio": ratio, f"{measure}_p_adjusted": p}
     row |= {f"{measure}_low": ratio / 1.2, f"{measure}_high": ratio * 1.2}
-    assert numbers.verdict(row, measure) == said
+    assert verdict(row, measure) == said
 
 
 def test_a_page_calls_what_is_worse_worse() -> None:
     unknown = dict.fromkeys(
-        [f"{m}_{c}" for m in numbers.MEASURES for c in ("ratio", "low", "high", "p", "p_adjusted")],
+        [f"{m}_{c}" for m in MEASURES for c in ("ratio", "low", "high", "p", "p_adjusted")],
         math.nan,
     )
     usual = {"env": "arm", "loss": 1.0, "loss_2se": 0.1, "coverage": 0.3, "coverage_2se": 0.1}
@@ -163,14 +165,16 @@ def test_a_page_calls_what_is_worse_worse() -> None:
 
 
 def test_entries_with_commas_are_separated_by_semicolons(reader: Reader) -> None:
-    table = numbers.adjust(
-        [numbers.tabulate_field(reader, field) for field in fields(reader, Filter(("pendulum",)))]
+    table = adjust(
+        [tabulate_group(reader, group) for group in variant_groups(reader, Filter(("pendulum",)))]
     )
     text = page.write(table, [], "origin", {})
     lines = [line for line in text.splitlines() if line.startswith("  - ")]
     entries = [entry for line in lines for entry in line.split(": ")[1].split("; ")]
     names = {entry.rpartition(" (")[0] for entry in entries if entry != "none"}
-    assert names == {one.label for one in fields(reader, Filter(("pendulum",)))[0].others}
+    assert names == {
+        one.label for one in variant_groups(reader, Filter(("pendulum",)))[0].variants[1:]
+    }
 
 
 def test_the_command_writes_a_page_with_picture_and_provenance(url: str, tmp_path: Path) -> None:
@@ -205,4 +209,24 @@ def test_a_report_of_one_variant_is_refused(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/one.db"
     fill(url, make_grid(("pendulum",), ("d_optimal",), range(2), **SHORT))
     with Reader.open(url) as reader, pytest.raises(AnalysisError, match="of another variant"):
-        fields(reader, Filter())
+        variant_groups(reader, Filter())
+
+
+def test_the_tables_and_a_report_agree_to_the_last_digit(reader: Reader) -> None:
+    wanted = Filter(("pendulum",), ("d_optimal", "uniform", "random"), {"learner.window": 100})
+    table = compare_policies(reader, select(reader, wanted)).set_index("variant")
+    report = tabulate_group(reader, variant_groups(reader, wanted)[0]).set_index("variant")
+    for variant in ("uniform", "random"):
+        for column in ("ratio", "low", "high", "improvement"):
+            assert table[column][variant] == report[f"loss_{column}"][variant]
+
+
+def test_another_reference_turns_the_ratio_round(reader: Reader) -> None:
+    wanted = Filter(("pendulum",), ("d_optimal", "random"), {"learner.window": 100})
+    usual = compare_policies(reader, select(reader, wanted)).iloc[0]
+    turned = compare_policies(reader, select(reader, replace(wanted, reference="random"))).iloc[0]
+    assert (usual.variant, usual.reference) == ("random", "D-optimal")
+    assert (turned.variant, turned.reference) == ("D-optimal", "random")
+    assert turned.ratio == pytest.approx(1 / usual.ratio)
+    (group,) = variant_groups(reader, replace(wanted, reference="random"))
+    assert group.reference.label == "random"

@@ -11,16 +11,16 @@ import pandas as pd
 import pytest
 
 from analysis.__main__ import main
-from analysis.choice import Filter
-from analysis.control import measure_control, scores_at
-from analysis.numbers import number
-from analysis.report import numbers
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import Selection
+from analysis.formatting import number
+from analysis.report import variant_table
 from analysis.report.control import section, tabulate
-from analysis.report.numbers import LEVEL
-from analysis.report.variants import fields
-from analysis.selection import Selection
+from analysis.report.variant_table import SIGNIFICANCE
+from analysis.report.variants import variant_groups
+from analysis.stats.control import measure_control, scores_at
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fill, make_grid
 
@@ -43,9 +43,9 @@ def test_what_the_models_are_good_for_has_a_section(tmp_path: Path) -> None:
     table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     with Reader.open(url) as reader:
         costs = {
-            one.entry.cell.policy: scores_at(reader, one.entry, 20).by_seed
-            for one in fields(reader, Filter())[0].variants
-            if one.entry.cell.config.get("task")
+            one.cell.policy: scores_at(reader, one, 20).by_seed
+            for one in variant_groups(reader, Filter())[0].variants
+            if one.cell.config.get("task")
         }
     ratios = [costs["uniform"][seed] / costs["d_optimal"][seed] for seed in SEEDS]
     expected = np.exp(np.mean(np.log(ratios)))
@@ -118,12 +118,12 @@ def test_cells_of_control_are_below_their_own_steps(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal", "uniform"), SEEDS, **SHORT, **task)
     fill(url, specs, edit=stopped)
     with Reader.open(url) as opened:
-        found = fields(opened, Filter())
+        found = variant_groups(opened, Filter())
         controlled = tabulate(opened, found)
         assert controlled is not None
         text = section(controlled)
-        table = numbers.tabulate_field(opened, found[0]).set_index("variant")
-        whole = measure_control(opened, Selection((found[0].others[0].entry,)))[0]
+        table = variant_table.tabulate_group(opened, found[0]).set_index("variant")
+        whole = measure_control(opened, Selection((found[0].variants[1],)))[0]
     rows = {row["variant"]: row for row in control_rows(text)}
     assert rows["D-optimal"]["success after 10"] == rows["D-optimal"]["cost after 10"] == "–"
     assert rows["D-optimal"]["success after 20"].startswith("1.00")
@@ -202,13 +202,13 @@ def test_successes_are_tested_in_pairs(tmp_path: Path) -> None:
     )
     fill(url, specs, edit=decided)
     with Reader.open(url) as opened:
-        table = tabulate(opened, fields(opened, Filter()))
+        table = tabulate(opened, variant_groups(opened, Filter()))
     assert table is not None
     rows = table.set_index(["variant", "t"])
     for t in (20, 40):
         assert rows.loc[("uniform", t), "success_p"] == pytest.approx(2 / 2**6)
         assert math.isnan(rows.loc[("D-optimal", t), "success_p"])
-        assert rows.loc[("uniform", t), "success_p_adjusted"] < LEVEL
+        assert rows.loc[("uniform", t), "success_p_adjusted"] < SIGNIFICANCE
     assert math.isnan(rows.loc[("uniform", 0), "success_p"])
     cells = {row["variant"]: row for row in control_rows(section(table))}
     assert cells["uniform"]["success after 20"].startswith("1.00* [")

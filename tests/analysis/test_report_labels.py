@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from analysis.choice import Filter
-from analysis.report.variants import fields
+from analysis.data.config_matching import Filter
+from analysis.report.variants import variant_groups
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fill, make_grid
 
@@ -64,4 +64,4 @@ def test_variants_of_one_name_are_told_apart_by_all_that_is_unusual(
         specs += make_grid(("pendulum",), (policy,), range(2), **SHORT, **sections)
     fill(url, specs)
     with Reader.open(url) as opened:
-        assert [one.label for one in fields(opened, Filter())[0].variants] == labels
+        assert [one.label for one in variant_groups(opened, Filter())[0].variants] == labels

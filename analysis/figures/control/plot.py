@@ -11,13 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from analysis.control import ControlCurve, control_part, measure_control, tabulate_control
-from analysis.counts import count_text
+from analysis.data.trial_selection import policy_rank
 from analysis.figures.axes import log_limits, log_scale
 from analysis.figures.plot import Plot
-from analysis.figures.style import GUIDE, TEXT_WIDTH, environment_title, policy_style
-from analysis.numbers import share
-from analysis.selection import policy_rank
+from analysis.figures.style import GUIDE, TEXT_WIDTH
+from analysis.formatting import count_text, share
+from analysis.line_styles import environment_title, policy_style
+from analysis.stats.control import ControlCurve, control_part, measure_control, tabulate_control
 
 ROW_HEIGHT = 1.9
 LEGEND_HEIGHT = 0.5

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from analysis.data.trial_selection import Entry, Selection
 from analysis.errors import AnalysisError
-from analysis.selection import Entry, Selection
-from analysis.spectrum import Spectrum, average_spectrum
+from analysis.stats.spectrum import Spectrum, average_spectrum
 from dopt.systems import system_from_mapping
 from dopt.systems.equilibrium import eigenmode
 from orchestrate.store import Reader

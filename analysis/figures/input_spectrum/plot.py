@@ -6,16 +6,22 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.choice import REFERENCE
-from analysis.counts import count_text
+from analysis.data.config_matching import REFERENCE
 from analysis.figures.axes import log_scale, log_ticks
+from analysis.figures.input_spectrum.data import (
+    InputSpectra,
+    PolicySpectrum,
+    measure_spectra,
+    tabulate_spectra,
+)
 from analysis.figures.plot import Plot
-from analysis.figures.style import COLUMN_WIDTH, GUIDE, environment_title, policy_style
-from analysis.input_spectra import InputSpectra, PolicySpectrum, measure_spectra, tabulate_spectra
+from analysis.figures.style import COLUMN_WIDTH, GUIDE
+from analysis.formatting import count_text
+from analysis.line_styles import environment_title, policy_style
 
 HEIGHT = 3.0
 SHOWN = (REFERENCE, "random", "periodic")
-GREYS = {"random": "#9a9a9a", "periodic": "#555555"}
+GREYS = {"random": "#8a8a8a", "periodic": "#555555"}
 DECADES = 4
 INNER = slice(1, -1)
 """Neither the zero frequency nor the Nyquist frequency, whose one-sided density counts once."""

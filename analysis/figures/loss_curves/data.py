@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.divergence import DivergenceRule, Sample
-from analysis.reading import read_sample
-from analysis.selection import Entry, Selection
-from analysis.statistics import Band, Statistic, band
+from analysis.data.config_matching import check_keys, setting_value
+from analysis.data.curves import read_sample
+from analysis.data.divergence import DivergenceRule, Sample
+from analysis.data.trial_selection import Entry, Selection
+from analysis.line_styles import LineStyle, policy_style, sequence_style
+from analysis.stats.intervals import Band, Statistic, band
+from analysis.units import loss_unit
 from dopt.systems import system_from_mapping
 from orchestrate.store import Reader
 
@@ -26,12 +30,18 @@ class Axis(StrEnum):
 
 @dataclass(frozen=True)
 class LossCurve:
-    """One policy in one environment: t in steps (T,), x on the axis (T,), band over trials."""
+    """One entry in one environment: t in steps (T,), x on the axis (T,), band over trials.
+
+    ``unit`` is that of the loss.
+    """
 
     env: str
     policy: str
+    label: str
+    style: LineStyle
     t: npt.NDArray[np.int64]
     x: npt.NDArray[np.float64]
+    unit: str
     band: Band
     statistic: Statistic
     sample: Sample
@@ -44,16 +54,47 @@ def measure_curves(
     rule: DivergenceRule,
     axis: Axis = Axis.STEPS,
     statistic: Statistic = Statistic.MEAN,
+    color_by: str | None = None,
 ) -> tuple[LossCurve, ...]:
-    """Return a curve for each entry of the selection, in its order."""
+    """Return a curve for each entry of the selection, in its order.
+
+    ``color_by`` is the setting whose values have a colour each, by default the first of those by
+    which the selection is grouped.
+    """
+    styles = line_styles(selection, color_by)
     return tuple(
-        _measure(reader, entry, column, rule, axis, statistic) for entry in selection.entries
+        _measure(reader, entry, styles[entry.label], column, rule, axis, statistic)
+        for entry in selection.entries
     )
+
+
+def line_styles(selection: Selection, color_by: str | None = None) -> dict[str, LineStyle]:
+    """Return the style of each label: of policies their own, of other settings by value.
+
+    Entries of one colour are told apart by their dashes.
+    """
+    key = color_by or selection.group_by[0]
+    check_keys([key], [entry.cell for entry in selection.entries])
+    values = list(dict.fromkeys(repr(setting_value(e.cell, key)) for e in selection.entries))
+    used: Counter[str] = Counter()
+    styles: dict[str, LineStyle] = {}
+    for entry in selection.entries:
+        if entry.label in styles:
+            continue
+        if key == "policy" and selection.group_by == ("policy",):
+            styles[entry.label] = replace(policy_style(entry.cell.policy), label=entry.label)
+            continue
+        value = repr(setting_value(entry.cell, key))
+        base = policy_style(entry.cell.policy).colour if key == "policy" else None
+        styles[entry.label] = sequence_style(values.index(value), used[value], entry.label, base)
+        used[value] += 1
+    return styles
 
 
 def _measure(
     reader: Reader,
     entry: Entry,
+    style: LineStyle,
     column: str,
     rule: DivergenceRule,
     axis: Axis,
@@ -61,10 +102,13 @@ def _measure(
 ) -> LossCurve:
     sample = read_sample(reader, entry, column, rule)
     t = np.arange(sample.values.shape[1])
-    scale = system_from_mapping(entry.cell.config["env"]).dt if axis is Axis.SECONDS else 1.0
+    system = system_from_mapping(entry.cell.config["env"])
+    scale = system.dt if axis is Axis.SECONDS else 1.0
     x, cell = scale * t.astype(float), entry.cell
     shown = band(sample.values, statistic)
-    return LossCurve(cell.env, cell.policy, t, x, shown, statistic, sample)
+    return LossCurve(
+        cell.env, cell.policy, entry.label, style, t, x, loss_unit(system), shown, statistic, sample
+    )
 
 
 def tabulate_curves(curves: tuple[LossCurve, ...]) -> pd.DataFrame:
@@ -77,6 +121,7 @@ def _rows(curve: LossCurve) -> pd.DataFrame:
         {
             "env": curve.env,
             "policy": curve.policy,
+            "label": curve.label,
             "t": curve.t,
             "x": curve.x,
             str(curve.statistic): curve.band.centre,

@@ -1,9 +1,9 @@
-"""Figure 1: loss against time, one panel per environment, all policies."""
+"""Figure 1: loss against time, one panel per environment, a line for each policy or value."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -13,30 +13,30 @@ from matplotlib.gridspec import SubplotSpec
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from analysis.counts import count_text
-from analysis.divergence import DivergenceRule
+from analysis.data.divergence import DivergenceRule
+from analysis.data.missing_trials import why_impossible
+from analysis.data.trial_selection import policy_rank
 from analysis.figures.axes import log_scale, rows_and_columns
 from analysis.figures.axis_break import Limits, axis_parts, mark_break
+from analysis.figures.loss_curves.data import Axis, LossCurve, measure_curves, tabulate_curves
 from analysis.figures.plot import Plot
-from analysis.figures.style import GREY, TEXT_WIDTH, environment_title, policy_style
-from analysis.gaps import why_impossible
-from analysis.loss_curves import Axis, LossCurve, measure_curves, tabulate_curves
-from analysis.request import Request, Spread
-from analysis.selection import policy_rank
+from analysis.figures.style import TEXT_WIDTH
+from analysis.formatting import count_text
+from analysis.line_styles import GREY, LineStyle, environment_title
+from analysis.plot_options import PlotOptions, Spread
+from dopt.policies.titles import policy_title
 
 PANEL_HEIGHT = 2.3
 
-NORM = {
-    "loss": r"$\Vert f_\theta - f\,\Vert_2$ on the grid",
-    "reachable_loss": r"$\Vert f_\theta - f\,\Vert_2$, reachable set",
-}
+PLACES = {"loss": "grid", "reachable_loss": "reachable set"}
+"""Points at which the error of the model is evaluated, by column of a step."""
 
 BARS = 12
 """Steps at which error bars are drawn."""
 
 _SPREADS = {Spread.BAND: "bands", Spread.ERRORBAR: f"bars at {BARS} steps"}
 
-Numbers = tuple[str, Request, tuple[LossCurve, ...]]
+Numbers = tuple[str, PlotOptions, tuple[LossCurve, ...]]
 
 
 def loss_plot(name: str, column: str) -> Plot[Numbers]:
@@ -47,11 +47,12 @@ def loss_plot(name: str, column: str) -> Plot[Numbers]:
         statistic=f"{{centre}} over trials of {column} at every step",
         band="{interval}",
         part=lambda selection: selection,
-        measure=lambda reader, selection, request: (
+        measure=lambda reader, selection, options: (
             column,
-            request,
+            options,
             measure_curves(
-                reader, selection, column, request.rule, request.axis, request.statistic
+                *(reader, selection, column, options.rule),
+                *(options.axis, options.statistic, options.color_by),
             ),
         ),
         tabulate=lambda numbers: tabulate_curves(numbers[2]),
@@ -62,21 +63,21 @@ def loss_plot(name: str, column: str) -> Plot[Numbers]:
 
 def draw(numbers: Numbers) -> Figure:
     """Draw one panel for each environment with a legend below all."""
-    column, request, curves = numbers
+    column, options, curves = numbers
     envs = list(dict.fromkeys(curve.env for curve in curves))
     rows, columns = rows_and_columns(len(envs), 2)
     size = (TEXT_WIDTH if columns > 1 else TEXT_WIDTH * 0.62, PANEL_HEIGHT * rows + 0.75)
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.add_gridspec(rows, columns)
-    unit = "steps" if request.axis is Axis.STEPS else "s"
+    unit = "steps" if options.axis is Axis.STEPS else "s"
     for index, env in enumerate(envs):
         shown = [curve for curve in curves if curve.env == env]
-        panel = _panel(figure, grid[index], shown, request.spread, list(_absent(curves, env)))
+        panel = _panel(figure, grid[index], shown, options.spread, list(_absent(curves, env)))
         if index + columns >= len(envs):
             panel[-1].set_xlabel(f"time t [{unit}]")
-        if index % columns == 0:
-            panel[0].set_ylabel(NORM.get(column, column))
-    handles = legend_handles({curve.policy for curve in curves}, request)
+        panel[0].set_ylabel(loss_label(column, shown[0].unit))
+    ordered = sorted(curves, key=lambda curve: policy_rank(curve.policy))
+    handles = legend_handles({curve.label: curve.style for curve in ordered}, options)
     per_row = 4 if columns > 1 else 2
     figure.legend(handles=handles, loc="outside lower center", ncols=per_row)
     return figure
@@ -100,8 +101,8 @@ def _panel(
         _lines(axes[0], curves, parts.upper, spread)
         _lines(axes[1], curves, parts.lower, spread)
         mark_break(*axes)
-    counts = {policy_style(c.policy).label: c.sample.describe() for c in curves}
-    text = "; no ".join([count_text(counts), *(policy_style(one).label for one in absent)])
+    counts = {curve.label: curve.sample.describe() for curve in curves}
+    text = "; no ".join([count_text(counts), *map(policy_title, absent)])
     axes[0].set_title(_title(environment_title(curves[0].env), f"({text})"))
     return axes
 
@@ -116,7 +117,7 @@ def _absent(curves: Sequence[LossCurve], env: str) -> dict[str, str]:
 
 def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits, spread: Spread) -> None:
     for place, curve in reversed(list(enumerate(curves))):
-        style, band = policy_style(curve.policy), curve.band
+        style, band = curve.style, curve.band
         axes.plot(curve.x, band.centre, color=style.colour, ls=style.line, lw=style.width)
         if spread is Spread.BAND:
             axes.fill_between(curve.x, band.low, band.high, color=style.colour, alpha=0.18, lw=0)
@@ -134,9 +135,14 @@ def _bars(axes: Axes, curve: LossCurve, phase: float) -> None:
     ends = np.array([band.low[shown], band.high[shown]])
     half = np.nan_to_num(np.abs(ends - band.centre[shown]))
     axes.errorbar(
-        curve.x[shown], band.centre[shown], half, color=policy_style(curve.policy).colour,
+        curve.x[shown], band.centre[shown], half, color=curve.style.colour,
         ls="none", elinewidth=0.8, capsize=1.6, capthick=0.8,
     )  # fmt: skip
+
+
+def loss_label(column: str, unit: str) -> str:
+    """Return the label of an axis of losses, such as ``RMS error, grid [rad/s²]``."""
+    return f"RMS error, {PLACES.get(column, column)} [{unit}]"
 
 
 def _breaks(curves: Sequence[LossCurve]) -> str:
@@ -164,27 +170,25 @@ def _end(curve: LossCurve) -> float:
     return float(curve.x[-1]) * steps / (steps - 1) if steps > 1 else 1.0
 
 
-def legend_handles(policies: set[str], request: Request) -> list[Artist]:
-    """Return a line for each policy, in the order of all figures, and the interval's name."""
-    handles: list[Artist] = []
-    for policy in sorted(policies, key=policy_rank):
-        style = policy_style(policy)
-        handles.append(
-            Line2D([], [], color=style.colour, ls=style.line, lw=style.width, label=style.label)
-        )
-    name = request.statistic.band
-    if request.spread is Spread.BAND:
+def legend_handles(styles: Mapping[str, LineStyle], options: PlotOptions) -> list[Artist]:
+    """Return a line for each label, and the interval's name."""
+    handles: list[Artist] = [
+        Line2D([], [], color=style.colour, ls=style.line, lw=style.width, label=label)
+        for label, style in styles.items()
+    ]
+    name = options.statistic.band
+    if options.spread is Spread.BAND:
         return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=name)]
     return [*handles, Line2D([], [], ls="none", marker="|", ms=9, mew=1, color=GREY, label=name)]
 
 
 def caption(numbers: Numbers) -> str:
     """Return the caption, with the statistic, the band, n and the rule for diverged trials."""
-    column, request, curves = numbers
+    column, options, curves = numbers
     where = "evaluation grid" if column == "loss" else "reachable set"
     counts = [
         f"{environment_title(env)} "
-        + count_text({c.policy: c.sample.describe() for c in curves if c.env == env})
+        + count_text({c.label: c.sample.describe() for c in curves if c.env == env})
         for env in dict.fromkeys(c.env for c in curves)
     ]
     envs = dict.fromkeys(curve.env for curve in curves)
@@ -195,9 +199,10 @@ def caption(numbers: Numbers) -> str:
         DivergenceRule.MEDIAN: "A diverged trial counts with the median loss of each step.",
     }
     return (
-        f"L² norm of the model's error over the {where} against time t, one panel per environment. "
-        f"Lines: {request.statistic.label} over trials; {_SPREADS[request.spread]}: "
-        f"{request.statistic.band}; no smoothing. "
-        f"{_breaks(curves)}{rules[request.rule]} Policies of one environment share initial "
+        f"Root mean square error of the model over the {where} against time t, one panel per "
+        f"environment. "
+        f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
+        f"{options.statistic.band}; no smoothing. "
+        f"{_breaks(curves)}{rules[options.rule]} Policies of one environment share initial "
         f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )

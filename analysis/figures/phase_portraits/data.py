@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.choice import REFERENCE
+from analysis.data.config_matching import REFERENCE
+from analysis.data.trial_selection import Entry, Selection
 from analysis.errors import AnalysisError
-from analysis.phase import wrapped_line
-from analysis.selection import Entry, Selection
-from analysis.statistics import mean, standard_error
+from analysis.figures.phase_portraits.angles import wrapped_line
+from analysis.stats.intervals import mean, standard_error
 from dopt.coverage import Plane
 from dopt.systems import system_from_mapping
 from orchestrate.store import Reader

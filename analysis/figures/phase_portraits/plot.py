@@ -11,16 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from analysis.figures.axes import angle_ticks, rows_and_columns
-from analysis.figures.plot import Plot
-from analysis.figures.style import (
-    BLACK,
-    TEXT_WIDTH,
-    environment_title,
-    mathematical,
-    policy_style,
-)
-from analysis.numbers import plus_minus
-from analysis.portraits import (
+from analysis.figures.phase_portraits.data import (
     SEED_RULE,
     DrawnPlane,
     Portrait,
@@ -28,6 +19,10 @@ from analysis.portraits import (
     measure_portraits,
     tabulate_portraits,
 )
+from analysis.figures.plot import Plot
+from analysis.figures.style import TEXT_WIDTH, mathematical
+from analysis.formatting import plus_minus
+from analysis.line_styles import BLACK, environment_title, policy_style
 from dopt.coverage import CELLS
 
 PANEL_HEIGHT = 2.1
@@ -46,7 +41,7 @@ def phase_plot(env: str) -> Plot[Portraits]:
         name=f"figure2_phase_{env}",
         title=f"Phase portraits, {environment_title(env)}",
         statistic=f"one trajectory per policy: {SEED_RULE}; coverage: mean over trials",
-        band="standard error of the mean coverage (printed)",
+        band="± 2 standard errors of the mean coverage (printed)",
         part=lambda selection: selection.only([env]).compared(),
         measure=lambda reader, selection, _: measure_portraits(reader, selection, env),
         tabulate=tabulate_portraits,
@@ -87,7 +82,7 @@ def _panel(axes: Axes, portrait: Portrait, plane: DrawnPlane) -> None:
     axes.plot(portrait.line[:, 0], portrait.line[:, 1], color=style.colour, lw=0.7, zorder=2)
     axes.plot(*portrait.start, marker="o", ms=4, mfc="white", mec=BLACK, mew=1, zorder=3)
     axes.set_title(
-        f"{style.label} ({count_text(portrait)})\n{coverage_text(portrait)}", fontsize=7.5
+        f"{style.label}\n{coverage_text(portrait)} ({count_text(portrait)})", fontsize=7.5
     )
     if not len(portrait.line):
         axes.text(0.5, 0.5, "no finished trial", transform=axes.transAxes, ha="center")
@@ -102,11 +97,11 @@ def count_text(portrait: Portrait) -> str:
 
 
 def coverage_text(portrait: Portrait) -> str:
-    """Return the coverage in per cent, with its standard error where there is one."""
+    """Return the mean coverage in per cent ± 2 standard errors."""
     if not portrait.n:
         return "coverage unknown"
     error = portrait.coverage_error if portrait.n > 1 else 0.0
-    return f"coverage {plus_minus(100 * portrait.coverage, 100 * error)} %"
+    return f"coverage {plus_minus(100 * portrait.coverage, 200 * error)} %"
 
 
 def _set_axes(axes: Axes, portraits: Portraits) -> None:
@@ -140,5 +135,5 @@ def caption(portraits: Portraits) -> str:
         f"all of seed {portraits.seed} ({SEED_RULE}). Angles are wrapped around the stable "
         f"equilibrium and the line is broken where it wraps. Circle: start. Dashed: evaluation "
         f"box. Coverage: share of the {CELLS} × {CELLS} cells of that box which a trial visits, "
-        f"mean ± standard error over trials."
+        f"mean over n trials ± 2 standard errors."
     )

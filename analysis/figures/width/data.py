@@ -15,12 +15,15 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.choice import REFERENCE, flatten, nearness
-from analysis.divergence import DivergenceRule
-from analysis.measures import final_losses
-from analysis.reading import read_sample
-from analysis.selection import Entry, Selection
-from analysis.statistics import mean, standard_error
+from analysis.data.config_matching import REFERENCE, nearness
+from analysis.data.curves import read_sample
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import Entry, Selection
+from analysis.stats.intervals import mean, standard_error
+from analysis.stats.trial_scores import final_losses
+from analysis.units import loss_unit
+from dopt.spec.label import flatten
+from dopt.systems import system_from_mapping
 from orchestrate.store import Reader
 
 PARTS = ("plan", "learn", "evaluate")
@@ -79,6 +82,7 @@ class WidthLosses:
     mean: npt.NDArray[np.float64]
     error: npt.NDArray[np.float64]
     counts: tuple[str, ...]
+    unit: str
     n: tuple[int, ...]
 
 
@@ -181,6 +185,7 @@ def measure_losses(reader: Reader, selection: Selection, rule: DivergenceRule) -
         mean=np.array([mean(values) for values in losses]),
         error=np.array([standard_error(values) for values in losses]),
         counts=tuple(final.describe() for final in finals),
+        unit=loss_unit(system_from_mapping(line[0].cell.config["env"])),
         n=tuple(len(values) for values in losses),
     )
 

@@ -7,21 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from analysis.counts import count_text
 from analysis.figures.axes import log_limits, log_scale
-from analysis.figures.loss_curves import NORM
+from analysis.figures.loss_curves.plot import loss_label
 from analysis.figures.plot import Plot
-from analysis.figures.style import (
-    BLUE,
-    COLUMN_WIDTH,
-    GREEN,
-    GREY,
-    GUIDE,
-    VERMILLION,
-    environment_title,
-    policy_style,
-)
-from analysis.width import (
+from analysis.figures.style import COLUMN_WIDTH, GUIDE
+from analysis.figures.width.data import (
     Cost,
     WidthCosts,
     WidthLosses,
@@ -31,6 +21,8 @@ from analysis.width import (
     tabulate_losses,
     width_part,
 )
+from analysis.formatting import count_text
+from analysis.line_styles import BLUE, GREEN, GREY, VERMILLION, environment_title, policy_style
 
 HEIGHT = 3.2
 LOSS_HEIGHT = 2.6
@@ -63,7 +55,7 @@ def loss_against_width_plot(name: str) -> Plot[WidthLosses]:
         statistic="mean over trials of the loss after the last step",
         band="± 2 standard errors of the mean",
         part=width_part,
-        measure=lambda reader, selection, request: measure_losses(reader, selection, request.rule),
+        measure=lambda reader, selection, options: measure_losses(reader, selection, options.rule),
         tabulate=tabulate_losses,
         draw=draw_losses,
         caption=caption_losses,
@@ -140,7 +132,7 @@ def draw_losses(numbers: WidthLosses) -> Figure:
     )  # fmt: skip
     edges = np.r_[numbers.mean - half, numbers.mean + half, numbers.mean]
     log_scale(axes, *log_limits(edges, margin=1.35))
-    axes.set_ylabel(f"final {NORM['loss']}")
+    axes.set_ylabel(f"final {loss_label('loss', numbers.unit)}")
     axes.set_title(f"{style.label}, {environment_title(numbers.env)} ({_counts(numbers)})")
     return figure
 
@@ -152,8 +144,8 @@ def _counts(numbers: WidthLosses) -> str:
 def caption_losses(numbers: WidthLosses) -> str:
     """Return the caption, with the statistic and n by width."""
     return (
-        f"L² norm of the model's error over the evaluation grid after the last step, against the "
-        f"width of both hidden layers, {policy_style(numbers.policy).label} in the "
+        f"Root mean square error of the model over the evaluation grid after the last step, "
+        f"against the width of both hidden layers, {policy_style(numbers.policy).label} in the "
         f"{environment_title(numbers.env)}: mean over trials ± 2 standard errors. "
         f"Trials by width: {_counts(numbers)}."
     )

@@ -21,8 +21,8 @@ import uvicorn
 from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 
 from analysis.serve.app import create_app
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 FLAGS = [
     "--headless",
     "--no-sandbox",

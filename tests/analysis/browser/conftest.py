@@ -6,6 +6,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from sqlalchemy import text
@@ -15,6 +16,10 @@ from analysis.serve.app import create_app
 from orchestrate.store import Reader
 from tests.analysis.browser import grids
 from tests.conftest import SERVER
+from tests.paths import ROOT
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
 
 BASE = "http://127.0.0.1:8000"
 
@@ -23,6 +28,13 @@ BASE = "http://127.0.0.1:8000"
 def sqlite_grid(tmp_path_factory: pytest.TempPathFactory) -> str:
     url = f"sqlite:///{tmp_path_factory.mktemp('mixed')}/results.db"
     grids.mixed(url)
+    return url
+
+
+@pytest.fixture(scope="session")
+def variants_grid(tmp_path_factory: pytest.TempPathFactory) -> str:
+    url = f"sqlite:///{tmp_path_factory.mktemp('variants')}/results.db"
+    grids.variants(url)
     return url
 
 
@@ -49,6 +61,53 @@ def grid(request: pytest.FixtureRequest) -> str:
 def url(request: pytest.FixtureRequest) -> str:
     """Return the URL of no database yet, of each kind."""
     return str(request.getfixturevalue(f"{request.param}_url"))
+
+
+@pytest.fixture(scope="package")
+def browser() -> Iterator[Browser]:
+    """Return one Chromium for all tests of this folder."""
+    from tests.analysis.browser import chromium
+
+    with chromium.opened() as opened:
+        yield opened
+
+
+@pytest.fixture(scope="session")
+def figures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of one figure and one table."""
+    folder = tmp_path_factory.mktemp("figures")
+    icon = ROOT / "analysis" / "serve" / "static" / "icon.svg"
+    (folder / "figure1.svg").write_bytes(icon.read_bytes())
+    (folder / "figure1.txt").write_text("A caption.")
+    (folder / "figure1.json").write_text('{"title": "Loss curves", "statistic": "mean"}')
+    (folder / "summary.csv").write_text("env,policy,loss\narm,random,0.123456\n")
+    return folder
+
+
+@pytest.fixture(scope="package")
+def address(sqlite_grid: str, figures: Path) -> Iterator[str]:
+    """Return the address of a server of the mixed grid."""
+    from tests.analysis.browser import chromium
+
+    with chromium.served(sqlite_grid, figures) as found:
+        yield found
+
+
+@pytest.fixture(scope="package")
+def variants(variants_grid: str, figures: Path) -> Iterator[str]:
+    """Return the address of a server of the grid of variants."""
+    from tests.analysis.browser import chromium
+
+    with chromium.served(variants_grid, figures) as found:
+        yield found
+
+
+@pytest.fixture
+def page(browser: Browser, address: str) -> Iterator[Page]:
+    from tests.analysis.browser import chromium
+
+    with chromium.strict_page(browser, address) as opened:
+        yield opened
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
 from tests.analysis.synthetic import fake_result, fill, make_grid
 
@@ -25,6 +25,22 @@ def mixed(url: str) -> None:
     diverged = {_key(specs, "cartpole", "random", 2): 17}
     fill(url, specs, skipped=left, diverged=diverged)
     fail_one(url, left[0])
+
+
+def variants(url: str) -> None:
+    """Fill a database with configurations that share environment, policy and width, and a task."""
+    task = {"task": {"name": "control", "checkpoints": [10, 20]}}
+    replay = {"learner": {"name": "adam_replay"}}
+    features = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+    one = ("pendulum",)
+    specs = make_grid(one, ("d_optimal", "random"), range(3), **SHORT)
+    specs += make_grid(one, ("d_optimal", "random"), range(3), env={"horizon": 40, "gamma": 3.0})
+    specs += make_grid(one, ("d_optimal",), range(3), **SHORT, **replay)
+    specs += make_grid(one, ("d_optimal",), range(3), **SHORT, **features)
+    specs += make_grid(
+        ("pendulum", "quadrotor"), ("d_optimal", "random"), range(3), **SHORT, **task
+    )
+    fill(url, specs)
 
 
 def fail_one(url: str, spec: TrialSpec) -> None:

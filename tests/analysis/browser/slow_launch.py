@@ -6,10 +6,10 @@ import sys
 import time
 
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
-from orchestrate.campaign import Work, launch_grid
-from orchestrate.grid import Grid
-from orchestrate.settings import LaunchSettings
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
+from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord
 from tests.analysis.browser.grids import SHORT
 from tests.analysis.synthetic import fake_result, make_grid
@@ -26,7 +26,7 @@ def main(url: str, seeds: int, seconds: float) -> int:
     settings = LaunchSettings(executor="inprocess", store_url=url, workers=1)
     record = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
     work = Work(run, prepare=lambda: None)
-    grid = Grid(specs, asked=len(specs), left_out={})
+    grid = Grid(specs, n_jobs=len(specs), left_out={})
     return int(launch_grid(grid, settings, record, work, lambda _: None, stream=None))
 
 

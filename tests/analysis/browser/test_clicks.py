@@ -19,36 +19,13 @@ pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 expect.set_options(timeout=1000 * PATIENCE)
 
 CONTRAST = (Path(__file__).parent / "contrast.js").read_text()
-PATHS = ("/", "/curves", "/trials", "/compare", "/figures", "/sql?q=SELECT env, seed FROM v_trial")
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium.opened() as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def figures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("figures")
-    icon = ROOT / "analysis" / "serve" / "static" / "icon.svg"
-    (folder / "figure1.svg").write_bytes(icon.read_bytes())
-    (folder / "figure1.txt").write_text("A caption.")
-    (folder / "figure1.json").write_text('{"title": "Loss curves", "statistic": "mean"}')
-    (folder / "summary.csv").write_text("env,policy,loss\narm,random,0.123456\n")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def address(sqlite_grid: str, figures: Path) -> Iterator[str]:
-    with chromium.served(sqlite_grid, figures) as found:
-        yield found
-
-
-@pytest.fixture
-def page(browser: Browser, address: str) -> Iterator[Page]:
-    with chromium.strict_page(browser, address) as opened:
-        yield opened
+PATHS = (
+    *("/", "/curves", "/trials", "/compare", "/control", "/figures"),
+    "/sql?q=SELECT env, seed FROM v_trial",
+)
+TRIALS = ("/trials?status=failed", "/trials?env=cartpole&status=diverged")
+WIDE = """[...document.querySelectorAll('main .scroll, main .card')]
+  .filter((box) => box.scrollWidth > box.clientWidth).map((box) => box.innerText.slice(0, 60))"""
 
 
 @pytest.fixture
@@ -183,6 +160,9 @@ def test_comparisons_and_figures(page: Page) -> None:
     page.goto("/compare")
     expect(page.locator("tbody tr")).to_have_count(8)
     expect(page.locator("svg.forest")).to_have_count(8)
+    page.get_by_label("Reference").select_option("oracle")
+    expect(page.locator("tbody tr").first).to_contain_text("D-optimal")
+    expect(page.get_by_label("Reference")).to_have_value("oracle")
     page.get_by_label("Judged by").select_option("steps")
     expect(page.get_by_role("columnheader", name="P(earlier)")).to_be_visible()
     page.get_by_role("link", name="Figures", exact=True).click()
@@ -196,17 +176,32 @@ def test_comparisons_and_figures(page: Page) -> None:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_is_readable_and_fits_a_phone(browser: Browser, address: str, scheme: str) -> None:
-    size = {"viewport": {"width": 390, "height": 800}, "color_scheme": scheme}
+    size = {"viewport": {"width": 390, "height": 844}, "color_scheme": scheme}
     with chromium.strict_page(browser, address, **size) as page:
         for path in PATHS:
             page.goto(path)
             if path == "/curves":
                 page.wait_for_selector("#chart[data-shown]")
-            overflow = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-            assert page.evaluate(overflow) <= 0, path
-            assert page.evaluate(CONTRAST) == [], path
-            unnamed = "[...document.querySelectorAll('input:not([type=hidden]), select, textarea')]"
-            assert page.evaluate(f"{unnamed}.filter((field) => !field.labels.length).length") == 0
+            check_phone(page, path)
+        for path in TRIALS:
+            page.goto(path)
+            page.locator("tbody a").first.click()
+            expect(page.locator("#trial-key")).to_have_text(re.compile("^[0-9a-f]{64}$"))
+            page.wait_for_load_state()  # the style sheet too
+            key = page.locator("#trial-key").bounding_box()
+            assert key
+            assert key["x"] + key["width"] <= 390
+            check_phone(page, path)
+
+
+def check_phone(page: Page, path: str) -> None:
+    """Check that nothing is wider than the window, and that all text and controls are readable."""
+    root = "document.documentElement"
+    assert page.evaluate(f"{root}.scrollWidth - {root}.clientWidth") <= 0, path
+    assert page.evaluate(WIDE) == [], path
+    assert page.evaluate(CONTRAST) == [], path
+    unnamed = "[...document.querySelectorAll('input:not([type=hidden]), select, textarea')]"
+    assert page.evaluate(f"{unnamed}.filter((field) => !field.labels.length).length") == 0
 
 
 def test_pages_follow_a_launch(browser: Browser, tmp_path: Path) -> None:
@@ -217,7 +212,7 @@ def test_pages_follow_a_launch(browser: Browser, tmp_path: Path) -> None:
         chromium.strict_page(browser, address) as page,
     ):
         page.goto("/")
-        expect(page.locator("#grid")).to_contain_text("holds no trial yet")
+        expect(page.locator("#grid")).to_contain_text("has no trials yet")
         program = [sys.executable, "-m", "tests.analysis.browser.slow_launch", url, "6", "0.7"]
         launch = subprocess.Popen(program, cwd=ROOT)
         expect(page.locator("#state")).to_have_attribute("data-mode", "writing")
@@ -252,7 +247,7 @@ def test_small_databases_are_shown_without_complaint(
     url = f"sqlite:///{tmp_path}/results.db"
     state(url)
     page = show(url)
-    for path in ("/", "/curves", "/trials", "/figures", "/sql"):
+    for path in ("/", "/curves", "/trials", "/control", "/figures", "/sql"):
         page.goto(path)
         expect(page.locator("h1")).to_be_visible()
         if path == "/curves" and state is not grids.nothing:

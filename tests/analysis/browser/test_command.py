@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from analysis.cli import main
-from analysis.serve.answers import loss_text, plain
-from analysis.serve.memory import Memory
+from analysis.serve.cache import Cache
+from analysis.serve.responses import loss_text, plain
 
 
 @pytest.fixture
@@ -58,10 +58,10 @@ def test_without_its_libraries_it_says_which_to_install(
 
 
 def test_a_kept_value_is_not_computed_again_until_it_is_forgotten() -> None:
-    memory, seen = Memory(size=2), []
+    memory, seen = Cache(size=2), []
 
     def value(key: str) -> str:
-        return memory.recall(key, lambda: seen.append(key) or key.upper())
+        return memory.get_or_compute(key, lambda: seen.append(key) or key.upper())
 
     assert [value(key) for key in ("a", "a", "b", "a", "c", "a", "b")] == list("AABACAB")
     assert seen == ["a", "b", "c", "b"]

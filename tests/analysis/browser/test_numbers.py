@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.choice import Filter
-from analysis.divergence import DivergenceRule
-from analysis.loss_curves import Axis, measure_curves, tabulate_curves
-from analysis.measures import Measure
-from analysis.request import Request
-from analysis.selection import select
-from analysis.summary import summarise
-from analysis.tables import comparison
+from analysis.data.config_matching import Filter
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import select
+from analysis.figures.loss_curves.data import Axis, measure_curves, tabulate_curves
+from analysis.plot_options import PlotOptions
+from analysis.stats.control import control_part, measure_control, tabulate_control
+from analysis.stats.trial_scores import Measure
+from analysis.tables.registry import comparison
+from analysis.tables.summary import summarise
 from orchestrate.store import Reader
 
 
@@ -83,9 +85,9 @@ def test_a_width_and_a_condition_choose_other_configurations(client: TestClient)
 def test_comparisons_are_those_of_the_command(
     client: TestClient, reader: Reader, measure: Measure
 ) -> None:
-    kind, request = comparison("loss", measure), Request()
+    kind, request = comparison("loss", measure), PlotOptions()
     expected = kind.measure(reader, kind.part(select(reader, Filter())), request)
-    sheet = kind.sheet(expected, request)
+    sheet = kind.render(expected, request)
     found = client.get(f"/api/compare?measure={measure}").json()
     assert found["headers"] == list(sheet.headers)
     assert found["rows"] == [list(row) for row in sheet.rows]
@@ -96,8 +98,53 @@ def test_comparisons_are_those_of_the_command(
     assert all(str(header) in page for header in sheet.headers)
 
 
+def test_the_reference_can_be_chosen(client: TestClient, reader: Reader) -> None:
+    kind, options = comparison("loss", Measure.FINAL), PlotOptions()
+    selection = select(reader, Filter(reference="random"))
+    expected = kind.measure(reader, kind.part(selection), options)
+    found = client.get("/api/compare?reference=random").json()
+    assert [row["ratio"] for row in found["numbers"]] == expected["ratio"].tolist()
+    assert {row["reference"] for row in found["numbers"]} == {"random"}
+    assert [one["label"] for one in found["variants"]] == expected["variant"].tolist()
+    refused = client.get("/api/compare?reference=randon")
+    assert refused.status_code == 400
+    assert "did you mean 'random'?" in refused.json()["error"]
+
+
+def test_control_results_are_those_of_figure_5(
+    visit: Callable[..., TestClient], variants_grid: str
+) -> None:
+    client = visit(variants_grid)
+    found = client.get("/api/control").json()
+    with Reader.open(variants_grid) as reader:
+        expected = measure_control(reader, control_part(select(reader, Filter())))
+    shown = {
+        (one["env"], curve["policy"]): curve
+        for one in found["environments"]
+        for curve in one["curves"]
+    }
+    assert list(shown) == [(curve.env, curve.policy) for curve in expected]
+    for curve in expected:
+        for name in ("t", "n", "success", "success_low", "success_high", "cost", "cost_high"):
+            values = np.array(shown[curve.env, curve.policy][name], dtype=float)
+            np.testing.assert_array_equal(values, getattr(curve, name))
+    table = pd.read_csv(io.StringIO(client.get("/api/control.csv").text))
+    pd.testing.assert_frame_equal(table, tabulate_control(expected), check_dtype=False, rtol=1e-15)
+    curve = expected[0]
+    low, high = curve.success_low[-1], curve.success_high[-1]
+    assert f"{curve.success[-1]:.2f} [{low:.2f}, {high:.2f}]" in client.get("/control").text
+
+
+def test_a_database_without_a_task_says_how_to_get_control_results(client: TestClient) -> None:
+    assert "task=control" in client.get("/control").text
+    assert client.get("/api/control").json()["environments"] == []
+    refused = client.get("/api/control.csv")
+    assert refused.status_code == 400
+    assert "task=control" in refused.json()["error"]
+
+
 def test_a_trial_shows_what_is_stored(client: TestClient, reader: Reader) -> None:
-    (cell,) = [c for c in reader.cells() if (c.env, c.policy) == ("cartpole", "d_optimal")]
+    (cell,) = [c for c in reader.configs() if (c.env, c.policy) == ("cartpole", "d_optimal")]
     row = reader.trials(cell.config_key)[1]
     found = client.get(f"/api/trials/{row.trial_key}").json()
     assert found["trial"]["final_loss"] == row.final_loss
@@ -113,6 +160,15 @@ def test_a_trial_shows_what_is_stored(client: TestClient, reader: Reader) -> Non
     assert len(frequency) == len(density) == 19
     assert 0.4 < arrays["spectrum"]["eigenfrequency"] < 0.7
     assert len(arrays["phase"]["x"]) >= 41
+
+
+def test_a_trial_names_its_unusual_settings(
+    visit: Callable[..., TestClient], variants_grid: str
+) -> None:
+    client = visit(variants_grid)
+    rows = client.get("/api/trials?policy=random&env=pendulum&seed=0").json()["rows"]
+    (wide,) = (row for row in rows if row["gamma"] == 3.0)
+    assert "random, γ=3, horizon 40" in client.get(f"/trials/{wide['trial_key']}").text
 
 
 def test_a_failed_trial_shows_its_traceback_as_text(client: TestClient) -> None:

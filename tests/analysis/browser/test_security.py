@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from analysis.serve.guard import is_own
+from analysis.serve.security import is_own
 
 Visit = Callable[..., TestClient]
 
@@ -145,9 +145,9 @@ NAMES = st.sampled_from(
         *("after", "before", "column", "x", "diverged", "where", "measure", "q", "hide"),
     ]
 )
-PAGES = ("/", "/curves", "/trials", "/compare", "/figures", "/sql")
-DATA = ("progress", "grid", "curves", "trials", "compare", "figures", "sql")
-TABLES = ("curves.csv", "compare.csv", "sql.csv")
+PAGES = ("/", "/curves", "/trials", "/compare", "/control", "/figures", "/sql")
+DATA = ("progress", "grid", "curves", "trials", "compare", "control", "figures", "sql")
+TABLES = ("curves.csv", "compare.csv", "control.csv", "sql.csv")
 PATHS = st.sampled_from([*PAGES, *(f"/api/{name}" for name in (*DATA, *TABLES))]) | st.builds(
     lambda base, tail: base + tail,
     st.sampled_from(["/trials/", "/api/trials/", "/figures/", "/static/", "/"]),

@@ -10,6 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.serve import sql
+from orchestrate.store.views import VIEWS
 
 Visit = Callable[..., TestClient]
 
@@ -65,6 +66,17 @@ def test_every_example_answers(client: TestClient) -> None:
         assert client.get("/api/sql.csv", params={"q": statement}).status_code == 200
 
 
+def test_the_page_names_every_view_with_its_columns(client: TestClient) -> None:
+    assert set(sql.VIEWS) == set(VIEWS)
+    _, found = ask(client, "")
+    for view in found["views"]:  # type: ignore[attr-defined]
+        _, answer = ask(client, f"SELECT * FROM {view['name']}")
+        assert answer["columns"] == view["columns"]
+    page = client.get("/sql").text
+    assert "v_assessment" in page
+    assert "status, t, measure, value" in page
+
+
 def test_an_answer_has_columns_rows_and_bytes_in_words(client: TestClient) -> None:
     _, found = ask(client, "SELECT env, policy, seed % 2 AS odd FROM v_trial WHERE width = 4")
     assert found["columns"] == ["env", "policy", "odd"]
@@ -80,13 +92,13 @@ def test_rows_are_cut_and_the_page_says_so(client: TestClient) -> None:
     statement = SERIES.format(2500) + "SELECT n FROM s"
     _, found = ask(client, statement)
     assert found["cut"] is True
-    assert len(found["rows"]) == sql.ROWS  # type: ignore[arg-type]
+    assert len(found["rows"]) == sql.MAX_ROWS  # type: ignore[arg-type]
     assert "Only the first 1,000 rows" in client.get("/sql", params={"q": statement}).text
     assert len(client.get("/api/sql.csv", params={"q": statement}).text.splitlines()) == 2501
 
 
 def test_a_slow_query_is_ended(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sql, "SECONDS", 0.5)
+    monkeypatch.setattr(sql, "TIMEOUT_SECONDS", 0.5)
     start = time.monotonic()
     status, found = ask(client, SERIES.format(10**12) + "SELECT count(*) FROM s")
     assert status == 400
@@ -126,14 +138,14 @@ def test_a_value_cannot_fill_the_memory(visit: Visit, sqlite_grid: str) -> None:
 def test_too_many_at_once_wait_or_are_told(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sql, "SECONDS", 0.05)
-    for _ in range(sql.AT_ONCE):
-        assert sql._places.acquire(blocking=False)
+    monkeypatch.setattr(sql, "TIMEOUT_SECONDS", 0.05)
+    for _ in range(sql.MAX_CONCURRENT):
+        assert sql._slots.acquire(blocking=False)
     try:
         assert client.get("/api/sql?q=SELECT 1").status_code == 429
     finally:
-        for _ in range(sql.AT_ONCE):
-            sql._places.release()
+        for _ in range(sql.MAX_CONCURRENT):
+            sql._slots.release()
     assert client.get("/api/sql?q=SELECT 1 AS one").status_code == 200
 
 

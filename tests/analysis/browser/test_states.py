@@ -14,7 +14,7 @@ from orchestrate.store import Store
 from tests.analysis.browser import grids
 from tests.analysis.synthetic import make_grid
 
-PAGES = ("/", "/curves", "/trials", "/figures", "/sql")
+PAGES = ("/", "/curves", "/trials", "/control", "/figures", "/sql")
 Visit = Callable[..., TestClient]
 
 
@@ -64,8 +64,8 @@ def test_an_empty_database_says_so(url: str, visit: Visit) -> None:
     client = visit(url)
     for path in PAGES:
         check(client, path)
-    assert "holds no trial yet" in client.get("/").text
-    assert "holds no trial yet" in client.get("/curves").text
+    assert "has no trials yet" in client.get("/").text
+    assert "has no trials yet" in client.get("/curves").text
     assert client.get("/api/progress").json()["total"] == 0
     for path in ("/api/curves", "/api/compare", "/compare"):
         assert client.get(path).status_code == 400

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.serve.trials import COLUMNS
+from analysis.serve.trial_columns import COLUMNS
+from tests.analysis.synthetic import fill, make_grid
 
 
 def walk(client: TestClient, asked: str, way: str, start: str = "") -> list[list[dict[str, Any]]]:
@@ -47,6 +50,36 @@ def _place(row: dict[str, Any], sort: str) -> str:
     return json.dumps([row[sort], row["trial_id"]])
 
 
+def test_columns_that_tell_configurations_apart_are_shown(
+    client: TestClient, visit: Callable[..., TestClient], variants_grid: str
+) -> None:
+    plain = client.get("/api/trials").json()["columns"]
+    assert not {"model", "learner", "gamma", "task", "settings"} & set(plain)
+    variants = visit(variants_grid)
+    found = variants.get("/api/trials?env=pendulum&policy=d_optimal&seed=0&size=25").json()
+    assert {"model", "learner", "gamma", "task"} <= set(found["columns"])
+    assert "settings" not in found["columns"]
+    names = ("model", "learner", "gamma", "task")
+    rows = {tuple(row[name] for name in names) for row in found["rows"]}
+    assert len(rows) == len(found["rows"]) == 5
+    page = variants.get("/trials?policy=d_optimal").text
+    assert "adam replay" in page
+    one = variants.get("/api/trials?policy=random&env=quadrotor").json()["columns"]
+    assert not {"model", "learner", "gamma", "task"} & set(one)
+
+
+def test_settings_are_shown_where_no_other_column_differs(
+    visit: Callable[..., TestClient], tmp_path: Path
+) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    for noise in (0.01, 0.02):
+        env = {"horizon": 40, "noise": noise}
+        fill(url, make_grid(("pendulum",), ("random",), range(1), env=env))
+    found = visit(url).get("/api/trials").json()
+    assert found["columns"]["settings"] == "settings"
+    assert {row["settings"] for row in found["rows"]} == {"σ=0.01", "σ=0.02"}
+
+
 def test_filters_narrow_the_list(client: TestClient) -> None:
     found = client.get("/api/trials?env=cartpole&policy=random").json()
     assert (found["total"], len(found["rows"])) == (4, 4)
@@ -58,7 +91,7 @@ def test_filters_narrow_the_list(client: TestClient) -> None:
     key = client.get(f"/api/trials/{config['trial_key']}").json()["trial"]["config_key"]
     assert client.get(f"/api/trials?config={key}").json()["total"] == 4
     assert client.get("/api/trials?config=' OR 1=1 --").json()["total"] == 0
-    assert "No trial fits" in client.get("/trials?env=cartpole&width=4").text
+    assert "No trial matches" in client.get("/trials?env=cartpole&width=4").text
 
 
 @pytest.mark.parametrize(

@@ -6,20 +6,20 @@ from collections.abc import Mapping
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from analysis.choice import USUAL, Candidate, Filter, choose, difference, flatten
+from analysis.data.config_matching import USUAL, Candidate, Filter, choose, difference, flatten
 from analysis.errors import AnalysisError
-from orchestrate.store import Cell
+from orchestrate.store import ConfigRow
 from tests.analysis.synthetic import make_spec
 from tests.orchestrate.conftest import ROOT
 
 
-def cell(system: str, name: str, **sections: Mapping[str, object]) -> Cell:
+def cell(system: str, name: str, **sections: Mapping[str, object]) -> ConfigRow:
     spec = make_spec(system, name, 0, **sections)
     counts = dict.fromkeys(
         ("n_done", "n_diverged", "n_failed", "n_cancelled", "n_pending", "n_running"), 0
     )
     config = json.loads(spec.config_json)
-    return Cell(spec.config_key, **spec.columns(), **counts, config=config)  # type: ignore[arg-type]
+    return ConfigRow(spec.config_key, **spec.columns(), **counts, config=config)  # type: ignore[arg-type]
 
 
 WIDE = {"model": {"width": 64}}

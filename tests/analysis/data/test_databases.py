@@ -5,15 +5,15 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from analysis.choice import Filter
-from analysis.divergence import DivergenceRule
-from analysis.input_spectra import measure_spectra, tabulate_spectra
-from analysis.loss_curves import measure_curves, tabulate_curves
-from analysis.portraits import measure_portraits, tabulate_portraits
-from analysis.request import Request
-from analysis.selection import select
-from analysis.statistics import Statistic
-from analysis.tables import TABLES
+from analysis.data.config_matching import Filter
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import select
+from analysis.figures.input_spectrum.data import measure_spectra, tabulate_spectra
+from analysis.figures.loss_curves.data import measure_curves, tabulate_curves
+from analysis.figures.phase_portraits.data import measure_portraits, tabulate_portraits
+from analysis.plot_options import PlotOptions
+from analysis.stats.intervals import Statistic
+from analysis.tables.registry import TABLES
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, controlled
 from tests.analysis.synthetic import fill, make_grid
@@ -38,7 +38,7 @@ def test_every_number_is_the_same(twins: tuple[Reader, Reader]) -> None:
 
 def _numbers(reader: Reader) -> list[pd.DataFrame]:
     selection, rule = select(reader, Filter()), DivergenceRule.EXCLUDE
-    asked = Request()
+    asked = PlotOptions()
     tables = [kind.measure(reader, kind.part(selection, asked), asked) for kind in TABLES.values()]
     curves = [
         tabulate_curves(measure_curves(reader, selection, "loss", rule, statistic=statistic))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.divergence import DivergenceRule, apply_rule
+from analysis.data.divergence import DivergenceRule, apply_rule
 
 NAN = np.nan
 SEEDS = np.array([0, 1, 2, 3])

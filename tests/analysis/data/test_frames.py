@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import analysis
+from analysis.data.frames import STEP_COLUMNS
 from analysis.errors import AnalysisError
-from analysis.loading import STEP_COLUMNS
+from dopt.run import run_trial
 from orchestrate.store import NoDatabaseError
-from tests.analysis.synthetic import fake_result, make_spec
+from tests.analysis.synthetic import fake_result, fill, make_spec
 
 
 @pytest.fixture
@@ -59,6 +61,15 @@ def test_a_matrix_is_that_of_the_figures(results: analysis.Results) -> None:
     assert np.isnan(matrix.values[2, 20:]).all()
 
 
+def test_one_configuration_of_each_policy_is_shown(results: analysis.Results) -> None:
+    shown = results.shown()
+    assert not shown.duplicated(["env", "policy"]).any()
+    assert len(shown) == 3 * 5 - 1  # the quadrotor has no eigenmode
+    dopt = shown[(shown.env == "cartpole") & (shown.policy == "d_optimal")]
+    assert dopt.width.tolist() == [16]
+    assert set(shown.index) < set(results.configurations().index)
+
+
 def test_trajectories_are_stacked(results: analysis.Results) -> None:
     paths = results.trajectories("cartpole", "random")
     assert paths.states.shape == (5, 61, 4)
@@ -74,3 +85,46 @@ def test_what_is_not_there_is_a_sentence(results: analysis.Results, url: str) ->
         analysis.load(url, where={"model.width": 5}).trials()
     with pytest.raises(NoDatabaseError):
         analysis.load("sqlite:///nowhere/results.db")
+
+
+def test_a_stored_trial_has_its_model_again(results: analysis.Results) -> None:
+    trials = results.trials()
+    row = trials[(trials.env == "quadrotor") & (trials.policy == "random")].iloc[2]
+    model = results.model(row)
+    spec = model.spec
+    assert (spec.trial_key, spec.seed) == (row.trial_key, row.seed)
+    assert results.model(row.trial_key).spec == spec
+    expected = fake_result(spec).parameters
+    np.testing.assert_array_equal(model.parameters, expected)
+    states, inputs = np.zeros((3, spec.system.n_states)), np.ones((3, spec.system.n_inputs))
+    states[1:] = 0.3
+    accelerations = model.predict(states)
+    np.testing.assert_array_equal(accelerations, spec.model.predict(spec.system, expected, states))
+    np.testing.assert_allclose(model.predict(states[1]), accelerations[1], rtol=1e-12)
+    difference = spec.system.derivative(states[1], inputs[1]) - model.predict(states, inputs)[1]
+    error = spec.system.learned(states)[1] - accelerations[1]
+    np.testing.assert_allclose(difference[list(spec.system.learned_rows)], error, rtol=1e-9)
+    others = np.delete(difference, list(spec.system.learned_rows))
+    np.testing.assert_allclose(others, 0.0, atol=1e-12)
+
+
+def test_a_model_of_no_trial_or_of_wrong_states_is_a_sentence(results: analysis.Results) -> None:
+    with pytest.raises(AnalysisError, match="No trial of the request has the key 'abc'"):
+        results.model("abc")
+    model = results.model(results.trials().iloc[0])
+    with pytest.raises(AnalysisError, match=r"states have the shape \(3,\), but \(N, 2\)"):
+        model.predict(np.zeros(3))
+
+
+def test_the_error_of_a_stored_model_is_the_stored_loss(tmp_path: Path) -> None:
+    """The trial, the database and the prediction agree on the accelerations that were learned."""
+    spec = make_spec("pendulum", "random", 0, env={"horizon": 40})
+    url, result = f"sqlite:///{tmp_path}/one.db", run_trial(spec, path="reference")
+    fill(url, [spec], edit=lambda *_: result)
+    with analysis.load(url) as results:
+        trials = results.trials()
+        model = results.model(trials.iloc[0])
+    grid = spec.system.grid()
+    error = model.predict(grid) - spec.system.learned(grid)
+    rms = np.sqrt(np.mean(np.sum(error**2, axis=1)))
+    assert trials.final_loss[0] == pytest.approx(rms, rel=1e-4)

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from analysis.choice import Filter
+from analysis.data.config_matching import Filter
+from analysis.data.missing_trials import ranges
+from analysis.data.trial_selection import Selection, environment_rank, newest, policy_rank, select
 from analysis.errors import AnalysisError
-from analysis.gaps import ranges
-from analysis.selection import Selection, environment_rank, newest, policy_rank, select
-from dopt import cell
 from dopt.policies import POLICIES
-from dopt.spec import TrialSpec
+from dopt.spec import config
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT
@@ -85,13 +85,13 @@ def test_assessments_of_different_versions_do_not_mix(
     plain = make_grid(("pendulum",), policies, range(2))
     new = make_grid(("pendulum",), policies, range(2), **task)
     keys = {one.trial_key for one in (*plain, *new)}
-    monkeypatch.setattr(cell, "ASSESSMENT_VERSION", 1)
+    monkeypatch.setattr(config, "ASSESSMENT_VERSION", 1)
     old = make_grid(("pendulum",), policies, range(2), **task)
     assert keys.isdisjoint(one.trial_key for one in old)
     url = f"sqlite:///{tmp_path}/versions.db"
     fill(url, [*plain, *old, *new])
     with Reader.open(url) as opened:
-        kept = {cell.config_key for cell in newest(list(opened.cells()))}
+        kept = {cell.config_key for cell in newest(list(opened.configs()))}
     assert kept == {one.config_key for one in (*plain, *new)}
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.phase import wrapped_line
+from analysis.figures.phase_portraits.angles import wrapped_line
 from dopt.coverage import TURN, turns, wrap
 
 ANGLES = st.lists(st.floats(-30, 30), min_size=1, max_size=30)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from analysis.figures.axis_break import axis_parts, band_limits
-from analysis.statistics import Band
+from analysis.stats.intervals import Band
 
 
 def band(*mean: float, half: float = 0.1) -> Band:

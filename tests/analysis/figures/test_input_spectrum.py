@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.choice import Filter
-from analysis.figures.input_spectrum import caption
-from analysis.input_spectra import measure_spectra, tabulate_spectra, unit_of
-from analysis.selection import select
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import select
+from analysis.figures.input_spectrum.data import measure_spectra, tabulate_spectra, unit_of
+from analysis.figures.input_spectrum.plot import caption
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import fill, make_grid

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from analysis.choice import Filter
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError
-from analysis.portraits import (
+from analysis.figures.phase_portraits.data import (
     measure_portraits,
     median_seed,
     tabulate_portraits,
 )
-from analysis.selection import select
 from dopt.coverage import Plane
 from dopt.systems import SYSTEMS
 from orchestrate.store import Reader

@@ -10,7 +10,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from analysis.figures.axes import angle_text, log_limits, log_text, log_ticks, rows_and_columns
-from analysis.figures.style import mathematical, policy_style
+from analysis.figures.input_spectrum.plot import GREYS
+from analysis.figures.style import mathematical
+from analysis.line_styles import SEQUENCE, policy_style, sequence_style
 from dopt.policies import POLICIES
 
 PAPER = ("oracle", "periodic", "d_optimal", "uniform", "random")
@@ -39,10 +41,28 @@ def test_the_policies_of_the_paper_differ_in_grey() -> None:
     assert min(np.diff(greys)) > 0.1
 
 
-def test_every_colour_is_seen_on_white() -> None:
-    for policy in POLICIES:
-        luminance = np.dot(to_rgb(policy_style(policy).colour), (0.2126, 0.7152, 0.0722))
-        assert luminance < 0.75
+def contrast_to_white(colour: str) -> float:
+    """Return the contrast ratio as WCAG 2 defines it, from 1 to 21."""
+    channels = np.array(to_rgb(colour))
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(1.05 / (linear @ (0.2126, 0.7152, 0.0722) + 0.05))
+
+
+@pytest.mark.parametrize(
+    "colour",
+    sorted(
+        {policy_style(policy).colour for policy in (*POLICIES, "my_policy")}
+        | {*SEQUENCE, *GREYS.values()}
+    ),
+)
+def test_every_line_has_a_contrast_of_three_to_white(colour: str) -> None:
+    assert contrast_to_white("#ffffff") == pytest.approx(1)
+    assert contrast_to_white(colour) >= 3
+
+
+def test_values_of_a_setting_look_different() -> None:
+    styles = [sequence_style(place, 0, "") for place in range(2 * len(SEQUENCE))]
+    assert len({(style.colour, style.line) for style in styles}) == len(styles)
 
 
 def test_a_policy_of_the_user_has_a_style() -> None:

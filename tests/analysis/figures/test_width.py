@@ -5,12 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.choice import Filter
-from analysis.divergence import DivergenceRule
-from analysis.figures.plot import Request
-from analysis.figures.registry import build
-from analysis.selection import Selection, select
-from analysis.width import (
+from analysis.data.config_matching import Filter
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import Selection, select
+from analysis.figures.width.data import (
     exponent,
     measure_costs,
     measure_losses,
@@ -18,7 +16,9 @@ from analysis.width import (
     tabulate_losses,
     width_part,
 )
-from dopt.spec import TrialSpec
+from analysis.outputs.registry import build
+from analysis.plot_options import PlotOptions
+from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, wide
 from tests.analysis.synthetic import fill, make_grid
@@ -71,7 +71,7 @@ def test_all_widths_are_taken_and_the_condition_of_the_user_holds(reader: Reader
 def test_two_widths_are_too_few_and_that_is_said(tmp_path: Path) -> None:
     with reader_of(tmp_path, (wide(8, range(2)) + wide(16, range(2)), [])) as reader:
         names = ("figure4_width", "figure4_width_loss")
-        outcomes = list(build(reader, select(reader, Filter()), Request(), tmp_path, names))
+        outcomes = list(build(reader, select(reader, Filter()), PlotOptions(), tmp_path, names))
     assert {one.state for one in outcomes} == {"not drawn, nothing is stored for it"}
 
 

@@ -12,17 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.choice import Filter
-from analysis.figures.input_spectrum import spectrum_plot
-from analysis.figures.loss_curves import _title, loss_plot
-from analysis.figures.phase_portraits import coverage_text, phase_plot
-from analysis.figures.plot import Request
-from analysis.figures.registry import NAMES, PLOTS, build
-from analysis.portraits import Portrait
-from analysis.selection import Selection, select
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import Selection, select
+from analysis.figures.input_spectrum.plot import spectrum_plot
+from analysis.figures.loss_curves.plot import _title, loss_plot
+from analysis.figures.phase_portraits.data import Portrait
+from analysis.figures.phase_portraits.plot import coverage_text, phase_plot
+from analysis.outputs.registry import NAMES, PLOTS, build
+from analysis.plot_options import PlotOptions
 from orchestrate.store import Reader
 
 QUICK = ("figure2_spectrum", "comparison")
+
+pytestmark = pytest.mark.xdist_group("figures")  # all outputs are drawn once for all of them
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +32,7 @@ def folder(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """All outputs of the complete grid, made once."""
     target = tmp_path_factory.mktemp("figures")
     with Reader.open(url) as reader:
-        outcomes = list(build(reader, select(reader, Filter()), Request(), target))
+        outcomes = list(build(reader, select(reader, Filter()), PlotOptions(), target))
     assert [(outcome.name, outcome.state) for outcome in outcomes] == [
         (name, "written") for name in (*NAMES, "README.md")
     ]
@@ -40,7 +42,7 @@ def folder(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def make(reader: Reader, selection: Selection, target: Path, **options: bool) -> list[str]:
     return [
         outcome.state
-        for outcome in build(reader, selection, Request(), target, QUICK, **options)
+        for outcome in build(reader, selection, PlotOptions(), target, QUICK, **options)
         if outcome.name in QUICK
     ]
 
@@ -98,7 +100,7 @@ def test_a_line_that_cannot_be_is_explained(folder: Path) -> None:
 
 def test_all_portraits_have_the_same_axes(reader: Reader) -> None:
     plot = phase_plot("pendulum")
-    panels = plot.make(reader, plot.part(select(reader, Filter())), Request()).figure.axes[:5]
+    panels = plot.make(reader, plot.part(select(reader, Filter())), PlotOptions()).figure.axes[:5]
     assert len({(*axes.get_xlim(), *axes.get_ylim()) for axes in panels}) == 1
 
 
@@ -115,17 +117,17 @@ def test_a_long_title_is_broken_between_counts() -> None:
 def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:
     alone = select(reader, Filter(("cartpole",), ("d_optimal",)))
     curves, spectrum = loss_plot("figure1", "loss"), spectrum_plot("cartpole", "spectrum")
-    assert "slanted strokes" not in curves.make(reader, alone, Request()).caption
-    assert "in grey" not in spectrum.make(reader, alone, Request()).caption
+    assert "slanted strokes" not in curves.make(reader, alone, PlotOptions()).caption
+    assert "in grey" not in spectrum.make(reader, alone, PlotOptions()).caption
     grey = select(reader, Filter(("cartpole",), ("d_optimal", "random")))
-    assert "; random in grey;" in spectrum.make(reader, grey, Request()).caption
+    assert "; random in grey;" in spectrum.make(reader, grey, PlotOptions()).caption
 
 
 @pytest.mark.parametrize(
     ("coverage", "error", "n", "words"),
     [
-        (0.1234, 0.00021, 100, "coverage 12.340 ± 0.021 %"),
-        (0.5, 0.02, 9, "coverage 50.0 ± 2.0 %"),
+        (0.1234, 0.00021, 100, "coverage 12.340 ± 0.042 %"),
+        (0.5, 0.02, 9, "coverage 50.0 ± 4.0 %"),
         (0.125, float("nan"), 1, "coverage 12.5 %"),
         (float("nan"), float("nan"), 0, "coverage unknown"),
     ],
@@ -169,7 +171,7 @@ def test_what_is_unchanged_is_not_drawn_again(reader: Reader, tmp_path: Path) ->
 
 def test_steps_to_a_given_loss_need_no_random_inputs(reader: Reader, tmp_path: Path) -> None:
     pair = select(reader, Filter(("pendulum",), ("d_optimal", "uniform")))
-    for request, state in ((Request(), "not drawn"), (Request(epsilon=1.0), "written")):
+    for request, state in ((PlotOptions(), "not drawn"), (PlotOptions(epsilon=1.0), "written")):
         outcome, *_ = build(reader, pair, request, tmp_path, ("comparison_steps",))
         assert outcome.state.startswith(state)
 
@@ -177,7 +179,8 @@ def test_steps_to_a_given_loss_need_no_random_inputs(reader: Reader, tmp_path: P
 def test_what_has_no_trials_is_said(reader: Reader, tmp_path: Path) -> None:
     part = select(reader, Filter(("quadrotor",)))
     states = {
-        outcome.name: outcome.state for outcome in build(reader, part, Request(), tmp_path, QUICK)
+        outcome.name: outcome.state
+        for outcome in build(reader, part, PlotOptions(), tmp_path, QUICK)
     }
     assert states["figure2_spectrum"].startswith("not drawn")
     assert states["comparison"] == "written"

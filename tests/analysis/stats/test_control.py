@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 import analysis
-from analysis.choice import Filter
-from analysis.comparisons import compare_control
-from analysis.control import (
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import Selection, select
+from analysis.figures.control.plot import caption_control, draw_control
+from analysis.outputs.registry import build
+from analysis.plot_options import PlotOptions
+from analysis.stats.control import (
     ControlCurve,
     control_part,
     measure_control,
@@ -18,13 +21,10 @@ from analysis.control import (
     scores_at,
     tabulate_control,
 )
-from analysis.figures.control import caption_control, draw_control
-from analysis.figures.registry import build
-from analysis.request import Request
-from analysis.selection import Selection, select
-from analysis.sheets import control_sheet
+from analysis.tables.comparisons import compare_control
+from analysis.tables.rendering import control_table
 from dopt.result import Assessment, TrialResult
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import fake_result, fill, make_grid
@@ -82,16 +82,16 @@ def test_wilson_intervals_are_those_of_the_textbook(reader: Reader, part: Select
 def test_the_comparison_pairs_seeds(reader: Reader, part: Selection) -> None:
     table = compare_control(reader, part)
     assert sorted(set(table.t)) == [20, 40, 60]
-    row = table[(table.env == "quadrotor") & (table.t == 40) & (table.baseline == "random")]
+    row = table[(table.env == "quadrotor") & (table.t == 40) & (table.policy == "random")]
     entries = {entry.cell.policy: entry for entry in part.of("quadrotor")}
     ours, theirs = (
         scores_at(reader, entries[name], 40).by_seed for name in ("d_optimal", "random")
     )
-    ratios = [np.log(ours[seed] / theirs[seed]) for seed in range(5)]
+    ratios = [np.log(theirs[seed] / ours[seed]) for seed in range(5)]
     assert row.ratio.item() == pytest.approx(np.exp(np.mean(ratios)))
     assert row.n_pairs.item() == 5
-    assert row.improvement.item() == 1.0
-    sheet = control_sheet(table)
+    assert row.improvement.item() == 0.0
+    sheet = control_table(table)
     assert len(sheet.rows) == len(table) == 2 * 3 * 2
     assert "| quadrotor |" in sheet.markdown()
 
@@ -155,9 +155,9 @@ def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
     assert "Lost: episodes" in caption_control(curves)
     assert "2 lost" in draw_control(curves).axes[0].get_title()
     row = table[table.t == 20].iloc[0]
-    assert (row.n_pairs, row.n_lost, row.improvement) == (5, 2, 1.0)
+    assert (row.n_pairs, row.n_lost, row.improvement) == (5, 2, 0.0)
     assert row.p_value == pytest.approx(2 / 2**5)  # all five, the lost ones too
-    lines = control_sheet(table).markdown().splitlines()
+    lines = control_table(table).markdown().splitlines()
     assert "], 2 lost |" in lines[2]
     assert "lost" not in lines[3]
 
@@ -174,7 +174,7 @@ def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> 
     assert [curve.lost.tolist() for curve in curves] == [[5, 5, 5]] * 2
     assert np.isnan(curves[0].cost).all()
     assert curves[0].success[-1] == 1.0
-    assert "| –, 5 lost |" in " ".join(control_sheet(table).markdown().split())
+    assert "| –, 5 lost |" in " ".join(control_table(table).markdown().split())
 
 
 def test_the_picture_has_a_column_for_each_task(reader: Reader, part: Selection) -> None:
@@ -221,7 +221,9 @@ def test_a_grid_without_a_task_has_no_such_figure(tmp_path: Path) -> None:
     fill(url, make_grid(("pendulum",), ("d_optimal", "random"), range(2), **SHORT))
     names = ("figure5_control", "comparison_control")
     with Reader.open(url) as reader:
-        outcomes = build(reader, select(reader, Filter()), Request(), tmp_path / "figures", names)
+        outcomes = build(
+            reader, select(reader, Filter()), PlotOptions(), tmp_path / "figures", names
+        )
         states = {outcome.name: outcome.state for outcome in outcomes}
     assert all(states[name] == "not drawn, nothing is stored for it" for name in names)
 

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
+from scipy import stats
 
-from analysis.statistics import Statistic, centre, mean, standard_error
-from analysis.statistics import band as band_of
+from analysis.stats.intervals import RESAMPLES, Statistic, centre, mean, standard_error
+from analysis.stats.intervals import band as band_of
 
 
 def test_band_of_three_numbers_by_hand() -> None:
@@ -94,3 +96,29 @@ def test_the_bootstrap_interval_covers_about_as_often_as_it_says(statistic: Stat
 def test_names_are_those_of_the_captions() -> None:
     assert Statistic.MEAN.band == "95 % t-interval of the mean"
     assert Statistic.IQM.band == "95 % bootstrap interval of the interquartile mean"
+
+
+@pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
+@pytest.mark.parametrize("n", [2, 3, 5, 20, 31])
+def test_the_bootstrap_is_that_of_scipy(statistic: Statistic, n: int) -> None:
+    values = np.exp(np.random.default_rng(n).normal(size=(n, 6)))
+    values[:, 3] = 1.0
+    values[: n // 2, 4] = 2.0  # ties
+    values[0, 5] = 1e12
+    centres = {Statistic.MEDIAN: np.median, Statistic.IQM: iqm}
+    found = stats.bootstrap(
+        (values,),
+        centres[statistic],
+        n_resamples=RESAMPLES,
+        batch=100,
+        confidence_level=0.95,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    shown = band_of(values, statistic)
+    assert shown.low == pytest.approx(found.low, rel=1e-12)
+    assert shown.high == pytest.approx(found.high, rel=1e-12)
+
+
+def iqm(values: npt.NDArray[np.float64], axis: int) -> npt.NDArray[np.float64]:
+    return np.asarray(stats.trim_mean(values, 0.25, axis=axis))

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.paired import (
+from analysis.stats.paired_tests import (
     benjamini_hochberg,
     compare,
     interval_of_mean,

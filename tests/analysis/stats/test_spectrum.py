@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.spectrum import average_spectrum, periodogram
+from analysis.stats.spectrum import average_spectrum, periodogram
 
 
 @given(

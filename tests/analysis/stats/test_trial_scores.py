@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from analysis.choice import Filter
-from analysis.comparisons import compare_policies, compare_steps
-from analysis.divergence import DivergenceRule
+from analysis.data.config_matching import Filter
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError
-from analysis.measures import (
+from analysis.stats.paired_tests import censored_median, compare_hitting_times, sign_test
+from analysis.stats.trial_scores import (
     Measure,
     first_passage,
     geometric_mean,
@@ -17,9 +18,8 @@ from analysis.measures import (
     mean_losses,
     steps_to,
 )
-from analysis.paired import censored_median, race, sign_test
-from analysis.selection import select
-from analysis.sheets import race_sheet
+from analysis.tables.comparisons import compare_policies, compare_steps
+from analysis.tables.rendering import TextTable, hitting_times_table
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fake_result, make_spec
 
@@ -55,20 +55,20 @@ def test_a_scale_moves_threshold_and_curve_alike() -> None:
 
 
 def test_race_by_hand() -> None:
-    found = race(np.array([3.0, 5, INF, INF, 7]), np.array([4.0, 5, 8, INF, INF]))
-    assert (found.n_pairs, found.reached, found.reached_baseline) == (5, 3, 3)
+    found = compare_hitting_times(np.array([3.0, 5, INF, INF, 7]), np.array([4.0, 5, 8, INF, INF]))
+    assert (found.n_pairs, found.reached, found.reached_reference) == (5, 3, 3)
     assert found.improvement == (2 + 2 / 2) / 5  # earlier twice, tied twice
     assert found.p_value == pytest.approx(1.0)  # two wins and one loss of three
-    assert (found.median, found.median_baseline) == (7, 8)
+    assert (found.median, found.median_reference) == (7, 8)
 
 
 def test_swapping_the_sides_swaps_the_race() -> None:
     steps = np.random.default_rng(1).integers(1, 9, size=(2, 40)).astype(float)
     steps[steps > 7] = INF
-    forth, back = race(*steps), race(*steps[::-1])
+    forth, back = compare_hitting_times(*steps), compare_hitting_times(*steps[::-1])
     assert forth.improvement + back.improvement == pytest.approx(1)
     assert forth.p_value == pytest.approx(back.p_value)
-    assert forth.median == back.median_baseline
+    assert forth.median == back.median_reference
 
 
 def test_sign_test_of_a_textbook_case() -> None:
@@ -79,7 +79,7 @@ def test_sign_test_of_a_textbook_case() -> None:
 def test_the_sign_test_rejects_a_true_null_as_rarely_as_it_says() -> None:
     draws = np.random.default_rng(2).exponential(size=(2000, 2, 41))
     censored = np.where(draws > 1.0, INF, draws)
-    rejected = np.mean([race(*pair).p_value < 0.05 for pair in censored])
+    rejected = np.mean([compare_hitting_times(*pair).p_value < 0.05 for pair in censored])
     assert rejected < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 2000)
 
 
@@ -91,7 +91,7 @@ def test_a_median_past_the_horizon_is_censored() -> None:
 
 
 def test_race_of_no_pair_is_nan() -> None:
-    found = race(np.empty(0), np.empty(0))
+    found = compare_hitting_times(np.empty(0), np.empty(0))
     assert found.n_pairs == 0
     assert math.isnan(found.improvement)
     assert math.isnan(found.p_value)
@@ -121,7 +121,7 @@ def test_the_area_compares_whole_curves(reader: Reader) -> None:
     selection = select(reader, Filter(("pendulum",), ("d_optimal", "random")))
     row = compare_policies(reader, selection, measure=Measure.AUC).iloc[0]
     logs = [
-        np.mean(np.log(curve("pendulum", "d_optimal", s)) - np.log(curve("pendulum", "random", s)))
+        np.mean(np.log(curve("pendulum", "random", s)) - np.log(curve("pendulum", "d_optimal", s)))
         for s in SEEDS
     ]
     assert row.ratio == pytest.approx(math.exp(np.mean(logs)))
@@ -129,19 +129,19 @@ def test_the_area_compares_whole_curves(reader: Reader) -> None:
 
 def test_steps_to_what_random_inputs_know_at_the_end(reader: Reader) -> None:
     table = compare_steps(reader, select(reader, Filter()))
-    row = table[(table.env == "pendulum") & (table.baseline == "uniform")].iloc[0]
+    row = table[(table.env == "pendulum") & (table.policy == "uniform")].iloc[0]
     finals = [curve("pendulum", "random", seed)[-1] for seed in SEEDS]
     assert row.epsilon == pytest.approx(np.median(finals))
     ours = np.array([curve("pendulum", "d_optimal", seed) for seed in SEEDS])
-    assert row["median"] == np.median(first_passage(ours, row.epsilon))
-    assert row.reached == np.sum(ours.min(axis=1) <= row.epsilon)
+    assert row["median_reference"] == np.median(first_passage(ours, row.epsilon))
+    assert row.reached_reference == np.sum(ours.min(axis=1) <= row.epsilon)
 
 
 def test_an_epsilon_that_nobody_reaches_is_a_tie(reader: Reader) -> None:
     selection = select(reader, Filter(("pendulum",), ("d_optimal", "periodic")))
     table = compare_steps(reader, selection, epsilon=1e-9)
     assert (table.improvement.item(), table.p_value.item()) == (0.5, 1.0)
-    assert "> 60" in race_sheet(table, "exclude").markdown()
+    assert "> 60" in hitting_times_table(table, "exclude").markdown()
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -1.0, INF, math.nan])
@@ -156,11 +156,29 @@ def test_without_random_inputs_an_epsilon_is_needed(reader: Reader) -> None:
         compare_steps(reader, selection)
 
 
-def test_a_sheet_in_latex_has_its_letters_as_commands(reader: Reader) -> None:
-    sheet = race_sheet(compare_steps(reader, select(reader, Filter())), "exclude")
-    note, *table = sheet.latex().splitlines()
-    assert note.startswith("% Steps")
-    assert table[0] == r"\begin{tabular}{lllllllllll}"
-    assert r"$\varepsilon$" in table[2]
-    assert r"d\_optimal" not in "".join(table)  # the reference is the sheet's subject
-    assert all(ord(letter) < 128 for line in table for letter in line)
+def test_a_table_in_latex_needs_no_package(reader: Reader) -> None:
+    table = hitting_times_table(compare_steps(reader, select(reader, Filter())), "exclude")
+    text = table.latex()
+    lines = [line for line in text.splitlines() if not line.startswith("%")]
+    assert text.isascii()
+    assert text.startswith("% Steps")
+    assert lines[0] == r"\begin{tabular}{llllllllllll}"
+    assert lines[-1] == r"\end{tabular}"
+    rows = [line for line in lines if line.endswith(r"\\")]
+    assert len(rows) == 1 + len(table.rows)
+    assert {row.count(" & ") for row in rows} == {11}
+    assert [line for line in lines if line not in rows] == [
+        lines[0],
+        *[r"\hline"] * 3,
+        r"\end{tabular}",
+    ]
+    assert r"$\varepsilon$" in rows[0]
+
+
+def test_every_letter_of_a_label_compiles() -> None:
+    row = ["adam_replay ×30", "γ=3 & λ", "50 % of #1 {x}", "q̇₁ ~ a^b", "[2, 3] m/s²"]
+    text = TextTable(["a", "b", "c", "d", "e"], [row], "rad/s²\nµs").latex()
+    assert text.startswith("% rad/s2\n% ")
+    assert text.isascii()
+    assert r"adam\_replay $\times$30 & $\gamma$=3 \& $\lambda$ & 50 \% of \#1 \{x\} & " in text
+    assert r"q1 \textasciitilde{} a\textasciicircum{}b & {[}2, 3] m/s$^2$ \\" in text

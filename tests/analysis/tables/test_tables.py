@@ -6,19 +6,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.choice import Filter
-from analysis.comparisons import compare_policies
-from analysis.counts import count_text
-from analysis.divergence import DivergenceRule
+from analysis.data.config_matching import Filter
+from analysis.data.divergence import DivergenceRule
+from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError
-from analysis.loss_curves import Axis, measure_curves, tabulate_curves
-from analysis.measures import Measure
-from analysis.numbers import number, p_text, plus_minus
+from analysis.figures.loss_curves.data import Axis, measure_curves, tabulate_curves
+from analysis.formatting import count_text, number, p_text, plus_minus
+from analysis.report.forest_plot import CAPTION
 from analysis.report.page import EXPLAINED
-from analysis.report.picture import CAPTION
-from analysis.selection import select
-from analysis.sheets import comparison_sheet, control_sheet, summary_sheet
-from analysis.summary import summarise
+from analysis.stats.trial_scores import Measure
+from analysis.tables.comparisons import compare_policies
+from analysis.tables.rendering import comparison_table, control_table, summary_table
+from analysis.tables.summary import summarise
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fake_result, make_spec
 
@@ -53,10 +52,10 @@ def test_a_diverged_trial_is_left_out_counted_or_the_worst(reader: Reader) -> No
 
 def test_comparison_pairs_the_seeds(reader: Reader) -> None:
     table = compare_policies(reader, select(reader, Filter()))
-    row = table[(table.env == "cartpole") & (table.baseline == "random")].iloc[0]
+    row = table[(table.env == "cartpole") & (table.policy == "random")].iloc[0]
     seeds = [seed for seed in SEEDS if seed != 2]
     logs = [
-        math.log(final("cartpole", "d_optimal", seed) / final("cartpole", "random", seed))
+        math.log(final("cartpole", "random", seed) / final("cartpole", "d_optimal", seed))
         for seed in seeds
     ]
     assert (row.n_pairs, row.n_diverged) == (4, 1)
@@ -71,7 +70,7 @@ def test_a_row_does_not_depend_on_the_others(reader: Reader) -> None:
     part = compare_policies(
         reader, select(reader, Filter(("cartpole",), ("d_optimal", "periodic")))
     )
-    same = whole[(whole.env == "cartpole") & (whole.baseline == "periodic")]
+    same = whole[(whole.env == "cartpole") & (whole.policy == "periodic")]
     columns = ["n_pairs", "ratio", "low", "high", "p_value"]
     assert same[columns].to_numpy().tolist() == part[columns].to_numpy().tolist()
 
@@ -133,37 +132,42 @@ def test_numbers() -> None:
 
 def test_markdown_shows_counts_and_dashes() -> None:
     nothing = {"ratio": math.nan, "low": math.nan, "high": math.nan, "improvement": math.nan}
-    row = {"env": "arm", "baseline": "random", "n_pairs": 0, "n_diverged": 3, **nothing}
+    row = {
+        "env": "arm",
+        "variant": "random",
+        "reference": "D-optimal",
+        "n_pairs": 0,
+        "n_diverged": 3,
+        **nothing,
+    }
     table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
-    assert "Student's below 30 pairs" in comparison_sheet(table, "exclude").note
-    line = comparison_sheet(table, "exclude").markdown().splitlines()[2]
+    assert "Student's below 30 pairs" in comparison_table(table, "exclude").note
+    line = comparison_table(table, "exclude").markdown().splitlines()[2]
     assert [field.strip() for field in line.strip("|").split("|")] == [
-        "arm", "random", "–", "–", "–", "–", "0, 3 diverged",
+        "arm", "random", "D-optimal", "–", "–", "–", "–", "0, 3 diverged",
     ]  # fmt: skip
     values = {
         f"{name}{part}": value
         for name in ("loss", "reachable_loss")
         for part, value in (("", 1.0), ("_2se", 0.1), ("_median", 0.9), ("_iqm", 0.95))
     }
-    counts = {"env": "arm", "policy": "random", "n": 98, "n_diverged": 2}
-    summary = summary_sheet(pd.DataFrame([counts | values]), "worst").markdown()
+    counts = {"env": "arm", "policy": "random", "label": "random", "n": 98, "n_diverged": 2}
+    summary = summary_table(pd.DataFrame([counts | values]), "worst").markdown()
     assert "1.00 ± 0.10" in summary
     assert "Diverged trials: worst." in summary
 
 
 def test_every_caption_says_what_is_divided_by_what() -> None:
     for note in (
-        comparison_sheet(pd.DataFrame(), "exclude").note,
-        comparison_sheet(pd.DataFrame(), "exclude", Measure.AUC).note,
-        control_sheet(pd.DataFrame()).note,
+        comparison_table(pd.DataFrame(), "exclude").note,
+        comparison_table(pd.DataFrame(), "exclude", Measure.AUC).note,
+        control_table(pd.DataFrame()).note,
     ):
-        assert "atio: D-optimal / baseline, below 1 D-optimal is better" in note
-        assert "(a report has it the other way, variant / D-optimal)" in note
+        assert "atio: variant / reference, below 1 the variant is better" in note
     explained = " ".join(EXPLAINED)
-    assert "Ratio: variant / D-optimal inputs" in explained
+    assert "Ratio: variant / reference" in explained
     assert "below 1 the variant is better" in explained
-    assert "the other way, D-optimal / baseline" in explained
-    assert "variant / D-optimal inputs: left of the line, below 1, the variant is better" in CAPTION
+    assert "variant / reference: left of the line, below 1, the variant is better" in CAPTION
 
 
 def test_count_text() -> None:

@@ -1,4 +1,4 @@
-/** Error bars: the interval of a curve at a few steps, those of different policies side by side. */
+/** Error bars: the interval of each curve at a few steps, shifted so that policies do not overlap. */
 
 import { ink } from "./plot.js";
 

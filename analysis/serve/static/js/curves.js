@@ -1,7 +1,9 @@
-/** The page of curves: what is drawn, switched by its form, kept in its address, followed live. */
+/** Curves page: chart and legend of loss curves, updated by the form and by the database. */
 
 import { errorBars } from "./bars.js";
+import { hoverBox } from "./hover.js";
 import { fillLegend, readLegend } from "./legend.js";
+import { numeral } from "./numbers.js";
 import { axis, describe, ink, logRange, plot, veil } from "./plot.js";
 
 const HEIGHT = 430;
@@ -19,7 +21,7 @@ let answer = null;
 let chart = null;
 let asking = null;
 
-/** What the form says, without what is usual. */
+/** The values of the form that differ from the defaults. */
 function chosen() {
   const found = new URLSearchParams();
   for (const [name, value] of new FormData(form)) {
@@ -28,7 +30,7 @@ function chosen() {
   return found;
 }
 
-/** Offer the widths of the chosen environment. @param {string|null} wanted */
+/** Fill the menu of widths for the chosen environment. @param {string|null} wanted */
 function offerWidths(wanted) {
   const environments = JSON.parse(form.dataset.environments);
   const env = new FormData(form).get("env");
@@ -40,7 +42,7 @@ function offerWidths(wanted) {
   select.value = widths.map(String).includes(wanted ?? "") ? wanted : "";
 }
 
-/** Ask the server for the curves and draw them. */
+/** Fetch the curves and draw them. */
 async function load() {
   asking?.abort();
   const mine = (asking = new AbortController());
@@ -61,7 +63,7 @@ async function load() {
   part("csv").href = `/api/curves.csv?${query}`;
 }
 
-/** Show a sentence in place of the chart, or none. @param {string} sentence */
+/** Show an error message in place of the chart, or hide it. @param {string} sentence */
 function complain(sentence) {
   part("problem").textContent = sentence;
   part("problem").hidden = sentence === "";
@@ -74,7 +76,7 @@ function complain(sentence) {
   place.dataset.shown = "";
 }
 
-/** Keep the address in step, so that it can be sent to somebody. */
+/** Write the settings into the URL, so that it can be shared. */
 function remember() {
   const query = chosen();
   if (hidden.size) query.set("hide", [...hidden].join(","));
@@ -82,7 +84,7 @@ function remember() {
   history.replaceState(null, "", text ? `?${text}` : location.pathname);
 }
 
-/** Draw the answer: three series for each policy, centre, low and high. */
+/** Draw the curves: three series for each policy, centre, low and high. */
 function draw() {
   const choice = new FormData(form);
   const range = chart && chart.zoomed ? { ...chart.scales.x } : null;
@@ -93,6 +95,7 @@ function draw() {
   const style = choice.get("style");
   const unit = choice.get("x") === "seconds" ? "s" : "steps";
   chart = plot(place, options(style, unit, choice.get("column")), data(), HEIGHT);
+  hoverBox(place, chart, values);
   if (range) chart.setScale("x", { min: range.min, max: range.max });
   part("band").textContent = style === "none" ? "" : `Interval: ${answer.band}.`;
   part("legend").tHead.rows[0].cells[0].textContent = "policy";
@@ -100,7 +103,7 @@ function draw() {
   shown();
 }
 
-/** Columns of uPlot; an interval that reaches towards zero, or below, ends at a quarter of its centre. */
+/** Columns of uPlot; the lower end of an interval is at least a quarter of its centre (log axis). */
 function data() {
   const columns = [answer.x];
   for (const curve of answer.curves) {
@@ -143,7 +146,7 @@ function options(style, unit, column) {
   };
 }
 
-/** Limits of the loss axis: what is visible, without what runs far below the rest. */
+/** Limits of the loss axis: the visible curves, without those far below the others. */
 function limits(_, low, high) {
   const [bottom, top] = logRange([low, high]);
   const all = !answer.main || new FormData(form).get("range") === "all";
@@ -156,17 +159,17 @@ function limits(_, low, high) {
   return cut ? [Math.max(bottom, floor), top] : [bottom, top];
 }
 
-/** The dot of the cursor sits on centres alone. */
+/** Colour of the cursor's point: only centres have one. */
 function pointFill(series) {
   return series % 3 === 1 ? ink(answer.curves[(series - 1) / 3].colour) : "transparent";
 }
 
-/** What the bars need of each curve. */
+/** The curves with their visibility, for the error bars. */
 function barred() {
   return answer.curves.map((curve) => ({ ...curve, shown: !hidden.has(curve.policy) }));
 }
 
-/** Read the curves at the cursor, or at the last step. @param {number|null} index */
+/** Write the values at the cursor, or at the last step, into the legend. @param {number|null} index */
 function read(index) {
   if (!answer) return;
   const last = answer.x.length - 1;
@@ -175,6 +178,20 @@ function read(index) {
   part("at").textContent =
     index === null ? `${answer.statistic} at the last step` : `${answer.statistic} at t = ${Number(answer.x[at].toPrecision(6))}${unit}`;
   readLegend(part("legend"), answer.curves, at);
+}
+
+/** The values of the visible curves at one step, for the box at the cursor. @param {number} index */
+function values(index) {
+  const unit = new FormData(form).get("x") === "seconds" ? " s" : "";
+  const rows = answer.curves
+    .filter((curve) => !hidden.has(curve.policy))
+    .map((curve) => {
+      const [centre, low, high] = [curve.centre, curve.low, curve.high].map((column) => column[index]);
+      const known = low !== null && low !== undefined;
+      const interval = known ? ` [${numeral(low, 3)}, ${numeral(high, 3)}]` : "";
+      return { line: curve, label: curve.label, value: `${numeral(centre, 3)}${interval}` };
+    });
+  return { title: `t = ${Number(answer.x[index].toPrecision(6))}${unit}`, rows };
 }
 
 /** @param {string} policy @param {boolean} on */
@@ -189,7 +206,7 @@ function toggle(policy, on) {
   shown();
 }
 
-/** Name what is drawn, for those who cannot see it. */
+/** Describe the chart for screen readers. */
 function shown() {
   const curves = answer.curves.filter((curve) => !hidden.has(curve.policy));
   place.dataset.shown = curves.map((curve) => curve.policy).join(" ");
@@ -197,7 +214,7 @@ function shown() {
   describe(place, `Loss against time in the ${answer.env}: ${curves.map((curve) => curve.label).join(", ")}. The table below has the values.`);
 }
 
-/** Say what is missing from the curves, and what else is stored. */
+/** List missing trials and configurations that are not shown. */
 function warn() {
   const notes = answer.notes.map((text) => note("note", `${text}.`));
   const gaps = answer.missing.map((gap) => `${gap.policy}: ${gap.states} (seeds ${gap.seeds})`);
@@ -212,7 +229,7 @@ function note(kind, text) {
   return made;
 }
 
-/** Move the cursor by keys. @param {KeyboardEvent} event */
+/** Move the cursor with the arrow keys. @param {KeyboardEvent} event */
 function steer(event) {
   const move = { ArrowLeft: -1, ArrowRight: 1, PageUp: -25, PageDown: 25 }[event.key];
   if (!chart || !move) return;

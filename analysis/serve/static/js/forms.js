@@ -1,4 +1,4 @@
-/** Small comforts of forms: choices apply at once, and addresses carry no empty values. */
+/** Forms: a choice in a menu is applied at once, and URLs contain no empty values. */
 
 /** @param {HTMLFormElement} form @param {boolean} off */
 function silence(form, off) {
@@ -9,7 +9,7 @@ function silence(form, off) {
 
 for (const form of document.querySelectorAll("form[action]")) {
   form.addEventListener("submit", () => silence(form, true));
-  addEventListener("pageshow", () => silence(form, false)); // also when it comes back from history
+  addEventListener("pageshow", () => silence(form, false)); // also after the Back button
   if ("auto" in form.dataset) {
     form.addEventListener("change", (event) => {
       if (event.target instanceof HTMLSelectElement) form.requestSubmit();

@@ -1,21 +1,21 @@
-/** The table below the curves: it names them, switches them on and off, and reads them at a step. */
+/** Legend table of the curves: names, check boxes, and the values at one step. */
 
 import { numeral } from "./numbers.js";
 
 const SPACE = "http://www.w3.org/2000/svg";
 
-/** A sample of a policy's line. @param {{colour: string, dash: number[], line_width: number}} look */
-function swatch(look) {
+/** A sample of a line. @param {{colour: string, dash: number[], line_width: number}} entry */
+export function swatch(entry) {
   const svg = document.createElementNS(SPACE, "svg");
   const line = document.createElementNS(SPACE, "line");
   svg.setAttribute("class", "swatch");
   svg.setAttribute("viewBox", "0 0 34 12");
   svg.setAttribute("aria-hidden", "true");
-  const given = { x1: 1, x2: 33, y1: 6, y2: 6, "stroke-width": 1.5 * look.line_width };
+  const given = { x1: 1, x2: 33, y1: 6, y2: 6, "stroke-width": 1.5 * entry.line_width };
   for (const [name, value] of Object.entries(given)) line.setAttribute(name, String(value));
-  if (look.colour === "#000000") line.setAttribute("class", "ink");
-  else line.setAttribute("stroke", look.colour);
-  const dash = look.dash.map((part) => part * look.line_width * 1.3).join(" ");
+  if (entry.colour === "#000000") line.setAttribute("class", "ink");
+  else line.setAttribute("stroke", entry.colour);
+  const dash = entry.dash.map((part) => part * entry.line_width * 1.3).join(" ");
   if (dash) line.setAttribute("stroke-dasharray", dash);
   svg.append(line);
   return svg;
@@ -40,7 +40,7 @@ export function fillLegend(table, curves, hidden, onToggle) {
     label.append(box, swatch(curve), curve.label);
     const name = document.createElement("td");
     name.append(label);
-    row.append(name, cell(""), cell(""), cell(curve.count));
+    row.append(name, cell("value"), cell("95 % interval"), cell("trials", curve.count));
     row.classList.toggle("off", !box.checked);
     box.addEventListener("change", () => {
       row.classList.toggle("off", !box.checked);
@@ -54,9 +54,11 @@ export function fillLegend(table, curves, hidden, onToggle) {
   if (kept) table.querySelector(`input[value="${CSS.escape(focused)}"]`)?.focus();
 }
 
-function cell(text) {
+/** A cell with the heading that a phone shows in it. */
+function cell(heading, text = "") {
   const made = document.createElement("td");
   made.className = "number";
+  made.dataset.label = heading;
   made.textContent = text;
   return made;
 }

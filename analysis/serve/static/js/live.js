@@ -1,4 +1,4 @@
-/** Keeps a page up to date while a launch writes: a light poll, and new content where it changed. */
+/** Live updates: polls the progress and replaces the content of the page after a change. */
 
 const PERIOD = 2000;
 const state = document.getElementById("state");
@@ -15,18 +15,18 @@ let token = document.body.dataset.token;
  * @property {number} launches_running
  */
 
-/** Say in the head of the page where the grid stands. @param {Progress} progress */
+/** Show the progress of the grid in the header. @param {Progress} progress */
 function say(progress) {
   const writing = progress.launches_running > 0 && progress.ended < progress.total;
   state.dataset.mode = writing ? "writing" : "still";
   const counts = `${progress.ended.toLocaleString("en")} of ${progress.total.toLocaleString("en")}`;
   const failed = progress.counts.failed ? `, ${progress.counts.failed} failed` : "";
-  const text = progress.total ? `${counts} trials ended${failed}` : "no trial yet";
+  const text = progress.total ? `${counts} trials ended${failed}` : "no trials yet";
   if (words.textContent !== text) words.textContent = text;
-  state.title = writing ? "A launch is writing; this page follows it." : "No launch is writing.";
+  state.title = writing ? "A launch is running; this page updates itself." : "No launch is running.";
 }
 
-/** Replace the parts of the page that show data by those of a fresh copy. */
+/** Replace the parts of the page that show data by their new content. */
 async function refresh() {
   const parts = document.querySelectorAll("[data-live]");
   if (!parts.length) return;
@@ -36,7 +36,7 @@ async function refresh() {
   for (const part of parts) {
     const next = fresh.getElementById(part.id);
     if (!next) {
-      location.reload(); // a trial that waited has ended: its page has charts now
+      location.reload(); // a pending trial has ended: its page now has charts
       return;
     }
     if (next.innerHTML === part.innerHTML) continue;
@@ -47,7 +47,7 @@ async function refresh() {
   }
 }
 
-/** Ask once, and tell the page when something changed. */
+/** Fetch the progress once; update the page after a change. */
 async function poll() {
   try {
     const answer = await fetch("/api/progress", { signal: AbortSignal.timeout(10_000) });
@@ -64,11 +64,11 @@ async function poll() {
     }
   } catch {
     state.dataset.mode = "lost";
-    words.textContent = "no answer";
+    words.textContent = "server not reachable";
   }
 }
 
-/** Poll for as long as somebody looks. */
+/** Poll while the page is visible. */
 async function follow() {
   if (!document.hidden) await poll();
   setTimeout(follow, PERIOD);

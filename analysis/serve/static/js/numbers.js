@@ -1,4 +1,4 @@
-/** Numbers as texts, in the way of the tables. */
+/** Number formats, the same as in the tables. */
 
 const RAISED = { "-": "⁻", 0: "⁰", 1: "¹", 2: "²", 3: "³", 4: "⁴", 5: "⁵", 6: "⁶", 7: "⁷", 8: "⁸", 9: "⁹" };
 

@@ -1,4 +1,4 @@
-/** The path of a trial in the phase plane, as a picture of vectors. */
+/** Phase-plane path of a trial as SVG. */
 
 import { ink } from "./plot.js";
 
@@ -49,7 +49,7 @@ function tickText(value, angle) {
  * @param {HTMLElement} place
  * @param {object} phase as the server gives it: x, y, start, labels, angles, box
  * @param {string} colour
- * @param {string} description for those who cannot see it
+ * @param {string} description for screen readers
  */
 export function drawPhase(place, phase, colour, description) {
   const ranges = [extent(phase.x, phase.box[0]), extent(phase.y, phase.box[1])];
@@ -88,7 +88,7 @@ function axes(svg, phase, ranges, across, up) {
   svg.append(shape("text", { class: "label", transform: `translate(15 ${middle}) rotate(-90)`, "text-anchor": "middle" }, phase.labels[1]));
 }
 
-/** The line of the path, lifted where the server broke it. */
+/** SVG path data, interrupted where the server inserted a break. */
 function path(phase, across, up) {
   let pen = "M";
   const pieces = [];

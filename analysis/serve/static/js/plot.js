@@ -1,4 +1,4 @@
-/** What all charts share: colours of the theme, axes, size, and a redraw when either changes. */
+/** Shared parts of all charts: theme colours, axes, and a redraw after a change of size or theme. */
 
 import { logText, logTicks, numeral } from "./numbers.js";
 
@@ -9,7 +9,7 @@ export function theme(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 }
 
-/** The colour of a line: black becomes the colour of text, so that it shows on dark. */
+/** The colour of a line: black becomes the text colour, which is visible on a dark background. */
 export function ink(colour) {
   return colour === "#000000" ? theme("text") : colour;
 }
@@ -49,7 +49,7 @@ export function axis(label, logarithmic = false, more = {}) {
   };
 }
 
-/** A tick of a linear axis, as many places as the spacing needs. */
+/** Text of a tick of a linear axis, with the decimals that the spacing needs. */
 function number(tick, ticks) {
   const step = ticks.length > 1 ? Math.abs(ticks[1] - ticks[0]) : 1;
   let places = 0;
@@ -99,7 +99,7 @@ export function plot(place, options, data, height) {
   return chart;
 }
 
-/** Say what a chart shows where it cannot be seen. */
+/** Set the description of a chart for screen readers. */
 export function describe(place, text) {
   place.setAttribute("aria-label", text);
 }

@@ -1,5 +1,7 @@
-/** The charts of one trial. */
+/** Trial page: charts of loss, inputs, spectrum and phase plane. */
 
+import { hoverBox } from "./hover.js";
+import { swatch } from "./legend.js";
 import { drawPhase } from "./phase.js";
 import { numeral } from "./numbers.js";
 import { axis, ink, logRange, plot, theme } from "./plot.js";
@@ -17,10 +19,15 @@ function line(colour, more = {}) {
   return { stroke: () => ink(colour), width: 1.6, points: { show: false }, ...more };
 }
 
+/** What a legend needs of a line. */
+function sample(colour, dash = []) {
+  return { colour, dash, line_width: 1.2 };
+}
+
 function drawLoss(found) {
-  const series = [{}, line(found.look.colour), line(found.look.colour, { dash: [5, 4], width: 1.2 })];
+  const series = [{}, line(found.legend_entry.colour), line(found.legend_entry.colour, { dash: [5, 4], width: 1.2 })];
   const range = () => logRange([...found.loss, ...found.reachable_loss].filter((one) => one !== null));
-  plot(
+  const chart = plot(
     part("loss"),
     {
       series,
@@ -31,12 +38,19 @@ function drawLoss(found) {
     [found.t, found.loss, found.reachable_loss],
     HEIGHT,
   );
+  hoverBox(part("loss"), chart, (index) => ({
+    title: `t = ${found.t[index]}`,
+    rows: [
+      { line: sample(found.legend_entry.colour), label: "evaluation grid", value: numeral(found.loss[index]) },
+      { line: sample(found.legend_entry.colour, [5, 4]), label: "reachable set", value: numeral(found.reachable_loss[index]) },
+    ],
+  }));
 }
 
 function drawInputs(found) {
   const times = found.t.map((t) => t * found.dt);
   const series = [{}, ...found.inputs.map((_, index) => line(paint(found, index), { width: 1.2 }))];
-  plot(
+  const chart = plot(
     part("inputs"),
     {
       series,
@@ -47,12 +61,28 @@ function drawInputs(found) {
     [times, ...found.inputs.map((one) => one.values)],
     HEIGHT,
   );
+  hoverBox(part("inputs"), chart, (index) => ({
+    title: `t = ${numeral(times[index])} s`,
+    rows: found.inputs.map((one, i) => ({ line: sample(paint(found, i)), label: one.label, value: numeral(one.values[index]) })),
+  }));
+  nameInputs(found);
   const names = found.inputs.length > 1 ? `Bound of the norm` : `Bound`;
   part("inputs-note").textContent = `${names}: γ = ${numeral(found.gamma, 3)}.`;
 }
 
+/** Write the legend of several inputs above their chart. */
+function nameInputs(found) {
+  const items = found.inputs.map((one, index) => {
+    const item = document.createElement("li");
+    item.append(swatch(sample(paint(found, index))), one.label);
+    return item;
+  });
+  part("inputs-legend").replaceChildren(...items);
+  part("inputs-legend").hidden = items.length < 2;
+}
+
 function paint(found, index) {
-  return found.inputs.length === 1 ? found.look.colour : PAINTS[index % PAINTS.length];
+  return found.inputs.length === 1 ? found.legend_entry.colour : PAINTS[index % PAINTS.length];
 }
 
 function drawSpectrum(found) {
@@ -64,10 +94,10 @@ function drawSpectrum(found) {
   const top = Math.max(...density);
   const range = () => logRange(density.filter((value) => value > top * 1e-5));
   const clipped = density.map((value) => Math.max(value, top * 1e-7) || null);
-  plot(
+  const chart = plot(
     part("spectrum"),
     {
-      series: [{}, line(found.look.colour, { width: 1.3 })],
+      series: [{}, line(found.legend_entry.colour, { width: 1.3 })],
       scales: { x: { time: false, distr: 3, log: 10, range: () => [frequency[0], frequency.at(-1)] }, y: { distr: 3, log: 10, range } },
       axes: [axis("frequency [Hz]", true, { size: 38 }), axis("density of u [unit²/Hz]", true, { size: 54 })],
       cursor: { y: false, drag: { x: false, y: false } },
@@ -76,6 +106,10 @@ function drawSpectrum(found) {
     [frequency, clipped],
     HEIGHT,
   );
+  hoverBox(part("spectrum"), chart, (index) => ({
+    title: `${numeral(frequency[index])} Hz`,
+    rows: [{ line: sample(found.legend_entry.colour), label: "density", value: numeral(density[index]) }],
+  }));
   part("spectrum-note").textContent = eigenfrequency
     ? `Dashed: eigenfrequency f₀ = ${numeral(eigenfrequency, 3)} Hz at the stable equilibrium, and 3 f₀.`
     : "The linearised system does not oscillate: there is no eigenfrequency.";
@@ -104,7 +138,7 @@ function mark(u, frequency) {
   ctx.restore();
 }
 
-/** Ask for the arrays and draw them all. */
+/** Fetch the arrays and draw all charts. */
 async function load() {
   try {
     const answer = await fetch(`/api/trials/${encodeURIComponent(charts.dataset.key)}/arrays`);
@@ -114,7 +148,7 @@ async function load() {
     drawInputs(found);
     drawSpectrum(found);
     if (found.phase && part("phase")) {
-      drawPhase(part("phase"), found.phase, found.look.colour, `Path in the plane of ${found.phase.labels.join(" and ")}`);
+      drawPhase(part("phase"), found.phase, found.legend_entry.colour, `Path in the plane of ${found.phase.labels.join(" and ")}`);
     }
     charts.dataset.drawn = "yes";
   } catch (error) {

@@ -1,0 +1,84 @@
+"""Model that a stored trial learned, as a function of the state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.errors import AnalysisError
+from dopt.spec.config import without_versions
+from dopt.spec.trial import TrialSpec
+from orchestrate.store import ConfigRow, Reader
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LearnedModel:
+    """The model of a trial with the parameters that it had learned at the end.
+
+    Attributes
+    ----------
+    spec : TrialSpec
+        The trial; ``spec.system`` has the true accelerations, ``spec.system.learned(states)``.
+    parameters : (q,)
+        Parameters of the model, as stored.
+    """
+
+    spec: TrialSpec
+    parameters: Array
+
+    def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike | None = None) -> Array:
+        """Return the learned accelerations, or with inputs the whole derivative of the state.
+
+        Parameters
+        ----------
+        states : (N, d) or (d,)
+            States in the units of ``spec.system.state_labels``.
+        inputs : (N, m) or (m,), optional
+            Inputs in the units of ``spec.system.input_labels``.
+
+        Returns
+        -------
+        (N, r) or (r,)
+            Accelerations at zero input, one for each learned row of the state, per second what that
+            state is measured in. With inputs dx/dt = known(x, u) + E a(x), (N, d) or (d,).
+
+        Raises
+        ------
+        AnalysisError
+            If the last axes are not those of the system's states and inputs.
+        """
+        x = _rows(states, self.spec.system.n_states, "states")
+        single = np.ndim(states) == 1
+        values = self.spec.model.predict(self.spec.system, self.parameters, x)
+        if inputs is not None:
+            u = _rows(inputs, self.spec.system.n_inputs, "inputs")
+            values = self._derivative(x, u, values)
+        return values[0] if single else values
+
+    def _derivative(self, x: Array, u: Array, accelerations: Array) -> Array:
+        system = self.spec.system
+        known = system.known(tuple(x.T), tuple(u.T), system.parameters)
+        flow = np.stack([np.broadcast_to(row, len(x)) for row in known], axis=-1).astype(float)
+        flow[:, list(system.learned_rows)] += accelerations
+        return flow
+
+
+def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
+    rows = np.atleast_2d(np.asarray(given, dtype=float))
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise AnalysisError(
+            f"{what} have the shape {np.shape(given)}, but (N, {size}) or ({size},) is expected: "
+            f"give one row for each point."
+        )
+    return rows
+
+
+def learned_model(reader: Reader, configuration: ConfigRow, seed: int) -> LearnedModel:
+    """Read the final parameters of a trial; raise ``QueryError`` where it is not finished."""
+    spec = TrialSpec.from_mapping({**without_versions(configuration.config), "seed": seed})
+    parameters = reader.trajectory(configuration.config_key, seed).parameters
+    return LearnedModel(spec, parameters)

@@ -1,0 +1,1 @@
+"""Control with the learned model (Figure 5)."""

@@ -1,0 +1,1 @@
+"""Spectrum of inputs (Figure 2, right)."""

@@ -1,0 +1,1 @@
+"""Loss curves (Figure 1)."""

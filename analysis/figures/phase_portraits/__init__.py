@@ -1,0 +1,1 @@
+"""Phase portraits (Figure 2, left and middle)."""

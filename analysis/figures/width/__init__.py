@@ -1,0 +1,1 @@
+"""Cost and loss against the width of the network (Figure 4)."""

@@ -1,0 +1,82 @@
+"""Line styles of policies and of other compared values; no plotting library is loaded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dopt.policies.titles import policy_title
+
+Dashes = str | tuple[float, tuple[float, ...]]
+"""``"-"``, or an offset and lengths of strokes and gaps in units of the line's width."""
+
+BLACK, GREY = "#000000", "#8c8c8c"
+VERMILLION, GREEN, BLUE, PURPLE = "#D55E00", "#009E73", "#0072B2", "#CC79A7"
+"""Colours of Okabe and Ito with a contrast of at least 3 : 1 to white."""
+
+GOLD, SEA, TEAL = "#a87b00", "#3a96c8", "#00594c"
+"""Their orange and sky blue, darkened to that contrast, and a dark green."""
+
+WINE, INDIGO, OLIVE, MAROON, ORCHID = "#882255", "#332288", "#999933", "#661100", "#aa4499"
+"""Muted colours of Paul Tol."""
+
+BROWN, PINK = "#8b4513", "#e7298a"
+
+
+@dataclass(frozen=True)
+class LineStyle:
+    """Label, colour and dashes of a line in every figure; ``width`` in points."""
+
+    label: str
+    colour: str
+    line: Dashes
+    width: float = 1.2
+
+
+# The policies of the paper come first: their greys, as printed, are as far apart as can be.
+_POLICIES: dict[str, tuple[str, Dashes, float]] = {
+    "d_optimal": (VERMILLION, "-", 1.6),
+    "oracle": (BLACK, (0, (4, 1.5)), 1.2),
+    "uniform": (PURPLE, (0, (6, 1.2, 1.2, 1.2)), 1.2),
+    "periodic": (BLUE, (0, (1.2, 1.2)), 1.4),
+    "random": (TEAL, (0, (2.5, 1.2)), 1.2),
+    "random_held": (GREEN, (0, (6, 1.2, 1.2, 1.2, 1.2, 1.2)), 1.2),
+    "random_sphere": (GOLD, (0, (8, 2)), 1.2),
+    "prbs": (WINE, (0, (1.2, 2.4)), 1.2),
+    "multisine": (INDIGO, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2)), 1.2),
+    "chirp": (OLIVE, (0, (6, 2.4)), 1.2),
+    "lookahead": (BLACK, (0, (9, 1)), 1.6),
+    "exact": (BROWN, (0, (5, 1)), 1.2),
+    "trace": (SEA, (0, (2, 1)), 1.2),
+    "trace_linearized": (GOLD, (0, (3, 1, 1, 1)), 1.2),
+    "a_optimal": (PURPLE, (0, (7, 1.5)), 1.2),
+    "e_optimal": (OLIVE, (0, (1, 2)), 1.2),
+    "task": (GREEN, (0, (5, 1, 1, 1, 1, 1)), 1.2),
+    "max": (PINK, (0, (4, 1, 1, 1)), 1.2),
+    "gaussian_process": (ORCHID, (0, (5, 1, 2, 1)), 1.2),
+    "gradient": (INDIGO, (0, (7, 1)), 1.2),
+    "linear": (MAROON, (0, (2, 1, 5, 1)), 1.2),
+}
+
+SEQUENCE = (VERMILLION, BLUE, GREEN, BLACK, PURPLE, GOLD, INDIGO, PINK, OLIVE, SEA, WINE, TEAL)
+"""Colours of the values of any other setting, in the order in which they are shown."""
+
+_DASHES: tuple[Dashes, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.2, 1.2, 1.2)))
+
+
+def policy_style(policy: str) -> LineStyle:
+    """Return a policy's style; policies of a user are grey, each with dashes from its name."""
+    if policy in _POLICIES:
+        return LineStyle(policy_title(policy), *_POLICIES[policy])
+    dash = 2.0 + sum(policy.encode()) % 7
+    return LineStyle(policy_title(policy), GREY, (0, (dash, 1.5)))
+
+
+def sequence_style(place: int, same: int, label: str, colour: str | None = None) -> LineStyle:
+    """Return the style of the value at a place, with ``same`` lines of its colour before it."""
+    dashes = _DASHES[(place // len(SEQUENCE) + same) % len(_DASHES)]
+    return LineStyle(label, colour or SEQUENCE[place % len(SEQUENCE)], dashes)
+
+
+def environment_title(env: str) -> str:
+    """Return the name of an environment as a title."""
+    return env.replace("_", " ")

@@ -1,0 +1,1 @@
+"""Outputs: the registry of figures and tables, and what is written for each."""

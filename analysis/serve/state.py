@@ -1,0 +1,28 @@
+"""State that all pages share: database, folder of figures and caches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from analysis.data.config_matching import Filter
+from analysis.data.trial_selection import Selection, select
+from analysis.serve.cache import Cache
+from analysis.serve.database import Database
+from analysis.serve.progress import read_progress
+from orchestrate.store import Reader
+
+
+@dataclass(frozen=True)
+class ServerState:
+    """The database, the folder of figures, and the caches of computed values."""
+
+    database: Database
+    figures: Path
+    cache: Cache = field(default_factory=Cache)
+    selections: Cache = field(default_factory=lambda: Cache(4))  # each contains all its trials
+
+    def select(self, reader: Reader, wanted: Filter) -> Selection:
+        """Return the requested trials; they are read again after any trial changed."""
+        key = ("selection", reader, read_progress(reader)["token"], repr(wanted))
+        return self.selections.get_or_compute(key, lambda: select(reader, wanted))

@@ -1,0 +1,1 @@
+"""Statistics: intervals, paired tests, scores of trials, spectra, control."""
