@@ -7,14 +7,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.fields import quantity
-from dopt.learning.base import Array, Updated, Updater
+from dopt.declare.validated_fields import parameter
+from dopt.learning.base import Array, CustomLearner, Updater
 from dopt.systems import System
-from dopt.view import View
+from dopt.trial_view import TrialView
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussNewton(Updated):
+class GaussNewton(CustomLearner):
     """θ ← θ + Jᵀ(J Jᵀ + δ I)⁻¹(y - a_θ(x)), for the samples x, y that are drawn at a step.
 
     Parameters
@@ -27,8 +27,8 @@ class GaussNewton(Updated):
 
     name: ClassVar[str] = "gauss_newton"
 
-    batch: int = quantity(8, "samples", "positive")
-    damping: float = quantity(1.0, bound="positive")
+    batch: int = parameter(8, "samples", "positive")
+    damping: float = parameter(1.0, bound="positive")
 
     def updater(
         self,
@@ -42,7 +42,7 @@ class _Updater(Updater):
     def __init__(self, batch: int, damping: float, rng: np.random.Generator) -> None:
         self._batch, self._damping, self._rng = batch, damping, rng
 
-    def update(self, view: View) -> Array:
+    def update(self, view: TrialView) -> Array:
         drawn = self._rng.choice(view.t, min(view.t, self._batch), replace=False)
         errors = (view.accelerations[drawn] - view.predict(view.states[drawn])).ravel()
         J = np.concatenate([view.jacobian(state) for state in view.states[drawn]])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.gymnasium import Environment
 from dopt.systems import Feature
 
@@ -33,12 +33,12 @@ class Swing(Environment):
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
 
-    id: str = quantity("Pendulum-v1")
-    gamma: float = quantity(2.0, "N m", "positive")
-    dt: float = quantity(0.05, "s", "positive")
-    horizon: int = quantity(200, "steps", "positive")
-    grid_half_widths: tuple[float, ...] = quantity((math.pi, 8.0), bound="positive")
-    grid_points: tuple[int, ...] = quantity((32, 32), bound="positive")
+    id: str = parameter("Pendulum-v1")
+    gamma: float = parameter(2.0, "N m", "positive")
+    dt: float = parameter(0.05, "s", "positive")
+    horizon: int = parameter(200, "steps", "positive")
+    grid_half_widths: tuple[float, ...] = parameter((math.pi, 8.0), bound="positive")
+    grid_points: tuple[int, ...] = parameter((32, 32), bound="positive")
 
     @staticmethod
     def known(

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.fields import quantity
+from dopt.declare.validated_fields import parameter
 from dopt.policies.base import OpenLoop
 from dopt.systems import Feature, System
 from dopt.systems.elementary import magnitude
@@ -31,15 +31,15 @@ class Boat(System):
     phase_plane: ClassVar[tuple[int, int]] = (0, 1)
     grid_indices: ClassVar[tuple[int, ...]] = (1,)
 
-    mass: float = quantity(2.0, "kg", "positive")
-    linear_drag: float = quantity(0.5, "kg/s", "nonnegative")
-    quadratic_drag: float = quantity(0.3, "kg/m", "nonnegative")
-    gamma: float = quantity(4.0, "N", "positive")
-    dt: float = quantity(0.05, "s", "positive")
-    horizon: int = quantity(200, "steps", "positive")
-    initial_state: tuple[float, ...] = quantity((0.0, 0.0))
-    grid_half_widths: tuple[float, ...] = quantity((3.0,), bound="positive")
-    grid_points: tuple[int, ...] = quantity((64,), bound="positive")
+    mass: float = parameter(2.0, "kg", "positive")
+    linear_drag: float = parameter(0.5, "kg/s", "nonnegative")
+    quadratic_drag: float = parameter(0.3, "kg/m", "nonnegative")
+    gamma: float = parameter(4.0, "N", "positive")
+    dt: float = parameter(0.05, "s", "positive")
+    horizon: int = parameter(200, "steps", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((3.0,), bound="positive")
+    grid_points: tuple[int, ...] = parameter((64,), bound="positive")
 
     @staticmethod
     def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
@@ -58,7 +58,7 @@ class Staircase(OpenLoop):
 
     name: ClassVar[str] = "staircase"
 
-    levels: int = quantity(8, "levels", "positive")
+    levels: int = parameter(8, "levels", "positive")
 
     def inputs(
         self,
