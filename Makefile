@@ -1,4 +1,5 @@
-# One command each, the same by hand and in CI. Every target sets up .venv by itself when missing.
+# One command each, the same by hand and in CI. Every target installs what it needs into .venv:
+# the package with its libraries to run grids and draw figures, the developers' tools for the rest.
 
 PYTHON ?= python3
 VENV := .venv
@@ -16,21 +17,57 @@ export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup test test-machines soak image lint format grid figures study claims smoke bench clean
+# One worker for each of two cores: tests with limits of seconds fail where more processes compete.
+# tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
+ALL := --numprocesses 2 --dist loadgroup --no-loadscope-reorder -m 'not soak and not machines and not image'
+# Tests of pure functions, of the configuration and of the architecture: no trial, no database server,
+# no cluster and no browser. Two files compile, or compose many grids, and are left to `make test`.
+FAST := tests/test_architecture.py tests/test_release.py tests/dopt/declare tests/dopt/math \
+	tests/dopt/spec tests/dopt/control tests/dopt/systems tests/analysis/stats tests/orchestrate/config \
+	--ignore=tests/dopt/systems/test_chain.py --ignore=tests/orchestrate/config/test_several_grids.py
+.PHONY: help setup run test test-fast test-lowest test-machines soak image coverage lint format docs \
+	grid figures study claims smoke bench clean
 
 help:  ## show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
 
-setup: $(VENV)/ready  ## create .venv with the tested versions
+setup: $(VENV)/dev  ## create .venv with the tested versions and the developers' tools
 
-$(VENV)/ready: pyproject.toml constraints.txt
+run: $(VENV)/run  ## create .venv with what grids and figures need
+
+# Python writes the bytecode of a library when it is first imported; pip would write all of it.
+$(VENV)/run: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable .
+	touch $@
+
+$(VENV)/dev: $(VENV)/run
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt pip
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[all]' --group dev
 	touch $@
 
 test: setup  ## run the test suite
 	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadgroup -m 'not soak and not machines and not image'
+	$(BIN)/python -m pytest $(ALL)
+
+test-fast: setup  ## run the tests of pure functions and of the configuration
+	$(BIN)/python -m pytest --numprocesses 2 --quiet $(FAST)
+
+test-lowest: .venv-lowest/ready  ## run the fast tests with the lowest versions that are supported
+	.venv-lowest/bin/python -m pytest --numprocesses 2 --quiet $(FAST)
+
+.venv-lowest/ready: pyproject.toml constraints-lowest.txt
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet --upgrade 'pip>=25.1'
+	.venv-lowest/bin/python -m pip install --quiet --no-compile --constraint constraints-lowest.txt --editable '.[all]' --group test
+	touch $@
+
+coverage: setup  ## run the test suite and require that 90 % of the lines are run
+	$(BIN)/coverage erase
+	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
+	$(BIN)/coverage run -m pytest $(ALL)
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report
 
 test-machines: setup  ## run grids on hosts that are lost and cut off, as root, in namespaces
 	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
@@ -46,6 +83,8 @@ lint: setup  ## check style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/codespell
+	$(BIN)/zizmor --quiet --offline .github
 	$(BIN)/hadolint --failure-threshold warning docker/Dockerfile .ci/postgres/Dockerfile
 	$(BIN)/check-jsonschema --quiet --builtin-schema vendor.compose-spec docker/compose.yaml docker/compose.hosts.yaml
 	$(BIN)/shellcheck docker/*.sh .ci/run .ci/image .ci/packages .ci/start_postgres .ci/postgres/*.sh
@@ -54,31 +93,34 @@ format: setup  ## apply the style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-grid: setup  ## run the paper's grid, or what is left of it
+docs: setup  ## build the pages and the API reference into site/, and fail on a broken link
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+grid: run  ## run the paper's grid, or what is left of it
 	$(BIN)/python orchestrate/launch.py -m 'env=glob(*)' 'policy=glob(*)' store.url='$(DB)'
 
 figures: grid  ## run the paper's grid and draw its figures
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures
 
-study: setup  ## run everything beyond the paper and compare it on one page, report/README.md
+study: run  ## run everything beyond the paper and compare it on one page, report/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=beyond store.url='$(STUDY_DB)'
 	$(BIN)/python -m analysis report --db '$(STUDY_DB)' --out report
 	$(BIN)/python -m analysis figures --db '$(STUDY_DB)' --out report/figures --only figure5_control --env pendulum cartpole arm quadrotor --policy $(CONTROLLED)
 
-claims: setup  ## run with 100 seeds what few leave open, and compare it on one page, report/claims/README.md
+claims: run  ## run with 100 seeds what few leave open, and compare it on one page, report/claims/README.md
 	$(BIN)/python orchestrate/launch.py -m experiment=claims store.url='$(CLAIMS_DB)'
 	$(BIN)/python -m analysis report --db '$(CLAIMS_DB)' --out report/claims
 	$(BIN)/python -m analysis figures --db '$(CLAIMS_DB)' --out report/claims/figures --only figure5_control --env pendulum --policy $(CONTROLLED)
 
-smoke: setup  ## a small grid and its figures, in a database of their own
+smoke: run  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'
 	$(BIN)/python -m analysis figures --db '$(SMOKE_DB)' --out figures/smoke
 
-bench: setup  ## print measured speed beside its targets, and draw cost against width
+bench: run  ## print measured speed beside its targets, and draw cost against width
 	$(BIN)/python -m benchmarks
 	$(BIN)/python orchestrate/launch.py -m experiment=width executor=local store.url='$(DB)'
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width_loss
 
 clean:  ## remove what the targets made, except results
-	rm -rf $(VENV) figures .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .venv-lowest figures site build htmlcov .coverage* .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from orchestrate.surroundings import pin_threads
+from orchestrate.executors.worker_environment import pin_threads
 
 pin_threads()
 

@@ -1,4 +1,4 @@
-"""Speed of other people's code for the same task.
+"""Reference speeds: the authors' code and other implementations of the same task.
 
 All were measured on one core of a two-core machine in float64: cartpole, two hidden layers of 16
 units (386 parameters), D-optimal policy. The authors' figures are those of the code that they

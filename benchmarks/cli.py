@@ -1,4 +1,4 @@
-"""The command line of the benchmarks, and the table that it prints."""
+"""Command line of the benchmarks and the table that it prints."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from benchmarks.rows import Row
 
 QUESTIONS = (
     "step",
+    "compiled_plugins",
     "jax_scan",
     "reference",
-    "shortfall",
+    "linearisation_gap",
     "evaluation",
     "trial",
     "width",

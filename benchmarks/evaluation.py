@@ -1,4 +1,4 @@
-"""What does the evaluation of a step cost, and how does that compare with the step itself?"""
+"""Cost of the evaluation of a step, compared with the step itself."""
 
 from __future__ import annotations
 

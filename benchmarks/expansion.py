@@ -1,4 +1,4 @@
-"""How long does a grid take to expand, and a finished one to be recognised? Whole processes."""
+"""Time to expand a grid and to recognise a finished one, as whole processes."""
 
 from __future__ import annotations
 

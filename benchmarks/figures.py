@@ -1,4 +1,4 @@
-"""How long do the figures take from two million rows? Real trials, each stored many times."""
+"""Time of all figures from two million rows: real trials, each stored many times."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.selection import ENVIRONMENTS
+from analysis.data.trial_selection import ENVIRONMENTS
 from benchmarks.launches import RECORD, claims_for, run_record
 from benchmarks.processes import database, run
 from benchmarks.rows import Row, Target
 from dopt.errors import IncompatibleError
-from dopt.exploration import run_trial
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from orchestrate.store import Store
 
 PAPER = ("random", "uniform", "periodic", "d_optimal", "oracle")

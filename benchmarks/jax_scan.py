@@ -1,4 +1,4 @@
-"""How fast is the same step as a JAX scan, the whole trial compiled? Only where JAX is installed.
+"""Speed of the same trial as a compiled JAX scan, where JAX is installed.
 
 It chooses the kernel's inputs: the same equations, random numbers and rules. The table says how
 many of its first inputs are the kernel's; where rounding once decides otherwise, the two part.
@@ -20,12 +20,12 @@ import numpy as np
 from benchmarks import anchors
 from benchmarks.rows import Anchor, Row
 from benchmarks.trials import TINY_GRID, cartpole, median_of, step_us
-from dopt.exploration import run_trial
 from dopt.learning import Adam
 from dopt.models import MLP
 from dopt.policies import DOptimal
 from dopt.randomness import draw
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems.features import feature_values
 
 

@@ -1,4 +1,4 @@
-"""Launches in this process, and stand-ins for what a launch tells the database."""
+"""Launches in this process, and stand-in records of a launch for the database."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from dopt.exploration import run_trial
 from dopt.kernel import warm_up
-from dopt.spec import TrialSpec
-from orchestrate.campaign import Work, launch_grid
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
+from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.grid import Grid
-from orchestrate.settings import LaunchSettings
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import Claim, LaunchRecord, Reader, RunRecord, Store
 
 RECORD = LaunchRecord(argv=["benchmarks"], overrides=[], host="benchmark", pid=1)
@@ -40,7 +40,7 @@ class Accounts:
 def launch_trials(url: str, specs: Sequence[TrialSpec], workers: int) -> Accounts:
     """Run the trials of one cell on the local executor."""
     settings = LaunchSettings(executor="local", store_url=url, workers=workers)
-    grid = Grid(list(specs), asked=len(specs), left_out={})
+    grid = Grid(list(specs), n_jobs=len(specs), left_out={})
     work = Work(run_trial, warm_up)
     code = launch_grid(grid, settings, RECORD, work, say=_nothing, stream=None)
     if code is not ExitCode.DONE:

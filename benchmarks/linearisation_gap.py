@@ -1,4 +1,4 @@
-"""How far the closed form of Proposition 1 falls short of the optimum that it approximates.
+"""Gap between the closed form of Proposition 1 and the optimum that it approximates.
 
 At every step of trials with the D-optimal policy, the exact gain of Definition 1 is evaluated at
 the input that was chosen and maximised over the sphere, both for the component k that was drawn,
@@ -7,7 +7,7 @@ which is what the proposition linearises, and for all learned components togethe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,18 +15,20 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from benchmarks.rows import Row
 from dopt.policies.gradient import GradientDOptimal
+from dopt.reference.batch import Lockstep
 from dopt.reference.exact_gain import ExactGain, Situation, candidates
-from dopt.reference.lockstep import Lockstep
-from dopt.spec import TrialSpec
+from dopt.spec.trial import TrialSpec
 
 Array = npt.NDArray[np.float64]
 
+ENVS = ("pendulum", "cartpole", "arm", "quadrotor")
 SEARCH = GradientDOptimal(candidates=64, starts=3, iterations=6)
 
 
 @dataclass(frozen=True)
-class Shortfall:
+class LinearisationGap:
     """Exact gains over the planned steps t = 1 ... T-1 of n trials, (n, T - 1) each.
 
     Attributes
@@ -56,10 +58,10 @@ class Shortfall:
 
 
 @torch.no_grad()
-def shortfalls(
+def linearisation_gaps(
     specs: Sequence[TrialSpec], search: GradientDOptimal = SEARCH
-) -> tuple[Shortfall, Shortfall]:
-    """Run trials of one D-optimal cell; return what they missed of one component and of all."""
+) -> tuple[LinearisationGap, LinearisationGap]:
+    """Run trials of one D-optimal configuration; return the gaps of one component and of all."""
     batch = Lockstep(specs)
     assert batch.information is not None, "the policy plans with an information matrix"
     single, whole = ExactGain(batch, single=True), ExactGain(batch)
@@ -72,7 +74,7 @@ def shortfalls(
         if t > 0:
             start = torch.cat([batch.inputs[:, t].unsqueeze(1), given], dim=1)
             found.append((_gains(single, start, now, search), _gains(whole, start, now, search)))
-    return _shortfall([one for one, _ in found]), _shortfall([every for _, every in found])
+    return _gap([one for one, _ in found]), _gap([every for _, every in found])
 
 
 def _gains(gain: ExactGain, start: Tensor, now: Situation, search: GradientDOptimal) -> Tensor:
@@ -82,5 +84,32 @@ def _gains(gain: ExactGain, start: Tensor, now: Situation, search: GradientDOpti
     return torch.stack([values[:, 0], torch.maximum(best, values.amax(1)), values.amin(1)], dim=-1)
 
 
-def _shortfall(gains: list[Tensor]) -> Shortfall:
-    return Shortfall(*(rows.numpy() for rows in torch.stack(gains, dim=1).unbind(-1)))
+def _gap(gains: list[Tensor]) -> LinearisationGap:
+    return LinearisationGap(*(rows.numpy() for rows in torch.stack(gains, dim=1).unbind(-1)))
+
+
+def measure(quick: bool) -> list[Row]:
+    """Return shares of the largest gain that D-optimal inputs missed, by system.
+
+    The gain is that of the drawn component, which is linearised, and that of all components.
+    """
+    seeds, horizon = (1, 6) if quick else (4, 100)
+    return [row for env in ENVS for row in _rows(env, seeds, horizon)]
+
+
+def _rows(env: str, seeds: int, horizon: int) -> Iterator[Row]:
+    names = {"policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
+    sections = {key: {"name": name} for key, name in names.items()}
+    spec = TrialSpec.from_mapping(
+        {"env": {"name": env, "horizon": horizon}, **sections, "path": "reference"}
+    )
+    one, every = linearisation_gaps([spec.with_seed(seed) for seed in range(seeds)])
+    for name, found in (("drawn component", one), ("all components", every)):
+        note = f"{seeds} trials of {horizon} steps"
+        yield Row(f"{env}, {name}, mean", float(found.relative.mean()), "", note=_spread(found))
+        yield Row(f"{env}, {name}, median", float(np.median(found.relative)), "", note=note)
+
+
+def _spread(found: LinearisationGap) -> str:
+    missed = float(found.of_range.mean())
+    return f"{missed:.2g} of what the input can change; at most {found.relative.max():.2g}"

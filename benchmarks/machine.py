@@ -1,4 +1,4 @@
-"""Where and with what something was measured."""
+"""Machine and library versions of a measurement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What does a trial cost beside its own work, in trials of two steps through a whole launch?"""
+"""Overhead of the orchestration for a trial: trials of two steps through a whole launch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long do the pages of the results browser take over twenty million rows?
+"""Response times of the results browser over twenty million rows.
 
 The database is one of SQLite that is made for it, or the PostgreSQL one that ``DOPT_BENCH_DB``
 names: that one is filled where it is empty, and kept.

@@ -1,4 +1,4 @@
-"""How long does the grid of Figure 1 take: every system, every policy, 100 seeds, all stored?"""
+"""Time of the grid of Figure 1: every system, every policy, 100 seeds, all stored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands as a user runs them: a whole process, its time and its memory."""
+"""Measurement of commands as whole processes: time and memory."""
 
 from __future__ import annotations
 

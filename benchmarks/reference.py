@@ -1,4 +1,4 @@
-"""How fast is the plain reference in torch, one trial at a time and a hundred in lockstep?"""
+"""Speed of the torch reference, one trial at a time and a hundred in lockstep."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def measure(quick: bool) -> list[Row]:
 
 
 def _rows(size: int, steps: int, device: str = "cpu") -> list[Row]:
-    from dopt.reference.lockstep import run_trials
+    from dopt.reference.batch import run_trials
 
     specs = [cartpole(seed=seed, horizon=steps) for seed in range(size)]
     result = run_trials(specs, device)[0]

@@ -1,4 +1,4 @@
-"""Write a grid down without running it: ``python -m benchmarks.register [key=value ...]``."""
+"""Registration of a grid without running it: ``python -m benchmarks.register [key=value ...]``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ sys.path.append(str(ROOT / "orchestrate"))  # where Hydra finds the sweeper
 
 def main() -> None:
     """Register the trials of the command line in its database."""
-    from orchestrate.grid import build_grid
-    from orchestrate.launch import read_command_line
+    from orchestrate.config.grid import build_grid
+    from orchestrate.config.request import read_command_line
 
     request = read_command_line()
     assert request is not None

@@ -1,4 +1,4 @@
-"""What a question answers with: a measured value beside its target and its anchor."""
+"""Rows of the benchmark table: a measured value beside its target and its reference speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Do two workers do twice the work of one, on whole D-optimal trials in turn?"""
+"""Scaling: throughput of two workers against one, on whole D-optimal trials in turn."""
 
 from __future__ import annotations
 

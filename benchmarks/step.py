@@ -1,4 +1,4 @@
-"""What does a step cost, by the kernel's own clocks, inside whole trials?"""
+"""Cost of a step, by the kernel's own clocks, inside whole trials."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many rows of steps a second does the results database take, committed trial by trial?"""
+"""Rows of steps that the results database takes a second, committed trial by trial."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.launches import RECORD, claims_for, run_record
 from benchmarks.processes import database
 from benchmarks.rows import Row, Target
 from benchmarks.trials import cartpole
-from dopt.exploration import run_trial
+from dopt.run import run_trial
 from orchestrate.store import Claim, Store
 
 ROUNDS = 4

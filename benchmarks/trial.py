@@ -1,4 +1,4 @@
-"""How long does a whole trial take, evaluated in every step and with everything around it?"""
+"""Time of a whole trial that is evaluated in every step."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from benchmarks import anchors
 from benchmarks.rows import Anchor, Row, Target
 from benchmarks.trials import LARGE_GRID, cartpole
-from dopt.exploration import run_trial
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 
 TIMES_FASTER = 40
 

@@ -1,4 +1,4 @@
-"""The trials that are measured: all in the cartpole, as the anchors are."""
+"""Trials that are measured: all on the cartpole, as are the reference speeds."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dopt.exploration import run_trial
 from dopt.result import TrialResult
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 
 TINY_GRID, LARGE_GRID = (2, 2, 2), (20, 20, 20)
 

@@ -1,4 +1,4 @@
-"""How does planning scale with the width of the network, in each form of the information matrix?"""
+"""Scaling of planning with the width of the network, in each form of the information matrix."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.rows import Row, Target
 from benchmarks.trials import TINY_GRID, cartpole
-from dopt.exploration import run_trial
-from dopt.spec import TrialSpec
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 
 WIDTHS = (8, 16, 32, 64, 128, 256)
 LARGEST_MATRIX = 2**30

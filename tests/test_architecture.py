@@ -1,34 +1,72 @@
-"""Who may import what: the layers, read from the imports themselves."""
+"""Rules of the architecture, read from the imports and docstrings of the packages."""
 
 from __future__ import annotations
 
 import ast
 import functools
+import itertools
 import json
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 from dopt.kernel.cache import COMPILED_SOURCES
+from tests.paths import ROOT
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("dopt", "orchestrate", "analysis")
+PACKAGES = ("dopt", "orchestrate", "analysis", "hydra_plugins")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
 ONLY_IN = {
-    "hydra": ("orchestrate/launch.py", "orchestrate/hydra_plugins/"),
-    "ray": ("orchestrate/executors/ray",),
+    "hydra": ("orchestrate/config/", "hydra_plugins/"),
+    "omegaconf": ("orchestrate/config/", "hydra_plugins/"),
+    "ray": ("orchestrate/executors/ray/",),
     "sqlalchemy": ("orchestrate/store/",),
     "psycopg": ("orchestrate/store/",),
     "torch": ("dopt/reference/", "orchestrate/executors/lockstep.py"),
     "numba": ("dopt/kernel/",),
     "gymnasium": ("dopt/gymnasium/",),
-    "matplotlib": ("analysis/",),
+    "matplotlib": (
+        "analysis/figures/",
+        "analysis/outputs/",
+        "analysis/animation/",
+        "analysis/report/",
+    ),
     "starlette": ("analysis/serve/",),
     "uvicorn": ("analysis/serve/",),
     "jinja2": ("analysis/serve/",),
 }
+
+NUMBERS = (
+    "analysis/data",
+    "analysis/stats",
+    "analysis/tables",
+    "analysis/report/numbers.py",
+    "analysis/report/variants.py",
+)
+"""Parts of the analysis that compute or select numbers and draw nothing."""
+
+BASE = {"errors", "records", "redaction", "cli_parser"}
+ORCHESTRATE_IMPORTS = {
+    "errors": set(),
+    "records": set(),
+    "redaction": set(),
+    "cli_parser": set(),
+    "config": BASE,
+    "executors": BASE | {"config"},
+    "store": {"records", "redaction"},
+    "queries": BASE | {"store"},
+    "runner": BASE | {"config", "executors", "store"},
+    "export": BASE | {"queries", "store"},
+    "commands": BASE | {"export", "queries", "runner", "store"},
+    "launch": BASE | {"executors", "runner"},
+    "__main__": BASE | {"commands", "store"},
+}
+"""Folders and modules of orchestrate that each one may import."""
+
+QUESTION_WORDS = ("What", "How", "Where", "Whether", "Who", "Whose", "When", "Why")
 
 
 def sources(package: str) -> list[Path]:
@@ -46,6 +84,41 @@ def imports(path: Path) -> frozenset[str]:
             assert node.level == 0, f"{path}: imports are absolute"
             names.add(str(node.module))
     return frozenset(names)
+
+
+def module_name(path: Path) -> str:
+    """Return the dotted name of a file; a package is the name of its folder."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@functools.cache
+def own_modules() -> frozenset[str]:
+    """Return all modules of the packages."""
+    return frozenset(module_name(path) for package in PACKAGES for path in sources(package))
+
+
+def own_imports(path: Path) -> Iterator[str]:
+    """Yield the modules of the packages that a file imports, also only to check types."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in own_modules())
+        elif isinstance(node, ast.ImportFrom) and node.module in own_modules():
+            names = (f"{node.module}.{alias.name}" for alias in node.names)
+            yield from (name if name in own_modules() else str(node.module) for name in names)
+
+
+def circle(arrows: Iterable[tuple[str, str]]) -> list[str]:
+    """Return a circle of the graph, empty if there is none."""
+    graph: dict[str, set[str]] = {}
+    for source, target in arrows:
+        if source != target:
+            graph.setdefault(source, set()).add(target)
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
 
 
 def importers(module: str) -> list[str]:
@@ -74,7 +147,7 @@ def test_the_science_knows_no_effects() -> None:
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
-    shared = ("orchestrate.store", "orchestrate.usage")
+    shared = ("orchestrate.store", "orchestrate.cli_parser")
     for path in sources("analysis"):
         names = imports(path)
         assert not {name.split(".")[0] for name in names} & {"torch", "ray", "hydra", "numba"}, path
@@ -84,12 +157,13 @@ def test_the_analysis_reads_through_the_store_alone() -> None:
 
 def test_what_is_compiled_is_made_of_sources_that_name_its_cache() -> None:
     """A change anywhere else would leave stale machine code where the launcher finds it."""
-    folders = tuple(f"dopt.{folder}" for folder in COMPILED_SOURCES)
+    folders = tuple(f"dopt.{source.removesuffix('.py')}" for source in COMPILED_SOURCES)
+    annotations = "dopt.types"  # which numba never reads
     for path in sources("dopt/kernel"):
         names = imports(path)
         if names & {"dopt.kernel.compiler"} and path.name != "equations.py":
             own = {name for name in names if name.startswith("dopt.")}
-            assert all(name.startswith(folders) for name in own), path
+            assert all(name.startswith((*folders, annotations)) for name in own), path
 
 
 def test_nothing_imports_the_analysis_but_itself() -> None:
@@ -103,27 +177,68 @@ def test_a_library_is_seen_by_one_layer(module: str) -> None:
         assert path.startswith(ONLY_IN[module]), f"{path} imports {module}"
 
 
-@pytest.mark.parametrize(
-    "folder", ["systems", "models", "policies", "learning", "planning", "control"]
-)
+@pytest.mark.parametrize("folder", ["systems", "models", "policies", "learning", "control"])
 def test_what_a_trial_is_does_not_depend_on_how_it_is_run(folder: str) -> None:
     for path in sources(f"dopt/{folder}"):
         for name in imports(path):
-            assert not name.startswith(("dopt.kernel", "dopt.reference", "dopt.exploration")), path
+            assert not name.startswith(("dopt.kernel", "dopt.reference", "dopt.run")), path
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_import_circle_even_for_types(package: str) -> None:
+    arrows = ((module_name(path), name) for path in sources(package) for name in own_imports(path))
+    assert not circle(arrows)
+
+
+@pytest.mark.parametrize("part", ORCHESTRATE_IMPORTS)
+def test_orchestrate_imports_downwards_only(part: str) -> None:
+    folder = ROOT / "orchestrate" / part
+    for path in sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]:
+        parts = {
+            name.split(".")[1] for name in own_imports(path) if name.startswith("orchestrate.")
+        }
+        assert parts <= ORCHESTRATE_IMPORTS[part] | {part}, path
+
+
+def test_every_part_of_orchestrate_has_its_place() -> None:
+    found = {path.relative_to(ROOT / "orchestrate").parts[0] for path in sources("orchestrate")}
+    assert {name.removesuffix(".py") for name in found} - {"__init__"} == set(ORCHESTRATE_IMPORTS)
+    arrows = ((part, name) for part, names in ORCHESTRATE_IMPORTS.items() for name in names)
+    assert not circle(arrows)
+
+
+def test_numbers_load_no_matplotlib() -> None:
+    paths = [ROOT / part for part in NUMBERS]
+    files = itertools.chain.from_iterable(
+        sorted(path.rglob("*.py")) if path.is_dir() else [path] for path in paths if path.exists()
+    )
+    modules = [module_name(path) for path in files]
+    assert len(modules) > 15
+    assert "matplotlib" not in loaded_by(", ".join(modules))
+
+
+def test_a_specification_loads_no_torch() -> None:
+    modules = ", ".join(module_name(path) for path in sources("dopt/spec"))
+    assert "torch" not in loaded_by(modules)
 
 
 def test_a_specification_loads_numpy_and_nothing_heavier() -> None:
-    third_party = loaded_by("dopt.spec") - set(sys.stdlib_module_names)
+    third_party = loaded_by("dopt.spec.trial") - set(sys.stdlib_module_names)
     assert {name for name in third_party if not name.startswith("_")} <= {"dopt", "numpy"}
 
 
 def test_a_trial_in_the_kernel_needs_no_torch() -> None:
-    assert "torch" not in loaded_by("dopt.exploration, dopt.kernel.run")
+    assert "torch" not in loaded_by("dopt.run, dopt.kernel.run")
 
 
 def test_the_read_side_loads_neither_torch_nor_ray_nor_hydra() -> None:
-    loaded = loaded_by("analysis.reading")
+    loaded = loaded_by("analysis.data.curves")
     assert not loaded & {"torch", "ray", "hydra", "numba"}
+
+
+def test_numbers_load_no_plotting_library() -> None:
+    modules = "analysis.report.variant_table, analysis.report.control, analysis.tables.registry"
+    assert "matplotlib" not in loaded_by(f"{modules}, analysis.serve.policy_labels")
 
 
 def test_every_package_is_typed_and_described() -> None:
@@ -131,3 +246,13 @@ def test_every_package_is_typed_and_described() -> None:
         for path in sources(package):
             tree = ast.parse(path.read_text())
             assert ast.get_docstring(tree) or not tree.body, f"{path} says nothing of itself"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_module_docstring_begins_with_a_noun_phrase(package: str) -> None:
+    first_words = {
+        module_name(path): (ast.get_docstring(ast.parse(path.read_text())) or "").split(" ")[0]
+        for path in sources(package)
+    }
+    riddles = {name: word for name, word in first_words.items() if word in QUESTION_WORDS}
+    assert not riddles

@@ -1,77 +1,300 @@
-"""The pages of ``docs/`` keep their word: queries answer on both databases, commands run."""
+"""The pages for readers are true: their commands run, their queries answer, their links resolve."""
 
 from __future__ import annotations
 
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
+from analysis import cli
+from benchmarks.cli import QUESTIONS
+from dopt.result import TrialResult
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+from orchestrate import __main__ as orchestrate
+from orchestrate import launch
+from orchestrate.commands import COMMANDS
 from orchestrate.store import Reader
 from orchestrate.store.schema import SCHEMA_VERSION, metadata
 from orchestrate.store.views import VIEWS
 from tests.analysis.synthetic import fill, make_grid
+from tests.pages import GENERATED, PAGES, Command, anchors, blocks, commands, links
+from tests.paths import EXAMPLE, ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGES = {path.name: path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))}
-QUERIES = re.findall(r"```sql\n-- (.*?)\n(.*?)```", PAGES["database.md"], flags=re.DOTALL)
+pytestmark = pytest.mark.xdist_group("docs")  # one database for all of them
+
+TUTORIAL = "docs/tutorial.md"
+PLUGINS = "docs/compiled_plugins.md"
+DATABASE = "docs/database.md"
+QUERIES = [
+    (question, query)
+    for block in blocks(PAGES[DATABASE], "sql")
+    for question, query in [block.removeprefix("-- ").split("\n", 1)]
+]
 EMPTY = {
     "which trials were run more than once, and what ended the other attempts?",
     "what failed, and why?",
 }
-LINKS = [
-    (page, link.split("#")[0])
-    for page, text in PAGES.items()
-    for link in re.findall(r"\]\(([^)]+)\)", text)
-    if "://" not in link and link.split("#")[0]
-]
+"""Questions to which a grid without faults has no answer."""
+
+SHORT = {"env": {"horizon": 40}}
+TASK = {"task": {"name": "control", "checkpoints": [20]}}
+
+MADE = {"docker/secrets"}
+"""Paths that a command of the page writes."""
+
+SHELL = {
+    "docs/install.md": {".", "make"},
+    "docs/many_machines.md": {"sh", "export", "docker", "mkdir", "git", "make", "set", "ray"},
+    "README.md": {"make"},
+}
+"""Programs that no test here runs, by page; those of three machines have tests of their own."""
+
+# Which commands a reader types
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def filled(request: pytest.FixtureRequest) -> str:
-    """Return a small grid in a database of each kind."""
-    url = str(request.getfixturevalue(f"{request.param}_url"))
-    short = {"env": {"horizon": 40}}
-    task = {"task": {"name": "control", "checkpoints": [20]}}
-    fill(url, make_grid(("pendulum", "cartpole"), seeds=range(8), **short))
-    fill(url, make_grid(("pendulum",), ("random",), seeds=range(8), **short, **task))
+def test_every_command_is_one_that_is_tested() -> None:
+    ours = {"launch.py", "orchestrate", "analysis", "benchmarks"}
+    for command in commands():
+        assert command.program in ours | SHELL.get(command.page, set()), command
+
+
+def test_every_target_of_make_exists() -> None:
+    text = "\n".join(PAGES[page] for page in PAGES if page not in GENERATED)
+    named = set(re.findall(r"^make ([a-z-]+)", text, flags=re.MULTILINE))
+    named |= set(re.findall(r"`make ([a-z-]+)`", text))
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+    assert {"figures", "test"} <= named <= set(targets)
+
+
+@pytest.mark.parametrize("command", commands("launch.py"), ids=str)
+def test_every_launch_command_is_accepted(
+    command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if "PYTHONPATH" in command.variables:
+        monkeypatch.syspath_prepend(str(EXAMPLE))
+    more: tuple[str, ...] = ()
+    if "-m" in command.words:
+        more = ("launch.dry_run=true", f"store.url=sqlite:///{tmp_path / 'results.db'}")
+        if not any(word.startswith("seed=") for word in command.words):
+            more = (*more, "seed=0")  # the same configurations, composed once and not 100 times
+    elif "--help" not in command.words:
+        more = ("--cfg", "job")
+    monkeypatch.setattr(sys, "argv", ["launch.py", *command.words, *more])
+    monkeypatch.chdir(ROOT)
+    try:
+        code = launch.main()
+    except SystemExit as end:  # Hydra's own after --help
+        code = end.code or 0  # type: ignore[assignment]
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    assert printed.out
+
+
+def _run_one(spec: TrialSpec, made_up: TrialResult) -> TrialResult:
+    """Run the trials of which a page makes a film: a film replays its trial."""
+    if (spec.system.name, spec.policy.name) != ("cartpole", "d_optimal"):
+        return made_up
+    untasked = {key: value for key, value in spec.to_mapping().items() if key != "task"}
+    result = run_trial(TrialSpec.from_mapping(untasked))
+    return replace(result, assessments=made_up.assessments)
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a small database with what the pages ask for: widths, learners and control."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('docs') / 'results.db'}"
+    both, seeds = ("pendulum", "cartpole"), range(5)
+    more = make_grid(both, ("lookahead", "random_held"), seeds, **SHORT, **TASK)
+    fill(url, make_grid(both, seeds=seeds, **SHORT, **TASK) + more, edit=_run_one)
+    ekf = {"learner": {"name": "ekf"}, **SHORT, **TASK}
+    fill(url, make_grid(both, ("d_optimal", "lookahead"), seeds, **ekf))
+    for width in (4, 8):
+        wide = {"model": {"width": width}, **SHORT, **TASK}
+        fill(url, make_grid(("cartpole",), ("d_optimal",), seeds, **wide))
     return url
 
 
-def test_there_are_eleven_queries() -> None:
-    assert len(QUERIES) == 11
+@pytest.fixture
+def typed(
+    database: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Callable[[Command], str]:
+    """Return a function that runs a command on the database, in a new folder: what it printed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DOPT_DB", database)
+
+    def run(command: Command) -> str:
+        words = list(command.words)
+        if "--db" in words:  # the database of a study, which takes hours
+            del words[words.index("--db") : words.index("--db") + 2]
+        code = orchestrate.main(words) if command.program == "orchestrate" else cli.main(words)
+        printed = capsys.readouterr()
+        assert code == 0, printed.err
+        return printed.out
+
+    return run
 
 
-def test_every_query_answers_on_both_databases(filled: str) -> None:
-    with Reader.open(filled) as reader:
-        for question, query in QUERIES:
-            assert reader.query(query) or question in EMPTY, question
+def _on_results(*programs: str) -> list[Command]:
+    """Return the commands outside the pages that are run as a whole; each of them once."""
+    found = [c for c in commands(*programs) if c.page not in (TUTORIAL, PLUGINS, *GENERATED)]
+    return list({c.words: c for c in found if c.words and c.words[0] != "COMMAND"}.values())
+
+
+@pytest.mark.parametrize("command", _on_results("orchestrate"), ids=str)
+def test_every_command_on_results_works(
+    command: Command, typed: Callable[[Command], str], database: str, tmp_path: Path
+) -> None:
+    (tmp_path / "results").mkdir()
+    shutil.copy(database.removeprefix("sqlite:///"), tmp_path / "results" / "other.db")
+    words = tuple("SELECT 1 AS one" if word == "SELECT ..." else word for word in command.words)
+    assert typed(Command(command.page, {}, "orchestrate", words))
+
+
+def test_every_command_has_a_line() -> None:
+    shown = {
+        c.words[0] for c in commands("orchestrate", pages=("docs/command_line.md",)) if c.words
+    }
+    assert shown - {"COMMAND"} == {command.name for command in COMMANDS}
+
+
+def _outputs(command: Command) -> list[str]:
+    return [
+        name
+        for word, name in zip(command.words, command.words[1:], strict=False)
+        if word == "--only"
+    ]
+
+
+FIGURES = sorted({name for c in _on_results("analysis") for name in _outputs(c)})
+
+
+def test_every_figure_has_a_line_and_a_command_that_draws_it() -> None:
+    """The pictures themselves are drawn by the tests of the figures and by the tutorial."""
+    rows = re.findall(r"^\| `(.*?)` \|", PAGES["docs/figures.md"], flags=re.MULTILINE)
+    assert set(cli.NAMES) <= set(rows)
+    assert {name for name in cli.NAMES if name.startswith("figure")} <= set(FIGURES)
+    for name in FIGURES:
+        assert cli.parser().read(["figures", "--only", name]).only == [name]
+
+
+@pytest.mark.parametrize(
+    "command", [c for c in _on_results("analysis") if not _outputs(c)], ids=str
+)
+def test_every_command_of_the_analysis_works(
+    command: Command, typed: Callable[[Command], str]
+) -> None:
+    extra = {"animate": ("--frames", "2"), "summary": (), "compare": (), "report": ()}
+    if command.words[0] == "serve":  # which does not end; its own tests start it
+        assert cli.parser().read(command.words)
+    else:
+        more = extra.get(command.words[0], ("--only", "summary"))
+        assert typed(Command(command.page, {}, "analysis", (*command.words, *more)))
+
+
+def test_every_benchmark_exists() -> None:
+    for command in commands("benchmarks"):
+        assert command.words[-1] in QUESTIONS, command
+
+
+# Queries
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def small(request: pytest.FixtureRequest) -> str:
+    """Return a small grid in a database of each kind."""
+    url = str(request.getfixturevalue(f"{request.param}_url"))
+    fill(url, make_grid(("pendulum", "cartpole"), seeds=range(8), **SHORT))
+    fill(url, make_grid(("pendulum",), ("random",), seeds=range(8), **SHORT, **TASK))
+    return url
+
+
+def _answers(url: str) -> dict[str, tuple[list[str], list[tuple[object, ...]]]]:
+    """Return the columns and rows of every query of the page, numbers to nine digits."""
+    with Reader.open(url) as reader:
+        tables = {question: reader.query(query) for question, query in QUERIES}
+    return {
+        question: (list(table.columns), [tuple(map(_rounded, row)) for row in table])
+        for question, table in tables.items()
+    }
+
+
+def _rounded(value: object) -> object:
+    return f"{value:.9g}" if isinstance(value, float) else value
+
+
+def test_every_query_answers_and_mixes_no_configurations(small: str) -> None:
+    """A second configuration of a cell adds rows, but changes none and doubles no step."""
+    before = _answers(small)
+    for question, (_, rows) in before.items():
+        assert rows or question in EMPTY, question
+    other = {"env": {"horizon": 40, "gamma": 3.0}}
+    fill(small, make_grid(("pendulum", "cartpole"), seeds=range(6), **other))
+    fill(
+        small,
+        make_grid(("cartpole",), ("d_optimal",), range(6), policy={"regularization": 0.1}, **SHORT),
+    )
+    for question, (columns, rows) in _answers(small).items():
+        assert set(before[question][1]) <= set(rows), question
+        assert len(set(rows)) == len(rows), question
+        if "t" in columns and "config_key" not in columns:
+            steps = [row[columns.index("t")] for row in rows]
+            assert len(set(steps)) == len(steps), question
+
+
+def test_the_page_counts_its_queries() -> None:
+    numbers = {"Eleven": 11, "Twelve": 12, "Thirteen": 13}
+    (said,) = re.findall(r"^## (\w+) useful queries$", PAGES[DATABASE], flags=re.MULTILINE)
+    assert numbers[said] == len(QUERIES)
 
 
 def test_every_table_and_view_is_described() -> None:
-    page = PAGES["database.md"]
+    page = PAGES[DATABASE]
     for name in (*metadata.tables, *VIEWS):
         assert f"`{name}`" in page or name == "alembic_version", name
     assert f"The schema is version {SCHEMA_VERSION}." in page
 
 
-@pytest.mark.parametrize(("page", "link"), LINKS)
-def test_every_link_leads_to_a_file(page: str, link: str) -> None:
-    assert (ROOT / "docs" / link).exists(), page
+# Links
 
 
-TUTORIAL = [
-    line.strip()
-    for line in PAGES["tutorial.md"].splitlines()
-    if re.match(r"    (PYTHON|python )", line)
-]
-SNIPPETS = re.findall(r"```python\n(.*?)```", PAGES["tutorial.md"], flags=re.DOTALL)
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_leads_to_a_file_and_a_heading(page: str) -> None:
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        target = (ROOT / page).parent / path if path else ROOT / page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target.read_text()), link
+
+
+def test_every_file_that_a_page_names_exists() -> None:
+    folders = "analysis|benchmarks|conf|docker|docs|dopt|orchestrate|tests"
+    for page, text in PAGES.items():
+        for path in re.findall(rf"`((?:{folders})/[\w./-]+)`", text):
+            if page not in GENERATED and path not in MADE:
+                assert (ROOT / path).exists(), f"{page}: {path}"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_no_page_says_that_it_is_out_of_date(page: str) -> None:
+    assert not re.search(r"out of date|outdated|no longer true|earlier version of", PAGES[page])
+
+
+# The tutorial, from its first command to its last
 
 
 @pytest.mark.long
@@ -80,11 +303,12 @@ def test_the_tutorial_runs_from_its_first_command_to_its_last(tmp_path: Path) ->
     """In a folder that looks like the repository, so that nothing is left in the real one."""
     for name in ("analysis", "dopt", "docs", "orchestrate"):
         (tmp_path / name).symlink_to(ROOT / name)
-    assert len(TUTORIAL) >= 15
-    for command in TUTORIAL:
-        if "serve" not in command:  # which does not end; its own tests start it
-            _run_in(tmp_path, command)
-    for snippet in SNIPPETS:
+    lines = [line for block in blocks(PAGES[TUTORIAL], "bash") for line in block.splitlines()]
+    assert len(lines) >= 15
+    for line in lines:
+        if "serve" not in line:  # which does not end; its own tests start it
+            _run_in(tmp_path, line)
+    for snippet in blocks(PAGES[TUTORIAL], "python"):
         _run_in(tmp_path, f"python -c {shlex.quote(snippet)}")
     written = {str(path.relative_to(tmp_path)) for path in (tmp_path / "figures").rglob("*.*")}
     assert {
@@ -110,18 +334,3 @@ def _run_in(folder: Path, command: str) -> None:
     )
     assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
     assert done.stdout, command
-
-
-def test_the_notebook_is_executed_and_runs_again(
-    sqlite_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    notebook = nbformat.read(ROOT / "docs" / "explore.ipynb", as_version=4)
-    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
-    assert sum("image/png" in str(cell.outputs) for cell in cells) >= 3
-    specs = make_grid(("pendulum", "cartpole"), ("d_optimal", "random"), range(6))
-    fill(sqlite_url, specs)
-    monkeypatch.setenv("DOPT_DB", sqlite_url)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    client = NotebookClient(notebook, timeout=200, resources={"metadata": {"path": str(tmp_path)}})
-    client.execute()  # raises what a cell raises

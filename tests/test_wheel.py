@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-SOURCES = ("dopt", "orchestrate", "analysis", "conf")
+from tests.paths import ROOT
+
+SOURCES = ("dopt", "hydra_plugins", "orchestrate", "analysis", "conf")
 FILES = ("pyproject.toml", "README.md", "LICENSE")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
 
@@ -68,7 +69,7 @@ def test_every_source_and_every_setting_is_in_it(wheel: Path) -> None:
     settings = {f"orchestrate/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
     sources = {
         str(path.relative_to(ROOT))
-        for package in ("dopt", "orchestrate", "analysis")
+        for package in ("dopt", "hydra_plugins", "orchestrate", "analysis")
         for path in (ROOT / package).rglob("*.py")
     }
     assert len(settings) > 20

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from benchmarks.cli import HEADERS, QUESTIONS, main, parser
 from benchmarks.launches import _accounts
 from benchmarks.rows import Anchor, Row, Target
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.paths import ROOT
 
 
 def table(text: str) -> list[dict[str, str]]:
@@ -64,7 +62,8 @@ def test_a_question_that_does_not_exist_is_refused(capsys: pytest.CaptureFixture
 @pytest.mark.parametrize("question", QUESTIONS)
 def test_every_question_has_a_file_of_its_own(question: str) -> None:
     text = (ROOT / "benchmarks" / f"{question}.py").read_text(encoding="utf-8")
-    assert "?" in text.splitlines()[0]
+    assert text.startswith('"""')
+    assert "\ndef measure(" in text
 
 
 def test_ratios_are_above_one_where_the_target_is_met() -> None:

@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.pages import PAGES
+from tests.paths import ROOT
+
 DOCKER = ROOT / "docker"
 COMPOSE = yaml.safe_load((DOCKER / "compose.yaml").read_text())
 HOSTS = yaml.safe_load((DOCKER / "compose.hosts.yaml").read_text())
@@ -131,14 +133,12 @@ def test_nobody_else_on_the_machine_reads_them(tmp_path: Path) -> None:
         assert path.stat().st_mode & 0o777 == 0o644  # the container's user reads its own copy
 
 
-def test_the_readme_names_services_and_variables_that_exist() -> None:
-    section = (ROOT / "README.md").read_text().split("## Three machines")[1].split("\n## ")[0]
-    named = re.findall(
-        r"^    docker compose (?:up|run) (.*?)(?:  #.*)?$", section, flags=re.MULTILINE
-    )
+def test_the_page_names_services_and_variables_that_exist() -> None:
+    section = PAGES["docs/many_machines.md"].split("## Three machines")[1].split("\n## ")[0]
+    named = re.findall(r"^docker compose (?:up|run) (.*?)(?:  #.*)?$", section, flags=re.MULTILINE)
     words = {word for line in named for word in line.split() if not word.startswith("--")}
     assert words - {"figures"} == {"db", "head", "worker", "launch", "analysis"}
     given = set(re.findall(r"(DOPT_\w+)=", section)) - {"DOPT_COMMIT"}
     assert given == set(re.findall(r"(DOPT_\w+):\?", (DOCKER / "compose.hosts.yaml").read_text()))
-    (files,) = set(re.findall(r"^    export COMPOSE_FILE=(\S+)$", section, flags=re.MULTILINE))
+    (files,) = set(re.findall(r"^export COMPOSE_FILE=(\S+)$", section, flags=re.MULTILINE))
     assert all((ROOT / file).is_file() for file in files.split(":"))

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from tests.docker.running.engine import Machine
+from tests.paths import ROOT
 
-ROOT = Path(__file__).resolve().parents[3]
 PASSWORD = 'a:b\\c d"e@/f'
 TOKEN = "token-that-nobody-else-has-0123456789"
 
@@ -26,7 +26,7 @@ def _engine() -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of what the services are started with, with secrets of its own."""
     root = tmp_path_factory.mktemp("checkout")
-    settings = "orchestrate/executors/ray.env"
+    settings = "orchestrate/executors/ray/ray.env"
     shutil.copytree(ROOT / "docker", root / "docker", ignore=shutil.ignore_patterns("secrets"))
     (root / settings).parent.mkdir(parents=True)
     shutil.copy(ROOT / settings, root / settings)

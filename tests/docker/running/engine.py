@@ -54,7 +54,7 @@ class Machine:
         return done
 
     def compose(self, *words: str, check: bool = True) -> Ended:
-        """Run ``docker compose`` as the README writes it."""
+        """Run ``docker compose`` as docs/many_machines.md writes it."""
         command = (sys.executable, "-m", "podman_compose", "--project-name", self.name)
         # A service that is named needs no profile with Docker, and one with podman.
         profile = ("--profile", "tools") if words[0] == "run" or words[-1] == "browser" else ()

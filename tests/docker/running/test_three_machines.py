@@ -1,23 +1,22 @@
-"""The README's commands for three machines, each machine a network namespace on one bridge."""
+"""The page's commands for three machines, each machine a network namespace on one bridge."""
 
 from __future__ import annotations
 
-import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.docker.running.conftest import ROOT
 from tests.docker.running.engine import Ended, Machine
+from tests.pages import PAGES, blocks
 
 pytestmark = [pytest.mark.image, pytest.mark.timeout(900)]
 
-SECTION = (ROOT / "README.md").read_text().split("## Three machines")[1].split("\n## ")[0]
+SECTION = PAGES["docs/many_machines.md"].split("## Three machines")[1].split("\n## ")[0]
 FIRST, OTHERS, LAST = (
     [line.split("  #")[0].strip() for line in block.splitlines()]
-    for block in re.findall(r"(?:^    .*\n)+", SECTION, flags=re.MULTILINE)
+    for block in blocks(SECTION, "bash")
 )
 SMALL = "launch -m experiment=smoke env.horizon=20"
 TRIALS = 38
@@ -40,7 +39,7 @@ def namespace(number: int) -> tuple[str, ...]:
 
 
 class Reader:
-    """Someone who types the README's lines at a machine, with a smaller grid."""
+    """Someone who types the page's lines at a machine, with a smaller grid."""
 
     def __init__(self, folder: Path, number: int) -> None:
         self.variables = {"DOPT_CPUS": "1"}
@@ -65,7 +64,7 @@ class Reader:
 
 @pytest.fixture(scope="module")
 def readers(folder: Path, _cleared: None) -> Iterator[list[Reader]]:
-    """Return three machines, on each of which the README's lines have been typed."""
+    """Return three machines, on each of which the page's lines have been typed."""
     for command in ("ip link add lan type bridge", "ip link set lan up"):
         subprocess.run(command.split(), check=True)
     readers = [Reader(folder, number) for number in (1, 2, 3)]
@@ -83,7 +82,7 @@ def readers(folder: Path, _cleared: None) -> Iterator[list[Reader]]:
     subprocess.run(["ip", "link", "delete", "lan"], check=True)
 
 
-def test_the_readme_runs_a_grid_on_three_machines(readers: list[Reader]) -> None:
+def test_the_page_runs_a_grid_on_three_machines(readers: list[Reader]) -> None:
     first = readers[0]
     launched = first.types(LAST[0])
     assert f"{TRIALS} of {TRIALS} done" in launched.stdout
