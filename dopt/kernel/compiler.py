@@ -30,7 +30,11 @@ def called_from_python(function: F) -> F:
 
 
 def contracted(function: F) -> F:
-    """Compile a function whose products and sums may be fused: a·b + c rounds once."""
+    """Compile a function whose products and sums may be fused: a·b + c rounds once.
+
+    Write x·x with :func:`squared`: Numba compiles the operator ``**`` as a function of its own,
+    with the liberties of whichever function uses it first in a process.
+    """
     return _njit(function, fastmath={"contract"})
 
 
@@ -39,8 +43,14 @@ def vectorized(function: F) -> F:
     return _njit(function, fastmath={"contract", "reassoc"})
 
 
-def _njit(function: F, **options: object) -> F:
-    return cast(F, stored(numba.njit(error_model="numpy", **options)(function)))
+def _njit(function: F, *, fastmath: bool | set[str] = False, nogil: bool = False) -> F:
+    """Compile a function whose rounding does not depend on which function calls it first.
+
+    Numba compiles a function once, and hands it the liberties of the caller for which it does so
+    unless ``fastmath`` is given, if only as False.
+    """
+    options = {"error_model": "numpy", "fastmath": fastmath, "nogil": nogil}
+    return cast(F, stored(numba.njit(**options)(function)))
 
 
 def compilable(function: F) -> F:
@@ -49,8 +59,14 @@ def compilable(function: F) -> F:
         helper = function.__globals__.get(name)
         if isinstance(helper, FunctionType) and helper.__module__ == function.__module__:
             compilable(helper)
-    register_jitable(function)
+    register_jitable(error_model="numpy", fastmath=False)(function)
     return function
+
+
+@compiled
+def squared(x: float) -> float:
+    """Return x², rounded by itself."""
+    return x * x
 
 
 @intrinsic

@@ -70,11 +70,15 @@ def _where(condition: NumbaType, first: NumbaType, second: NumbaType) -> NumbaTy
 def _compare_real_parts(compare: Callable[[Scalar, Scalar], Scalar]) -> None:
     """Let compiled equations compare complex states, by their real parts."""
 
+    def of_real_parts(a: Scalar, b: Scalar) -> Scalar:
+        return compare(a.real, b.real)
+
+    # Four functions of one name could share a symbol in the code of different processes.
+    of_real_parts.__qualname__ = of_real_parts.__name__ = f"{compare.__name__}_of_real_parts"
+
     @overload(compare, strict=False)
     def _compare(a: NumbaType, b: NumbaType) -> NumbaType:
-        if isinstance(a, types.Complex) or isinstance(b, types.Complex):
-            return lambda a, b: compare(a.real, b.real)
-        return None
+        return of_real_parts if any(isinstance(x, types.Complex) for x in (a, b)) else None
 
 
 for _comparison in (operator.gt, operator.ge, operator.lt, operator.le):
@@ -182,7 +186,7 @@ def _compiled_for(
     name = f"{function.__module__}.{function.__qualname__}.{sizes[0]}"
     into.__qualname__ = name if own else f"{name}.{next(_foreign)}"
     into.__name__ = into.__qualname__.replace(".", "_").replace("<", "_").replace(">", "_")
-    compiled = numba.njit(error_model="numpy")(into)
+    compiled = numba.njit(error_model="numpy", fastmath=False)(into)
     if own:  # the cache's folder is named after the package's sources: only they belong in it
         stored(compiled)
     try:

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from dopt.algorithm import FeatureKind
-from dopt.kernel.compiler import compiled, contracted, vectorized
+from dopt.kernel.compiler import compiled, contracted, squared, vectorized
 from dopt.kernel.structs import Network
 from dopt.kernel.tanh import tanh
 from dopt.types import Matrix, Real, Vector
@@ -191,12 +191,12 @@ def back_signals(
     depth = network.offsets.shape[0] - 1
     W, _ = layer(network, theta, depth)
     for i in range(deltas.shape[1]):
-        deltas[depth - 1, i] = W[component, i] * (1.0 - hidden[depth - 1, i] ** 2)
+        deltas[depth - 1, i] = W[component, i] * (1.0 - squared(hidden[depth - 1, i]))
     for index in range(depth - 1, 0, -1):
         W, _ = layer(network, theta, index)
         _transposed_product(W, deltas[index], deltas[index - 1])
         for i in range(deltas.shape[1]):
-            deltas[index - 1, i] *= 1.0 - hidden[index - 1, i] ** 2
+            deltas[index - 1, i] *= 1.0 - squared(hidden[index - 1, i])
 
 
 @contracted
@@ -241,7 +241,7 @@ def tangents_at(
             total = 0.0
             for j in range(below.shape[0]):
                 total += W[i, j] * below[j]
-            hidden_dot[index, i] = (1.0 - hidden[index, i] ** 2) * total
+            hidden_dot[index, i] = (1.0 - squared(hidden[index, i])) * total
         below = hidden_dot[index]
     W, _ = layer(network, theta, depth)
     for i in range(width):

@@ -17,4 +17,4 @@ def compiled_here(function: Callable[..., None]) -> CompiledFunction:
 
     The folder of the cache is named after the sources of this package, which do not hold it.
     """
-    return numba.njit(error_model="numpy")(compilable(function))
+    return numba.njit(error_model="numpy", fastmath=False)(compilable(function))

@@ -49,11 +49,16 @@ def adam_update(
 ) -> None:
     """Move θ, (q,), and the moments, (q,), along a gradient: step t + 1."""
     learning_rate, beta_1, beta_2, epsilon = numbers[0], numbers[1], numbers[2], numbers[3]
-    correction_1 = 1.0 - beta_1 ** (t + 1)
-    correction_2 = 1.0 - beta_2 ** (t + 1)
+    correction_1, correction_2 = _sum_of_weights(beta_1, t + 1), _sum_of_weights(beta_2, t + 1)
     for i in range(gradient.shape[0]):
         g = gradient[i]
         moment_1[i] = beta_1 * moment_1[i] + (1.0 - beta_1) * g
         moment_2[i] = beta_2 * moment_2[i] + (1.0 - beta_2) * g * g
         deviation = np.sqrt(moment_2[i] / correction_2)
         theta[i] -= learning_rate * (moment_1[i] / correction_1) / (deviation + epsilon)
+
+
+@compiled
+def _sum_of_weights(beta: float, n: int) -> float:
+    """Return the sum of the weights that a moment of decay β gives to n gradients."""
+    return float(1.0 - beta**n)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import TIE_MARGIN
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.policies.prediction import input_columns, predicted_state
 from dopt.kernel.structs import Trial
 from dopt.types import Matrix, Vector
@@ -59,7 +59,7 @@ def _distances(
     for s in range(t + 1):
         square = 0.0
         for i in range(d):
-            square += (point[i] - states[s, i]) ** 2
+            square += squared(point[i] - states[s, i])
         if square > 0.0:
             norm = np.sqrt(square)
             total += norm

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import Score
-from dopt.kernel.compiler import compiled, vectorized
+from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import inner
 from dopt.kernel.search.krylov import krylov_space, largest_eigenvalue
 from dopt.kernel.search.path import Path, model_and_jacobian, whiten
@@ -37,7 +37,7 @@ def score_of_path(score: int, path: Path, context: ScoreContext) -> float:
         if score == Score.A:
             total += inner(path.products[i], path.products[i])
         for j in range(context.probes.shape[0]):
-            total += inner(path.products[i], context.probes[j]) ** 2
+            total += squared(inner(path.products[i], context.probes[j]))
     return total
 
 
