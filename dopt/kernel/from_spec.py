@@ -12,6 +12,7 @@ from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
+from dopt.kernel.information import absent, dual, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
 from dopt.learning import Learner
 from dopt.learning.base import CompiledLearner
@@ -28,6 +29,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Vector
 
+MODULES = {Form.PRIMAL: primal_network, Form.DUAL: dual, Form.SKETCH: sketch}
 FEATURE_KINDS = {"identity": FeatureKind.IDENTITY, "cos": FeatureKind.COS, "sin": FeatureKind.SIN}
 
 
@@ -86,9 +88,17 @@ def algorithm_of(config: TrialConfig) -> args.Algorithm:
         np.array(policy.kernel_numbers(q, regularization)),
         np.array(learner.kernel_numbers(q, regularization)),
         _search(config),
-        isinstance(policy, InformationPolicy) and not learner.updates_information,
-        _form(config),
-        regularization,
+    )
+
+
+def information_of(config: TrialConfig) -> args.Information:
+    """Return the functions for the form that holds M, which are compiled when a trial runs."""
+    if not isinstance(config.policy, InformationPolicy):
+        return args.Information(absent.add_rows, absent.planning_forms)
+    module = primal_linear if isinstance(config.model, Linear) else MODULES[Form(_form(config))]
+    return args.Information(
+        absent.add_rows if config.learner.updates_information else module.add_rows,
+        absent.planning_forms if isinstance(config.policy, Search) else module.planning_forms,
     )
 
 
@@ -166,20 +176,20 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, a
     """Return the initial information in the chosen form; the other forms are empty."""
     policy = spec.policy
     form = _form(spec.config)
-    size, dual, sketch = 0, _empty_dual(spec, 0), count_sketch(0, 1)
+    size, rows, projection = 0, _empty_dual(spec, 0), count_sketch(0, 1)
     if form == Form.PRIMAL and _held(spec.config):
         size = q
     elif form == Form.DUAL:
-        dual = _empty_dual(spec, spec.system.horizon)
+        rows = _empty_dual(spec, spec.system.horizon)
     elif form == Form.SKETCH and isinstance(policy, DOptimal):
         size = policy.sketch_size
-        sketch = count_sketch(q, size)
+        projection = count_sketch(q, size)
     covariance = args.Covariance(
         np.eye(size) / _regularization(spec.config),
         np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
         np.zeros(1, dtype=np.int64),
     )
-    return covariance, dual, args.Sketch(*sketch, size)
+    return covariance, rows, args.Sketch(*projection, size)
 
 
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
@@ -192,6 +202,7 @@ def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
         np.empty((r, depth, states, width)),
         np.empty((r * states, r * states)),
         np.zeros(1, dtype=np.int64),
+        _regularization(spec.config),
     )
 
 

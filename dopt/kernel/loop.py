@@ -7,7 +7,6 @@ import numpy as np
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
 from dopt.kernel.evaluation import evaluation_buffers, follow_truth, model_error
-from dopt.kernel.information.update import update_information
 from dopt.kernel.structs import Evaluation, Learn, Plan, Plant, Trial
 from dopt.types import Vector
 
@@ -60,8 +59,7 @@ def advance(
         clock_3 = monotonic_microseconds()
         if not within(theta, np.inf):
             return t
-        if trial.algorithm.informed:
-            update_information(plant, network, trial.algorithm, trial.state, x)
+        trial.information.add_rows(plant, network, trial.state, x)
         clock_4 = monotonic_microseconds()
         if plant.history.shape[0] > 1:
             follow_truth(plant, network, points, t)

@@ -1,7 +1,7 @@
-"""Compilation of the loop, the policy and the learner of a trial for function pointers.
+"""Compilation of the loop and of the parts of a trial that it calls through function pointers.
 
-The loop is compiled once for all systems, policies and learners; a policy or a learner is compiled
-when a trial first needs it.
+The loop is compiled once for all systems, models, policies and learners; a policy, a learner or a
+form of the information matrix is compiled when a trial first needs it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dopt.errors import SpecificationError
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
 from dopt.kernel.loop import advance
-from dopt.kernel.structs import Evaluation, Plant, Trial
+from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Trial
 from dopt.kernel.user_code import compiled_here
 from dopt.learning.base import CompiledLearner, Learner
 from dopt.policies.base import CompiledPolicy, Policy
@@ -37,8 +37,24 @@ class Compiled(NamedTuple):
 def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evaluation) -> Compiled:
     """Compile the loop for a trial, with the functions of its policy and its learner."""
     plan, learn = signatures(trial)
+    compile_information(trial)
     loop = compiled_loop(trial, points)
     return Compiled(loop, function_of(policy, plan), function_of(learner, learn))
+
+
+def compile_information(trial: Trial) -> None:
+    """Compile the functions of the form in which a trial holds M."""
+    kinds = _information_signatures(trial.plant, trial.network, trial.state)
+    for function, signature in zip(trial.information, kinds, strict=True):
+        path = f"{function.__module__}.{function.__name__}"
+        compiled_for(path, function, signature.args)
+
+
+def _information_signatures(
+    plant: Plant, network: Network, state: State
+) -> tuple[NumbaType, NumbaType]:
+    given = (*map(kind_of, (plant, network, state)), float64[::1])
+    return types.void(*given), float64[:, ::1](*given, float64[:, ::1], int64)
 
 
 def signatures(trial: Trial) -> tuple[NumbaType, NumbaType]:
@@ -96,12 +112,18 @@ def _own(
 
 
 def kind_of(value: object) -> NumbaType:
-    """Return the type of an argument for numba; of equations, that of a pointer to them."""
+    """Return the type of an argument for numba; of a compiled function, that of a pointer to it."""
     if not isinstance(value, tuple):
         return numba.typeof(value)
-    kinds = [kind_of(item) for item in value[3 if isinstance(value, Plant) else 0 :]]
     if isinstance(value, Plant):
-        kinds = [*map(pointer, (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)), *kinds]
+        equations = (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)
+        kinds = [*map(pointer, equations), *map(kind_of, value[len(equations) :])]
+    elif isinstance(value, Trial):
+        functions = _information_signatures(value.plant, value.network, value.state)
+        information = types.NamedTuple([*map(pointer, functions)], Information)
+        kinds = [information if isinstance(part, Information) else kind_of(part) for part in value]
+    else:
+        kinds = [*map(kind_of, value)]
     return types.NamedTuple(kinds, type(value))
 
 

@@ -9,7 +9,13 @@ import numpy as np
 from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
 from dopt.kernel.evaluation_points import own_targets
-from dopt.kernel.from_spec import constants, empty_record, empty_scratch, initial_state
+from dopt.kernel.from_spec import (
+    constants,
+    empty_record,
+    empty_scratch,
+    information_of,
+    initial_state,
+)
 from dopt.kernel.pointers import compiled_trial
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import draw
@@ -46,6 +52,7 @@ class KernelTrial:
             plant,
             network,
             algorithm,
+            information_of(spec.config),
             args.Randomness(*(getattr(draws, name) for name in args.Randomness._fields)),
             initial_state(spec, draws.weights),
             empty_scratch(spec, network),

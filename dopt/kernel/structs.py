@@ -63,14 +63,11 @@ class Search(NamedTuple):
 
 
 class Algorithm(NamedTuple):
-    """Settings of policy and learner, and how the information matrix M is held."""
+    """Settings of policy and learner."""
 
     policy: Vector  # numbers of the policy, in the order that its kernel function takes
     learner: Vector  # numbers of the learner, in the order that its kernel function takes
     search: Search
-    informed: bool  # whether the policy plans with an M that the learner does not update
-    form: int  # of M, dopt.algorithm.Form
-    regularization: float  # λ of M₀ = λI
 
 
 class Randomness(NamedTuple):
@@ -121,6 +118,7 @@ class Dual(NamedTuple):
     deltas: Stack  # (r, L, T, w)
     factor: Matrix  # (r T, r T), C in the lower triangle
     n_states: Integers  # (1,)
+    regularization: float  # λ of M₀ = λI
 
 
 class Sketch(NamedTuple):
@@ -180,6 +178,24 @@ class Record(NamedTuple):
     evaluate_us: Vector  # (T,)
 
 
+AddRows = Callable[[Plant, Network, State, Vector], None]
+"""Addition of JᵀJ to M at a state, (d,), and the current parameters."""
+
+PlanningForms = Callable[[Plant, Network, State, Vector, Matrix, int], Matrix]
+"""Products xᵀM⁻¹y for x and y among g and the columns of D B, (1 or 1 + m, 1 + m).
+
+Given a state, (d,), the columns of B as rows, (m, d), and the component of a_θ whose gradient g is.
+With one input the row of g is enough: the quadratic term of equation 7 is constant on the sphere.
+"""
+
+
+class Information(NamedTuple):
+    """Compiled functions for the form that holds M (:mod:`dopt.kernel.information`)."""
+
+    add_rows: AddRows
+    planning_forms: PlanningForms
+
+
 class Trial(NamedTuple):
     """All that the policy and the learner of a trial work on.
 
@@ -190,6 +206,7 @@ class Trial(NamedTuple):
     plant: Plant
     network: Network
     algorithm: Algorithm
+    information: Information
     randomness: Randomness
     state: State
     scratch: Scratch

@@ -6,22 +6,24 @@ the cache. Reading it there is a matter of seconds.
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from dopt.kernel.cache import completed
 from dopt.kernel.equations import compiled_equations
-from dopt.kernel.pointers import compiled_loop, function_of, signatures
+from dopt.kernel.pointers import compile_information, compiled_loop, function_of, signatures
 from dopt.kernel.run import KernelTrial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 
-SHARES = (("loop",), ("policy", "learner", "equations"))
-"""Parts that each process compiles; together they take about as long."""
+ENDS = ("first", "last")
+"""Ends of the list of parts, at which the two processes begin."""
 
 SECONDS_BETWEEN_MESSAGES = 5.0
 
@@ -30,10 +32,10 @@ _log = logging.getLogger("dopt.kernel")
 
 def compile_in_two_processes() -> None:
     """Fill the cache; what a process could not compile is left to whoever needs it."""
-    if len(os.sched_getaffinity(0)) < len(SHARES):
+    if len(os.sched_getaffinity(0)) < len(ENDS):
         return
-    start, total = time.perf_counter(), len(SYSTEMS) + 3
-    running = [_started(share) for share in SHARES]
+    start, total = time.perf_counter(), len(SYSTEMS) + 5
+    running = [_started(end) for end in ENDS]
     said = -SECONDS_BETWEEN_MESSAGES
     try:
         while any(process.poll() is None for process in running):
@@ -51,32 +53,35 @@ def compile_in_two_processes() -> None:
             process.wait()
 
 
-def _started(share: tuple[str, ...]) -> subprocess.Popen[bytes]:
+def _started(end: str) -> subprocess.Popen[bytes]:
     place = str(Path(__file__).resolve().parents[2])
     paths = os.pathsep.join(filter(None, (place, os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", __spec__.name, *share],  # no module of the working folder
+        [sys.executable, "-P", "-m", __spec__.name, end],  # no module of the working folder
         env=os.environ | {"PYTHONPATH": paths},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
 
 
-def compile_share(share: list[str]) -> None:
-    """Compile parts of the kernel as a trial of the paper needs them."""
+def compile_parts(end: str) -> None:
+    """Compile the parts of the kernel that a trial of the paper needs, beginning at one end.
+
+    The two processes meet: what the other has compiled is only loaded.
+    """
     spec = TrialSpec.from_names({"name": "pendulum", "grid_points": [2, 2]}, "d_optimal")
     trial = KernelTrial(spec)
     plan, learn = signatures(trial.trial)
-    if "policy" in share:
-        function_of(spec.policy, plan)
-    if "loop" in share:
-        compiled_loop(trial.trial, trial.constants[3])
-    if "learner" in share:
-        function_of(spec.learner, learn)
-    if "equations" in share:
-        for system in SYSTEMS.values():
-            compiled_equations(system())
+    parts: list[Callable[[], object]] = [
+        lambda: compiled_loop(trial.trial, trial.constants[3]),
+        lambda: function_of(spec.learner, learn),
+        *(functools.partial(compiled_equations, system()) for system in SYSTEMS.values()),
+        lambda: function_of(spec.policy, plan),
+        lambda: compile_information(trial.trial),
+    ]
+    for part in parts if end == "first" else reversed(parts):
+        part()
 
 
 if __name__ == "__main__":
-    compile_share(sys.argv[1:])
+    compile_parts(sys.argv[1])

@@ -19,8 +19,27 @@ import numpy as np
 
 from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.information.primal import inner
-from dopt.kernel.structs import Dual, Linearization
+from dopt.kernel.model import all_components, linearization_at
+from dopt.kernel.structs import Dual, Linearization, Network, Plant, State
 from dopt.types import Matrix, Stack, Vector
+
+
+@compiled
+def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
+    """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
+    value = np.zeros(plant.learned_rows.shape[0])
+    phi, hidden, deltas = all_components(network, state.theta, x, value)
+    _rank_update(state.dual, phi, hidden, deltas)
+
+
+@compiled
+def planning_forms(
+    plant: Plant, network: Network, state: State, bar: Vector, columns: Matrix, component: int
+) -> Matrix:
+    """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
+    value = np.empty(plant.learned_rows.shape[0])
+    point = linearization_at(network, state.theta, bar, columns, component, value)
+    return _forms(state.dual, point, component)
 
 
 @compiled
@@ -45,7 +64,7 @@ def stored_below(dual: Dual, n: int, index: int) -> Matrix:
 
 
 @compiled
-def dual_forms(dual: Dual, regularization: float, point: Linearization, component: int) -> Matrix:
+def _forms(dual: Dual, point: Linearization, component: int) -> Matrix:
     """Return xᵀM⁻¹y, (1 + m, 1 + m), for x and y among g and the columns of D B."""
     n, r = dual.n_states[0], dual.deltas.shape[0]
     products = _products(dual, n, point, component)
@@ -53,14 +72,12 @@ def dual_forms(dual: Dual, regularization: float, point: Linearization, componen
     out = _own_products(point)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            out[i, j] = (out[i, j] - inner(products[i], products[j])) / regularization
+            out[i, j] = (out[i, j] - inner(products[i], products[j])) / dual.regularization
     return out
 
 
 @compiled
-def dual_rank_update(
-    dual: Dual, regularization: float, phi: Vector, hidden: Matrix, deltas: Stack
-) -> None:
+def _rank_update(dual: Dual, phi: Vector, hidden: Matrix, deltas: Stack) -> None:
     """Add the r rows of J at one state, given the passes there; ``deltas`` is (r, L, w)."""
     n, r = dual.n_states[0], deltas.shape[0]
     _store(dual, n, phi, hidden, deltas)
@@ -82,7 +99,7 @@ def dual_rank_update(
             dual.factor[R, i] = rows[k, i]
         # A Schur complement of λI + GGᵀ: never below λ but for rounding.
         rest = rows[k, R] - inner(rows[k, :R], rows[k, :R])
-        dual.factor[R, R] = np.sqrt(regularization + max(rest, 0.0))
+        dual.factor[R, R] = np.sqrt(dual.regularization + max(rest, 0.0))
     dual.n_states[0] = n + 1
 
 

@@ -1,16 +1,14 @@
-"""Update of the information matrix by a sample, and the correction of θ that goes with it."""
+"""Rows of J for either model, and the filter step of the learners that use them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import Form, ModelKind
+from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled
-from dopt.kernel.information.dual import dual_rank_update
 from dopt.kernel.information.primal import rank_update
-from dopt.kernel.information.sketch import sketched
 from dopt.kernel.model import add_linear, all_components, network_rows, regressors
-from dopt.kernel.structs import Algorithm, Covariance, Network, Plant, State
+from dopt.kernel.structs import Covariance, Network, Plant
 from dopt.types import Matrix, Vector
 
 
@@ -24,22 +22,6 @@ def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: 
         return rows
     phi, hidden, deltas = all_components(network, theta, x, value)
     return network_rows(network, phi, hidden, deltas, theta.shape[0])
-
-
-@compiled
-def update_information(
-    plant: Plant, network: Network, algorithm: Algorithm, state: State, x: Vector
-) -> None:
-    """Add JᵀJ at a state and the current parameters to M, in the form that holds it."""
-    residuals = np.zeros(plant.learned_rows.shape[0])
-    if network.kind != ModelKind.LINEAR and algorithm.form == Form.DUAL:
-        phi, hidden, deltas = all_components(network, state.theta, x, residuals)
-        dual_rank_update(state.dual, algorithm.regularization, phi, hidden, deltas)
-        return
-    rows = model_rows(plant, network, state.theta, x, residuals)
-    if network.kind != ModelKind.LINEAR and algorithm.form == Form.SKETCH:
-        rows = sketched(state.sketch, rows)
-    rank_update(state.covariance, rows, residuals, np.empty(rows.shape))
 
 
 @compiled

@@ -1,0 +1,35 @@
+"""The q × q information matrix of the linear model in compiled code."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.kernel.compiler import compiled
+from dopt.kernel.information.primal import quadratic_forms, rank_update
+from dopt.kernel.model import linear_gradients, regressors
+from dopt.kernel.structs import Network, Plant, State
+from dopt.types import Matrix, Vector
+
+
+@compiled
+def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:  # noqa: ARG001  # one signature for all forms
+    """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
+    r = plant.learned_rows.shape[0]
+    rows = np.empty((r, state.theta.shape[0]))
+    regressors(plant, x, rows, np.empty(r))
+    rank_update(state.covariance, rows, np.zeros(r), np.empty(rows.shape))
+
+
+@compiled
+def planning_forms(
+    plant: Plant,
+    network: Network,  # noqa: ARG001
+    state: State,
+    bar: Vector,
+    columns: Matrix,
+    component: int,
+) -> Matrix:
+    """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
+    m = columns.shape[0]
+    G = linear_gradients(plant, state.theta.shape[0], bar, columns, component)
+    return quadratic_forms(state.covariance, G[: 1 if m == 1 else 1 + m], G)
