@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,6 +20,7 @@ import pytest
 
 from dopt.kernel import cache, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
+from dopt.kernel.compiler import compiled, contracted, squared, vectorized
 from dopt.kernel.equations import compiled_equations
 from dopt.systems import SYSTEMS, Chain, Pendulum, System
 from tests.paths import ROOT
@@ -216,3 +219,44 @@ def test_a_function_compiled_for_another_is_not_stored(tmp_path: Path) -> None:
     subprocess.run([sys.executable, tmp_path / "pair.py"], check=True, env=environment)
     found = [path.name.partition("-")[0] for path in tmp_path.rglob("*.nbi")]
     assert found == ["pair.outer"]
+
+
+ROUNDED = 1.0 + 2.0**-27
+"""A number whose square is not a double: fused, x² - fl(x²) is not zero."""
+
+
+@pytest.mark.parametrize("liberal", [contracted, vectorized])
+def test_rounding_does_not_depend_on_which_function_calls_first(
+    liberal: Callable[[Callable[..., float]], Callable[..., float]],
+) -> None:
+    """Numba compiles a function once, and would hand it the liberties of its first caller."""
+
+    @compiled
+    def difference(x: float, z: float) -> float:
+        return x * x - z
+
+    @liberal
+    def first(x: float, z: float) -> float:
+        return difference(x, z)
+
+    assert first(ROUNDED, ROUNDED * ROUNDED) == 0.0
+    assert difference(ROUNDED, ROUNDED * ROUNDED) == 0.0
+
+
+def test_a_square_is_rounded_before_it_enters_a_sum() -> None:
+    @contracted
+    def with_square(x: float, z: float) -> float:
+        return squared(x) - z
+
+    assert with_square(ROUNDED, ROUNDED * ROUNDED) == 0.0
+
+
+def test_no_function_that_may_fuse_uses_the_operator_of_powers() -> None:
+    """It is compiled as a function of its own, with the liberties of whichever uses it first."""
+    for path in (ROOT / "dopt" / "kernel").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                names = {d.id for d in node.decorator_list if isinstance(d, ast.Name)}
+                if names & {"contracted", "vectorized"}:
+                    powers = [n for n in ast.walk(node) if isinstance(n, ast.Pow)]
+                    assert not powers, f"{path.name}: {node.name}"
