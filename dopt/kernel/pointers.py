@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import NamedTuple
 
 import numba
+import numpy as np
 from numba import float64, int64, types
 from numba.core.errors import NumbaError
 
@@ -36,10 +37,32 @@ class Compiled(NamedTuple):
 
 def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evaluation) -> Compiled:
     """Compile the loop for a trial, with the functions of its policy and its learner."""
-    plan, learn = signatures(trial)
-    compile_information(trial)
-    loop = compiled_loop(trial, points)
-    return Compiled(loop, function_of(policy, plan), function_of(learner, learn))
+    key = (layout_of(trial), layout_of(points), _source(policy), _source(learner))
+    if key not in _trials:
+        plan, learn = signatures(trial)
+        compile_information(trial)
+        loop = compiled_loop(trial, points)
+        _trials[key] = Compiled(loop, function_of(policy, plan), function_of(learner, learn))
+    return _trials[key]
+
+
+_trials: dict[Hashable, Compiled] = {}
+
+
+def layout_of(value: object) -> Hashable:
+    """Return what the type of an argument for Numba depends on, which takes longer to find out."""
+    if isinstance(value, tuple):
+        return (type(value), *map(layout_of, value))
+    if isinstance(value, np.ndarray):
+        return value.dtype.char, value.ndim, value.flags.num
+    return type(value) if isinstance(value, (int, float)) else value
+
+
+def _source(part: Policy | Learner) -> Hashable:
+    """Return what tells the compiled function of a policy or a learner from others."""
+    if isinstance(part, CompiledPolicy):
+        return part.plan
+    return part.learn if isinstance(part, CompiledLearner) else part.kernel_function
 
 
 def compile_information(trial: Trial) -> None:

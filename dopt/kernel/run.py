@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 
 import numpy as np
@@ -16,7 +17,7 @@ from dopt.kernel.from_spec import (
     information_of,
     initial_state,
 )
-from dopt.kernel.pointers import compiled_trial
+from dopt.kernel.pointers import Compiled, compiled_trial
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import draw
 from dopt.result import TrialResult
@@ -72,6 +73,10 @@ class KernelTrial:
         """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
         return self.record.states
 
+    @functools.cached_property
+    def _code(self) -> Compiled:
+        return compiled_trial(self.spec.policy, self.spec.learner, self.trial, self.constants[3])
+
     def advance(self, last: int) -> None:
         """Run the steps up to ``last``, unless they are done or the trial has diverged.
 
@@ -87,10 +92,10 @@ class KernelTrial:
             )
         if self.diverged_at is not None or last <= self.done:
             return
-        points = self.constants[3]
-        before = self.done
-        code = compiled_trial(self.spec.policy, self.spec.learner, self.trial, points)
-        self.done = code.advance(self.trial, points, code.plan, code.learn, self.done, last)
+        before, code = self.done, self._code
+        self.done = code.advance(
+            self.trial, self.constants[3], code.plan, code.learn, self.done, last
+        )
         _check_inputs(self.spec, self.record.inputs, before, self.done)
         if self.done < last:
             self.diverged_at = self.done
