@@ -20,7 +20,7 @@ from orchestrate.store import Store
 
 PAPER = ("random", "uniform", "periodic", "d_optimal", "oracle")
 SEEDS = 212
-"""With 19 cells of 500 steps, two million rows."""
+"""With 19 configurations of 500 steps, two million rows."""
 
 
 def measure(quick: bool) -> list[Row]:
@@ -36,20 +36,20 @@ def measure(quick: bool) -> list[Row]:
 
 
 def fill(url: str, seeds: int) -> int:
-    """Store one real trial of each cell under many seeds, its losses scaled; return the rows."""
+    """Store a trial of each configuration under many seeds, losses scaled; return the rows."""
     rows = 0
     with Store.open(url) as store:
         launch = store.begin_launch(RECORD)
-        for cell in _cells():
-            result = run_trial(cell)
-            claims = claims_for(store, launch, [cell.with_seed(seed) for seed in range(seeds)])
+        for spec in _specs():
+            result = run_trial(spec)
+            claims = claims_for(store, launch, [spec.with_seed(seed) for seed in range(seeds)])
             items = [(claim, _varied(result, i), run_record()) for i, claim in enumerate(claims)]
-            rows += sum(store.commit_many(items)) * cell.system.horizon
+            rows += sum(store.commit_many(items)) * spec.system.horizon
         store.end_launch(launch, "done")
     return rows
 
 
-def _cells() -> Iterator[TrialSpec]:
+def _specs() -> Iterator[TrialSpec]:
     for env in ENVIRONMENTS:
         for policy in PAPER:
             linear = policy == "oracle"

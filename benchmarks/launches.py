@@ -38,7 +38,7 @@ class Accounts:
 
 
 def launch_trials(url: str, specs: Sequence[TrialSpec], workers: int) -> Accounts:
-    """Run the trials of one cell on the local executor."""
+    """Run the trials of one configuration on the local executor."""
     settings = LaunchSettings(executor="local", store_url=url, workers=workers)
     grid = Grid(list(specs), n_jobs=len(specs), left_out={})
     work = Work(run_trial, warm_up)

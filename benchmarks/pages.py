@@ -22,7 +22,7 @@ from benchmarks.rows import Row, Target
 from orchestrate.store import NoDatabaseError, Reader
 
 SEEDS = 2_120
-"""With 19 cells of 500 steps, twenty million rows."""
+"""With 19 configurations of 500 steps, twenty million rows."""
 
 LISTS = ("/", "/trials", "/trials?env=cartpole&sort=final_loss", "/api/progress")
 CURVES = ("/api/curves?env=pendulum", "/api/curves?env=quadrotor", "/compare?env=pendulum")

@@ -20,7 +20,7 @@ def measure(quick: bool) -> list[Row]:
     minutes = (long + (SEEDS - more) * each) / 60
     cores = len(os.sched_getaffinity(0))
     note = f"extended from {more} seeds at {each:.2f} s each, {cores} workers"
-    return [Row("19 cells × 100 seeds", minutes, "min", Target(3, 5), note=note)]
+    return [Row("19 configurations × 100 seeds", minutes, "min", Target(3, 5), note=note)]
 
 
 def _seconds(folder: str, seeds: int) -> float:

@@ -238,7 +238,7 @@ def _rounded(value: object) -> object:
 
 
 def test_every_query_answers_and_mixes_no_configurations(small: str) -> None:
-    """A second configuration of a cell adds rows, but changes none and doubles no step."""
+    """A second configuration of a policy adds rows, but changes none and doubles no step."""
     before = _answers(small)
     for question, (_, rows) in before.items():
         assert rows or question in EMPTY, question

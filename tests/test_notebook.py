@@ -21,7 +21,7 @@ def test_it_is_executed() -> None:
 
 
 @pytest.mark.parametrize("opened_in", ["docs", "."])
-def test_it_runs_on_two_configurations_of_a_cell(
+def test_it_runs_on_two_configs_of_a_policy(
     opened_in: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In the root of a repository and in its docs; the other configuration has as many trials."""

@@ -49,7 +49,7 @@ def _entry(reader: Reader, env: str, policy: str) -> Entry:
     chosen = [
         entry
         for entry in select(reader, Filter(environments=(env,))).entries
-        if entry.cell.policy == policy
+        if entry.config.policy == policy
     ]
     if not chosen:
         # Asked for by name, the policy is found or refused with the names there are.
@@ -61,7 +61,7 @@ def _median(entry: Entry) -> int:
     losses = entry.final_losses()
     if not losses:
         raise AnalysisError(
-            f"{entry.cell.env} × {entry.cell.policy} has no finished trial that did not diverge: "
-            f"run one, or give --seed."
+            f"{entry.config.env} × {entry.config.policy} has no finished trial that did not "
+            f"diverge: run one, or give --seed."
         )
     return median_seed(losses)

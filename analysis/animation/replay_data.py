@@ -66,14 +66,14 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
         through the stored states.
     """
     spec = _specification(entry, seed)
-    stored = reader.trajectory(entry.cell.config_key, seed)
-    curves = reader.curves(entry.cell.config_key)
+    stored = reader.trajectory(entry.config.config_key, seed)
+    curves = reader.curves(entry.config.config_key)
     loss = curves.values[int(np.flatnonzero(curves.seeds == seed)[0])]
     end = int(np.isfinite(stored.states).all(axis=1).sum()) - 1
     if end < 1:
         raise AnalysisError(
-            f"Seed {seed} of {entry.cell.env} × {entry.cell.policy} diverged at its first steps, "
-            f"so that there is nothing to show: choose another with --seed."
+            f"Seed {seed} of {entry.config.env} × {entry.config.policy} diverged at its first "
+            f"steps, so that there is nothing to show: choose another with --seed."
         )
     steps = np.unique(np.linspace(0, end, frames).round().astype(np.int64))
     seen = rerun(spec, steps.tolist())
@@ -81,8 +81,8 @@ def tell(reader: Reader, entry: Entry, seed: int, frames: int) -> Story:
     states = stored.states[: end + 1]
     learned = [spec.model.predict(spec.system, theta, states) for theta in seen.parameters]
     return Story(
-        entry.cell.env,
-        entry.cell.policy,
+        entry.config.env,
+        entry.config.policy,
         seed,
         spec.system,
         seen.steps,
@@ -101,18 +101,19 @@ def _specification(entry: Entry, seed: int) -> TrialSpec:
     if seed not in finished:
         listed = ", ".join(map(str, sorted(finished)[:10])) or "none"
         raise AnalysisError(
-            f"{entry.cell.env} × {entry.cell.policy} has no finished trial of seed {seed}, "
+            f"{entry.config.env} × {entry.config.policy} has no finished trial of seed {seed}, "
             f"finished are {listed}: choose one of these with --seed."
         )
-    return TrialSpec.from_mapping({**without_versions(entry.cell.config), "seed": seed})
+    return TrialSpec.from_mapping({**without_versions(entry.config.config), "seed": seed})
 
 
 def _check_same(replayed: Array, stored: Array, entry: Entry, seed: int) -> None:
     if not np.allclose(replayed, stored, rtol=1e-6, atol=1e-9):
         raise AnalysisError(
-            f"Seed {seed} of {entry.cell.env} × {entry.cell.policy} runs another way here than it "
-            f"did when it was stored, so what its model knew is not known: it was run by another "
-            f"version or on another kind of machine, run it again here in a database of its own."
+            f"Seed {seed} of {entry.config.env} × {entry.config.policy} runs another way here than "
+            f"it did when it was stored, so what its model knew is not known: it was run by "
+            f"another version or on another kind of machine, run it again here in a database of "
+            f"its own."
         )
 
 

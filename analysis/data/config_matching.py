@@ -40,7 +40,7 @@ Setting = tuple[str, str, str]
 class Candidate:
     """A configuration and the number of its registered trials."""
 
-    cell: ConfigRow
+    config: ConfigRow
     n_trials: int
 
 
@@ -60,18 +60,19 @@ class Filter:
     reference: str = REFERENCE
     group_by: tuple[str, ...] = ("policy",)
 
-    def accepts(self, cell: ConfigRow) -> bool:
+    def accepts(self, config: ConfigRow) -> bool:
         return (
-            (not self.environments or cell.env in self.environments)
-            and (not self.policies or cell.policy in self.policies)
+            (not self.environments or config.env in self.environments)
+            and (not self.policies or config.policy in self.policies)
             and all(
-                flatten(cell.config).get(path, value) == value for path, value in self.where.items()
+                flatten(config.config).get(path, value) == value
+                for path, value in self.where.items()
             )
         )
 
-    def check_where(self, cells: Sequence[ConfigRow]) -> None:
+    def check_where(self, configs: Sequence[ConfigRow]) -> None:
         """Raise AnalysisError for a condition that no stored configuration meets."""
-        flat = [flatten(cell.config) for cell in cells]
+        flat = [flatten(config.config) for config in configs]
         for path, value in self.where.items():
             stored = {json.dumps(entry[path]) for entry in flat if path in entry}
             if not stored:
@@ -102,8 +103,8 @@ def choose(candidates: Iterable[Candidate], reference: str = REFERENCE) -> list[
     """Return one configuration for each (environment, policy); raise AnalysisError on a tie."""
     groups: dict[str, list[Candidate]] = {}
     for candidate in candidates:
-        groups.setdefault(candidate.cell.env, []).append(candidate)
-    return [cell for group in groups.values() for cell in _choose_policies(group, reference)]
+        groups.setdefault(candidate.config.env, []).append(candidate)
+    return [config for group in groups.values() for config in _choose_policies(group, reference)]
 
 
 def choose_by(
@@ -116,25 +117,30 @@ def choose_by(
     """
     groups: dict[tuple[object, ...], list[Candidate]] = {}
     for candidate in candidates:
-        values = [setting_value(candidate.cell, key) for key in keys]
+        values = [setting_value(candidate.config, key) for key in keys]
         if None not in values:
-            groups.setdefault((candidate.cell.env, *map(repr, values)), []).append(candidate)
+            groups.setdefault((candidate.config.env, *map(repr, values)), []).append(candidate)
     chosen = [_choose_policies(group, reference) for group in groups.values()]
-    return [min(cells, key=lambda one: (one.policy != reference, one.policy)) for cells in chosen]
+    return [
+        min(configs, key=lambda one: (one.policy != reference, one.policy)) for configs in chosen
+    ]
 
 
-def setting_value(cell: ConfigRow, key: str) -> object:
+def setting_value(config: ConfigRow, key: str) -> object:
     """Return a value by column (``width``) or by dotted path (``env.gamma``), None without one."""
     if key in CONFIG_COLUMNS:
-        return getattr(cell, key)
-    return flatten(cell.config).get(key)
+        return getattr(config, key)
+    return flatten(config.config).get(key)
 
 
-def check_keys(keys: Sequence[str], cells: Sequence[ConfigRow]) -> None:
+def check_keys(keys: Sequence[str], configs: Sequence[ConfigRow]) -> None:
     """Raise AnalysisError for a setting that no configuration has."""
     for key in keys:
-        if all(setting_value(cell, key) is None for cell in cells):
-            known = {*CONFIG_COLUMNS, *(path for cell in cells for path in flatten(cell.config))}
+        if all(setting_value(config, key) is None for config in configs):
+            known = {
+                *CONFIG_COLUMNS,
+                *(path for config in configs for path in flatten(config.config)),
+            }
             near = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.4)
             raise AnalysisError(
                 f"'{key}' is no setting of a stored configuration, but a column or a dotted path "
@@ -144,40 +150,40 @@ def check_keys(keys: Sequence[str], cells: Sequence[ConfigRow]) -> None:
 
 
 def _choose_policies(group: Sequence[Candidate], reference: str) -> list[ConfigRow]:
-    setting = _setting(_reference(group, reference).cell)
+    setting = _setting(_reference(group, reference).config)
     chosen = []
-    for policy in sorted({candidate.cell.policy for candidate in group}):
-        own = [candidate for candidate in group if candidate.cell.policy == policy]
-        same = [candidate for candidate in own if _setting(candidate.cell) == setting]
-        world = [candidate for candidate in own if _setting(candidate.cell)[0] == setting[0]]
+    for policy in sorted({candidate.config.policy for candidate in group}):
+        own = [candidate for candidate in group if candidate.config.policy == policy]
+        same = [candidate for candidate in own if _setting(candidate.config) == setting]
+        world = [candidate for candidate in own if _setting(candidate.config)[0] == setting[0]]
         if same or world:
-            chosen.append(_most(same or world).cell)
+            chosen.append(_most(same or world).config)
     return chosen
 
 
 def _reference(group: Sequence[Candidate], reference: str) -> Candidate:
     """Return the candidate that fixes the setting; see the top of this file for the order."""
-    pool = [candidate for candidate in group if candidate.cell.policy == reference] or group
+    pool = [candidate for candidate in group if candidate.config.policy == reference] or group
     totals: Counter[Setting] = Counter()
     policies: dict[Setting, set[str]] = {}
     for candidate in group:
-        setting = _setting(candidate.cell)
+        setting = _setting(candidate.config)
         totals[setting] += candidate.n_trials
-        policies.setdefault(setting, set()).add(candidate.cell.policy)
+        policies.setdefault(setting, set()).add(candidate.config.policy)
 
     def rank(candidate: Candidate) -> tuple[int, ...]:
-        setting = _setting(candidate.cell)
+        setting = _setting(candidate.config)
         alone = len(policies[setting]) < 2
-        return -alone, totals[setting], candidate.n_trials, *nearness(candidate.cell)
+        return -alone, totals[setting], candidate.n_trials, *nearness(candidate.config)
 
     best = _first(pool, rank)
-    if len({_setting(candidate.cell) for candidate in best}) > 1:
+    if len({_setting(candidate.config) for candidate in best}) > 1:
         raise _tie(best)
     return best[0]
 
 
 def _most(candidates: Sequence[Candidate]) -> Candidate:
-    best = _first(candidates, lambda one: (one.n_trials, *nearness(one.cell)))
+    best = _first(candidates, lambda one: (one.n_trials, *nearness(one.config)))
     if len(best) > 1:
         raise _tie(best)
     return best[0]
@@ -191,25 +197,25 @@ def _first(
     return [candidate for candidate in candidates if rank(candidate) == top]
 
 
-def nearness(cell: ConfigRow) -> tuple[int, int, int]:
+def nearness(config: ConfigRow) -> tuple[int, int, int]:
     """Return a key by which the configuration that is nearest to the defaults is the largest.
 
     The model and the learner that a launch takes by itself come first, then fewer values that are
     not defaults of what is named, then no task: it changes nothing of the trial.
     """
-    usual, parts = defaults(cell), _sections(cell)
+    usual, parts = defaults(config), _sections(config)
     task = parts.pop("task", None) is not None
     own = flatten(parts) if usual else {}
     names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
     return -sum(names), -sum(usual.get(path) != value for path, value in own.items()), -task
 
 
-def defaults(cell: ConfigRow) -> dict[str, object]:
+def defaults(config: ConfigRow) -> dict[str, object]:
     """Return the defaults of what a configuration names, without a task, as dotted paths.
 
     There are none where it holds a system or policy of a user's own, which is not registered here.
     """
-    names = {key: {"name": section.get("name")} for key, section in _sections(cell).items()}
+    names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
     names.pop("task", None)
     try:
         return flatten(TrialSpec.from_mapping(names).to_mapping())
@@ -217,24 +223,24 @@ def defaults(cell: ConfigRow) -> dict[str, object]:
         return {}
 
 
-def _sections(cell: ConfigRow) -> dict[str, Mapping[str, Any]]:
-    return {key: value for key, value in cell.config.items() if isinstance(value, Mapping)}
+def _sections(config: ConfigRow) -> dict[str, Mapping[str, Any]]:
+    return {key: value for key, value in config.config.items() if isinstance(value, Mapping)}
 
 
 def _tie(pool: Sequence[Candidate]) -> AnalysisError:
     first = pool[0]
-    path, values = difference([candidate.cell.config for candidate in pool])
+    path, values = difference([candidate.config.config for candidate in pool])
     listed = ", ".join(json.dumps(value, ensure_ascii=False) for value in values)
     return AnalysisError(
-        f"{len(pool)} configurations of {first.cell.env} × {first.cell.policy} have "
+        f"{len(pool)} configurations of {first.config.env} × {first.config.policy} have "
         f"{first.n_trials} trials each and differ in {path} ({listed}): "
         f"choose one with --where {path}={json.dumps(values[0], ensure_ascii=False)}."
     )
 
 
-def _setting(cell: ConfigRow) -> Setting:
+def _setting(config: ConfigRow) -> Setting:
     env, model, learner = (
-        json.dumps(cell.config.get(section), sort_keys=True)
+        json.dumps(config.config.get(section), sort_keys=True)
         for section in ("env", "model", "learner")
     )
     return env, model, learner

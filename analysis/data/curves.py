@@ -14,7 +14,7 @@ def read_curves(reader: Reader, entry: Entry, column: str) -> Curves:
 
     A launch may be writing: trials that ended after the selection was made are left out.
     """
-    curves = reader.curves(entry.cell.config_key, column)
+    curves = reader.curves(entry.config.config_key, column)
     kept = np.isin(curves.seeds, [trial.seed for trial in entry.finished])
     return Curves(curves.seeds[kept], curves.t, curves.values[kept], curves.diverged[kept])
 

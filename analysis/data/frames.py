@@ -29,7 +29,7 @@ from orchestrate.store import ConfigRow, Curves, Reader, default_url
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 _MEASURED = ("seed", "t", "measure", "value", "diverged")
-_OF_CELL = (
+_OF_CONFIG = (
     "env",
     "policy",
     "model",
@@ -114,7 +114,7 @@ class Results:
 
     def configurations(self) -> pd.DataFrame:
         """Return one row for each configuration, with the number of its trials by status."""
-        table = pd.DataFrame([asdict(cell) for cell in self._cells()])
+        table = pd.DataFrame([asdict(config) for config in self._configs()])
         return table.set_index("config_key")
 
     def shown(self) -> pd.DataFrame:
@@ -123,15 +123,15 @@ class Results:
         The rows are those of :meth:`configurations`. Raises ``AnalysisError`` where two
         configurations fit equally well.
         """
-        chosen = choose(Candidate(cell, cell.n) for cell in self._cells())
-        return self.configurations().loc[[cell.config_key for cell in chosen]]
+        chosen = choose(Candidate(config, config.n) for config in self._configs())
+        return self.configurations().loc[[config.config_key for config in chosen]]
 
     def trials(self) -> pd.DataFrame:
         """Return one row for each registered trial: configuration, status, losses, cost, node."""
         return pd.concat(
             [
-                _labelled(pd.DataFrame(map(asdict, self.reader.trials(cell.config_key))), cell)
-                for cell in self._cells()
+                _labelled(pd.DataFrame(map(asdict, self.reader.trials(config.config_key))), config)
+                for config in self._configs()
             ],
             ignore_index=True,
         )
@@ -142,25 +142,25 @@ class Results:
         ``t`` is the step and ``time`` the same in seconds; after a divergence values are NaN.
         """
         return pd.concat(
-            [self._tidy(cell, columns or STEP_COLUMNS) for cell in self._cells()],
+            [self._tidy(config, columns or STEP_COLUMNS) for config in self._configs()],
             ignore_index=True,
         )
 
-    def _tidy(self, cell: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
-        read = {name: self.reader.curves(cell.config_key, name) for name in columns}
+    def _tidy(self, config: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
+        read = {name: self.reader.curves(config.config_key, name) for name in columns}
         first = next(iter(read.values()))
         n, steps = first.values.shape
         frame = pd.DataFrame(
             {
                 "seed": np.repeat(first.seeds, steps),
                 "t": np.tile(first.t, n),
-                "time": np.tile(cell.dt * first.t, n),
+                "time": np.tile(config.dt * first.t, n),
                 "diverged": np.repeat(first.diverged, steps),
                 # A launch may finish a trial between two reads: each column is cut to the first's.
                 **{k: c.values[np.isin(c.seeds, first.seeds)].ravel() for k, c in read.items()},
             }
         )
-        return _labelled(frame, cell)
+        return _labelled(frame, config)
 
     def assessments(self, *measures: str) -> pd.DataFrame:
         """Return one row for each finished trial, measure and number of explored steps ``t``.
@@ -169,16 +169,16 @@ class Results:
         lies past a divergence, is NaN.
         """
         parts = [
-            self._measured(cell, measure)
-            for cell in self._cells()
-            for measure in (measures or self.reader.measures(cell.config_key))
+            self._measured(config, measure)
+            for config in self._configs()
+            for measure in (measures or self.reader.measures(config.config_key))
         ]
         if not parts:
-            return pd.DataFrame(columns=[*_OF_CELL, "config_key", *_MEASURED])
+            return pd.DataFrame(columns=[*_OF_CONFIG, "config_key", *_MEASURED])
         return pd.concat(parts, ignore_index=True)
 
-    def _measured(self, cell: ConfigRow, measure: str) -> pd.DataFrame:
-        found = self.reader.assessments(cell.config_key, measure)
+    def _measured(self, config: ConfigRow, measure: str) -> pd.DataFrame:
+        found = self.reader.assessments(config.config_key, measure)
         n, steps = found.values.shape
         columns = (
             np.repeat(found.seeds, steps),
@@ -187,7 +187,7 @@ class Results:
             found.values.ravel(),
             np.repeat(found.diverged, steps),
         )
-        return _labelled(pd.DataFrame(dict(zip(_MEASURED, columns, strict=True))), cell)
+        return _labelled(pd.DataFrame(dict(zip(_MEASURED, columns, strict=True))), config)
 
     def matrix(self, env: str, policy: str, column: str = "loss") -> Curves:
         """Return one column of the steps of a policy in an environment as a matrix (seed, t).
@@ -198,15 +198,15 @@ class Results:
 
     def trajectories(self, env: str, policy: str) -> Trajectories:
         """Return states and inputs of the finished trials of a policy in an environment."""
-        cell = self._one(env, policy)
-        trials = self.reader.trials(cell.config_key)
+        config = self._one(env, policy)
+        trials = self.reader.trials(config.config_key)
         seeds = [trial.seed for trial in trials if trial.status in ("done", "diverged")]
         if not seeds:
             raise AnalysisError(f"{env} × {policy} has no finished trial: run the grid first.")
-        paths = [self.reader.trajectory(cell.config_key, seed) for seed in seeds]
+        paths = [self.reader.trajectory(config.config_key, seed) for seed in seeds]
         return Trajectories(
             seeds=np.array(seeds, dtype=np.int64),
-            t=cell.dt * np.arange(cell.horizon + 1, dtype=np.float64),
+            t=config.dt * np.arange(config.horizon + 1, dtype=np.float64),
             states=np.stack([path.states for path in paths]),
             inputs=np.stack([path.inputs for path in paths]),
         )
@@ -227,41 +227,41 @@ class Results:
             If the trial is not finished.
         """
         key = trial if isinstance(trial, str) else str(trial["trial_key"])
-        for cell in self._cells():
-            for row in self.reader.trials(cell.config_key):
+        for config in self._configs():
+            for row in self.reader.trials(config.config_key):
                 if row.trial_key == key:
-                    return learned_model(self.reader, cell, row.seed)
+                    return learned_model(self.reader, config, row.seed)
         raise AnalysisError(
             f"No trial of the request has the key '{key}': take one of results.trials()."
         )
 
     def _one(self, env: str, policy: str) -> ConfigRow:
-        fitting = [cell for cell in self._cells() if cell.env == env]
-        chosen = choose(Candidate(cell, cell.n) for cell in fitting)
-        found = [cell for cell in chosen if cell.policy == policy]
+        fitting = [config for config in self._configs() if config.env == env]
+        chosen = choose(Candidate(config, config.n) for config in fitting)
+        found = [config for config in chosen if config.policy == policy]
         if not found:
-            have = ", ".join(sorted({f"{c.env} × {c.policy}" for c in self._cells()}))
+            have = ", ".join(sorted({f"{c.env} × {c.policy}" for c in self._configs()}))
             raise AnalysisError(
                 f"No configuration of {env} × {policy} fits the request, stored are {have}: "
                 f"choose one of these."
             )
         return found[0]
 
-    def _cells(self) -> list[ConfigRow]:
-        cells = self.reader.configs()
-        self._wanted.check_where(cells)
-        fitting = newest([cell for cell in cells if self._wanted.accepts(cell)])
+    def _configs(self) -> list[ConfigRow]:
+        configs = self.reader.configs()
+        self._wanted.check_where(configs)
+        fitting = newest([config for config in configs if self._wanted.accepts(config)])
         if not fitting:
             raise AnalysisError(
                 f"No configuration in {self.reader.safe_url} fits the request, "
-                f"it holds {len(cells)} in all: run the grid first, or ask for less."
+                f"it holds {len(configs)} in all: run the grid first, or ask for less."
             )
         return sorted(fitting, key=lambda c: (environment_rank(c.env), policy_rank(c.policy)))
 
 
-def _labelled(frame: pd.DataFrame, cell: ConfigRow) -> pd.DataFrame:
+def _labelled(frame: pd.DataFrame, config: ConfigRow) -> pd.DataFrame:
     """Put what tells the configuration in front."""
-    for place, name in enumerate(_OF_CELL):
-        frame.insert(place, name, getattr(cell, name))
-    frame.insert(len(_OF_CELL), "config_key", cell.config_key)
+    for place, name in enumerate(_OF_CONFIG):
+        frame.insert(place, name, getattr(config, name))
+    frame.insert(len(_OF_CONFIG), "config_key", config.config_key)
     return frame

@@ -65,13 +65,13 @@ def why_impossible(env: str, policy: str) -> str | None:
 _SECTIONS = ("env", "policy", "model", "learner")
 
 
-def absent_cells(
-    cells: Sequence[ConfigRow], compatible: Compatible = is_possible
+def absent_pairs(
+    configs: Sequence[ConfigRow], compatible: Compatible = is_possible
 ) -> list[tuple[str, str]]:
     """Return the (environment, policy) pairs of which nothing is stored though they make sense."""
-    stored = {(cell.env, cell.policy) for cell in cells}
-    environments = {cell.env: cell for cell in cells}
-    policies = {cell.policy: cell for cell in cells}
+    stored = {(config.env, config.policy) for config in configs}
+    environments = {config.env: config for config in configs}
+    policies = {config.policy: config for config in configs}
     return [
         (env, policy)
         for env in environments

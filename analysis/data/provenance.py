@@ -62,25 +62,26 @@ def describe(reader: Reader, selection: Selection) -> dict[str, Any]:
         "selection": selection.fingerprint(),
         "git": git_state(),
         "versions": versions(),
+        # The key of released files, of what is a configuration everywhere else.
         "cells": [
             {
-                "env": entry.cell.env,
-                "policy": entry.cell.policy,
-                "model": entry.cell.model,
-                "learner": entry.cell.learner,
-                "width": entry.cell.width,
-                "config_key": entry.cell.config_key,
+                "env": entry.config.env,
+                "policy": entry.config.policy,
+                "model": entry.config.model,
+                "learner": entry.config.learner,
+                "width": entry.config.width,
+                "config_key": entry.config.config_key,
                 "n_registered": len(entry.trials),
                 "n_finished": len(entry.finished),
                 "n_diverged": sum(trial.status == "diverged" for trial in entry.trials),
-                "n_missing": missing.get((entry.cell.env, entry.cell.policy), 0),
+                "n_missing": missing.get((entry.config.env, entry.config.policy), 0),
             }
             for entry in selection.entries
         ],
         "absent": [
             [env, policy]
             for env, policy in missing
-            if all((e.cell.env, e.cell.policy) != (env, policy) for e in selection.entries)
+            if all((e.config.env, e.config.policy) != (env, policy) for e in selection.entries)
         ],
         "launches": [
             {"commit": one.git_commit, "dirty": bool(one.git_dirty), "host": one.host}

@@ -18,7 +18,7 @@ from analysis.data.config_matching import (
     nearness,
     setting_value,
 )
-from analysis.data.missing_trials import Compatible, Gap, absent_cells, is_possible
+from analysis.data.missing_trials import Compatible, Gap, absent_pairs, is_possible
 from analysis.errors import AnalysisError
 from dopt.policies.titles import TITLES
 from dopt.spec.label import labels, value_label
@@ -43,7 +43,7 @@ class Entry:
     which they are told apart.
     """
 
-    cell: ConfigRow
+    config: ConfigRow
     trials: tuple[TrialRow, ...]
     label: str = ""
     group: tuple[object, ...] = ()
@@ -78,15 +78,15 @@ class Selection:
 
     @property
     def environments(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(entry.cell.env for entry in self.entries))
+        return tuple(dict.fromkeys(entry.config.env for entry in self.entries))
 
     @property
     def policies(self) -> tuple[str, ...]:
-        return tuple(sorted({entry.cell.policy for entry in self.entries}, key=policy_rank))
+        return tuple(sorted({entry.config.policy for entry in self.entries}, key=policy_rank))
 
     def of(self, environment: str) -> tuple[Entry, ...]:
         """Return the entries of one environment."""
-        return tuple(entry for entry in self.entries if entry.cell.env == environment)
+        return tuple(entry for entry in self.entries if entry.config.env == environment)
 
     def only(self, environments: Iterable[str], policies: Iterable[str] = ()) -> Selection:
         """Return the part about some environments and policies; no policies means all."""
@@ -97,9 +97,9 @@ class Selection:
 
         return replace(
             self,
-            entries=tuple(e for e in self.entries if kept(e.cell.env, e.cell.policy)),
+            entries=tuple(e for e in self.entries if kept(e.config.env, e.config.policy)),
             gaps=tuple(gap for gap in self.gaps if kept(gap.env, gap.policy)),
-            stored=tuple(e for e in self.stored if kept(e.cell.env, e.cell.policy)),
+            stored=tuple(e for e in self.stored if kept(e.config.env, e.config.policy)),
         )
 
     @property
@@ -114,21 +114,24 @@ class Selection:
         """
         entries = self.of(environment)
         if self.group_by == ("policy",):
-            return next((one for one in entries if one.cell.policy == self.reference), None)
-        texts = [{one.label, one.cell.policy, *map(str, one.group)} for one in entries]
+            return next((one for one in entries if one.config.policy == self.reference), None)
+        texts = [{one.label, one.config.policy, *map(str, one.group)} for one in entries]
         named = [one for one, text in zip(entries, texts, strict=True) if self.reference in text]
         pool = named or (list(entries) if self.reference == REFERENCE else [])
-        return max(pool, key=lambda one: nearness(one.cell)) if pool else None
+        return max(pool, key=lambda one: nearness(one.config)) if pool else None
 
     def compared(self) -> Selection:
         """Return the environments in which the reference has a final loss."""
         references = [self.reference_of(env) for env in self.environments]
-        return self.only(one.cell.env for one in references if one and one.final_losses())
+        return self.only(one.config.env for one in references if one and one.final_losses())
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the selected trials, their outcome and what is missing."""
         content = [
-            [entry.cell.config_key, *([t.trial_key, t.status, t.final_loss] for t in entry.trials)]
+            [
+                entry.config.config_key,
+                *([t.trial_key, t.status, t.final_loss] for t in entry.trials),
+            ]
             for entry in self.entries
         ]
         gaps = [[gap.env, gap.policy, list(gap.seeds)] for gap in self.gaps]
@@ -154,19 +157,19 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     AnalysisError
         When nothing fits, a name is unknown, or several configurations fit equally well.
     """
-    cells = list(reader.configs())
-    _check_names("environment", wanted.environments, {cell.env for cell in cells})
-    _check_names("policy", wanted.policies, {cell.policy for cell in cells})
-    wanted.check_where(cells)
-    accepted = newest([cell for cell in cells if wanted.accepts(cell)])
+    configs = list(reader.configs())
+    _check_names("environment", wanted.environments, {config.env for config in configs})
+    _check_names("policy", wanted.policies, {config.policy for config in configs})
+    wanted.check_where(configs)
+    accepted = newest([config for config in configs if wanted.accepts(config)])
     if not accepted:
         raise AnalysisError(
             f"No configuration in {reader.safe_url} fits the request, "
-            f"it holds {len(cells)} in all: run the grid first, or ask for less."
+            f"it holds {len(configs)} in all: run the grid first, or ask for less."
         )
     check_keys(wanted.group_by, accepted)
-    trials = {cell.config_key: tuple(reader.trials(cell.config_key)) for cell in accepted}
-    candidates = [Candidate(cell, len(trials[cell.config_key])) for cell in accepted]
+    trials = {config.config_key: tuple(reader.trials(config.config_key)) for config in accepted}
+    candidates = [Candidate(config, len(trials[config.config_key])) for config in accepted]
     by_policy = wanted.group_by == ("policy",)
     chosen = (
         choose(candidates, wanted.reference)
@@ -174,13 +177,13 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
         else choose_by(candidates, wanted.group_by, wanted.reference)
     )
     entries = tuple(
-        labelled((Entry(cell, trials[cell.config_key]) for cell in chosen), wanted.group_by)
+        labelled((Entry(config, trials[config.config_key]) for config in chosen), wanted.group_by)
     )
     return Selection(
         entries,
         tuple(_gaps(entries, compatible if by_policy else None)),
         tuple(_notes(accepted, chosen)),
-        tuple(labelled(Entry(cell, trials[cell.config_key]) for cell in accepted)),
+        tuple(labelled(Entry(config, trials[config.config_key]) for config in accepted)),
         wanted.reference,
         wanted.group_by,
     )
@@ -193,22 +196,24 @@ def labelled(entries: Iterable[Entry], group_by: Sequence[str] = ("policy",)) ->
     than the policy, those of the values.
     """
     found = list(entries)
-    words = labels_of([entry.cell for entry in found])
+    words = labels_of([entry.config for entry in found])
     rows = []
     for entry, label in zip(found, words, strict=True):
-        group = tuple(setting_value(entry.cell, key) for key in group_by)
+        group = tuple(setting_value(entry.config, key) for key in group_by)
         texts = [value_label(key, value) for key, value in zip(group_by, group, strict=True)]
         own = label if tuple(group_by) == ("policy",) else ", ".join(texts)
         rows.append(replace(entry, label=own, group=group))
     return sorted(
-        rows, key=lambda one: (environment_rank(one.cell.env), _group_rank(one, group_by))
+        rows, key=lambda one: (environment_rank(one.config.env), _group_rank(one, group_by))
     )
 
 
-def labels_of(cells: Iterable[ConfigRow]) -> list[str]:
+def labels_of(configs: Iterable[ConfigRow]) -> list[str]:
     """Return what differs among configurations; a task does not: it changes no loss."""
     hidden = ("task", "assessment_version")
-    return labels([{k: v for k, v in cell.config.items() if k not in hidden} for cell in cells])
+    return labels(
+        [{k: v for k, v in config.config.items() if k not in hidden} for config in configs]
+    )
 
 
 def _group_rank(entry: Entry, group_by: Sequence[str]) -> list[tuple[float, int, str]]:
@@ -225,23 +230,23 @@ def _group_rank(entry: Entry, group_by: Sequence[str]) -> list[tuple[float, int,
     return ranks
 
 
-def newest(cells: list[ConfigRow]) -> list[ConfigRow]:
-    """Return the cells of the newest code version: numbers of different versions do not mix.
+def newest(configs: list[ConfigRow]) -> list[ConfigRow]:
+    """Return the configurations of the newest code version: other versions' numbers do not mix.
 
     Of those with a task, whose assessments have a version of their own, the newest of these.
     """
-    code = max((cell.config.get("code_version", 0) for cell in cells), default=0)
-    assessment = max((_assessment_version(cell) or 0 for cell in cells), default=0)
+    code = max((config.config.get("code_version", 0) for config in configs), default=0)
+    assessment = max((_assessment_version(config) or 0 for config in configs), default=0)
     return [
-        cell
-        for cell in cells
-        if cell.config.get("code_version", 0) == code
-        and _assessment_version(cell) in (None, assessment)
+        config
+        for config in configs
+        if config.config.get("code_version", 0) == code
+        and _assessment_version(config) in (None, assessment)
     ]
 
 
-def _assessment_version(cell: ConfigRow) -> int | None:
-    return int(cell.config.get("assessment_version", 1)) if cell.config.get("task") else None
+def _assessment_version(config: ConfigRow) -> int | None:
+    return int(config.config.get("assessment_version", 1)) if config.config.get("task") else None
 
 
 def _check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
@@ -257,24 +262,24 @@ def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable
     """Yield what entries lack; policies without any trial where it is known which are possible."""
     seeds: dict[str, set[int]] = {}
     for entry in entries:
-        seeds.setdefault(entry.cell.env, set()).update(trial.seed for trial in entry.trials)
+        seeds.setdefault(entry.config.env, set()).update(trial.seed for trial in entry.trials)
     for entry in entries:
-        expected = seeds[entry.cell.env]
+        expected = seeds[entry.config.env]
         missing = expected - {trial.seed for trial in entry.finished}
         if missing:
             state = {trial.seed: trial.status for trial in entry.trials}
             states = Counter(state.get(seed, "not registered") for seed in missing)
             text = ", ".join(f"{count} {name}" for name, count in sorted(states.items()))
-            yield Gap(entry.cell.env, entry.cell.policy, tuple(sorted(missing)), text)
+            yield Gap(entry.config.env, entry.config.policy, tuple(sorted(missing)), text)
     if compatible is None:
         return
-    for env, policy in absent_cells([entry.cell for entry in entries], compatible):
+    for env, policy in absent_pairs([entry.config for entry in entries], compatible):
         expected = seeds[env]
         yield Gap(env, policy, tuple(sorted(expected)), f"{len(expected)} not registered")
 
 
 def _notes(accepted: list[ConfigRow], chosen: list[ConfigRow]) -> Iterable[str]:
-    kept = {cell.config_key for cell in chosen}
-    left = Counter(cell.env for cell in accepted if cell.config_key not in kept)
+    kept = {config.config_key for config in chosen}
+    left = Counter(config.env for config in accepted if config.config_key not in kept)
     for env, count in sorted(left.items()):
         yield f"{env}: {count} other stored configurations are not part of this (see --where)"

@@ -75,14 +75,14 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
 def _origin(facts: dict[str, object], *, controlled: bool) -> str:
     versions = facts["versions"]
     assert isinstance(versions, dict)
-    cells = facts["cells"]
-    assert isinstance(cells, list)
-    trials = sum(cell["n_finished"] for cell in cells)
+    configs = facts["cells"]
+    assert isinstance(configs, list)
+    trials = sum(config["n_finished"] for config in configs)
     control = f" and [{CONTROL}.csv]({CONTROL}.csv)" if controlled else ""
     return (
-        f"Made by dopt {versions['dopt']} from {trials:,} trials of {len(cells)} configurations in "
-        f"`{facts['database']}`. The numbers are in [{NAME}.csv]({NAME}.csv){control}, where they "
-        f"come from in [{NAME}.json]({NAME}.json)."
+        f"Made by dopt {versions['dopt']} from {trials:,} trials of {len(configs)} configurations "
+        f"in `{facts['database']}`. The numbers are in [{NAME}.csv]({NAME}.csv){control}, where "
+        f"they come from in [{NAME}.json]({NAME}.json)."
     )
 
 

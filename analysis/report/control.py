@@ -55,11 +55,11 @@ def tabulate(reader: Reader, groups: Sequence[VariantGroup]) -> pd.DataFrame | N
 def _rows(reader: Reader, group: VariantGroup) -> Iterator[dict[str, object]]:
     assessed = group.assessed
     curves = measure_control(reader, Selection(assessed))
-    successes = [reader.assessments(one.cell.config_key, SUCCESS) for one in assessed]
+    successes = [reader.assessments(one.config.config_key, SUCCESS) for one in assessed]
     reference = successes[0] if assessed[0] is group.reference else None
     for one, curve, own in zip(assessed, curves, successes, strict=True):
         losses = read_curves(reader, one, "loss").values
-        free_runs = reader.assessments(one.cell.config_key, FREE_RUN)
+        free_runs = reader.assessments(one.config.config_key, FREE_RUN)
         for k, t in enumerate(curve.t.tolist()):
             yield {
                 "env": group.env,

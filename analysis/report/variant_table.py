@@ -49,7 +49,7 @@ def tabulate_group(
     reader: Reader, group: VariantGroup, rule: DivergenceRule = DivergenceRule.EXCLUDE
 ) -> pd.DataFrame:
     """Return one row for each variant of an environment, the reference first."""
-    plane = Plane.of(system_from_mapping(group.reference.cell.config["env"]))
+    plane = Plane.of(system_from_mapping(group.reference.config.config["env"]))
     epsilon = loss_of_random_inputs(reader, group.variants, "loss", rule)
     scores = {one.label: _scores(reader, one, plane, rule) for one in group.variants}
     costs = _control_costs(reader, group)
@@ -103,14 +103,14 @@ def _scores(
 
 def _control_costs(reader: Reader, group: VariantGroup) -> dict[str, BySeed]:
     """Return the relative costs of the assessed variants after the first steps of their task."""
-    keys = {one.label: one.cell.config_key for one in group.assessed}
+    keys = {one.label: one.config.config_key for one in group.assessed}
     steps = {t for key in keys.values() for t in reader.assessments(key, "control_cost").t.tolist()}
     first = min((t for t in steps if t > 0), default=0)
     return {one.label: scores_at(reader, one, first).by_seed for one in group.assessed}
 
 
 def _coverages(reader: Reader, variant: Entry, plane: Plane) -> BySeed:
-    key = variant.cell.config_key
+    key = variant.config.config_key
     seeds = variant.final_losses()
     return {seed: plane.coverage(reader.trajectory(key, seed).states) for seed in seeds}
 
@@ -126,12 +126,12 @@ def _row(
     row: dict[str, object] = {
         "env": group.env,
         "variant": variant.label,
-        "policy": variant.cell.policy,
-        "policy_label": policy_title(variant.cell.policy),
-        "model": variant.cell.model,
-        "learner": variant.cell.learner,
-        "path": variant.cell.config["path"],
-        "dt": variant.cell.config["env"]["dt"],
+        "policy": variant.config.policy,
+        "policy_label": policy_title(variant.config.policy),
+        "model": variant.config.model,
+        "learner": variant.config.learner,
+        "path": variant.config.config["path"],
+        "dt": variant.config.config["env"]["dt"],
         "n": len(own["loss"]),
         "n_diverged": sum(trial.status == "diverged" for trial in trials),
         "plan_us": _typical(reader, variant, "plan_us"),
@@ -166,7 +166,7 @@ def _samples(
     compared = known and variant is not group.reference
     return {
         "epsilon": epsilon,
-        "horizon": variant.cell.horizon,
+        "horizon": variant.config.horizon,
         "steps": censored_median(steps) if known else math.nan,
         "reached": float(np.mean(np.isfinite(steps))) if known and len(steps) else math.nan,
         "steps_p": _hitting_time_p(own, reference) if compared else math.nan,

@@ -52,11 +52,11 @@ def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
     AnalysisError
         If no environment has both.
     """
-    cells = [cell for cell in newest(list(reader.configs())) if wanted.accepts(cell)]
-    entries = [Entry(cell, tuple(reader.trials(cell.config_key))) for cell in cells]
-    names = sorted({cell.env for cell in cells}, key=environment_rank)
+    configs = [config for config in newest(list(reader.configs())) if wanted.accepts(config)]
+    entries = [Entry(config, tuple(reader.trials(config.config_key))) for config in configs]
+    names = sorted({config.env for config in configs}, key=environment_rank)
     found = [
-        _group(env, [entry for entry in entries if entry.cell.env == env], wanted.reference)
+        _group(env, [entry for entry in entries if entry.config.env == env], wanted.reference)
         for env in names
     ]
     whole = [group for group in found if group is not None]
@@ -73,15 +73,15 @@ def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | No
     world = _one_world(entries)
     task = common_task(world)
     kept = _one_each(world, task)
-    references = [entry for entry in kept if entry.cell.policy == policy]
+    references = [entry for entry in kept if entry.config.policy == policy]
     if not references or len(kept) < 2:
         return None
-    reference = max(references, key=lambda entry: (_company(entry, kept), *nearness(entry.cell)))
-    words = labels_of(entry.cell for entry in kept)
+    reference = max(references, key=lambda entry: (_company(entry, kept), *nearness(entry.config)))
+    words = labels_of(entry.config for entry in kept)
     variants = [replace(entry, label=label) for entry, label in zip(kept, words, strict=True)]
-    first = next(one for one in variants if one.cell is reference.cell)
+    first = next(one for one in variants if one.config is reference.config)
     rest = [one for one in variants if one is not first]
-    rest.sort(key=lambda one: (policy_rank(one.cell.policy), one.label))
+    rest.sort(key=lambda one: (policy_rank(one.config.policy), one.label))
     left = len(entries) - len(kept)
     notes = [f"{left} configurations of another env section, task or fewer trials"] if left else []
     return VariantGroup(env, (first, *rest), (*notes, *_of_other_tasks([first, *rest], task)), task)
@@ -135,4 +135,4 @@ def _one_each(entries: Sequence[Entry], task: str | None) -> list[Entry]:
 
 
 def _section(entry: Entry, name: str) -> str:
-    return json.dumps(entry.cell.config.get(name), sort_keys=True)
+    return json.dumps(entry.config.config.get(name), sort_keys=True)

@@ -71,7 +71,9 @@ def table(state: ServerState, params: QueryParams) -> pd.DataFrame:
 
 def _policies(stored: Mapping[str, Sequence[ConfigRow]]) -> list[str]:
     """Return the stored policies in the order of legends."""
-    return sorted({cell.policy for cells in stored.values() for cell in cells}, key=policy_rank)
+    return sorted(
+        {config.policy for configs in stored.values() for config in configs}, key=policy_rank
+    )
 
 
 def _selected(
@@ -156,6 +158,6 @@ def _options(stored: dict[str, Any], policies: list[str]) -> dict[str, Any]:
         "env": list(stored),
         "measure": MEASURES,
         "column": COLUMNS,
-        "width": widths([cell for cells in stored.values() for cell in cells]),
+        "width": widths([config for configs in stored.values() for config in configs]),
         "diverged": list(DivergenceRule),
     }

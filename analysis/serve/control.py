@@ -49,7 +49,7 @@ def control(state: ServerState, params: QueryParams) -> dict[str, Any]:
         ],
         "notes": part.notes,
         "options": {
-            "env": sorted({cell.env for cell in assessed}, key=environment_rank),
+            "env": sorted({config.env for config in assessed}, key=environment_rank),
             "width": widths(assessed),
         },
     }
@@ -68,17 +68,17 @@ def table(state: ServerState, params: QueryParams) -> pd.DataFrame:
 
 def _assessed(reader: Reader) -> list[ConfigRow]:
     """Return the configurations with a task."""
-    return [cell for cell in newest(reader.configs()) if cell.config.get("task")]
+    return [config for config in newest(reader.configs()) if config.config.get("task")]
 
 
 def _measured(
     state: ServerState, reader: Reader, params: QueryParams, assessed: list[ConfigRow]
 ) -> tuple[Selection, Curves]:
     """Return the selected configurations and their curves."""
-    env = params.choice("env", {cell.env for cell in assessed})
+    env = params.choice("env", {config.env for config in assessed})
     if not assessed:
         return Selection(()), ()
-    environments = [env] if env else dict.fromkeys(cell.env for cell in assessed)
+    environments = [env] if env else dict.fromkeys(config.env for config in assessed)
     part = control_part(state.select(reader, params.filter(*environments)))
     key = ("control", reader, part.fingerprint())
     return part, state.cache.get_or_compute(key, lambda: measure_control(reader, part))

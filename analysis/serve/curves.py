@@ -25,7 +25,9 @@ def choices(state: ServerState, params: QueryParams) -> dict[str, Any]:
     stored = by_environment(state.database.reader())
     return {
         "env": params.choice("env", stored, next(iter(stored), "")),
-        "environments": [{"env": env, "widths": widths(cells)} for env, cells in stored.items()],
+        "environments": [
+            {"env": env, "widths": widths(configs)} for env, configs in stored.items()
+        ],
         "columns": COLUMNS,
         "rules": list(DivergenceRule),
     }
@@ -33,14 +35,14 @@ def choices(state: ServerState, params: QueryParams) -> dict[str, Any]:
 
 def by_environment(reader: Reader) -> dict[str, list[ConfigRow]]:
     """Return the stored configurations by environment, in the paper's order."""
-    cells = newest(reader.configs())
-    names = sorted({cell.env for cell in cells}, key=environment_rank)
-    return {env: [cell for cell in cells if cell.env == env] for env in names}
+    configs = newest(reader.configs())
+    names = sorted({config.env for config in configs}, key=environment_rank)
+    return {env: [config for config in configs if config.env == env] for env in names}
 
 
-def widths(cells: list[ConfigRow]) -> list[int]:
+def widths(configs: list[ConfigRow]) -> list[int]:
     """Return the widths of some configurations, ascending."""
-    return sorted({cell.width for cell in cells if cell.width is not None})
+    return sorted({config.width for config in configs if config.width is not None})
 
 
 def curves(state: ServerState, params: QueryParams) -> dict[str, Any]:
@@ -98,7 +100,7 @@ def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple
 
 def width_text(selection: Selection) -> str:
     """Return the end of a heading that names the width; empty for none or several widths."""
-    found = widths([entry.cell for entry in selection.entries])
+    found = widths([entry.config for entry in selection.entries])
     return f", width {found[0]}" if len(found) == 1 else ""
 
 

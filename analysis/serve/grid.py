@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from analysis.data.missing_trials import absent_cells
+from analysis.data.missing_trials import absent_pairs
 from analysis.data.trial_selection import environment_rank, newest, policy_rank
 from analysis.serve.policy_labels import legend_entry
 from analysis.serve.progress import read_progress
@@ -32,61 +32,61 @@ def grid(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa: AR
     reader = state.database.reader()
     progress = read_progress(reader)
     stored = reader.configs()
-    cells = newest(stored)
-    policies = sorted({cell.policy for cell in cells}, key=policy_rank)
+    configs = newest(stored)
+    policies = sorted({config.policy for config in configs}, key=policy_rank)
     finals = state.cache.get_or_compute(
         ("final", reader, progress["token"]), lambda: _finals(reader)
     )
-    slots = _slots(cells, finals)
-    absent = absent_cells(cells)
+    slots = _slots(configs, finals)
+    absent = absent_pairs(configs)
     environments = [
         {"env": env, "rows": _rows(env, slots, policies, absent)}
-        for env in sorted({cell.env for cell in cells}, key=environment_rank)
+        for env in sorted({config.env for config in configs}, key=environment_rank)
     ]
     return {
         "progress": progress,
         "policies": [legend_entry(policy) for policy in policies],
         "environments": environments,
-        "older": len(stored) - len(cells),
+        "older": len(stored) - len(configs),
     }
 
 
 Slots = dict[tuple[str, int | None, str], list[dict[str, Any]]]
 
 
-def _slots(cells: Sequence[ConfigRow], finals: dict[str, dict[str, Any]]) -> Slots:
+def _slots(configs: Sequence[ConfigRow], finals: dict[str, dict[str, Any]]) -> Slots:
     """Return the configurations of each (environment, width, policy), with shades and labels."""
     slots: Slots = {}
     nothing = _final(np.empty(0))
-    for env in {cell.env for cell in cells}:
-        own = [cell for cell in cells if cell.env == env]
-        widths = {cell.width for cell in own if cell.width is not None}
+    for env in {config.env for config in configs}:
+        own = [config for config in configs if config.env == env]
+        widths = {config.width for config in own if config.width is not None}
         only = next(iter(widths)) if len(widths) == 1 else None
-        found = [_configuration(cell, finals.get(cell.config_key, nothing)) for cell in own]
+        found = [_configuration(config, finals.get(config.config_key, nothing)) for config in own]
         _shade(found)
-        for cell, one in zip(own, found, strict=True):
-            slots.setdefault((env, cell.width or only, cell.policy), []).append(one)
+        for config, one in zip(own, found, strict=True):
+            slots.setdefault((env, config.width or only, config.policy), []).append(one)
     for group in slots.values():
         _label(group)
     return slots
 
 
-def _configuration(cell: ConfigRow, final: dict[str, Any]) -> dict[str, Any]:
+def _configuration(config: ConfigRow, final: dict[str, Any]) -> dict[str, Any]:
     counts = {
-        "done": cell.n_done,
-        "diverged": cell.n_diverged,
-        "failed": cell.n_failed,
-        "cancelled": cell.n_cancelled,
-        "running": cell.n_running,
-        "pending": cell.n_pending,
+        "done": config.n_done,
+        "diverged": config.n_diverged,
+        "failed": config.n_failed,
+        "cancelled": config.n_cancelled,
+        "running": config.n_running,
+        "pending": config.n_pending,
     }
     return {
-        "config_key": cell.config_key,
-        "width": cell.width,
-        "n": cell.n,
-        "ended": cell.n - cell.n_pending - cell.n_running,
+        "config_key": config.config_key,
+        "width": config.width,
+        "n": config.n,
+        "ended": config.n - config.n_pending - config.n_running,
         "counts": {status: count for status, count in counts.items() if count},
-        "config": cell.config,
+        "config": config.config,
         **final,
     }
 

@@ -49,18 +49,18 @@ Computed = Mapping[str, Mapping[str, str | None]]
 """Computed columns by configuration key."""
 
 
-def computed_columns(cells: Sequence[ConfigRow]) -> Computed:
+def computed_columns(configs: Sequence[ConfigRow]) -> Computed:
     """Return task and settings of each configuration, by its key."""
     return {
-        cell.config_key: {"task": _task_name(cell), "settings": label}
-        for group in _groups(cells)
-        for cell, label in zip(group, labels([cell.config for cell in group]), strict=True)
+        config.config_key: {"task": _task_name(config), "settings": label}
+        for group in _groups(configs)
+        for config, label in zip(group, labels([config.config for config in group]), strict=True)
     }
 
 
-def shown_columns(cells: Sequence[ConfigRow], computed: Computed, sort: str) -> dict[str, str]:
+def shown_columns(configs: Sequence[ConfigRow], computed: Computed, sort: str) -> dict[str, str]:
     """Return the headings of the columns to show; the column that sorts the list is always one."""
-    groups = list(_groups(cells))
+    groups = list(_groups(configs))
     hidden = {
         name
         for name in OPTIONAL
@@ -74,23 +74,23 @@ def shown_columns(cells: Sequence[ConfigRow], computed: Computed, sort: str) -> 
     return shown
 
 
-def _groups(cells: Sequence[ConfigRow]) -> Iterator[list[ConfigRow]]:
+def _groups(configs: Sequence[ConfigRow]) -> Iterator[list[ConfigRow]]:
     """Return the configurations of each environment and policy."""
-    ordered = sorted(cells, key=_env_and_policy)
+    ordered = sorted(configs, key=_env_and_policy)
     return (list(group) for _, group in groupby(ordered, _env_and_policy))
 
 
-def _env_and_policy(cell: ConfigRow) -> tuple[str, str]:
-    return cell.env, cell.policy
+def _env_and_policy(config: ConfigRow) -> tuple[str, str]:
+    return config.env, config.policy
 
 
-def _identity(cell: ConfigRow, computed: Computed) -> tuple[object, ...]:
+def _identity(config: ConfigRow, computed: Computed) -> tuple[object, ...]:
     """Return the values of a configuration in all columns but its settings."""
-    values = (getattr(cell, name) for name in ("width", *OPTIONAL))
-    return *values, computed[cell.config_key]["task"]
+    values = (getattr(config, name) for name in ("width", *OPTIONAL))
+    return *values, computed[config.config_key]["task"]
 
 
-def _task_name(cell: ConfigRow) -> str | None:
+def _task_name(config: ConfigRow) -> str | None:
     """Return the name of the task that assesses the trials, None without one."""
-    task = cell.config.get("task")
+    task = config.config.get("task")
     return str(task["name"]) if task else None

@@ -28,8 +28,8 @@ SIZES = ("25", "50", "100", "200")
 def trials(state: ServerState, params: QueryParams) -> dict[str, Any]:
     """Return one page of the list, the number of matches, and where adjacent pages start."""
     reader = state.database.reader()
-    cells = reader.configs()
-    conditions = _filters(params, cells)
+    configs = reader.configs()
+    conditions = _filters(params, configs)
     sort = params.choice("sort", COLUMNS, "env")
     descending = params.choice("order", ("asc", "desc"), "asc") == "desc"
     size = int(params.choice("size", SIZES, "50"))
@@ -39,7 +39,7 @@ def trials(state: ServerState, params: QueryParams) -> dict[str, Any]:
         reader, COLUMNS, conditions, sort, descending, after or before, backwards, size
     )
     total = count(reader, conditions)
-    matching = _matching(params, cells)
+    matching = _matching(params, configs)
     computed = computed_columns(matching)
     for row in rows:
         row |= computed.get(row["config_key"], NOT_COMPUTED)
@@ -54,29 +54,29 @@ def trials(state: ServerState, params: QueryParams) -> dict[str, Any]:
         "columns": shown_columns(matching, computed, sort),
         "sortable": list(COLUMNS),
         "numbers": NUMBERS,
-        "legend": {name: legend_entry(name) for name in _policies(cells)},
-        "options": _options(cells),
+        "legend": {name: legend_entry(name) for name in _policies(configs)},
+        "options": _options(configs),
     }
 
 
-def _matching(params: QueryParams, cells: list[ConfigRow]) -> list[ConfigRow]:
+def _matching(params: QueryParams, configs: list[ConfigRow]) -> list[ConfigRow]:
     """Return the configurations that the filters allow."""
-    config, width = params.text("config"), params.integer("width", low=1)
+    key, width = params.text("config"), params.integer("width", low=1)
     env, policy = params.text("env"), params.text("policy")
     return [
-        cell
-        for cell in cells
-        if cell.env == (env or cell.env)
-        and cell.policy == (policy or cell.policy)
-        and cell.config_key == (config or cell.config_key)
-        and cell.width == (width or cell.width)
+        config
+        for config in configs
+        if config.env == (env or config.env)
+        and config.policy == (policy or config.policy)
+        and config.config_key == (key or config.config_key)
+        and config.width == (width or config.width)
     ]
 
 
-def _filters(params: QueryParams, cells: list[ConfigRow]) -> list[Condition]:
+def _filters(params: QueryParams, configs: list[ConfigRow]) -> list[Condition]:
     given = {
-        "env": params.choice("env", {cell.env for cell in cells}),
-        "policy": params.choice("policy", {cell.policy for cell in cells}),
+        "env": params.choice("env", {config.env for config in configs}),
+        "policy": params.choice("policy", {config.policy for config in configs}),
         "status": params.choice("status", STATUSES),
         "config_key": params.text("config"),
         "width": params.integer("width", low=1),
@@ -90,15 +90,15 @@ def _filters(params: QueryParams, cells: list[ConfigRow]) -> list[Condition]:
     ]
 
 
-def _policies(cells: list[ConfigRow]) -> list[str]:
-    return sorted({cell.policy for cell in cells}, key=policy_rank)
+def _policies(configs: list[ConfigRow]) -> list[str]:
+    return sorted({config.policy for config in configs}, key=policy_rank)
 
 
-def _options(cells: list[ConfigRow]) -> dict[str, Any]:
+def _options(configs: list[ConfigRow]) -> dict[str, Any]:
     return {
-        "env": sorted({cell.env for cell in cells}, key=environment_rank),
-        "policy": {name: legend_entry(name)["label"] for name in _policies(cells)},
-        "width": widths(cells),
+        "env": sorted({config.env for config in configs}, key=environment_rank),
+        "policy": {name: legend_entry(name)["label"] for name in _policies(configs)},
+        "width": widths(configs),
         "status": STATUSES,
         "size": SIZES,
     }

@@ -99,20 +99,20 @@ def control_part(selection: Selection) -> Selection:
     """Return the entries with a task, in each environment those of the task with most trials."""
     asked = [entry for entry in selection.stored if task_of(entry)]
     chosen: list[Entry] = []
-    for env in dict.fromkeys(entry.cell.env for entry in asked):
+    for env in dict.fromkeys(entry.config.env for entry in asked):
         chosen += _of_one_task(
-            [entry for entry in asked if entry.cell.env == env], selection.reference
+            [entry for entry in asked if entry.config.env == env], selection.reference
         )
-    chosen.sort(key=lambda e: (environment_rank(e.cell.env), policy_rank(e.cell.policy)))
+    chosen.sort(key=lambda e: (environment_rank(e.config.env), policy_rank(e.config.policy)))
     entries, notes = tuple(labelled(chosen)), tuple(_unfinished(chosen))
     return replace(selection, entries=entries, gaps=(), notes=notes, stored=entries)
 
 
 def _of_one_task(entries: list[Entry], reference: str) -> list[Entry]:
     most = common_task(entries)
-    same = {entry.cell.config_key: entry for entry in entries if task_of(entry) == most}
-    candidates = [Candidate(entry.cell, len(entry.trials)) for entry in same.values()]
-    return [same[cell.config_key] for cell in choose(candidates, reference)]
+    same = {entry.config.config_key: entry for entry in entries if task_of(entry) == most}
+    candidates = [Candidate(entry.config, len(entry.trials)) for entry in same.values()]
+    return [same[config.config_key] for config in choose(candidates, reference)]
 
 
 def common_task(entries: Iterable[Entry]) -> str | None:
@@ -130,7 +130,7 @@ def common_task(entries: Iterable[Entry]) -> str | None:
 
 def task_of(entry: Entry) -> str | None:
     """Return the task by which trials of an entry were assessed, as JSON, None without one."""
-    task = entry.cell.config.get("task")
+    task = entry.config.config.get("task")
     return json.dumps(task, sort_keys=True) if task and entry.final_losses() else None
 
 
@@ -138,13 +138,14 @@ def _unfinished(entries: Iterable[Entry]) -> Iterable[str]:
     for entry in entries:
         left = len(entry.trials) - len(entry.finished)
         if left:
-            yield f"{entry.cell.env} × {entry.cell.policy}: {left} trials with a task not finished"
+            config = entry.config
+            yield f"{config.env} × {config.policy}: {left} trials with a task not finished"
 
 
 def measure_control(reader: Reader, selection: Selection) -> tuple[ControlCurve, ...]:
     """Return a curve for each entry."""
     truths = {env: true_model(reader, selection.of(env)) for env in selection.environments}
-    return tuple(_curve(reader, entry, truths[entry.cell.env]) for entry in selection.entries)
+    return tuple(_curve(reader, entry, truths[entry.config.env]) for entry in selection.entries)
 
 
 def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
@@ -156,7 +157,7 @@ def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
         {
             seed: value
             for entry in entries
-            for seed, value in _first(reader.assessments(entry.cell.config_key, measure)).items()
+            for seed, value in _first(reader.assessments(entry.config.config_key, measure)).items()
         }
         for measure in ("true_model_success", "true_model_cost")
     )
@@ -172,15 +173,15 @@ def _first(found: Assessments) -> dict[int, float]:
 
 
 def _curve(reader: Reader, entry: Entry, truth: TrueModel) -> ControlCurve:
-    successes = reader.assessments(entry.cell.config_key, "control_success")
+    successes = reader.assessments(entry.config.config_key, "control_success")
     ratios = relative_costs(reader, entry).values
     reached = np.isfinite(successes.values)
     success, success_low, success_high = _by_step(_rate, successes.values)
     cost, cost_low, cost_high = _by_step(_mean_ratio, ratios)
     diverged = int(np.sum(successes.diverged))
     return ControlCurve(
-        entry.cell.env,
-        entry.cell.policy,
+        entry.config.env,
+        entry.config.policy,
         successes.t,
         np.sum(reached, axis=0),
         success,
@@ -206,7 +207,7 @@ def relative_costs(reader: Reader, entry: Entry) -> Assessments:
     It is inf where the episode has no finite cost, and NaN where there was no episode or where the
     true model's has no finite cost, so that nothing can be said.
     """
-    key = entry.cell.config_key
+    key = entry.config.config_key
     costs = reader.assessments(key, "control_cost")
     reached = np.isfinite(reader.assessments(key, "control_success").values)
     of_seed = _first(reader.assessments(key, "true_model_cost"))
@@ -245,12 +246,12 @@ def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
     As in :func:`relative_costs` a lost episode has inf, and NaN where the true model's was lost.
     """
     costs = relative_costs(reader, entry)
-    reached = np.isfinite(reader.assessments(entry.cell.config_key, "control_success").values)
+    reached = np.isfinite(reader.assessments(entry.config.config_key, "control_success").values)
     at = costs.t == t
     seeds = costs.seeds[reached[:, at].any(axis=1)]
     column = costs.values[reached & at]
     by_seed = dict(zip(seeds.tolist(), column.tolist(), strict=True))
-    names = entry.cell.env, entry.cell.policy, entry.label
+    names = entry.config.env, entry.config.policy, entry.label
     return Scores(*names, by_seed, len(costs.seeds), int(np.sum(costs.diverged)))
 
 

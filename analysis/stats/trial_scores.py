@@ -121,5 +121,5 @@ def _scores(
 
 def _counted(entry: Entry, by_seed: Mapping[int, float]) -> Scores:
     diverged = sum(trial.status == "diverged" for trial in entry.trials)
-    names = entry.cell.env, entry.cell.policy, entry.label
+    names = entry.config.env, entry.config.policy, entry.label
     return Scores(*names, by_seed, len(entry.finished), diverged)

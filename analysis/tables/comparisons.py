@@ -113,7 +113,7 @@ def compare_steps(
         if threshold is None:
             continue
         scores = [steps_to(reader, entry, column, rule, threshold) for entry in entries]
-        facts = {"epsilon": threshold, "horizon": entries[0].cell.horizon}
+        facts = {"epsilon": threshold, "horizon": entries[0].config.horizon}
         for own, reference in _pairs(scores, selection, env):
             found = compare_hitting_times(*paired(own.by_seed, reference.by_seed))
             rows.append(_row(own, reference) | facts | asdict(found) | _diverged(own, reference))
@@ -130,7 +130,7 @@ def loss_of_random_inputs(
     reader: Reader, entries: tuple[Entry, ...], column: str, rule: DivergenceRule
 ) -> float | None:
     """Return the median final loss of random inputs, None where there are no trials of them."""
-    found = (entry for entry in entries if entry.cell.policy == EPSILON_POLICY)
+    found = (entry for entry in entries if entry.config.policy == EPSILON_POLICY)
     finals = next((final_losses(reader, entry, column, rule).values for entry in found), None)
     return float(np.median(finals)) if finals is not None and len(finals) else None
 
@@ -166,7 +166,7 @@ def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
 
 def _successes(reader: Reader, entry: Entry, t: int) -> float:
     """Return the share of successful episodes after t explored steps, NaN for none."""
-    found = reader.assessments(entry.cell.config_key, "control_success")
+    found = reader.assessments(entry.config.config_key, "control_success")
     known = found.values[:, found.t == t]
     known = known[np.isfinite(known)]
     return float(np.mean(known)) if len(known) else math.nan

@@ -80,9 +80,9 @@ def _raced(selection: Selection, options: PlotOptions = _DEFAULT) -> Selection:
     if options.epsilon is not None:
         return compared
     return compared.only(
-        entry.cell.env
+        entry.config.env
         for entry in compared.entries
-        if entry.cell.policy == EPSILON_POLICY and entry.final_losses()
+        if entry.config.policy == EPSILON_POLICY and entry.final_losses()
     )
 
 

@@ -32,24 +32,24 @@ _MATRICES: dict[
 _WRITERS = {"csv": tables.write_csv, "parquet": tables.write_parquet}
 
 
-def export(reader: Reader, cells: Sequence[ConfigRow], wanted: Export) -> dict[str, Any]:
+def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict[str, Any]:
     """Write the file, and after it its manifest; return what the manifest says.
 
-    Both appear whole or not at all. ``reader`` sees one moment, that of ``cells``. Raises
+    Both appear whole or not at all. ``reader`` sees one moment, that of ``configs``. Raises
     ``ExportError``.
     """
-    _expect_trials(reader, cells, wanted)
+    _expect_trials(reader, configs, wanted)
     try:
         wanted.out.parent.mkdir(parents=True, exist_ok=True)
         with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
-            content = _write(reader, cells, wanted, out)
+            content = _write(reader, configs, wanted, out)
             about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": _hash(out)}
             document = {
                 "kind": wanted.kind,
                 "format": wanted.format,
                 **about,
                 **content,
-                **provenance(reader, cells, wanted.filters),
+                **provenance(reader, configs, wanted.filters),
             }
             manifest.write_text(json.dumps(document, indent=2) + "\n")
     except OSError as error:
@@ -60,28 +60,30 @@ def export(reader: Reader, cells: Sequence[ConfigRow], wanted: Export) -> dict[s
     return document
 
 
-def _write(reader: Reader, cells: Sequence[ConfigRow], wanted: Export, out: Path) -> dict[str, Any]:
+def _write(
+    reader: Reader, configs: Sequence[ConfigRow], wanted: Export, out: Path
+) -> dict[str, Any]:
     # After an error the cursors must close before the database does.
     if wanted.format == "npz":
-        with closing(_MATRICES[wanted.kind](reader, cells)) as arrays:
+        with closing(_MATRICES[wanted.kind](reader, configs)) as arrays:
             return {"arrays": matrices.write(out, arrays)}
-    stream = _STREAMS[wanted.kind](reader, cells)
+    stream = _STREAMS[wanted.kind](reader, configs)
     columns = {field.name: str(field.type) for field in stream.schema}
     with closing(stream.batches):
         return {"rows": _WRITERS[wanted.format](out, stream), "columns": columns}
 
 
-def _expect_trials(reader: Reader, cells: Sequence[ConfigRow], wanted: Export) -> None:
-    if not cells:
+def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> None:
+    if not configs:
         raise ExportError(
             f"{reader.safe_url} holds no trials yet: run a launch that writes to it first."
         )
-    if wanted.kind == "assessments" and not any(reader.measures(c.config_key) for c in cells):
+    if wanted.kind == "assessments" and not any(reader.measures(c.config_key) for c in configs):
         raise ExportError(
             "No trial of these was assessed, so that there are no assessments to export: run them "
             "with task=control."
         )
-    if wanted.kind != "trials" and not any(cell.n_done + cell.n_diverged for cell in cells):
+    if wanted.kind != "trials" and not any(config.n_done + config.n_diverged for config in configs):
         raise ExportError(
             f"No trial of these is done yet, so that there are no {wanted.kind} to export: run "
             f"the launch, or see status."

@@ -16,10 +16,10 @@ _WRITERS = "SELECT DISTINCT config_key, launch_id FROM v_trial WHERE launch_id I
 
 
 def provenance(
-    reader: Reader, cells: Sequence[ConfigRow], filters: Mapping[str, Sequence[str]]
+    reader: Reader, configs: Sequence[ConfigRow], filters: Mapping[str, Sequence[str]]
 ) -> dict[str, Any]:
     """Return database, selection, configurations and launches, without passwords."""
-    keys = {cell.config_key for cell in cells}
+    keys = {config.config_key for config in configs}
     writers = {row.launch_id for row in reader.rows(_WRITERS) if row.config_key in keys}
     launches = [asdict(one) for one in reader.launches() if one.launch_id in writers]
     return {
@@ -28,9 +28,9 @@ def provenance(
         "database": reader.safe_url,
         "schema_version": reader.schema_version(),
         "filters": {name: list(values) for name, values in filters.items()},
-        "trials": dict(counts(cells)),
+        "trials": dict(counts(configs)),
         "missing_values": "empty in csv, null in parquet, NaN in npz: a loss that is not finite",
-        "configs": {cell.config_key: dict(cell.config) for cell in cells},
+        "configs": {config.config_key: dict(config.config) for config in configs},
         "launches": [_public(launch) for launch in launches],
     }
 

@@ -22,20 +22,20 @@ Named = tuple[str, npt.NDArray[Any], tuple[str, ...]]
 _AT_A_TIME = 100  # trajectories
 
 
-def names(cells: Sequence[ConfigRow]) -> list[str]:
+def names(configs: Sequence[ConfigRow]) -> list[str]:
     """Return env/policy/width of each configuration, and the key where that is not unique."""
-    short = [f"{c.env}/{c.policy}/{'-' if c.width is None else c.width}" for c in cells]
+    short = [f"{c.env}/{c.policy}/{'-' if c.width is None else c.width}" for c in configs]
     count = Counter(short)
     return [
-        f"{name}/{cell.config_key[: streams.KEY_DIGITS]}" if count[name] > 1 else name
-        for name, cell in zip(short, cells, strict=True)
+        f"{name}/{config.config_key[: streams.KEY_DIGITS]}" if count[name] > 1 else name
+        for name, config in zip(short, configs, strict=True)
     ]
 
 
-def curves(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
+def curves(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield the curves of the finished trials, (seed, t), NaN from a divergence on."""
-    for name, cell in zip(names(cells), cells, strict=True):
-        seeds, diverged, steps = _steps(reader, cell)
+    for name, config in zip(names(configs), configs, strict=True):
+        seeds, diverged, steps = _steps(reader, config)
         for column, values in zip(STEP_COLUMNS, steps, strict=True):
             yield f"{name}/{column}", values, ("seed", "t")
         yield f"{name}/seed", seeds, ("seed",)
@@ -43,17 +43,17 @@ def curves(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None,
 
 
 def _steps(
-    reader: Reader, cell: ConfigRow
+    reader: Reader, config: ConfigRow
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
     """Return seeds (n,), flags of divergence (n,) and the columns of the steps (5, n, T)."""
     trials: dict[int, bool] = {}
     blocks = [np.empty((0, len(STEP_COLUMNS)))]
-    with closing(streams.steps(reader, cell)) as batches:
+    with closing(streams.steps(reader, config)) as batches:
         for rows in batches:
             seeds, statuses, _t, *values = zip(*rows, strict=True)
             trials.update(zip(seeds, (status == "diverged" for status in statuses), strict=True))
             blocks.append(np.array(values, dtype=np.float64).T)
-    steps = np.concatenate(blocks).reshape(len(trials), cell.horizon, len(STEP_COLUMNS))
+    steps = np.concatenate(blocks).reshape(len(trials), config.horizon, len(STEP_COLUMNS))
     return (
         np.array([*trials], np.int64),
         np.array([*trials.values()], np.bool_),
@@ -61,10 +61,10 @@ def _steps(
     )
 
 
-def trajectories(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
+def trajectories(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield states, inputs and final parameters of the finished trials."""
-    for name, cell in zip(names(cells), cells, strict=True):
-        found = list(streams.of_cell(reader, cell, _AT_A_TIME))
+    for name, config in zip(names(configs), configs, strict=True):
+        found = list(streams.of_config(reader, config, _AT_A_TIME))
         if found:
             yield f"{name}/states", _stack([one.states for *_, one in found]), _axes("state")
             yield f"{name}/inputs", _stack([one.inputs for *_, one in found]), _axes("input")
@@ -75,19 +75,19 @@ def trajectories(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named,
         yield f"{name}/diverged", np.array(diverged, dtype=np.bool_), ("seed",)
 
 
-def assessments(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
+def assessments(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield each measure of the finished trials, (seed, t), with its seeds and numbers of steps."""
-    for name, cell in zip(names(cells), cells, strict=True):
-        for measure in reader.measures(cell.config_key):
-            found = reader.assessments(cell.config_key, measure)
+    for name, config in zip(names(configs), configs, strict=True):
+        for measure in reader.measures(config.config_key):
+            found = reader.assessments(config.config_key, measure)
             yield f"{name}/{measure}", found.values, ("seed", "t")
             yield f"{name}/{measure}/seed", found.seeds, ("seed",)
             yield f"{name}/{measure}/t", found.t, ("t",)
 
 
-def trials(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[Named, None, None]:
+def trials(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
     """Yield the columns of the table of trials; a missing number is NaN, a missing text empty."""
-    table = streams.trials(reader, cells)
+    table = streams.trials(reader, configs)
     batches = list(table.batches)
     for i, field in enumerate(TRIALS):
         values = [value for batch in batches for value in batch.column(i).to_pylist()]

@@ -53,78 +53,80 @@ class Stream:
     batches: Generator[pa.RecordBatch, None, None]
 
 
-def curves(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
+def curves(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
     """Return every step of the finished trials, sorted by configuration, seed and t."""
-    return Stream(columns.CURVES, _curves(reader, cells))
+    return Stream(columns.CURVES, _curves(reader, configs))
 
 
-def trials(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
+def trials(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
     """Return every trial, sorted by configuration and seed."""
-    return Stream(columns.TRIALS, _trials(reader, cells))
+    return Stream(columns.TRIALS, _trials(reader, configs))
 
 
-def trajectories(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
+def trajectories(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
     """Return states and inputs of the finished trials, sorted by configuration, seed and t."""
-    firsts = [next(of_cell(reader, cell, 1), None) for cell in cells]
+    firsts = [next(of_config(reader, config, 1), None) for config in configs]
     n_states = max((one[2].states.shape[1] for one in firsts if one), default=0)
     n_inputs = max((one[2].inputs.shape[1] for one in firsts if one), default=0)
     schema = columns.trajectories(n_states, n_inputs)
-    return Stream(schema, _trajectories(reader, cells, schema))
+    return Stream(schema, _trajectories(reader, configs, schema))
 
 
-def assessments(reader: Reader, cells: Sequence[ConfigRow]) -> Stream:
+def assessments(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
     """Return what finished trials were worth, sorted by configuration, seed, t and measure."""
-    return Stream(columns.ASSESSMENTS, _assessments(reader, cells))
+    return Stream(columns.ASSESSMENTS, _assessments(reader, configs))
 
 
-def steps(reader: Reader, cell: ConfigRow) -> Generator[list[Sequence[Any]], None, None]:
+def steps(reader: Reader, config: ConfigRow) -> Generator[list[Sequence[Any]], None, None]:
     """Yield (seed, status, t, *STEP_COLUMNS) of the finished trials, in batches, by seed and t."""
-    yield from reader.batches(ROWS, _CURVES, config_key=cell.config_key)
+    yield from reader.batches(ROWS, _CURVES, config_key=config.config_key)
 
 
-def of_cell(reader: Reader, cell: ConfigRow, size: int) -> Iterator[tuple[int, str, Trajectory]]:
+def of_config(
+    reader: Reader, config: ConfigRow, size: int
+) -> Iterator[tuple[int, str, Trajectory]]:
     """Yield (seed, status, trajectory) of a configuration; ``size`` of them are read at a time."""
-    for rows in reader.batches(size, _TRAJECTORIES, config_key=cell.config_key):
+    for rows in reader.batches(size, _TRAJECTORIES, config_key=config.config_key):
         for seed, status, dtype, *packed in rows:
             arrays = [unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)]
             yield seed, status, Trajectory(*arrays)
 
 
-def _curves(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
-    for cell in cells:
-        for rows in steps(reader, cell):
+def _curves(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
+    for config in configs:
+        for rows in steps(reader, config):
             names = ("seed", "status", "t", *columns.STEP_COLUMNS)
             values = dict(zip(names, zip(*rows, strict=True), strict=True))
-            yield _batch(columns.CURVES, {**_constants(cell), **values}, len(rows))
+            yield _batch(columns.CURVES, {**_constants(config), **values}, len(rows))
 
 
 def _assessments(
-    reader: Reader, cells: Sequence[ConfigRow]
+    reader: Reader, configs: Sequence[ConfigRow]
 ) -> Generator[pa.RecordBatch, None, None]:
-    for cell in cells:
-        for rows in reader.batches(ROWS, _ASSESSMENTS, config_key=cell.config_key):
+    for config in configs:
+        for rows in reader.batches(ROWS, _ASSESSMENTS, config_key=config.config_key):
             names = ("seed", "status", "t", "measure", "value")
             values = dict(zip(names, zip(*rows, strict=True), strict=True))
-            yield _batch(columns.ASSESSMENTS, {**_constants(cell), **values}, len(rows))
+            yield _batch(columns.ASSESSMENTS, {**_constants(config), **values}, len(rows))
 
 
-def _trials(reader: Reader, cells: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
-    for cell in cells:
-        for rows in reader.batches(ROWS, _TRIALS, config_key=cell.config_key):
+def _trials(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
+    for config in configs:
+        for rows in reader.batches(ROWS, _TRIALS, config_key=config.config_key):
             values = dict(zip(columns.TRIALS.names, zip(*rows, strict=True), strict=True))
             yield _batch(columns.TRIALS, values, len(rows))
 
 
 def _trajectories(
-    reader: Reader, cells: Sequence[ConfigRow], schema: pa.Schema
+    reader: Reader, configs: Sequence[ConfigRow], schema: pa.Schema
 ) -> Generator[pa.RecordBatch, None, None]:
-    for cell in cells:
-        size = max(1, ROWS // (cell.horizon + 1))
-        for seed, status, one in of_cell(reader, cell, size):
+    for config in configs:
+        size = max(1, ROWS // (config.horizon + 1))
+        for seed, status, one in of_config(reader, config, size):
             n = len(one.states)
             values = {"seed": seed, "status": status, "t": np.arange(n)}
             values |= _named("state", one.states, n) | _named("input", one.inputs, n)
-            yield _batch(schema, {**_constants(cell), **values}, n)
+            yield _batch(schema, {**_constants(config), **values}, n)
 
 
 def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:
@@ -134,11 +136,11 @@ def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:
     return {f"{name}_{i}": column for i, column in enumerate(padded.T)}
 
 
-def _constants(cell: ConfigRow) -> dict[str, Any]:
+def _constants(config: ConfigRow) -> dict[str, Any]:
     names = ("env", "policy", "model", "learner", "width", "depth")
     return {
-        "config": cell.config_key[:KEY_DIGITS],
-        **{name: getattr(cell, name) for name in names},
+        "config": config.config_key[:KEY_DIGITS],
+        **{name: getattr(config, name) for name in names},
     }
 
 

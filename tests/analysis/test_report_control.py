@@ -43,9 +43,9 @@ def test_what_the_models_are_good_for_has_a_section(tmp_path: Path) -> None:
     table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     with Reader.open(url) as reader:
         costs = {
-            one.cell.policy: scores_at(reader, one, 20).by_seed
+            one.config.policy: scores_at(reader, one, 20).by_seed
             for one in variant_groups(reader, Filter())[0].variants
-            if one.cell.config.get("task")
+            if one.config.config.get("task")
         }
     ratios = [costs["uniform"][seed] / costs["d_optimal"][seed] for seed in SEEDS]
     expected = np.exp(np.mean(np.log(ratios)))

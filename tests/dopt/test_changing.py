@@ -77,7 +77,7 @@ def test_without_a_drift_it_is_the_pendulum() -> None:
     assert two.loss == pytest.approx(one.loss, rel=1e-6)
 
 
-def test_trials_that_share_a_cell_do_not_share_the_truth() -> None:
+def test_trials_that_share_a_config_do_not_share_the_truth() -> None:
     spec = trial("drifting_pendulum", "random", env=DRIFT)
     first, second = KernelTrial(spec), KernelTrial(spec)
     first.advance(30)

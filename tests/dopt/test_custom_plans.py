@@ -98,7 +98,7 @@ def test_a_plan_that_gets_lost_ends_its_trial_alone() -> None:
     assert np.isnan(result.loss[5:]).all()
 
 
-def test_a_cell_of_own_parts_is_a_value() -> None:
+def test_a_config_of_own_parts_is_a_value() -> None:
     first, second = (specification(policy=own("Coin")).config for _ in range(2))
     assert isinstance(first, TrialConfig)
     assert first == second

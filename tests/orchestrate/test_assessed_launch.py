@@ -58,8 +58,8 @@ def test_the_rows_do_not_depend_on_the_executor(tmp_path: Path) -> None:
     assert rows(launched(tmp_path, "local", trials)) == rows(alone)
     assert [one for one in examine(alone) if one.severity == "error"] == []
     with Reader.open(alone) as reader:
-        (cell,) = reader.configs()
-    again = TrialSpec.from_mapping(without_versions(cell.config))
+        (config,) = reader.configs()
+    again = TrialSpec.from_mapping(without_versions(config.config))
     assert [trial.trial_key for trial in trials.trials][:1] == [again.trial_key]
 
 

@@ -188,7 +188,7 @@ def test_a_dry_run_counts_trials_that_run_again(
     assert "4 trials, 0 done, 4 to run" in command_line(*grid, "launch.retry=failed")[1]
 
 
-def test_a_dry_run_tells_its_cells_apart(command_line: Command) -> None:
+def test_a_dry_run_tells_its_configs_apart(command_line: Command) -> None:
     _, output, _ = command_line(
         "-m", "env=arm,pendulum", "policy=random", "env.mass=2,3", "env.dt=0.01,0.02", "seed=0",
         "launch.dry_run=true",

@@ -26,11 +26,11 @@ def losses(executor: str, folder: Path) -> list[float]:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     with Reader.open(url) as reader:
-        cells = sorted(reader.configs(), key=lambda cell: cell.config_key)
+        configs = sorted(reader.configs(), key=lambda config: config.config_key)
         return [
             float(loss)
-            for cell in cells
-            for loss in reader.curves(cell.config_key).values.ravel().tolist()
+            for config in configs
+            for loss in reader.curves(config.config_key).values.ravel().tolist()
         ]
 
 

@@ -52,7 +52,7 @@ class InputSpectra:
 def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpectra:
     """Return the spectra of every selected policy of an environment with a finished trial."""
     entries = selection.of(env)
-    system = system_from_mapping(entries[0].cell.config["env"])
+    system = system_from_mapping(entries[0].config.config["env"])
     mode = eigenmode(system)
     spectra = [_spectrum(reader, entry, system.dt) for entry in entries]
     found = tuple(spectrum for spectrum in spectra if spectrum is not None)
@@ -67,7 +67,7 @@ def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpec
         gamma=system.gamma,
         unit=unit_of(system.input_labels[0]),
         diverged=tuple(
-            entry.cell.policy
+            entry.config.policy
             for entry, spectrum in zip(entries, spectra, strict=True)
             if spectrum is None and entry.finished
         ),
@@ -83,9 +83,9 @@ def _spectrum(reader: Reader, entry: Entry, dt: float) -> PolicySpectrum | None:
     done = [trial.seed for trial in entry.trials if trial.status == "done"]
     if not done:
         return None
-    inputs = np.stack([reader.trajectory(entry.cell.config_key, seed).inputs for seed in done])
+    inputs = np.stack([reader.trajectory(entry.config.config_key, seed).inputs for seed in done])
     diverged = len(entry.finished) - len(done)
-    return PolicySpectrum(entry.cell.policy, average_spectrum(inputs, dt), diverged)
+    return PolicySpectrum(entry.config.policy, average_spectrum(inputs, dt), diverged)
 
 
 def tabulate_spectra(spectra: InputSpectra) -> pd.DataFrame:

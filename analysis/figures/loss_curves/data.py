@@ -74,18 +74,18 @@ def line_styles(selection: Selection, color_by: str | None = None) -> dict[str, 
     Entries of one colour are told apart by their dashes.
     """
     key = color_by or selection.group_by[0]
-    check_keys([key], [entry.cell for entry in selection.entries])
-    values = list(dict.fromkeys(repr(setting_value(e.cell, key)) for e in selection.entries))
+    check_keys([key], [entry.config for entry in selection.entries])
+    values = list(dict.fromkeys(repr(setting_value(e.config, key)) for e in selection.entries))
     used: Counter[str] = Counter()
     styles: dict[str, LineStyle] = {}
     for entry in selection.entries:
         if entry.label in styles:
             continue
         if key == "policy" and selection.group_by == ("policy",):
-            styles[entry.label] = replace(policy_style(entry.cell.policy), label=entry.label)
+            styles[entry.label] = replace(policy_style(entry.config.policy), label=entry.label)
             continue
-        value = repr(setting_value(entry.cell, key))
-        base = policy_style(entry.cell.policy).colour if key == "policy" else None
+        value = repr(setting_value(entry.config, key))
+        base = policy_style(entry.config.policy).colour if key == "policy" else None
         styles[entry.label] = sequence_style(values.index(value), used[value], entry.label, base)
         used[value] += 1
     return styles
@@ -102,13 +102,12 @@ def _measure(
 ) -> LossCurve:
     sample = read_sample(reader, entry, column, rule)
     t = np.arange(sample.values.shape[1])
-    system = system_from_mapping(entry.cell.config["env"])
+    system = system_from_mapping(entry.config.config["env"])
     scale = system.dt if axis is Axis.SECONDS else 1.0
-    x, cell = scale * t.astype(float), entry.cell
+    names = entry.config.env, entry.config.policy, entry.label
+    x = scale * t.astype(float)
     shown = band(sample.values, statistic)
-    return LossCurve(
-        cell.env, cell.policy, entry.label, style, t, x, loss_unit(system), shown, statistic, sample
-    )
+    return LossCurve(*names, style, t, x, loss_unit(system), shown, statistic, sample)
 
 
 def tabulate_curves(curves: tuple[LossCurve, ...]) -> pd.DataFrame:

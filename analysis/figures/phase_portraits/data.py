@@ -80,7 +80,7 @@ def median_seed(losses: dict[int, float]) -> int:
 def choose_seed(entries: Iterable[Entry]) -> int:
     """Return the seed to draw: that of the median among the reference policy's final losses."""
     for entry in entries:
-        if entry.cell.policy == REFERENCE and entry.final_losses():
+        if entry.config.policy == REFERENCE and entry.final_losses():
             return median_seed(entry.final_losses())
     raise AnalysisError(
         f"A phase portrait shows {SEED_RULE}, but no finished trial of {REFERENCE} is stored: "
@@ -92,13 +92,13 @@ def measure_portraits(reader: Reader, selection: Selection, env: str) -> Portrai
     """Return the portraits of one environment."""
     entries = selection.of(env)
     seed = choose_seed(entries)
-    plane = DrawnPlane.of(system_from_mapping(entries[0].cell.config["env"]))
+    plane = DrawnPlane.of(system_from_mapping(entries[0].config.config["env"]))
     panels = tuple(_portrait(reader, entry, seed, plane) for entry in entries)
     return Portraits(env, seed, plane, panels)
 
 
 def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Portrait:
-    key, finished = entry.cell.config_key, entry.finished
+    key, finished = entry.config.config_key, entry.finished
     status = {trial.seed: trial.status for trial in finished}
     points = np.empty((0, 2))
     if seed in status:
@@ -106,7 +106,7 @@ def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Por
         points = points[np.isfinite(points).all(axis=1)]
     shares = np.array([_share(reader, key, seed, plane) for seed in entry.final_losses()])
     return Portrait(
-        policy=entry.cell.policy,
+        policy=entry.config.policy,
         line=plane.line(points) if len(points) else points,
         start=plane.wrapped(points[:1])[0] if len(points) else np.full(2, np.nan),
         diverged=status.get(seed) == "diverged",

@@ -105,19 +105,19 @@ def _lines(entries: Iterable[Entry]) -> list[Line]:
     """Group entries of the reference policy that have a done trial and differ in width alone."""
     groups: dict[str, list[Entry]] = {}
     for entry in entries:
-        if entry.cell.policy == REFERENCE and entry.cell.width and entry.final_losses():
-            rest = {k: v for k, v in flatten(entry.cell.config).items() if k != "model.width"}
+        if entry.config.policy == REFERENCE and entry.config.width and entry.final_losses():
+            rest = {k: v for k, v in flatten(entry.config.config).items() if k != "model.width"}
             groups.setdefault(json.dumps(rest, sort_keys=True), []).append(entry)
-    return [tuple(sorted(group, key=lambda e: e.cell.width or 0)) for group in groups.values()]
+    return [tuple(sorted(group, key=lambda e: e.config.width or 0)) for group in groups.values()]
 
 
 def _rank(line: Line) -> tuple[int, ...]:
     trials = sum(len(entry.finished) for entry in line)
-    return len(line), *max(nearness(entry.cell) for entry in line), trials
+    return len(line), *max(nearness(entry.config) for entry in line), trials
 
 
 def _differ_in_form(one: Entry, other: Entry) -> bool:
-    a, b = flatten(one.cell.config), flatten(other.cell.config)
+    a, b = flatten(one.config.config), flatten(other.config.config)
     paths = {path for path in a.keys() | b.keys() if a.get(path) != b.get(path)}
     return paths <= {"policy.form", "model.width"}
 
@@ -126,12 +126,13 @@ def _unfinished(entries: Iterable[Entry]) -> Iterable[str]:
     for entry in entries:
         missing = len(entry.trials) - len(entry.finished)
         if missing:
-            yield f"{entry.cell.env}, width {entry.cell.width}: {missing} trials are not finished"
+            config = entry.config
+            yield f"{config.env}, width {config.width}: {missing} trials are not finished"
 
 
 def form_of(entry: Entry) -> str:
     """Return how the information matrix of an entry is held; M⁻¹ itself where nothing is said."""
-    policy: Mapping[str, object] = entry.cell.config["policy"]
+    policy: Mapping[str, object] = entry.config.config["policy"]
     return str(policy.get("form", "primal"))
 
 
@@ -142,12 +143,12 @@ def form_rank(form: str) -> tuple[int, str]:
 
 def measure_costs(reader: Reader, selection: Selection) -> WidthCosts:
     """Return all parts of the first line, and planning of the others."""
-    cell = selection.entries[0].cell
+    config = selection.entries[0].config
     lines = _by_form(selection)
     costs = []
     for index, line in enumerate(lines):
         costs += [_cost(reader, line, part) for part in (PARTS if index == 0 else PARTS[:1])]
-    return WidthCosts(cell.env, cell.policy, tuple(costs), 1e6 * cell.dt)
+    return WidthCosts(config.env, config.policy, tuple(costs), 1e6 * config.dt)
 
 
 def _by_form(selection: Selection) -> list[Line]:
@@ -161,7 +162,7 @@ def _cost(reader: Reader, line: Line, part: str) -> Cost:
         read_sample(reader, entry, f"{part}_us", DivergenceRule.EXCLUDE).values for entry in line
     ]
     low, median, high = np.array([np.quantile(values, QUANTILES) for values in samples]).T
-    widths = np.array([entry.cell.width for entry in line], dtype=np.int64)
+    widths = np.array([entry.config.width for entry in line], dtype=np.int64)
     n = np.array([len(values) for values in samples], dtype=np.int64)
     return Cost(form_of(line[0]), part, widths, n, low, median, high, exponent(widths, median))
 
@@ -179,13 +180,13 @@ def measure_losses(reader: Reader, selection: Selection, rule: DivergenceRule) -
     finals = [final_losses(reader, entry, "loss", rule) for entry in line]
     losses = [final.values for final in finals]
     return WidthLosses(
-        env=line[0].cell.env,
-        policy=line[0].cell.policy,
-        widths=np.array([entry.cell.width for entry in line], dtype=np.int64),
+        env=line[0].config.env,
+        policy=line[0].config.policy,
+        widths=np.array([entry.config.width for entry in line], dtype=np.int64),
         mean=np.array([mean(values) for values in losses]),
         error=np.array([standard_error(values) for values in losses]),
         counts=tuple(final.describe() for final in finals),
-        unit=loss_unit(system_from_mapping(line[0].cell.config["env"])),
+        unit=loss_unit(system_from_mapping(line[0].config.config["env"])),
         n=tuple(len(values) for values in losses),
     )
 

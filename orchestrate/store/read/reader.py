@@ -41,7 +41,7 @@ from orchestrate.store.schema import (
 )
 from orchestrate.store.serialization import unpack
 
-_CELLS = text(
+_CONFIGS = text(
     "SELECT p.config_key, p.env, p.policy, p.model, p.learner, p.width, p.depth, p.horizon, p.dt, "
     "p.gamma, p.label, p.n_done, p.n_diverged, p.n_failed, p.n_cancelled, p.n_pending, "
     "p.n_running, c.config_json "
@@ -107,8 +107,8 @@ class Reader:
     def configs(self) -> list[ConfigRow]:
         """Return all configurations, sorted by name, with the counts of their trials."""
         with self._snapshot() as connection:
-            cells = [_cell(*row) for row in connection.execute(_CELLS)]
-        return sorted(cells, key=_names)
+            configs = [_config_row(*row) for row in connection.execute(_CONFIGS)]
+        return sorted(configs, key=_names)
 
     def launches(self) -> list[LaunchRow]:
         """Return all launches that wrote to the database, the oldest first."""
@@ -236,14 +236,14 @@ def _kind(url: URL) -> ModuleType:
     return sqlite if url.get_backend_name() == "sqlite" else postgresql
 
 
-def _cell(*values: Any) -> ConfigRow:
+def _config_row(*values: Any) -> ConfigRow:
     return ConfigRow(*values[:-1], json.loads(values[-1]))  # type: ignore[call-arg]
 
 
-def _names(cell: ConfigRow) -> tuple[str | int, ...]:
+def _names(row: ConfigRow) -> tuple[str | int, ...]:
     """Return the sort key; not in SQL, where databases order letters and NULL differently."""
-    sizes = (-1 if size is None else size for size in (cell.width, cell.depth))
-    return (cell.env, cell.policy, cell.model, cell.learner, *sizes, cell.config_key)
+    sizes = (-1 if size is None else size for size in (row.width, row.depth))
+    return (row.env, row.policy, row.model, row.learner, *sizes, row.config_key)
 
 
 def _numbers(result: CursorResult[Any]) -> Array:
@@ -287,6 +287,6 @@ def _config(connection: Connection, config_key: str) -> tuple[int, int]:
     if row is None:
         raise QueryError(
             f"The configuration {config_key[:12]} is not in the database: "
-            "take one of those that cells() returns."
+            "take one of those that configs() returns."
         )
     return row[0], row[1]

@@ -144,17 +144,17 @@ def test_a_database_without_a_task_says_how_to_get_control_results(client: TestC
 
 
 def test_a_trial_shows_what_is_stored(client: TestClient, reader: Reader) -> None:
-    (cell,) = [c for c in reader.configs() if (c.env, c.policy) == ("cartpole", "d_optimal")]
-    row = reader.trials(cell.config_key)[1]
+    (config,) = [c for c in reader.configs() if (c.env, c.policy) == ("cartpole", "d_optimal")]
+    row = reader.trials(config.config_key)[1]
     found = client.get(f"/api/trials/{row.trial_key}").json()
     assert found["trial"]["final_loss"] == row.final_loss
     assert found["config"]["model.width"] == 16
     assert [one["outcome"] for one in found["attempts"]] == ["done"]
     assert found["launches"][0]["host"] == "h"
     arrays = client.get(f"/api/trials/{row.trial_key}/arrays").json()
-    losses = reader.curves(cell.config_key).values
+    losses = reader.curves(config.config_key).values
     assert arrays["loss"] == losses[1].tolist()
-    trajectory = reader.trajectory(cell.config_key, row.seed)
+    trajectory = reader.trajectory(config.config_key, row.seed)
     assert arrays["inputs"][0]["values"] == trajectory.inputs[:, 0].tolist()
     frequency, density = (np.array(arrays["spectrum"][key]) for key in ("frequency", "density"))
     assert len(frequency) == len(density) == 19

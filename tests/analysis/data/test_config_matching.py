@@ -13,13 +13,13 @@ from tests.analysis.synthetic import make_spec
 from tests.orchestrate.conftest import ROOT
 
 
-def cell(system: str, name: str, **sections: Mapping[str, object]) -> ConfigRow:
+def config(system: str, name: str, **sections: Mapping[str, object]) -> ConfigRow:
     spec = make_spec(system, name, 0, **sections)
     counts = dict.fromkeys(
         ("n_done", "n_diverged", "n_failed", "n_cancelled", "n_pending", "n_running"), 0
     )
-    config = json.loads(spec.config_json)
-    return ConfigRow(spec.config_key, **spec.columns(), **counts, config=config)  # type: ignore[arg-type]
+    mapping = json.loads(spec.config_json)
+    return ConfigRow(spec.config_key, **spec.columns(), **counts, config=mapping)  # type: ignore[arg-type]
 
 
 WIDE = {"model": {"width": 64}}
@@ -27,8 +27,8 @@ NARROW = {"model": {"width": 8}}
 
 
 def test_the_setting_with_most_trials_of_the_reference_decides_for_all_policies() -> None:
-    usual, wide = cell("pendulum", "d_optimal"), cell("pendulum", "d_optimal", **WIDE)
-    random, more = cell("pendulum", "random"), cell("pendulum", "random", **WIDE)
+    usual, wide = config("pendulum", "d_optimal"), config("pendulum", "d_optimal", **WIDE)
+    random, more = config("pendulum", "random"), config("pendulum", "random", **WIDE)
     chosen = choose(
         [Candidate(wide, 20), Candidate(usual, 100), Candidate(random, 10), Candidate(more, 50)]
     )
@@ -36,45 +36,45 @@ def test_the_setting_with_most_trials_of_the_reference_decides_for_all_policies(
 
 
 def test_the_oracle_comes_with_the_model_of_its_own() -> None:
-    usual, oracle = cell("pendulum", "d_optimal"), cell("pendulum", "oracle")
+    usual, oracle = config("pendulum", "d_optimal"), config("pendulum", "oracle")
     assert choose([Candidate(usual, 5), Candidate(oracle, 9)]) == [usual, oracle]
 
 
 def test_another_world_is_never_mixed_in() -> None:
-    usual = cell("pendulum", "d_optimal")
-    oracle = cell("pendulum", "oracle", env={"gamma": 3.0})
+    usual = config("pendulum", "d_optimal")
+    oracle = config("pendulum", "oracle", env={"gamma": 3.0})
     assert choose([Candidate(usual, 5), Candidate(oracle, 9)]) == [usual]
 
 
 def test_without_the_reference_the_commonest_setting_is_taken() -> None:
-    few, many = cell("pendulum", "random", **WIDE), cell("pendulum", "random")
+    few, many = config("pendulum", "random", **WIDE), config("pendulum", "random")
     assert choose([Candidate(few, 3), Candidate(many, 4)]) == [many]
 
 
 def test_a_tie_names_the_difference_and_the_way_out() -> None:
-    wide, narrow = (cell("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
+    wide, narrow = (config("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
     with pytest.raises(AnalysisError, match=r"20 trials each.*model\.width.*--where model\.width="):
         choose([Candidate(wide, 20), Candidate(narrow, 20)])
 
 
 def test_a_task_is_no_departure_but_the_last_to_decide() -> None:
     task = {"task": {"name": "control", "checkpoints": [100]}}
-    plain = cell("pendulum", "lookahead")
-    assessed = cell("pendulum", "lookahead", **task)
-    far = cell("pendulum", "lookahead", policy={"lookahead": 20})
+    plain = config("pendulum", "lookahead")
+    assessed = config("pendulum", "lookahead", **task)
+    far = config("pendulum", "lookahead", policy={"lookahead": 20})
     assert choose([Candidate(far, 5), Candidate(assessed, 5)]) == [assessed]
     assert choose([Candidate(assessed, 5), Candidate(plain, 5), Candidate(far, 5)]) == [plain]
 
 
 def test_of_learners_with_as_many_trials_that_of_a_launch_decides() -> None:
     learners = {name: {"learner": {"name": name}} for name in ("adam_window", "ekf", "adam_replay")}
-    cells = {
-        (policy, name): cell("pendulum", policy, **learner)
+    configs = {
+        (policy, name): config("pendulum", policy, **learner)
         for policy in ("d_optimal", "random")
         for name, learner in learners.items()
     }
-    chosen = choose([Candidate(one, 5) for one in cells.values()])
-    assert chosen == [cells["d_optimal", "adam_window"], cells["random", "adam_window"]]
+    chosen = choose([Candidate(one, 5) for one in configs.values()])
+    assert chosen == [configs["d_optimal", "adam_window"], configs["random", "adam_window"]]
 
 
 def test_what_is_usual_is_what_a_launch_takes() -> None:
@@ -86,32 +86,32 @@ def test_what_is_usual_is_what_a_launch_takes() -> None:
 
 def test_the_advice_on_a_tie_names_what_all_of_them_have() -> None:
     filters = [
-        cell("pendulum", "d_optimal", learner={"name": "ekf", "forgetting": value})
+        config("pendulum", "d_optimal", learner={"name": "ekf", "forgetting": value})
         for value in (0.9, 0.95)
     ]
     with pytest.raises(AnalysisError, match=r"differ in learner\.forgetting .* --where learner\."):
         choose([Candidate(one, 5) for one in filters])
-    path, values = difference([filters[0].config, cell("pendulum", "d_optimal").config])
+    path, values = difference([filters[0].config, config("pendulum", "d_optimal").config])
     assert (path, values) == ("learner.name", ["ekf", "adam_window"])
 
 
 def test_a_tie_between_variants_of_one_policy_is_an_error_too() -> None:
     mild, strong = (
-        cell("pendulum", "d_optimal", policy={"regularization": value}) for value in (1e-2, 1e-4)
+        config("pendulum", "d_optimal", policy={"regularization": value}) for value in (1e-2, 1e-4)
     )
     with pytest.raises(AnalysisError, match=r"policy\.regularization"):
         choose([Candidate(mild, 5), Candidate(strong, 5)])
 
 
 def test_more_trials_of_the_baselines_settle_a_tie_of_the_reference() -> None:
-    wide, narrow = (cell("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
-    random = cell("pendulum", "random", **NARROW)
+    wide, narrow = (config("pendulum", "d_optimal", **size) for size in (WIDE, NARROW))
+    random = config("pendulum", "random", **NARROW)
     chosen = choose([Candidate(wide, 20), Candidate(narrow, 20), Candidate(random, 20)])
     assert chosen == [narrow, random]
 
 
 def test_filter_by_value() -> None:
-    wide = cell("pendulum", "d_optimal", **WIDE)
+    wide = config("pendulum", "d_optimal", **WIDE)
     assert Filter(where={"model.width": 64}).accepts(wide)
     assert Filter(where={"env.gamma": int(wide.gamma)}).accepts(wide) == wide.gamma.is_integer()
     assert not Filter(where={"model.width": 16}).accepts(wide)
@@ -120,15 +120,15 @@ def test_filter_by_value() -> None:
 
 
 def test_a_condition_says_nothing_of_a_model_without_the_value() -> None:
-    assert Filter(where={"model.width": 64}).accepts(cell("pendulum", "oracle"))
+    assert Filter(where={"model.width": 64}).accepts(config("pendulum", "oracle"))
 
 
 def test_a_condition_that_nothing_meets_is_a_sentence() -> None:
-    cells = [cell("pendulum", "oracle"), cell("pendulum", "random")]
+    configs = [config("pendulum", "oracle"), config("pendulum", "random")]
     with pytest.raises(AnalysisError, match=r"model\.with names no value .* model\.width"):
-        Filter(where={"model.with": 16}).check_where(cells)
+        Filter(where={"model.with": 16}).check_where(configs)
     with pytest.raises(AnalysisError, match=r"model\.width=9 fits no .* stored are 16"):
-        Filter(where={"model.width": 9}).check_where(cells)
+        Filter(where={"model.width": 9}).check_where(configs)
 
 
 def test_flatten() -> None:
@@ -136,5 +136,5 @@ def test_flatten() -> None:
 
 
 def test_difference_of_equal_configurations_is_their_key() -> None:
-    same = cell("pendulum", "random").config
+    same = config("pendulum", "random").config
     assert difference([same, same])[0] == "config_key"

@@ -37,9 +37,9 @@ def bounds(bounds_url: str) -> Iterator[Reader]:
 def test_each_value_is_shown_once_in_the_order_of_the_numbers(bounds: Reader) -> None:
     selection = select(bounds, Filter(group_by=("env.gamma",)))
     assert selection.labels == ("γ=2", "γ=3", "γ=10")
-    assert {entry.cell.policy for entry in selection.entries} == {"d_optimal"}
+    assert {entry.config.policy for entry in selection.entries} == {"d_optimal"}
     one = select(bounds, Filter(policies=("random",), group_by=("gamma",)))
-    assert {entry.cell.policy for entry in one.entries} == {"random"}
+    assert {entry.config.policy for entry in one.entries} == {"random"}
 
 
 def test_settings_can_be_combined(bounds: Reader) -> None:

@@ -30,7 +30,7 @@ def test_a_complete_grid_has_no_gap_though_periodic_cannot_fly(reader: Reader) -
     assert selection.gaps == ()
     assert selection.environments == ("pendulum", "cartpole", "quadrotor")
     assert selection.policies == ("d_optimal", "oracle", "uniform", "periodic", "random")
-    assert [entry.cell.policy for entry in selection.of("quadrotor")] == [
+    assert [entry.config.policy for entry in selection.of("quadrotor")] == [
         "d_optimal",
         "oracle",
         "uniform",
@@ -91,7 +91,7 @@ def test_assessments_of_different_versions_do_not_mix(
     url = f"sqlite:///{tmp_path}/versions.db"
     fill(url, [*plain, *old, *new])
     with Reader.open(url) as opened:
-        kept = {cell.config_key for cell in newest(list(opened.configs()))}
+        kept = {row.config_key for row in newest(list(opened.configs()))}
     assert kept == {one.config_key for one in (*plain, *new)}
 
 

@@ -53,7 +53,7 @@ def test_panels_share_the_seed_and_the_start(reader: Reader) -> None:
 def test_the_line_goes_through_the_stored_states(reader: Reader) -> None:
     selection = select(reader, Filter())
     portraits = measure_portraits(reader, selection, "pendulum")
-    key = selection.of("pendulum")[0].cell.config_key
+    key = selection.of("pendulum")[0].config.config_key
     states = reader.trajectory(key, portraits.seed).states
     table = tabulate_portraits(portraits)
     drawn = table[(table.policy == "d_optimal") & table.x.notna()]

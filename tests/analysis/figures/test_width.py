@@ -32,13 +32,13 @@ def reader_of(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) 
 
 
 def widths_of(selection: Selection) -> list[int | None]:
-    return [entry.cell.width for entry in selection.entries]
+    return [entry.config.width for entry in selection.entries]
 
 
 def test_other_widths_leave_the_selection_of_the_other_figures_alone(reader: Reader) -> None:
     selection = select(reader, Filter())
     assert selection.gaps == ()
-    assert {entry.cell.width for entry in selection.of("cartpole")} == {16, None}
+    assert {entry.config.width for entry in selection.of("cartpole")} == {16, None}
     assert len(selection.of("cartpole")) == 5
 
 
@@ -50,7 +50,7 @@ def test_however_many_trials_another_width_has(tmp_path: Path, seeds: int) -> No
     with reader_of(tmp_path, (grid + extra, [])) as reader:
         selection = select(reader, Filter())
     assert selection.gaps == ()
-    assert {entry.cell.config_key for entry in selection.entries} == {s.config_key for s in grid}
+    assert {entry.config.config_key for entry in selection.entries} == {s.config_key for s in grid}
 
 
 def test_a_database_of_widths_alone_takes_the_width_of_the_paper(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_costs_are_medians_over_steps_and_trials(reader: Reader) -> None:
     assert [cost.part for cost in numbers.costs] == ["plan", "learn", "evaluate"]
     assert numbers.limit_us == pytest.approx(20_000)
     plan = numbers.costs[0]
-    values = reader.curves(part.entries[0].cell.config_key, "plan_us").values
+    values = reader.curves(part.entries[0].config.config_key, "plan_us").values
     assert plan.median[0] == np.median(values)
     assert (plan.low[0], plan.high[0]) == tuple(np.quantile(values, [0.1, 0.9]))
     assert plan.n.tolist() == [5] * 5
@@ -107,7 +107,7 @@ def test_a_diverged_trial_counts_in_neither(tmp_path: Path) -> None:
 def test_losses_have_two_standard_errors(reader: Reader) -> None:
     part = width_part(select(reader, Filter()))
     numbers = measure_losses(reader, part, DivergenceRule.EXCLUDE)
-    finals = reader.curves(part.entries[2].cell.config_key).values[:, -1]
+    finals = reader.curves(part.entries[2].config.config_key).values[:, -1]
     assert numbers.mean[2] == pytest.approx(finals.mean())
     table = tabulate_losses(numbers)
     assert table["width"].tolist() == [4, 8, 16, 32, 64]

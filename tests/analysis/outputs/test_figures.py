@@ -57,7 +57,7 @@ def test_every_figure_comes_whole(folder: Path, name: str) -> None:
     facts = json.loads((folder / f"{name}.json").read_text())
     assert facts["statistic"]
     assert facts["band"]
-    assert all(cell["n_finished"] == 5 for cell in facts["cells"])
+    assert all(config["n_finished"] == 5 for config in facts["cells"])
     assert not list(folder.glob(".*"))
 
 

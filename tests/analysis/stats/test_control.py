@@ -44,16 +44,16 @@ def curve_of(curves: tuple[ControlCurve, ...], env: str, policy: str) -> Control
 def test_only_trials_with_a_task_are_taken(reader: Reader, part: Selection) -> None:
     assert part.environments == ("pendulum", "quadrotor")
     assert part.policies == ("d_optimal", "uniform", "random")
-    assert all(entry.cell.config["task"] for entry in part.entries)
+    assert all(entry.config.config["task"] for entry in part.entries)
     whole = select(reader, Filter())
-    assert not any("task" in entry.cell.config for entry in whole.entries)
+    assert not any("task" in entry.config.config for entry in whole.entries)
 
 
 def test_the_numbers_are_those_of_the_trials(reader: Reader, part: Selection) -> None:
     curves = measure_control(reader, part)
     curve = curve_of(curves, "pendulum", "uniform")
-    entry = next(e for e in part.of("pendulum") if e.cell.policy == "uniform")
-    task = entry.cell.config["task"]
+    entry = next(e for e in part.of("pendulum") if e.config.policy == "uniform")
+    task = entry.config.config["task"]
     specs = make_grid(("pendulum",), ("uniform",), range(5), **SHORT, task=task)
     rows = [fake_result(spec).assessments for spec in specs]
     assert curve.t.tolist() == [0, 20, 40, 60]
@@ -83,7 +83,7 @@ def test_the_comparison_pairs_seeds(reader: Reader, part: Selection) -> None:
     table = compare_control(reader, part)
     assert sorted(set(table.t)) == [20, 40, 60]
     row = table[(table.env == "quadrotor") & (table.t == 40) & (table.policy == "random")]
-    entries = {entry.cell.policy: entry for entry in part.of("quadrotor")}
+    entries = {entry.config.policy: entry for entry in part.of("quadrotor")}
     ours, theirs = (
         scores_at(reader, entries[name], 40).by_seed for name in ("d_optimal", "random")
     )
@@ -141,7 +141,7 @@ def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
     with Reader.open(url) as reader:
         part = control_part(select(reader, Filter()))
         curves = measure_control(reader, part)
-        entry = next(entry for entry in part.entries if entry.cell.policy == "random")
+        entry = next(entry for entry in part.entries if entry.config.policy == "random")
         scores = scores_at(reader, entry, 20).by_seed
         table = compare_control(reader, part)
     curve = curve_of(curves, "pendulum", "random")

@@ -99,7 +99,7 @@ def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
     assert table["t"].tolist() == list(range(60))
     assert table["mean"].to_numpy() == pytest.approx(np.mean(losses, axis=0))
     seconds = tabulate_curves(measure_curves(*arguments, Axis.SECONDS))
-    dt = selection.entries[0].cell.dt
+    dt = selection.entries[0].config.dt
     assert seconds["x"].to_numpy() == pytest.approx(dt * table["x"].to_numpy())
 
 

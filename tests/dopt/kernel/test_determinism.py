@@ -61,7 +61,7 @@ def test_another_seed_gives_another_trial() -> None:
 
 
 def test_seeds_share_what_they_are_told_apart_by() -> None:
-    """Trials of one cell start from one state and are judged on the same points."""
+    """Trials of one configuration start from one state and are judged on the same points."""
     one, two = KernelTrial(trial("arm", "d_optimal", 0)), KernelTrial(trial("arm", "d_optimal", 1))
     assert all(a is b for a, b in zip(one.constants, two.constants, strict=True))
     assert np.array_equal(one.record.states[0], two.record.states[0])

@@ -49,7 +49,7 @@ def test_a_batch_is_its_trials_one_by_one(env: str, policy: str) -> None:
         assert many.parameters == pytest.approx(one.parameters, rel=1e-6, abs=1e-9)
 
 
-def test_trials_of_two_cells_are_no_batch() -> None:
+def test_trials_of_two_configs_are_no_batch() -> None:
     with pytest.raises(SpecificationError, match="may differ in the seed alone"):
         run_trials([trial("arm", "random"), trial("arm", "uniform")])
 

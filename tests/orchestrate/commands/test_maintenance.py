@@ -137,7 +137,7 @@ class TestDoctor:
         new = f"sqlite:///{tmp_path}/new.db"
         assert len(merge(new, url).incomplete) == 1
         with Reader.open(new) as reader:
-            assert sum(cell.n_done for cell in reader.configs()) == 3
+            assert sum(config.n_done for config in reader.configs()) == 3
 
     def test_knows_the_key_of_a_trial(self) -> None:
         trial = specification(seed=12345678901)

@@ -31,7 +31,7 @@ def rows(text: str) -> list[list[str]]:
 
 @pytest.mark.usefixtures("grid")
 class TestOnce:
-    def test_counts_each_cell(self, command: Run) -> None:
+    def test_counts_each_config(self, command: Run) -> None:
         table = rows(command("status").out)
         assert [" ".join(row) for row in table[:6]] == [
             "env policy width done of failed diverged running pending",
@@ -61,7 +61,7 @@ class TestOnce:
         assert document["complete"] is False
         assert document["per_second"] > 0
         assert document["seconds_left"] == pytest.approx(3 / document["per_second"])
-        assert [cell["n"] for cell in document["configs"]] == [2, 1, 3, 3]
+        assert [config["n"] for config in document["configs"]] == [2, 1, 3, 3]
         (kind,) = document["failures"]
         assert (kind["cause"], kind["trials"], kind["attempts"]) == ("exception", 2, 2)
         assert kind["last_line"].startswith("ZeroDivisionError: seed")
@@ -70,7 +70,7 @@ class TestOnce:
 
     def test_filters(self, command: Run) -> None:
         document = command("status", "--json", "--env", "cartpole").document
-        assert {cell["env"] for cell in document["configs"]} == {"cartpole"}
+        assert {config["env"] for config in document["configs"]} == {"cartpole"}
         assert document["failures"] == []
         assert document["per_second"] == 0
         both = command("status", "--json", "--env", "pendulum", "cartpole", "--policy", "random")
@@ -128,7 +128,7 @@ def test_the_rate_is_that_of_the_living(store: Store, take: Take, reader: Reader
 
 
 class TestTable:
-    def cells(self, reader: Reader, store: Store, specs: Sequence[Spec]) -> list[ConfigRow]:
+    def configs(self, reader: Reader, store: Store, specs: Sequence[Spec]) -> list[ConfigRow]:
         store.register(store.begin_launch(LAUNCH), specs)
         return reader.configs()
 
@@ -136,22 +136,22 @@ class TestTable:
         specs = [
             Spec(0, env, policy, width) for env in "ab" for policy in "xyz" for width in (1, 2)
         ]
-        cells = self.cells(reader, store, specs)
-        assert len(self.shown(cells, 12)) == 1 + 12 + 1
-        merged = self.shown(cells, 11)
+        configs = self.configs(reader, store, specs)
+        assert len(self.shown(configs, 12)) == 1 + 12 + 1
+        merged = self.shown(configs, 11)
         assert merged[0][:5] == ["env", "policy", "configs", "done", "of"]
         assert merged[1][:5] == ["a", "x", "2", "0", "2"]
         assert len(merged) == 1 + 6 + 1
-        assert self.shown(cells, 5)[1][:4] == ["a", "6", "0", "6"]
-        assert self.shown(cells, 1)[-1][:4] == ["total", "12", "0", "12"]
+        assert self.shown(configs, 5)[1][:4] == ["a", "6", "0", "6"]
+        assert self.shown(configs, 1)[-1][:4] == ["total", "12", "0", "12"]
 
     def test_what_tells_configurations_apart_is_shown(self, reader: Reader, store: Store) -> None:
-        cells = self.cells(reader, store, [Spec(horizon=5), Spec(horizon=6)])
-        assert self.shown(cells, 10)[0][:4] == ["env", "policy", "width", "horizon"]
+        configs = self.configs(reader, store, [Spec(horizon=5), Spec(horizon=6)])
+        assert self.shown(configs, 10)[0][:4] == ["env", "policy", "width", "horizon"]
 
-    def shown(self, cells: list[ConfigRow], most: int) -> list[list[str]]:
+    def shown(self, configs: list[ConfigRow], most: int) -> list[list[str]]:
         console = Console(file=io.StringIO(), width=200)
-        console.print(grid_table(cells, most))
+        console.print(grid_table(configs, most))
         return rows(console.file.getvalue())  # type: ignore[attr-defined]
 
 

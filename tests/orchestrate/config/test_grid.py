@@ -22,7 +22,7 @@ def combination(seeds: tuple[int, ...] | None = (0, 1), **sections: object) -> C
     return Combination({**SETTINGS, **sections}, seeds)
 
 
-def test_every_cell_gets_its_first_seed_before_any_gets_its_second() -> None:
+def test_every_config_gets_its_first_seed_before_any_gets_its_second() -> None:
     grid = build_grid([combination(), combination(policy={"name": "uniform"})])
     order = [(trial.policy.name, trial.seed) for trial in grid.trials]
     assert order == [("random", 0), ("uniform", 0), ("random", 1), ("uniform", 1)]

@@ -71,7 +71,7 @@ def test_a_grid_runs_in_lockstep(
     )
     assert code == 0, errors
     with Reader.open(url) as reader:
-        assert [cell.n_done for cell in reader.configs()] == [4, 4]
+        assert [config.n_done for config in reader.configs()] == [4, 4]
 
 
 def test_lockstep_and_the_kernel_keep_their_trials_apart(
@@ -83,7 +83,7 @@ def test_lockstep_and_the_kernel_keep_their_trials_apart(
     assert command_line(*one, "executor=lockstep")[0] == 0
     assert command_line(*one, "executor=inprocess")[0] == 0
     with Reader.open(url) as reader:
-        assert sorted(str(cell.config["path"]) for cell in reader.configs()) == [
+        assert sorted(str(config.config["path"]) for config in reader.configs()) == [
             "kernel",
             "reference",
         ]

@@ -88,10 +88,10 @@ def test_what_was_stored_is_read_back_as_the_trial_that_it_was(
     said, _ = process.communicate(timeout=PATIENCE_SECONDS)
     assert process.returncode == 0, said
     with Reader.open(url) as reader:
-        cells = reader.configs()
-    assert {cell.config["path"] for cell in cells} == {"reference"}
-    assert {cell.config["model"]["width"] for cell in cells} == {16}
+        configs = reader.configs()
+    assert {config.config["path"] for config in configs} == {"reference"}
+    assert {config.config["model"]["width"] for config in configs} == {16}
     monkeypatch.syspath_prepend(str(EXAMPLE))
-    for cell in cells:
-        config = without_versions(cell.config)
-        assert TrialSpec.from_mapping({**config, "seed": 0}).config_key == cell.config_key
+    for config in configs:
+        mapping = without_versions(config.config)
+        assert TrialSpec.from_mapping({**mapping, "seed": 0}).config_key == config.config_key

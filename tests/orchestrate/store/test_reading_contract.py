@@ -42,7 +42,7 @@ def grid(store: Store, launch: int, take: Take) -> list[Spec]:
 
 @pytest.mark.usefixtures("grid")
 class TestReader:
-    def test_counts_the_trials_of_each_cell(self, reader: Reader) -> None:
+    def test_counts_the_trials_of_each_config(self, reader: Reader) -> None:
         first, second = reader.configs()
         assert (first.policy, first.width, first.n, first.n_pending) == ("d_optimal", None, 1, 1)
         assert (second.policy, second.config_key, second.n) == ("random", KEY, 4)

@@ -117,7 +117,7 @@ def test_every_row_stays_as_it_was(old: str, version: int) -> None:
     assert contents(old, kept) == before
     with Reader.open(old) as reader:
         assert reader.schema_version() == str(SCHEMA_VERSION)
-        assert sum(cell.n_done for cell in reader.configs()) == 4
+        assert sum(config.n_done for config in reader.configs()) == 4
 
 
 def test_every_configuration_gets_its_label(old: str) -> None:
