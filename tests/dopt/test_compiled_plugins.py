@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shlex
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,6 +21,7 @@ from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
 from tests.paths import EXAMPLE, ROOT
+from tests.typed_commands import empty_folder, run_typed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,23 +143,13 @@ def test_a_class_does_not_inherit_that_it_is_compiled() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(1200)
-def test_the_commands_of_the_page_run(tmp_path: Path) -> None:
-    for name in ("analysis", "dopt", "docs", "orchestrate"):
-        (tmp_path / name).symlink_to(ROOT / name)
+@pytest.mark.timeout(600)
+def test_the_commands_of_the_page_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty_folder(tmp_path, monkeypatch)
     page = (ROOT / "docs" / "compiled_plugins.md").read_text()
-    commands = [line.strip() for line in page.splitlines() if line.startswith("    PYTHONPATH=")]
-    assert len(commands) == 2
-    for command in commands:
-        first, _, *words = shlex.split(command)
-        path = os.pathsep.join([str(ROOT), first.partition("=")[2]])
-        done = subprocess.run(
-            [sys.executable, *words],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
-        assert done.stdout, command
+    lines = [line.strip() for line in page.splitlines() if line.startswith("    PYTHONPATH=")]
+    assert len(lines) == 2
+    for line in lines:
+        run_typed(line, monkeypatch, capsys)

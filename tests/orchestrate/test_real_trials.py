@@ -34,8 +34,16 @@ def losses(executor: str, folder: Path) -> list[float]:
         ]
 
 
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> list[float]:
+    """Return the losses of the trials one after the other in one process."""
+    return losses("inprocess", tmp_path_factory.mktemp("alone"))
+
+
 @pytest.mark.parametrize("executor", ["local", "ray"])
-def test_every_executor_stores_the_same_losses(executor: str, tmp_path: Path) -> None:
-    alone = losses("inprocess", tmp_path)
+@pytest.mark.xdist_group("real trials")  # one run in one process for all of them
+def test_every_executor_stores_the_same_losses(
+    executor: str, alone: list[float], tmp_path: Path
+) -> None:
     assert len(alone) == 48
     assert losses(executor, tmp_path) == alone

@@ -17,6 +17,8 @@ from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.faults.outcome import Rows, flaws, results
 
+pytestmark = pytest.mark.xdist_group("reference launches")  # one undisturbed database
+
 EXAMPLE = ROOT / "docs" / "example"
 TRIALS = 6
 PATIENCE_SECONDS = 200.0
@@ -24,7 +26,7 @@ PATIENCE_SECONDS = 200.0
 
 def command(url: str) -> list[str]:
     """Return the command of a grid of a policy and a network that only the reference runs."""
-    words = ["--config-dir", str(EXAMPLE / "conf"), "-m", "env=boat", "env.horizon=60"]
+    words = ["--config-dir", str(EXAMPLE / "conf"), "-m", "env=boat", "env.horizon=30"]
     words += ["policy=curiosity", "model=residual", f"seed=range({TRIALS})"]
     words += ["executor=local", "launch.workers=1", "launch.chunk_seconds=0.1"]
     return [sys.executable, str(ROOT / "orchestrate" / "launch.py"), *words, f"store.url={url}"]
@@ -56,8 +58,17 @@ def numbers(url: str) -> Rows:
     return found | {"curve": [row[:4] for row in found["curve"]]}
 
 
-def test_a_killed_launch_of_reference_trials_goes_on(tmp_path: Path) -> None:
-    url, undisturbed = (f"sqlite:///{tmp_path / name}.db" for name in ("killed", "whole"))
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a database of the grid that nothing disturbed."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('whole') / 'results'}.db"
+    said, _ = started(url).communicate(timeout=PATIENCE_SECONDS)
+    assert done(url) == TRIALS, said
+    return url
+
+
+def test_a_killed_launch_of_reference_trials_goes_on(tmp_path: Path, undisturbed: str) -> None:
+    url = f"sqlite:///{tmp_path / 'killed'}.db"
     process, end = started(url), time.monotonic() + PATIENCE_SECONDS
     while done(url) < 2:
         assert process.poll() is None, process.communicate()[0]
@@ -68,26 +79,20 @@ def test_a_killed_launch_of_reference_trials_goes_on(tmp_path: Path) -> None:
     before = done(url)
     assert 2 <= before < TRIALS
     assert flaws(url) == []
-    for one in (url, undisturbed):
-        again = started(one)
-        said, _ = again.communicate(timeout=PATIENCE_SECONDS)
-        assert again.returncode == 0, said
-        if one == url:
-            assert f"{before} of {TRIALS} already done" in said
+    again = started(url)
+    said, _ = again.communicate(timeout=PATIENCE_SECONDS)
+    assert again.returncode == 0, said
+    assert f"{before} of {TRIALS} already done" in said
     assert flaws(url) == []
     assert done(url) == TRIALS
     assert numbers(url) == numbers(undisturbed)
 
 
 def test_what_was_stored_is_read_back_as_the_trial_that_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    undisturbed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also the network's arguments, the digest of its file and the path."""
-    url = f"sqlite:///{tmp_path / 'results.db'}"
-    process = started(url)
-    said, _ = process.communicate(timeout=PATIENCE_SECONDS)
-    assert process.returncode == 0, said
-    with Reader.open(url) as reader:
+    with Reader.open(undisturbed) as reader:
         configs = reader.configs()
     assert {config.config["path"] for config in configs} == {"reference"}
     assert {config.config["model"]["width"] for config in configs} == {16}
