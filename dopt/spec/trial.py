@@ -45,7 +45,7 @@ class TrialSpec(Validated):
         if not whole or not 0 <= self.seed <= LARGEST_SEED:
             raise SpecificationError(
                 f"seed is {_shown(self.seed)}, but a whole number of 0 or above and below 2^63 is "
-                f"expected: set it so."
+                f"expected: set seed to a whole number in this range."
             )
 
     @classmethod

@@ -45,7 +45,10 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["seed=99999999999999999999"], "seed is 9+, but a whole number .* below 2\\^63"),
         (["env.horizon=99999999999"], "env.horizon is 9+ steps, .* be from 1 to 2147483647: set"),
         (["-m", "seed=range(0,1e12)"], "has more than 1,000,000 values"),
-        (["policy=random", "policy.regularization=1"], "'regularization' is unknown, there is no"),
+        (
+            ["policy=random", "policy.regularization=1"],
+            "'regularization' is unknown, no setting of policy exists",
+        ),
         (["seed=1,2"], "'seed=1,2' gives several values to one trial: add -m"),
         (["seed=range(3)"], "'seed=range\\(3\\)' gives several values to one trial"),
         (["launch.ray=3"], "launch.ray is 3, but a section"),
