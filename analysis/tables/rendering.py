@@ -1,4 +1,4 @@
-"""Tables as a person reads them, in Markdown or LaTeX."""
+"""Rendering of tables as Markdown or LaTeX."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A finite set of directions, for objectives that are compared over inputs and not solved."""
+"""Finite sets of unit input directions, for policies that compare candidate inputs."""
 
 from __future__ import annotations
 

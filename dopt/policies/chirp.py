@@ -1,4 +1,4 @@
-"""A sine of rising frequency."""
+"""Chirp input: a sine of rising frequency."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Disagreement of an ensemble of networks (MAX), the paper's [10]."""
+"""Exploration by the disagreement of an ensemble of networks (MAX), reference [10] of the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sum of sines with a flat spectrum up to a chosen frequency."""
+"""Multisine input: a sum of sines with a flat spectrum up to a chosen frequency."""
 
 from __future__ import annotations
 

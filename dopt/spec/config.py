@@ -1,4 +1,4 @@
-"""A trial without its seed, and whether its parts go together and can run."""
+"""Configuration of a trial: everything but its seed, and checks that its parts fit together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trial is a value: everything that it depends on, and a key made from that."""
+"""Specification of a trial: its configuration, its seed and the key computed from both."""
 
 from __future__ import annotations
 
