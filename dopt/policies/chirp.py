@@ -28,6 +28,7 @@ class Chirp(OpenLoop):
     """
 
     name: ClassVar[str] = "chirp"
+    uses_full_amplitude: ClassVar[bool] = False
 
     band: float = parameter(0.1, "1", "share")
 

@@ -29,6 +29,7 @@ class Multisine(OpenLoop):
     """
 
     name: ClassVar[str] = "multisine"
+    uses_full_amplitude: ClassVar[bool] = False
 
     band: float = parameter(0.1, "1", "share")
 
