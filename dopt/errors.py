@@ -34,12 +34,12 @@ def unknown_name(kind: str, given: object, valid: Iterable[str]) -> Specificatio
 
 
 def suggestion(given: str, valid: Iterable[str]) -> str:
-    """Return what to write in place of a name: the nearest valid name first, if one is similar."""
-    names = sorted(valid)
+    """Return what to write in place of a name: the nearest one, if one is similar, then all."""
+    names = list(valid)
     near = max(names, key=lambda name: (*_similarity(given, name), name))
     if max(_similarity(given, near)) < SIMILAR:
         return f"choose one of {', '.join(names)}."
-    return f"did you mean '{near}'? Valid names are {', '.join(names)}."
+    return f"did you mean '{near}'? Choose one of {', '.join(names)}."
 
 
 def _similarity(given: str, name: str) -> tuple[float, float]:

@@ -37,8 +37,8 @@ class QueryParams:
         """Return one of several texts."""
         value, known = self.text(name, default), list(choices)
         if value and value not in known:
-            hint = suggestion(value, known) if known else f"remove it, no {name} exists."
-            raise RequestError(f"{name} '{truncated(value)}' is unknown: {hint}")
+            hint = suggestion(value, known) if known else "remove it, none exists."
+            raise RequestError(f"'{name}' is '{truncated(value)}', which is not valid: {hint}")
         return value
 
     def member(self, name: str, kind: type[E], default: E) -> E:

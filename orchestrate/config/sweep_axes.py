@@ -129,9 +129,8 @@ def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception
     key = override.key_or_group
     if options := every_option(loader, key):
         pattern = ",".join(glob.include)
-        return SpecificationError(
-            f"no name of {key} matches the pattern '{pattern}': {suggestion(pattern, options)}"
-        )
+        hint = suggestion(pattern, sorted(options))
+        return SpecificationError(f"no name of {key} matches the pattern '{pattern}': {hint}")
     names = sorted(name for name in loader.list_groups("") if name != "hydra")
     return ConfigCompositionException(
         f"'{override.input_line}' is a glob, but '{key}' is not a group: groups are "

@@ -25,7 +25,7 @@ NAMES = ("random", "d_optimal", "first/random_held", "first/prbs", "second/exact
 )
 def test_the_nearest_name_counts_its_folder_or_not(given: str, nearest: str) -> None:
     message = str(unknown_name("policy", given, NAMES))
-    start = f"policy '{given}' is unknown: did you mean '{nearest}'? Valid names are d_optimal, "
+    start = f"policy '{given}' is unknown: did you mean '{nearest}'? Choose one of d_optimal, "
     assert message.startswith(start)
 
 

@@ -95,7 +95,7 @@ def test_bad_values_are_refused_by_path_and_value(
         assert f"{section}.{field.name}" in message
         assert any(
             words in message
-            for words in (" expected", " has to be ", " needs ", " valid ", " choose one of ")
+            for words in (" expected", " has to be ", " needs ", " valid ", "hoose one of ")
         )
         assert message.endswith(".")
         assert "\n" not in message

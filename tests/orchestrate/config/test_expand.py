@@ -206,7 +206,7 @@ def test_a_key_that_some_choices_lack_holds_for_the_others(
         ),
         (
             "nothere=1",
-            "setting 'nothere' is unknown: did you mean 'nothing'\\? Valid names are env, ",
+            "setting 'nothere' is unknown: did you mean 'nothing'\\? Choose one of env, ",
         ),
         ("env.dtt=[1]", "setting of env 'dtt' is .*: did you mean 'dt'"),
         ("env.dtt.x=1", "setting of env 'dtt' is .*: did you mean 'dt'"),
