@@ -1,4 +1,4 @@
-"""The command line: what to read, what to make of it, and exit codes.
+"""Command line of the analysis: arguments, selection of trials, outputs and exit codes.
 
 0: made; 1: something of the request has no data; 2: the request cannot be answered; 3: trials are
 missing and ``--allow-partial`` was not given.

@@ -1,4 +1,4 @@
-"""Errors of the package; each message is one sentence: what was given, what was expected."""
+"""Errors of the package; each message says what was given, what was expected, what to do."""
 
 from __future__ import annotations
 
@@ -29,15 +29,17 @@ def unknown_name(kind: str, given: object, valid: Iterable[str]) -> Specificatio
     """Return the error for an unknown name, with the nearest valid one if any is near."""
     names = sorted(valid)
     if not names:
-        return SpecificationError(
-            f"{kind} '{given}' is unknown, there is none to set: leave it out."
-        )
-    near = max(names, key=lambda name: (*_similarity(str(given), name), name))
-    similar = max(_similarity(str(given), near)) >= SIMILAR
-    hint = f"did you mean '{near}'?" if similar else "choose one of these."
-    return SpecificationError(
-        f"{kind} '{given}' is unknown, valid names are {', '.join(names)}: {hint}"
-    )
+        return SpecificationError(f"{kind} '{given}' is unknown, no {kind} exists: remove it.")
+    return SpecificationError(f"{kind} '{given}' is unknown: {suggestion(str(given), names)}")
+
+
+def suggestion(given: str, valid: Iterable[str]) -> str:
+    """Return what to write in place of a name: the nearest one, if one is similar, then all."""
+    names = list(valid)
+    near = max(names, key=lambda name: (*_similarity(given, name), name))
+    if max(_similarity(given, near)) < SIMILAR:
+        return f"choose one of {', '.join(names)}."
+    return f"did you mean '{near}'? Choose one of {', '.join(names)}."
 
 
 def _similarity(given: str, name: str) -> tuple[float, float]:

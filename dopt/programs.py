@@ -1,4 +1,4 @@
-"""Installed programs, whose packages are those beside this one and no others of the same names.
+"""Entry points of the installed programs; each imports the packages installed beside this one.
 
 A folder that ``PYTHONPATH`` names, for the classes of a user's own, comes before the installed
 packages: an ``analysis.py`` in it would be taken for the package of that name.

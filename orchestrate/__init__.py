@@ -1,1 +1,1 @@
-"""The effects: grids, executors and the results database around the pure :mod:`dopt`."""
+"""Grids, executors and the results database: all input and output around :mod:`dopt`."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -30,6 +32,7 @@ from tests.typed_commands import empty_folder, run_typed
 pytestmark = pytest.mark.xdist_group("docs")  # one database for all of them
 
 TUTORIAL = "docs/tutorial.md"
+STRUCTURE = "docs/structure.md"
 PLUGINS = "docs/compiled_plugins.md"
 DATABASE = "docs/database.md"
 QUERIES = [
@@ -55,6 +58,23 @@ SHELL = {
     "README.md": {"make"},
 }
 """Programs that no test here runs, by page; those of three machines have tests of their own."""
+
+# The map of the source code
+
+
+def test_every_function_of_the_map_from_the_paper_exists() -> None:
+    places = re.findall(r"`(dopt/[\w/]+\.py):([\w.]+)`", PAGES[STRUCTURE])
+    assert len(places) > 30
+    for path, name in places:
+        module = importlib.import_module(path.removesuffix(".py").replace("/", "."))
+        assert callable(attrgetter(name)(module)), f"{path}:{name}"
+
+
+def test_every_module_at_the_top_of_dopt_has_a_line() -> None:
+    tree = PAGES[STRUCTURE].split("hydra_plugins/")[0]
+    modules = {path.name for path in (ROOT / "dopt").glob("*.py")} - {"__init__.py"}
+    assert set(re.findall(r"^  (\w+\.py) ", tree, flags=re.MULTILINE)) == modules
+
 
 # Which commands a reader types
 

@@ -1,1 +1,1 @@
-"""A stored trial as a moving picture."""
+"""Animation of a stored trial."""

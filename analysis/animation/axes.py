@@ -1,4 +1,4 @@
-"""The panels of an animation: drawn once, then moved from frame to frame."""
+"""Panels of an animation; each is drawn once and then updated for each frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command ``animate``: which trial, which file."""
+"""Command ``animate``: its arguments, the selection of the trial, and the output file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One stored trial as numbers, frame by frame."""
+"""Numbers of one stored trial for each frame of an animation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A film as a file: GIF by Pillow, MP4 by ffmpeg."""
+"""Writers of animation files: GIF by Pillow, MP4 by ffmpeg."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Ink: how numbers are drawn, and the files that a picture comes as."""
+"""Figures: drawing of measured numbers, with one folder for each figure."""

@@ -1,4 +1,4 @@
-"""A figure as data: what it needs, how it is measured, tabulated, drawn and described."""
+"""Interface of a figure: its requirements, measured numbers, table, drawing and caption."""
 
 from __future__ import annotations
 

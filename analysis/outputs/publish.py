@@ -1,4 +1,4 @@
-"""The files of an output: written whole or not at all, and not again when nothing changed."""
+"""Writing of the files of an output: atomically, and only if the content has changed."""
 
 from __future__ import annotations
 

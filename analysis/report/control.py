@@ -1,4 +1,4 @@
-"""The section of a report on control: what the models of each variant were good for."""
+"""Section of a report on control: success and cost with the models of each variant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Addresses that only this machine reaches, told without a library of the browser."""
+"""Recognition of loopback addresses, without importing the libraries of the browser."""
 
 from __future__ import annotations
 

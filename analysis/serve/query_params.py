@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 from collections.abc import Iterable, Mapping
@@ -11,6 +10,7 @@ from typing import TypeVar
 
 from analysis.data.config_matching import Filter, read_condition
 from analysis.serve.errors import RequestError
+from dopt.errors import suggestion
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -28,19 +28,17 @@ class QueryParams:
         """Return a text; zero characters are refused because no database accepts them."""
         value = self._values.get(name, "").strip()
         if "\0" in value:
-            raise RequestError(f"'{name}' holds a zero character, a text is expected: leave it.")
+            raise RequestError(
+                f"'{name}' holds a zero character, a text is expected: remove that character."
+            )
         return value or default
 
     def choice(self, name: str, choices: Iterable[str], default: str = "") -> str:
         """Return one of several texts."""
         value, known = self.text(name, default), list(choices)
         if value and value not in known:
-            near = difflib.get_close_matches(value, known, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else "choose one of these."
-            raise RequestError(
-                f"'{name}' is '{truncated(value)}', expected is one of "
-                f"{', '.join(known) or 'nothing: there is none'}: {hint}"
-            )
+            hint = suggestion(value, known) if known else "remove it, none exists."
+            raise RequestError(f"'{name}' is '{truncated(value)}', which is not valid: {hint}")
         return value
 
     def member(self, name: str, kind: type[E], default: E) -> E:

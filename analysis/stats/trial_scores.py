@@ -1,4 +1,4 @@
-"""One number for each trial: what tables average and comparisons pair."""
+"""Scores: one number for each trial, which tables average and comparisons pair."""
 
 from __future__ import annotations
 

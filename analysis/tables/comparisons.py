@@ -1,7 +1,9 @@
 """Paired comparisons: every variant against one reference, over the seeds that they share.
 
 All tables, the report and the browser take their ratios from :func:`against_reference`. A ratio is
-always variant / reference: below 1 the variant has the lower value.
+always variant / reference: below 1 the variant has the lower value. An environment has one
+reference; where variants are grouped by the policy and other settings, each one is compared with
+the reference policy under the same other settings (:func:`references`).
 """
 
 from __future__ import annotations
@@ -32,8 +34,8 @@ from orchestrate.store import Reader
 Array = npt.NDArray[np.float64]
 BySeed = Mapping[int, float]
 Score = Callable[[Reader, Entry, str, DivergenceRule], Scores]
-Pair = tuple[Scores, Scores]
-"""The scores of a variant and of the reference."""
+Pair = tuple[Scores, Scores, dict[str, object]]
+"""The scores of a variant and of its reference, and what the row says of the two."""
 
 EPSILON_POLICY = "random"
 """The policy whose median final loss is the ε that others are to reach."""
@@ -76,9 +78,9 @@ def compare_policies(
     rows = []
     for env in selection.environments:
         scores = [_SCORES[measure](reader, entry, column, rule) for entry in selection.of(env)]
-        for own, reference in _pairs(scores, selection, env):
+        for own, reference, row in _pairs(scores, selection, env):
             found = against_reference(own.by_seed, reference.by_seed, env, own.label, name)
-            rows.append(_row(own, reference) | asdict(found) | _diverged(own, reference))
+            rows.append(row | asdict(found) | _diverged(own, reference))
     return _adjusted(rows, selection)
 
 
@@ -114,9 +116,9 @@ def compare_steps(
             continue
         scores = [steps_to(reader, entry, column, rule, threshold) for entry in entries]
         facts = {"epsilon": threshold, "horizon": entries[0].config.horizon}
-        for own, reference in _pairs(scores, selection, env):
+        for own, reference, row in _pairs(scores, selection, env):
             found = compare_hitting_times(*paired(own.by_seed, reference.by_seed))
-            rows.append(_row(own, reference) | facts | asdict(found) | _diverged(own, reference))
+            rows.append(row | facts | asdict(found) | _diverged(own, reference))
     if not rows and selection.compared().entries and len(selection.entries) > 1:
         raise AnalysisError(
             f"Steps to a loss need that loss or trials of {EPSILON_POLICY}, whose median final "
@@ -152,12 +154,12 @@ def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
                 continue
             successes = {entry.label: _successes(reader, entry, t) for entry in entries}
             scores = [scores_at(reader, entry, t) for entry in entries]
-            for own, reference in _pairs(scores, selection, env):
+            for own, reference, row in _pairs(scores, selection, env):
                 values = paired(own.by_seed, reference.by_seed)
                 found = against_reference(
                     own.by_seed, reference.by_seed, env, own.label, f"control/{t}"
                 )
-                row = _row(own, reference) | {"t": t, "success": successes[own.label]}
+                row |= {"t": t, "success": successes[own.label]}
                 row |= {"success_reference": successes[reference.label]} | asdict(found)
                 row |= {"n_lost": without_ratio(*values)} | _diverged(own, reference)
                 rows.append(row)
@@ -172,22 +174,62 @@ def _successes(reader: Reader, entry: Entry, t: int) -> float:
     return float(np.mean(known)) if len(known) else math.nan
 
 
+def references(selection: Selection, env: str) -> Iterator[tuple[Entry, Entry, bool]]:
+    """Yield each variant of an environment, its reference, and whether they share a group.
+
+    A group is made of the entries that have the same values of all settings of ``group_by`` but the
+    policy. If the reference policy has a final loss in a group, it is the reference of the others
+    in the group. Everything else is compared with the reference of the environment.
+    """
+    overall = selection.reference_of(env)
+    if overall is None:
+        return
+    entries = selection.of(env)
+    of_group = {}
+    if selection.reference == overall.config.policy and len(_other_keys(selection)) > 0:
+        named = [one for one in entries if one.config.policy == selection.reference]
+        of_group = {_group(one, selection): one for one in named if one.final_losses()}
+    for one in entries:
+        reference = of_group.get(_group(one, selection))
+        if reference is not None and reference is not one:
+            yield one, reference, True
+        elif reference is one and any(
+            other is not one and _group(other, selection) == _group(one, selection)
+            for other in entries
+        ):
+            continue  # the reference of its group
+        elif one is not overall:
+            yield one, overall, False
+
+
+def _other_keys(selection: Selection) -> tuple[str, ...]:
+    """Return the settings other than the policy by which entries that name it are grouped."""
+    keys = selection.group_by
+    return tuple(key for key in keys if key != "policy") if "policy" in keys else ()
+
+
+def _group(entry: Entry, selection: Selection) -> tuple[object, ...]:
+    pairs = zip(selection.group_by, entry.group, strict=True)
+    return tuple(value for key, value in pairs if key != "policy")
+
+
 def _pairs(scores: list[Scores], selection: Selection, env: str) -> Iterator[Pair]:
-    """Yield the scores of each variant of an environment with those of the reference."""
-    wanted = selection.reference_of(env)
-    reference = next((one for one in scores if wanted and one.label == wanted.label), None)
-    for one in scores:
-        if reference is not None and one is not reference:
-            yield one, reference
-
-
-def _row(own: Scores, reference: Scores) -> dict[str, object]:
-    return {
-        "env": own.env,
-        "policy": own.policy,
-        "variant": own.label,
-        "reference": reference.label,
-    }
+    """Yield the scores of each variant of an environment with those of its reference."""
+    found = {one.label: one for one in scores}
+    keys = _other_keys(selection)
+    for entry, other, same_group in references(selection, env):
+        own, reference = found.get(entry.label), found.get(other.label)
+        if own is None or reference is None:
+            continue
+        row: dict[str, object] = {
+            "env": own.env,
+            "policy": own.policy,
+            "variant": own.label,
+            "reference": reference.label,
+        }
+        if keys:
+            row["same"] = ", ".join(keys) if same_group else ""
+        yield own, reference, row
 
 
 def _diverged(own: Scores, reference: Scores) -> dict[str, object]:

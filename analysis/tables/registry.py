@@ -1,4 +1,4 @@
-"""All tables by name: what each needs, how it is measured, and how a person reads it."""
+"""Registry of tables: what each one needs, how it is measured, and how it is rendered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables as a person reads them, in Markdown or LaTeX."""
+"""Rendering of tables as Markdown or LaTeX."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.
         for row in table.to_dict("records")
     ]
     headers = [
-        "env", "variant", "reference", "loss ratio [95 %]", "P(improvement)", "Wilcoxon p",
+        "env", "variant", _reference(table), "loss ratio [95 %]", "P(improvement)", "Wilcoxon p",
         "BH-adjusted p", "pairs",
     ]  # fmt: skip
     note = (
@@ -152,7 +152,7 @@ def control_table(table: pd.DataFrame) -> TextTable:
         for row in table.to_dict("records")
     ]
     headers = [
-        "env", "explored steps", "variant", "reference", "success", "success of reference",
+        "env", "explored steps", "variant", _reference(table), "success", "success of reference",
         "cost ratio [95 %]", "P(improvement)", "Wilcoxon p", "BH-adjusted p", "pairs",
     ]  # fmt: skip
     note = (
@@ -185,7 +185,7 @@ def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
         for row in table.to_dict("records")
     ]
     headers = [
-        "env", "variant", "reference", "ε", "steps", "steps of reference", "reached",
+        "env", "variant", _reference(table), "ε", "steps", "steps of reference", "reached",
         "reference reached",
         "P(earlier)", "sign p", "BH-adjusted p", "pairs",
     ]  # fmt: skip
@@ -198,6 +198,19 @@ def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
         f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: {rule}."
     )
     return TextTable(headers, rows, note)
+
+
+def _reference(table: pd.DataFrame) -> str:
+    """Return the heading of the references: one of the environment, or one with the same setting.
+
+    The column ``same`` names the settings that a variant shares with its reference; it is empty
+    where no trial of the reference policy has these values.
+    """
+    same = set(table.get("same", [])) - {""}
+    if not same:
+        return "reference"
+    [keys] = same
+    return f"reference (same {keys}{', if stored' if '' in set(table['same']) else ''})"
 
 
 def _test_columns(row: Mapping[Hashable, Any]) -> list[str]:

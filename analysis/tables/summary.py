@@ -1,4 +1,4 @@
-"""The table of final losses."""
+"""Table of final losses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From configuration sections to specification dataclasses and back.
+"""Conversion of configuration sections to specification dataclasses and back.
 
 A section names a class of this package by ``name``, or one of the user's own by ``_target_``, the
 dotted path of a class that can be imported. Such a section also holds the digest of the file that

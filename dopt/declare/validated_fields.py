@@ -19,13 +19,18 @@ Bound = Literal["any", "positive", "nonnegative", "fraction", "share"]
 
 _LARGEST_REAL = sys.float_info.max
 
-_BOUNDS: dict[str, tuple[Callable[[float], bool], str]] = {
-    "any": (lambda _: True, "finite"),
-    "positive": (lambda value: value > 0, "finite and above 0"),
-    "nonnegative": (lambda value: value >= 0, "finite and at least 0"),
-    "fraction": (lambda value: 0 <= value < 1, "at least 0 and below 1"),
-    "share": (lambda value: 0 < value <= 1, "above 0 and at most 1"),
+_BOUNDS: dict[str, tuple[Callable[[float], bool], str, str]] = {
+    "any": (lambda _: True, "finite", "a finite number"),
+    "positive": (lambda value: value > 0, "finite and above 0", "a positive number"),
+    "nonnegative": (lambda value: value >= 0, "finite and at least 0", "0 or a positive number"),
+    "fraction": (
+        lambda value: 0 <= value < 1,
+        "at least 0 and below 1",
+        "a number from 0 to below 1",
+    ),
+    "share": (lambda value: 0 < value <= 1, "above 0 and at most 1", "a positive number up to 1"),
 }
+"""Check of each bound, the bound in words, and what to set a field to that is outside it."""
 
 _SMALLEST_WHOLE = {
     "any": -LARGEST_WHOLE,
@@ -195,14 +200,15 @@ def _converted_number(
         raise _wrong_type(path, value, expected)
     number = value if whole else _real(value)
     bound = field.metadata.get("bound", "any")
-    holds, words = _BOUNDS[bound]
+    holds, words, remedy = _BOUNDS[bound]
     if whole:
         words = f"from {_SMALLEST_WHOLE[bound]} to {LARGEST_WHOLE}"
+        remedy = "a whole number in this range"
     if not abs(number) <= (LARGEST_WHOLE if whole else _LARGEST_REAL) or not holds(number):
         unit = field.metadata.get("unit", "1")
         suffix = "" if unit == "1" else f" {unit}"
         raise SpecificationError(
-            f"{path} is {number}{suffix}, but it has to be {words}: set it so."
+            f"{path} is {number}{suffix}, but it has to be {words}: set {path} to {remedy}."
         )
     return number
 
@@ -217,4 +223,6 @@ def _real(value: float) -> float:
 
 def _wrong_type(path: str, value: object, expected: str) -> SpecificationError:
     given = "null" if value is None else f"{value!r} ({type(value).__name__})"
-    return SpecificationError(f"{path} is {given}, but {expected} is expected: set it so.")
+    return SpecificationError(
+        f"{path} is {given}, but {expected} is expected: set {path} to {expected}."
+    )

@@ -1,4 +1,4 @@
-"""Adam on minibatches of all that has been seen: experience replay.
+"""Adam on minibatches of all samples so far: experience replay.
 
 Reference: L.-J. Lin, "Self-improving reactive agents based on reinforcement learning, planning and
 teaching", Machine Learning 8 (1992).

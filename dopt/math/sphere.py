@@ -88,7 +88,7 @@ def sphere_maximizer(Q: Array, v: Array, radius: float, tie: Array) -> Array:
         for j in range(m):
             w[i] += axes[j, i] * (v[j] / scale)
             preferred[i] += axes[j, i] * tie[j]
-        # Eigenvalues that differ by rounding alone are one: no direction of theirs stands out.
+        # Eigenvalues that differ from the largest by rounding errors only count as equal to it.
         gaps[i] = values[m - 1] - values[i]
         if gaps[i] <= ROUNDING * m * largest:
             gaps[i] = 0.0
@@ -105,9 +105,10 @@ def sphere_maximizer(Q: Array, v: Array, radius: float, tie: Array) -> Array:
 
 
 def _easy_case(w: Array, gaps: Array, top: float) -> Array:
-    """Return the unit vector -w/(gaps + s) at the root s of the secular equation.
+    """Return the unit vector -w/(gaps + s), with s the root of the secular equation.
 
-    ``top``, the norm of w in the top eigenspace, bounds s from below, ‖w‖ from above.
+    The root lies between ``top``, the norm of w in the eigenspace of the largest eigenvalue, and
+    ‖w‖.
     """
     low, high = top, _norm(w)
     s = low

@@ -1,4 +1,4 @@
-"""A finite set of directions, for objectives that are compared over inputs and not solved."""
+"""Finite sets of unit input directions, for policies that compare candidate inputs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sphere_directions(n_inputs: int, count: int) -> Array:
     if n_inputs < 1 or count < 1:
         raise SpecificationError(
             f"{count} directions of {n_inputs} inputs are asked for, but at least 1 direction of "
-            f"at least 1 input is expected: set them so."
+            f"at least 1 input is expected: give two whole numbers above 0."
         )
     if n_inputs == 1:
         return np.array([[1.0], [-1.0]])

@@ -37,10 +37,15 @@ def check_length(key: str, steps: int, system: System) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Policy(KernelPart):
-    """A rule that chooses the input u_t, ‖u_t‖ ≤ γ."""
+    """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.
+
+    ``uses_full_amplitude`` says whether every input has the norm γ; without it inputs may have
+    other norms.
+    """
 
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
+    uses_full_amplitude: ClassVar[bool] = True
 
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
@@ -109,6 +114,7 @@ class CustomPolicy(ClosedLoop):
     """A closed-loop policy whose plan is written in numpy; it runs on the reference path."""
 
     compiled: ClassVar[bool] = False
+    uses_full_amplitude: ClassVar[bool] = False
 
     @abstractmethod
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
@@ -126,6 +132,7 @@ class CompiledPolicy(ClosedLoop):
     """
 
     compiled: ClassVar[bool] = True
+    uses_full_amplitude: ClassVar[bool] = False
 
     @staticmethod
     @abstractmethod

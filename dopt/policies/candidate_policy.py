@@ -1,4 +1,4 @@
-"""A finite set of candidate inputs, for objectives that are compared and not solved."""
+"""Base class of policies that compare a finite set of candidate inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sine of rising frequency."""
+"""Chirp input: a sine of rising frequency."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ class Chirp(OpenLoop):
     """
 
     name: ClassVar[str] = "chirp"
+    uses_full_amplitude: ClassVar[bool] = False
 
     band: float = parameter(0.1, "1", "share")
 

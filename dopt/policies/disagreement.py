@@ -1,4 +1,4 @@
-"""Disagreement of an ensemble of networks (MAX), the paper's [10]."""
+"""Exploration by the disagreement of an ensemble of networks (MAX), reference [10] of the paper."""
 
 from __future__ import annotations
 
@@ -45,6 +45,6 @@ class Disagreement(HeldCandidates):
         super().__post_init__()
         if self.ensemble < 2:
             raise SpecificationError(
-                f"policy.ensemble is {self.ensemble}, but at least 2 networks are expected, for "
-                f"one alone never disagrees: set it so."
+                f"policy.ensemble is {self.ensemble}, but at least 2 networks are expected, as "
+                f"one network cannot disagree with itself: set policy.ensemble to 2 or more."
             )

@@ -1,4 +1,4 @@
-"""One-step information gain of all learned components, without linearisation."""
+"""Exploration by the one-step information gain of all learned components, not linearised."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Entropy of a Gaussian process, the paper's [8]."""
+"""Exploration by the predictive entropy of a Gaussian process, reference [8] of the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""D-optimal exploration without linearisation: Definition 1 as it stands."""
+"""D-optimal exploration without linearisation: maximises Definition 1 by gradient ascent."""
 
 from __future__ import annotations
 

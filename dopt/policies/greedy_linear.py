@@ -1,4 +1,4 @@
-"""Greedy D-optimal identification of linear systems, the paper's [7]."""
+"""Greedy D-optimal identification of linear systems, reference [7] of the paper."""
 
 from __future__ import annotations
 

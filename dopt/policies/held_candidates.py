@@ -1,4 +1,4 @@
-"""Candidate inputs that are held in prediction, for two baselines of the literature."""
+"""Base class of policies that predict candidate inputs held over several steps."""
 
 from __future__ import annotations
 

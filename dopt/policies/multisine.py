@@ -1,4 +1,4 @@
-"""A sum of sines with a flat spectrum up to a chosen frequency."""
+"""Multisine input: a sum of sines with a flat spectrum up to a chosen frequency."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ class Multisine(OpenLoop):
     """
 
     name: ClassVar[str] = "multisine"
+    uses_full_amplitude: ClassVar[bool] = False
 
     band: float = parameter(0.1, "1", "share")
 

@@ -1,4 +1,4 @@
-"""The oracle: D-optimal exploration that knows the physics down to its parameters."""
+"""Oracle: D-optimal exploration with the physical parametrisation of the true system."""
 
 from __future__ import annotations
 

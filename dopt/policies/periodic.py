@@ -26,6 +26,7 @@ class Periodic(OpenLoop):
     """
 
     name: ClassVar[str] = "periodic"
+    uses_full_amplitude: ClassVar[bool] = False
 
     frequency: float | None = parameter(None, "rad/s", "positive")
 

@@ -1,4 +1,4 @@
-"""Pseudo-random binary sequence, the workhorse of linear system identification."""
+"""Pseudo-random binary sequence, a common input of linear system identification."""
 
 from __future__ import annotations
 

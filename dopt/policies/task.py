@@ -1,4 +1,4 @@
-"""Exploration for a task: certainty where the task needs it."""
+"""V-optimal exploration: the smallest predictive variance at the states of a task."""
 
 from __future__ import annotations
 

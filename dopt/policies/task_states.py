@@ -1,4 +1,4 @@
-"""The states in which a task needs a good model."""
+"""Draw of the states at which a task needs an accurate model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One-step predictive variance of all learned components."""
+"""Exploration by the one-step predictive variance of all learned components."""
 
 from __future__ import annotations
 

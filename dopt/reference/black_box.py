@@ -1,4 +1,4 @@
-"""Systems that are stepped one trial after the other, for the trials of a batch."""
+"""Episodes of systems without equations, stepped trial by trial for a batch."""
 
 from __future__ import annotations
 

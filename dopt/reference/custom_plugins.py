@@ -1,4 +1,4 @@
-"""Plans and updates of a user's own, which see one trial at a time, in a batch of trials."""
+"""Adapter of custom policies and learners, which see one trial, to the batches of the reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plan of MAX: the input about whose consequences an ensemble disagrees most."""
+"""Plan of MAX: the input on whose predicted states an ensemble of networks disagrees most."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Definition 1 as it stands: the exact one-step information gain, and its largest value.
+"""Exact one-step information gain (Definition 1 of the paper) and its maximum over inputs.
 
 By the determinant lemma log det(M + JᵀJ) = log det M + log det(I + J M⁻¹ Jᵀ), with r × r matrices.
 

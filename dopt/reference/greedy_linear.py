@@ -1,4 +1,4 @@
-"""The closed form for linear systems: the plan of the paper's [7]."""
+"""Closed form of greedy D-optimal inputs for linear systems, reference [7] of the paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The learner of a batch, by its model and its specification."""
+"""Factory of the learner of a batch, from its specification and model."""
 
 from __future__ import annotations
 

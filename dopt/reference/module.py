@@ -114,7 +114,7 @@ def _canonical(given: Mapping[str, object]) -> str:
     except (TypeError, ValueError) as error:
         raise SpecificationError(
             f"the arguments of model.{TARGET} are {arguments!r}, but finite numbers, texts and "
-            f"lists of them are expected ({error}): set them so."
+            f"lists of them are expected ({error}): change these arguments."
         ) from error
 
 

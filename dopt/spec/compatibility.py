@@ -1,4 +1,4 @@
-"""Which policy, model and learner make sense together, and on which system."""
+"""Check that policy, model, learner and system can be combined."""
 
 from __future__ import annotations
 

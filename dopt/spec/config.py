@@ -1,4 +1,4 @@
-"""A trial without its seed, and whether its parts go together and can run."""
+"""Configuration of a trial: everything but its seed, and checks that its parts fit together."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class TrialConfig:
         if self.system.horizon > LARGEST_HORIZON:
             raise SpecificationError(
                 f"env.horizon is {self.system.horizon:,} steps, but it has to be at most "
-                f"{LARGEST_HORIZON:,}: set it so."
+                f"{LARGEST_HORIZON:,}: set env.horizon to a smaller number."
             )
         if self.memory > LARGEST_MEMORY:
             raise SpecificationError(

@@ -1,4 +1,4 @@
-"""Which information matrix a trial holds: the planner's, or that of the learner."""
+"""Information matrix of a trial: that of the planner or of the learner, and its form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trial is a value: everything that it depends on, and a key made from that."""
+"""Specification of a trial: its configuration, its seed and the key computed from both."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TrialSpec(Validated):
         if not whole or not 0 <= self.seed <= LARGEST_SEED:
             raise SpecificationError(
                 f"seed is {_shown(self.seed)}, but a whole number of 0 or above and below 2^63 is "
-                f"expected: set it so."
+                f"expected: set seed to a whole number in this range."
             )
 
     @classmethod

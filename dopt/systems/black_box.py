@@ -1,4 +1,4 @@
-"""A system that can only be stepped: nobody knows the equations of what is to be learned."""
+"""Systems that can be stepped but have no equations."""
 
 from __future__ import annotations
 

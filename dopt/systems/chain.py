@@ -121,7 +121,7 @@ class Chain(System):
         if self.n_links > LARGEST_CHAIN:
             raise SpecificationError(
                 f"env.n_links is {self.n_links}, but it has to be at most {LARGEST_CHAIN}: "
-                f"set it so."
+                f"set env.n_links to a smaller number."
             )
         self._take_shape(self.n_links)
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""Pendulum whose pivot wears out: a system that changes while it is explored."""
+"""Pendulum whose friction changes with time, while the system is explored."""
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from pathlib import Path
 
 from hydra.errors import (
     ConfigCompositionException,
@@ -17,10 +16,10 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from dopt.declare.registry import TARGET
 from dopt.errors import DoptError, unknown_name
+from orchestrate.config.request import CONFIGURATION
 from orchestrate.config.unknown_keys import unknown_field, unknown_setting
 
 _SEVERAL = re.compile(r"(?:Ambiguous value for argument|Sweep parameters) ('.*?')(?: requires|\n)")
-CONFIGURATION = Path(__file__).resolve().parents[1] / "conf"
 
 _OPTION = re.compile(r"(hydra/[^/]+|[^/]+)/(.+)")
 """Group and option; groups of Hydra itself have two parts."""

@@ -12,7 +12,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override, OverrideType, QuotedString
 from hydra.errors import ConfigCompositionException
 
-from dopt.errors import unknown_name
+from dopt.errors import SpecificationError, suggestion, unknown_name
 from orchestrate.config.globs import every_option, matches
 
 NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
@@ -128,7 +128,9 @@ def _check_count(override: Override) -> None:
 def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception:
     key = override.key_or_group
     if options := every_option(loader, key):
-        return unknown_name(f"glob of {key}", ",".join(glob.include), options)
+        pattern = ",".join(glob.include)
+        hint = suggestion(pattern, sorted(options))
+        return SpecificationError(f"no name of {key} matches the pattern '{pattern}': {hint}")
     names = sorted(name for name in loader.list_groups("") if name != "hydra")
     return ConfigCompositionException(
         f"'{override.input_line}' is a glob, but '{key}' is not a group: groups are "

@@ -53,4 +53,4 @@ def amount(key: str, value: object, unit: str, kind: str = "a number") -> float:
 
 def wrong(key: str, value: object, expected: str) -> LaunchError:
     """Return the error for a setting with an invalid value."""
-    return LaunchError(f"{key} is {value!r}, but {expected} is expected: set it so.")
+    return LaunchError(f"{key} is {value!r}, but {expected} is expected: change {key}.")

@@ -1,4 +1,4 @@
-"""Results database of a launch that repeats operations while it cannot be reached."""
+"""Store that repeats an operation while the results database cannot be reached."""
 
 from __future__ import annotations
 

@@ -12,8 +12,6 @@ from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-STOP_REQUESTED = "Ctrl-C: finishing running trials; press again to stop immediately"
-
 MAX_HELD_SIGNALS = 3
 """Signals during one undisturbed block after which it is interrupted."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 from sqlalchemy.engine import URL, make_url
@@ -16,6 +17,9 @@ URL_VARIABLE = "DOPT_DB"
 """Environment variable that names another default database; an empty one counts as unset."""
 
 _EXAMPLES = "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name"
+_SQLITE_FILE = re.compile(r"[\w./-]+\.(db|sqlite3?)")
+"""Path of a file in place of a URL; a text that may hold a password does not match."""
+
 _SECRETS = ("password", "sslpassword", "passfile")
 
 
@@ -27,25 +31,27 @@ def default_url() -> str:
 def parse(url: str) -> URL:
     """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
 
-    The message does not repeat the URL, because a mistyped one may hold a password.
+    The message says whether the URL came from ``DOPT_DB``. It repeats no text other than the path
+    of a SQLite file, because a mistyped URL may hold a password.
     """
+    source = f" in the environment variable {URL_VARIABLE}"
+    where = source if url == os.environ.get(URL_VARIABLE) else ""
     try:
         parsed = make_url(url)
     except (ArgumentError, ValueError):  # the latter for a port that is no number
-        raise StoreError(
-            f"The database URL cannot be read: expected something like {_EXAMPLES}."
-        ) from None
+        form = f"sqlite:///{url}" if _SQLITE_FILE.fullmatch(url) else _EXAMPLES
+        raise StoreError(f"The database URL{where} cannot be read: write it as {form}.") from None
     backend = parsed.get_backend_name()
     if backend == "postgresql":
         return parsed.set(drivername="postgresql+psycopg")
     if backend != "sqlite":
         raise StoreError(
-            f"A database of kind '{parsed.drivername}' is not supported: give {_EXAMPLES}."
+            f"A database of kind '{parsed.drivername}'{where} is not supported: give {_EXAMPLES}."
         )
     if parsed.host is not None:
         raise StoreError(
-            f"The database URL sqlite://{parsed.host}/... names a host, but SQLite has none: write "
-            f"three slashes, sqlite:///{parsed.host}/{parsed.database or 'results.db'}."
+            f"The database URL sqlite://{parsed.host}/...{where} names a host, but SQLite has "
+            f"none: write three slashes, sqlite:///{parsed.host}/{parsed.database or 'results.db'}."
         )
     return parsed.set(drivername="sqlite")
 

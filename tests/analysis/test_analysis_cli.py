@@ -51,6 +51,16 @@ def test_the_database_may_come_from_the_environment(
     assert "D-optimal" in capsys.readouterr().out
 
 
+def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "mine/x.db")
+    assert main(["summary"]) == 2
+    error = capsys.readouterr().err
+    assert "environment variable DOPT_DB" in error
+    assert "write it as sqlite:///mine/x.db." in error
+
+
 def test_missing_trials_are_refused_with_a_table(
     partial: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -25,14 +25,19 @@ NAMES = ("random", "d_optimal", "first/random_held", "first/prbs", "second/exact
 )
 def test_the_nearest_name_counts_its_folder_or_not(given: str, nearest: str) -> None:
     message = str(unknown_name("policy", given, NAMES))
-    assert message.startswith(f"policy '{given}' is unknown, valid names are d_optimal, ")
-    assert message.endswith(f": did you mean '{nearest}'?")
+    start = f"policy '{given}' is unknown: did you mean '{nearest}'? Choose one of d_optimal, "
+    assert message.startswith(start)
 
 
 @pytest.mark.parametrize("given", ["", "wxyz", None, 7])
 def test_no_name_is_suggested_where_none_is_near(given: object) -> None:
-    assert str(unknown_name("policy", given, NAMES)).endswith(": choose one of these.")
+    assert str(unknown_name("policy", given, NAMES)).endswith(
+        "is unknown: choose one of d_optimal, first/prbs, first/random_held, random, "
+        "second/exact, second/max."
+    )
 
 
 def test_where_there_is_no_name_none_is_asked_for() -> None:
-    assert str(unknown_name("field", "form", ())).endswith("there is none to set: leave it out.")
+    assert str(unknown_name("field", "form", ())).endswith(
+        "is unknown, no field exists: remove it."
+    )

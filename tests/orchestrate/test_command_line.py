@@ -25,6 +25,7 @@ Command = Callable[..., tuple[int, str, str]]
 OPTIONS = ROOT / "docs" / "example" / "conf"
 
 SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
+FROM_VARIABLE = "The database URL in the environment variable DOPT_DB cannot be read"
 
 
 @pytest.mark.parametrize(
@@ -45,7 +46,10 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["seed=99999999999999999999"], "seed is 9+, but a whole number .* below 2\\^63"),
         (["env.horizon=99999999999"], "env.horizon is 9+ steps, .* be from 1 to 2147483647: set"),
         (["-m", "seed=range(0,1e12)"], "has more than 1,000,000 values"),
-        (["policy=random", "policy.regularization=1"], "'regularization' is unknown, there is no"),
+        (
+            ["policy=random", "policy.regularization=1"],
+            "'regularization' is unknown, no setting of policy exists",
+        ),
         (["seed=1,2"], "'seed=1,2' gives several values to one trial: add -m"),
         (["seed=range(3)"], "'seed=range\\(3\\)' gives several values to one trial"),
         (["launch.ray=3"], "launch.ray is 3, but a section"),
@@ -217,6 +221,21 @@ def test_the_database_of_the_environment(
     monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/mine.db")
     assert command_line(*SHORT)[0] == 0
     assert (tmp_path / "mine.db").exists()
+
+
+def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "mine/x.db")
+    code, _, errors = command_line(*SHORT)
+    assert code == 2
+    assert f"{FROM_VARIABLE}: write it as sqlite:///mine/x.db." in errors
+    monkeypatch.setenv("DOPT_DB", "me:secret@host/x.db")
+    _, _, errors = command_line(*SHORT)
+    assert f"{FROM_VARIABLE}: write it as sqlite:///results/results.db or " in errors
+    assert "secret" not in errors
+    _, _, errors = command_line(*SHORT, "store.url=mine/x.db")
+    assert "The database URL cannot be read: write it as sqlite:///mine/x.db." in errors
 
 
 def test_an_empty_variable_counts_as_unset(

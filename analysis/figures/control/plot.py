@@ -1,4 +1,4 @@
-"""Figure 5: what exploration is for, control with the learned model."""
+"""Figure 5: control with the learned model against explored steps."""
 
 from __future__ import annotations
 

@@ -18,10 +18,13 @@ from dopt.kernel.structs import Covariance
 from dopt.types import Matrix, Vector
 
 PENDING_ROWS = 16
-"""Room for pending rows: a multiple of 4."""
+"""Rows that ``pending`` has room for; a multiple of 4 because the loops take 4 rows at a time."""
 
 SMALL = 32
-"""Up to this q the matrix lies in the first-level cache and there is little to save: 4 rows."""
+"""Largest q for which ``pending`` has room for 4 rows only.
+
+Such a matrix fits into the first-level cache, where a pass over it is fast.
+"""
 
 
 @vectorized
@@ -184,8 +187,9 @@ def rank_update(covariance: Covariance, rows: Matrix, residuals: Vector, scratch
     rows : (r, q)
         J.
     residuals : (r,)
-        e, overwritten: then ``scratch.T @ residuals`` is the least-squares correction of θ. NaN
-        where the variance J M⁻¹ Jᵀ overflows: θ must not seem to rest.
+        e, overwritten by L⁻¹e: ``scratch.T @ residuals`` is then the least-squares correction of θ.
+        NaN where the variance J M⁻¹ Jᵀ overflows: division by infinity would give a
+        correction of 0, as if θ had converged.
     scratch : (r, q)
         Overwritten by L⁻¹V.
     """

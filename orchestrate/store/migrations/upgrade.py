@@ -1,6 +1,8 @@
 """Upgrade of an older database to the newest schema, atomic and with a backup.
 
-The check for running launches, the backup and the migration are one exclusive transaction.
+The check for running launches, the backup, the migration and the labels of configurations are one
+exclusive transaction. A migration script uses no code of the program that may change; what the
+current program computes, the labels, is written after the scripts.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import make_backend
 from orchestrate.store.errors import LaunchAliveError
 from orchestrate.store.schema import SCHEMA_VERSION, launch
-from orchestrate.store.write import launches
+from orchestrate.store.write import labels, launches
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
                 _refuse_living(connection, backend)
                 name = backend.back_up(connection, before) if backup else None
                 migrations.migrate(connection, before)
+                labels.write_missing(connection)
     except BaseException:
         if name is not None:
             backend.discard_backup(name)

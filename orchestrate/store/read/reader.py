@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from typing import Any, Self, cast
 import numpy as np
 from sqlalchemy import URL, Connection, CursorResult, Engine, select, text
 
+from dopt.errors import suggestion
 from orchestrate.store import database_url, schema_version
 from orchestrate.store.backends import postgresql, sqlite
 from orchestrate.store.backends.driver_errors import translated, translated_query
@@ -273,11 +273,7 @@ def _assessments(rows: Sequence[Sequence[Any]]) -> Assessments:
 
 def _check_column(column: str) -> None:
     if column not in STEP_VALUES:
-        near = difflib.get_close_matches(column, STEP_VALUES, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else "choose one of these."
-        raise QueryError(
-            f"A step has no column '{column}', its columns are {', '.join(STEP_VALUES)}: {hint}"
-        )
+        raise QueryError(f"A step has no column '{column}': {suggestion(column, STEP_VALUES)}")
 
 
 def _config(connection: Connection, config_key: str) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Launches: beginning, heartbeat, end, and recovery of dead ones."""
+"""Rows of launches: insertion, lease renewal, end, and recovery of the trials of dead launches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ from orchestrate.store.write.claims import free_claims
 
 
 def begin(connection: Connection, backend: Backend, record: LaunchRecord) -> int:
-    """Insert the launch, alive from the first moment that others can see it."""
+    """Insert a running launch and return its number.
+
+    The launch holds its lock or lease before the transaction ends, so that no other process finds
+    it without one and takes it for dead.
+    """
     token = backend.token()
     statement = insert(launch).values(
         token=token,
@@ -35,7 +39,7 @@ def begin(connection: Connection, backend: Backend, record: LaunchRecord) -> int
 
 
 def end(connection: Connection, launch_id: int, state: str, exit_code: int | None) -> str:
-    """Write the last state, release the remaining claims and return the token of the launch."""
+    """Write the final state, release the remaining claims and return the token of the launch."""
     if state not in LAUNCH_STATES[1:]:
         raise ValueError(f"A launch cannot end as '{state}': give {', '.join(LAUNCH_STATES[1:])}.")
     statement = (
@@ -57,7 +61,7 @@ def end(connection: Connection, launch_id: int, state: str, exit_code: int | Non
 
 
 def renew(connection: Connection, backend: Backend, launch_id: int) -> None:
-    """Extend the life of the launch, also after it was marked as lost."""
+    """Renew the lease of the launch; one that was marked as lost is running again."""
     connection.execute(
         update(launch)
         .where(launch.c.launch_id == launch_id, launch.c.state == "lost")
@@ -67,9 +71,17 @@ def renew(connection: Connection, backend: Backend, launch_id: int) -> None:
 
 
 def recover(connection: Connection, backend: Backend) -> tuple[int, list[str]]:
-    """Free the claims of dead launches; return how many, and the tokens of the dead.
+    """Put trials that dead launches claimed back to pending, and mark these launches as lost.
 
-    What is locked just now is left for the next recovery: its transaction ends soon, or is evicted.
+    Rows that another transaction has locked are skipped and left for the next recovery: that
+    transaction ends soon, or :meth:`Backend.evict` ends it.
+
+    Returns
+    -------
+    int
+        Number of trials put back to pending.
+    list of str
+        Tokens of the dead launches.
     """
     backend.exclusive(connection)
     dead = backend.dead(connection, maybe_alive(connection, skip_locked=True))
@@ -84,16 +96,19 @@ def recover(connection: Connection, backend: Backend) -> tuple[int, list[str]]:
 
 
 def maybe_alive(connection: Connection, skip_locked: bool = False) -> list[LaunchLife]:
-    """Return the launches that run or still own a trial; in every schema alike.
+    """Return the launches whose state is running or that still own a trial.
 
-    ``skip_locked`` leaves out those of which a transaction is just renewing the lease.
+    The statement uses only columns that every schema version has, because the upgrade of an older
+    database calls it too. ``skip_locked`` leaves out launches whose lease another transaction is
+    renewing.
     """
     owners = select(trial.c.owner).where(trial.c.owner.is_not(None))
     statement = (
         select(launch.c.launch_id, launch.c.token, launch.c.lease_until)
         .where(or_(launch.c.state == "running", launch.c.launch_id.in_(owners)))
-        # A renewal of the lease waits for the verdict; a commit, which only needs the launch to
-        # exist, does not, and so cannot lock up with this.
+        # FOR NO KEY UPDATE: another transaction that renews the lease waits for this one. A commit
+        # of a result only checks that the launch exists (FOR KEY SHARE), does not wait, and so
+        # cannot deadlock with this one.
         .with_for_update(key_share=True, skip_locked=skip_locked)
     )
     return [LaunchLife(*row) for row in connection.execute(statement)]

@@ -1,4 +1,4 @@
-"""A whole grid is written down before its first trial runs."""
+"""Registration of a grid: its configurations and trials are inserted before any trial runs."""
 
 from __future__ import annotations
 

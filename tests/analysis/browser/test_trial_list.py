@@ -100,7 +100,7 @@ def test_filters_narrow_the_list(client: TestClient) -> None:
         ("sort=loss", "did you mean 'best_loss'?"),
         ("env=pendulun", "did you mean 'pendulum'?"),
         ("width=many", "a whole number of 1"),
-        ("size=10000", "expected is one of 25"),
+        ("size=10000", "Choose one of 25, 50, 100, 200"),
         ("after=[1]", "names no place"),
         ("after=[NaN, 3]", "names no place"),
         ("after=[[], 3]", "names no place"),

@@ -6,14 +6,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from analysis.__main__ import main
 from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import select
+from analysis.data.trial_selection import Entry, Selection, select
 from analysis.errors import AnalysisError
-from analysis.tables.comparisons import compare_policies
-from orchestrate.store import Reader
-from tests.analysis.synthetic import fill, make_grid
+from analysis.tables.comparisons import compare_policies, references
+from orchestrate.store import ConfigRow, Reader, TrialRow
+from tests.analysis.synthetic import fill, make_grid, make_spec
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,68 @@ def test_values_are_compared_with_the_default_or_the_one_that_is_named(
     )
     assert set(table.reference) == {name}
     assert len(table) == 2
+
+
+def test_policies_are_compared_under_the_same_setting(
+    bounds_url: str, bounds: Reader, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = compare_policies(bounds, select(bounds, Filter(group_by=("policy", "env.gamma"))))
+    assert dict(zip(table.variant, table.reference, strict=True)) == {
+        f"random, γ={gamma}": f"D-optimal, γ={gamma}" for gamma in (2, 3, 10)
+    }
+    assert main(["compare", "--db", bounds_url, "--group-by", "policy", "env.gamma"]) == 0
+    assert "| reference (same env.gamma) " in capsys.readouterr().out
+    named = Filter(reference="D-optimal, γ=3", group_by=("policy", "env.gamma"))
+    table = compare_policies(bounds, select(bounds, named))
+    assert set(table.reference) == {"D-optimal, γ=3"}
+    assert len(table) == 5
+
+
+GROUPS = [
+    (policy, gamma, width)
+    for policy in ("d_optimal", "random", "uniform")
+    for gamma in (2.0, 3.0)
+    for width in (4, 8)
+]
+
+
+@given(
+    chosen=st.lists(st.sampled_from(GROUPS), min_size=1, unique=True),
+    reference=st.sampled_from(["d_optimal", "random"]),
+    diverged=st.sets(st.sampled_from(GROUPS)),
+)
+def test_a_reference_differs_in_the_policy_alone_wherever_it_is_stored(
+    chosen: list[tuple[str, float, int]], reference: str, diverged: set[tuple[str, float, int]]
+) -> None:
+    entries = tuple(entry(*one, diverged=one in diverged) for one in chosen)
+    keys = ("policy", "env.gamma", "width")
+    selection = Selection(entries, reference=reference, group_by=keys)
+    overall = selection.reference_of("pendulum")
+    rows = list(references(selection, "pendulum"))
+    assert len({id(one) for one, _, _ in rows}) == len(rows)
+    for one, other, same in rows:
+        stored = (reference, *one.group[1:])
+        assert one is not other
+        assert same == (stored in chosen and stored not in diverged and one.group != stored)
+        assert other.group == stored if same else other is overall
+    left_out = [one for one in entries if all(one is not row[0] for row in rows)]
+    if overall is not None:
+        assert {one.config.policy for one in left_out} <= {overall.config.policy}
+        assert all(one is overall or one.config.policy == reference for one in left_out)
+
+
+def entry(policy: str, gamma: float, width: int, *, diverged: bool) -> Entry:
+    """Return a configuration with one trial."""
+    specification = make_spec("pendulum", policy, 0, env={"gamma": gamma}, model={"width": width})
+    config = {k: v for k, v in specification.to_mapping().items() if k != "seed"}
+    row = ConfigRow(
+        *(f"{policy}{gamma}{width}", "pendulum", policy, "mlp", "adam_window", width, 2, 40, 0.02),
+        *(gamma, "", 1, 0, 0, 0, 0, 0, config),
+    )
+    values = dict.fromkeys(TrialRow.__annotations__)
+    status, loss = ("diverged", None) if diverged else ("done", 1.0)
+    trial = TrialRow(**values | {"seed": 0, "status": status, "final_loss": loss})  # type: ignore[arg-type]
+    return Entry(row, (trial,), f"{policy}, {gamma}, {width}", (policy, gamma, width))
 
 
 def test_a_setting_that_nothing_has_is_a_sentence(bounds: Reader) -> None:

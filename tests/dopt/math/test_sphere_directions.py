@@ -65,6 +65,8 @@ def test_more_inputs_prefer_no_direction(count: int) -> None:
 
 @pytest.mark.parametrize(("m", "count"), [(0, 8), (3, 0), (2, -1)])
 def test_a_number_below_one_is_answered_by_one_sentence(m: int, count: int) -> None:
-    message = rf"{count} directions of {m} inputs are asked for, but .* expected: set them so\.$"
+    message = (
+        rf"{count} directions of {m} inputs are asked for, but .* expected: give two whole .*\.$"
+    )
     with pytest.raises(SpecificationError, match=message):
         sphere_directions(m, count)

@@ -95,7 +95,7 @@ def test_of_a_tiny_task_the_nearest_state_is_left() -> None:
         (
             "exact",
             {"candidates": 0},
-            r"policy\.candidates is 0 .* from 1 to 2147483647: set it so",
+            r"policy\.candidates is 0 .* from 1 to 2147483647: set policy\.candidates to a whole",
         ),
         ("exact", {"budget_us": -1.0}, r"policy\.budget_us is -1\.0 µs, .* at least 0"),
         ("exact", {"form": "dual"}, r"form"),

@@ -147,6 +147,17 @@ def test_the_database_comes_from_the_environment(
     assert f"{sqlite_url} holds no trials yet" in capsys.readouterr().out
 
 
+def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "mine/x.db")
+    assert main(["status"]) == 2
+    assert capsys.readouterr().err == (
+        "error: The database URL in the environment variable DOPT_DB cannot be read: "
+        "write it as sqlite:///mine/x.db.\n"
+    )
+
+
 def test_the_entry_point_is_the_same_program(monkeypatch: pytest.MonkeyPatch) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     module, _, function = project["scripts"]["dopt"].partition(":")

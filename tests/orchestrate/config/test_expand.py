@@ -150,7 +150,7 @@ def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> No
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("env=glob(frist)", "did you mean 'first'"),
+        ("env=glob(frist)", "no name of env matches the pattern 'frist': did you mean 'first'"),
         ("seed=range(5,5)", "has no values"),
         ("seed=range(5,1)", "has no values"),
         ("scale=interval(0,1)", "no finite list"),
@@ -200,11 +200,17 @@ def test_a_key_that_some_choices_lack_holds_for_the_others(
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
-        ("model.ordr=2,3", "setting of model 'ordr' is .* half, order, .*: did you mean 'order'"),
-        ("nothere=1", "setting 'nothere' is unknown, valid names are env, "),
+        (
+            "model.ordr=2,3",
+            "setting of model 'ordr' is unknown: did you mean 'order'.* half, order, ",
+        ),
+        (
+            "nothere=1",
+            "setting 'nothere' is unknown: did you mean 'nothing'\\? Choose one of env, ",
+        ),
         ("env.dtt=[1]", "setting of env 'dtt' is .*: did you mean 'dt'"),
         ("env.dtt.x=1", "setting of env 'dtt' is .*: did you mean 'dt'"),
-        ("env.dt.x=1", "setting of env.dt 'x' is unknown, there is none to set"),
+        ("env.dt.x=1", "'x' is unknown, no setting of env.dt exists: remove it"),
     ],
 )
 def test_a_key_that_every_choice_lacks_is_answered_with_the_names_of_all(

@@ -73,7 +73,7 @@ def test_a_setting_holds_for_the_grids_that_have_it(
     assert output.startswith("policy.iterations applies to policy=uniform only\n")
     code, _, errors = command_line("-m", *several, "policy.iteratons=3", "launch.dry_run=true")
     assert code == 2
-    assert "valid names are iterations: did you mean 'iterations'?" in errors
+    assert "did you mean 'iterations'? Choose one of iterations." in errors
 
 
 def test_a_setting_of_one_grid_is_not_said_to_hold_for_the_others(command_line: Command) -> None:

@@ -1,4 +1,4 @@
-"""Schema 1, the first one released; it was made without Alembic, so nothing leads to it."""
+"""Schema 1, the first released schema: the start of the migrations, with nothing to do."""
 
 from __future__ import annotations
 
@@ -7,4 +7,7 @@ down_revision = None
 
 
 def upgrade() -> None:
-    """Do nothing: such a database exists already, with its version in a table of our own."""
+    """Do nothing: databases of schema 1 were created without Alembic.
+
+    They keep their version in a table ``schema_version`` instead of Alembic's.
+    """

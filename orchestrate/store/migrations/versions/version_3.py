@@ -1,4 +1,4 @@
-"""Schema 3: what a trial was worth after some of its steps, one row for each measure."""
+"""Schema 3: table of assessments, one row for each trial, step and measure."""
 
 from __future__ import annotations
 

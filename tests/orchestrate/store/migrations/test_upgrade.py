@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -89,6 +90,18 @@ def test_there_is_a_script_for_each_version_and_one_database() -> None:
     scripts = {path.stem for path in (migrations.LOCATION / "versions").glob("version_*.py")}
     assert scripts == {f"version_{n}" for n in range(1, SCHEMA_VERSION + 1)}
     assert list(range(1, SCHEMA_VERSION)) == VERSIONS
+
+
+def test_a_script_uses_no_code_that_may_change() -> None:
+    for path in (migrations.LOCATION / "versions").glob("version_*.py"):
+        imported = {
+            alias.name if isinstance(node, ast.Import) else str(node.module)
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for alias in node.names
+        }
+        own = {name for name in imported if name.split(".")[0] in ("dopt", "orchestrate")}
+        assert own <= {"orchestrate.store.migrations.rebuilding"}, path.name
 
 
 @pytest.mark.parametrize("side", [Store, Reader])
