@@ -19,7 +19,6 @@ from dopt.systems import DriftingPendulum, Pendulum
 from tests.dopt.trials import trial
 
 DRIFT = {"final_friction": 2.0, "time_constant": 0.3, "friction": 0.1}
-SEEDS = 16
 
 
 def test_friction_tends_exponentially_to_its_end() -> None:
@@ -85,9 +84,15 @@ def test_trials_that_share_a_config_do_not_share_the_truth() -> None:
     assert np.array_equal(first.record.loss, second.record.loss)
 
 
-@pytest.mark.parametrize("model", ["mlp", "linear"])
-def test_forgetting_follows_a_drift_that_memory_averages(model: str) -> None:
-    """Paired over seeds: the loss in the second half of the trial, against the truth of then."""
+@pytest.mark.parametrize(("model", "seeds", "ratio"), [("mlp", 48, 1.1), ("linear", 8, 3.0)])
+def test_forgetting_follows_a_drift_that_memory_averages(
+    model: str, seeds: int, ratio: float
+) -> None:
+    """Paired over seeds: the loss in the second half of the trial, against the truth of then.
+
+    The trials of a network are chaotic, and differ between processors as they do between seeds:
+    over 96 seeds its loss is 1.22 times smaller, over 16 of them 1.14 to 1.29 times.
+    """
 
     def losses(forgetting: float) -> np.ndarray:
         specs = [
@@ -99,10 +104,10 @@ def test_forgetting_follows_a_drift_that_memory_averages(model: str) -> None:
                 model={"name": model},
                 learner={"name": "ekf", "forgetting": forgetting},
             )
-            for seed in range(SEEDS)
+            for seed in range(seeds)
         ]
         return np.array([run_trial(spec).loss[300:].mean() for spec in specs])
 
     gain = np.log(losses(1.0) / losses(0.98))
     assert stats.ttest_1samp(gain, 0.0, alternative="greater").pvalue < 1e-3
-    assert np.exp(gain.mean()) > 1.2
+    assert np.exp(gain.mean()) > ratio
