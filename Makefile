@@ -47,7 +47,7 @@ $(VENV)/dev: $(VENV)/run
 	touch $@
 
 test: setup  ## run the test suite
-	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
+	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up(everything=True)'
 	$(BIN)/python -m pytest $(ALL)
 
 test-fast: setup  ## run the tests of pure functions and of the configuration
@@ -64,13 +64,13 @@ test-lowest: .venv-lowest/ready  ## run the fast tests with the lowest versions 
 
 coverage: setup  ## run the test suite and require that 90 % of the lines are run
 	$(BIN)/coverage erase
-	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
+	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up(everything=True)'
 	$(BIN)/coverage run -m pytest $(ALL)
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report
 
 test-machines: setup  ## run grids on hosts that are lost and cut off, as root, in namespaces
-	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up()'
+	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up(everything=True)'
 	$(BIN)/python -m pytest -m machines tests/machines
 
 soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases

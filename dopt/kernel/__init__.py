@@ -6,18 +6,24 @@ declares ``compiled = True`` and every system whose equations compile.
 
 from __future__ import annotations
 
-EVERYTHING = "everything"
-"""Mark of a cache that holds all that :func:`warm_up` compiles."""
+MARKS = {False: "trials of the paper", True: "everything"}
+"""Marks of a cache that holds what :func:`warm_up` compiles, without and with everything."""
 
 
-def warm_up() -> None:
+def warm_up(everything: bool = False) -> None:
     """See to it that the disk cache holds the kernel for all registered systems.
 
     Called once before worker processes start, so that they find compiled code.
+
+    Parameters
+    ----------
+    everything : bool
+        Whether to compile every policy, learner and form of the information matrix, which
+        otherwise happens when a trial first needs it.
     """
     from dopt.kernel.cache import is_complete, mark_complete
 
-    if is_complete(EVERYTHING):
+    if is_complete(MARKS[everything]):
         return
     from dopt.kernel.equations import compiled_equations
     from dopt.kernel.run import run_trial_in_kernel
@@ -25,11 +31,12 @@ def warm_up() -> None:
     from dopt.spec.trial import TrialSpec
     from dopt.systems import SYSTEMS
 
-    compile_in_two_processes()
+    compile_in_two_processes(everything)
     for system in SYSTEMS.values():
         compiled_equations(system())
     section = {"name": "pendulum", "horizon": 2, "grid_points": [2, 2]}
     names = {"policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
     sections = {key: {"name": name} for key, name in names.items()}
     run_trial_in_kernel(TrialSpec.from_mapping({"env": section, **sections, "seed": 0}))
-    mark_complete(EVERYTHING)
+    for mark in {False, everything}:
+        mark_complete(MARKS[mark])

@@ -171,6 +171,23 @@ def network_rows(network: Network, phi: Vector, hidden: Matrix, deltas: Stack, q
 
 
 @compiled
+def network_jacobian(network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
+    """Return the learned rows of J, (r, q), at a state, and write a_θ(x), (r,)."""
+    phi, hidden, deltas = all_components(network, theta, x, value)
+    return network_rows(network, phi, hidden, deltas, theta.shape[0])
+
+
+@compiled
+def gradients_along_inputs(
+    plant: Plant, network: Network, theta: Vector, bar: Vector, columns: Matrix, component: int
+) -> Matrix:
+    """Return g at a state and D B along the columns of B, (m, d), as rows, (1 + m, q)."""
+    value = np.empty(plant.learned_rows.shape[0])
+    point = linearization_at(network, theta, bar, columns, component, value)
+    return network_gradients(network, point, component, theta.shape[0])
+
+
+@compiled
 def linear_gradients(
     plant: Plant,
     q: int,

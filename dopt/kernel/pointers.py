@@ -40,7 +40,7 @@ def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evalu
     key = (layout_of(trial), layout_of(points), _source(policy), _source(learner))
     if key not in _trials:
         plan, learn = signatures(trial)
-        compile_information(trial)
+        compile_information(trial, trial.information)
         loop = compiled_loop(trial, points)
         _trials[key] = Compiled(loop, function_of(policy, plan), function_of(learner, learn))
     return _trials[key]
@@ -65,10 +65,10 @@ def _source(part: Policy | Learner) -> Hashable:
     return part.learn if isinstance(part, CompiledLearner) else part.kernel_function
 
 
-def compile_information(trial: Trial) -> None:
-    """Compile the functions of the form in which a trial holds M."""
+def compile_information(trial: Trial, information: Information) -> None:
+    """Compile the functions of a form in which a trial may hold M."""
     kinds = _information_signatures(trial.plant, trial.network, trial.state)
-    for function, signature in zip(trial.information, kinds, strict=True):
+    for function, signature in zip(information, kinds, strict=True):
         path = f"{function.__module__}.{function.__name__}"
         compiled_for(path, function, signature.args)
 
@@ -104,15 +104,20 @@ def function_of(part: Policy | Learner, signature: NumbaType) -> CompiledFunctio
         return _own(part, part.plan, signature)
     if isinstance(part, CompiledLearner):
         return _own(part, part.learn, signature)
-    path = part.kernel_function
-    module, _, name = path.rpartition(".")
     try:
-        function = getattr(importlib.import_module(module), name)
+        return compiled_at(part.kernel_function, signature)
     except (ImportError, AttributeError, ValueError) as error:
         raise SpecificationError(
-            f"{part.section} '{part.name}' names the kernel function '{path}', which cannot be "
-            f"imported ({error}): set kernel_function in its class to the path of one."
+            f"{part.section} '{part.name}' names the kernel function '{part.kernel_function}', "
+            f"which cannot be imported ({error}): set kernel_function in its class to the path of "
+            f"one."
         ) from error
+
+
+def compiled_at(path: str, signature: NumbaType) -> CompiledFunction:
+    """Compile the function of the package at a dotted path."""
+    module, _, name = path.rpartition(".")
+    function = getattr(importlib.import_module(module), name)
     compiled_for(path, function, signature.args)
     return function
 

@@ -6,19 +6,25 @@ the cache. Reading it there is a matter of seconds.
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
 
 from dopt.kernel.cache import completed
 from dopt.kernel.equations import compiled_equations
-from dopt.kernel.pointers import compile_information, compiled_loop, function_of, signatures
+from dopt.kernel.information import absent, dual, primal_linear, primal_network, sketch
+from dopt.kernel.pointers import compile_information, compiled_at, compiled_loop, signatures
 from dopt.kernel.run import KernelTrial
+from dopt.kernel.structs import Information
+from dopt.learning import LEARNERS, Adam
+from dopt.policies import POLICIES, DOptimal
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 
@@ -30,12 +36,15 @@ SECONDS_BETWEEN_MESSAGES = 5.0
 _log = logging.getLogger("dopt.kernel")
 
 
-def compile_in_two_processes() -> None:
-    """Fill the cache; what a process could not compile is left to whoever needs it."""
+def compile_in_two_processes(everything: bool) -> None:
+    """Fill the cache; what a process could not compile is left to whoever needs it.
+
+    With ``everything``, all policies, learners and forms of M of the package are compiled.
+    """
     if len(os.sched_getaffinity(0)) < len(ENDS):
         return
-    start, total = time.perf_counter(), len(SYSTEMS) + 5
-    running = [_started(end) for end in ENDS]
+    start, total = time.perf_counter(), choices(everything).n_parts()
+    running = [_started(end, *(["everything"] if everything else [])) for end in ENDS]
     said = -SECONDS_BETWEEN_MESSAGES
     try:
         while any(process.poll() is None for process in running):
@@ -53,35 +62,64 @@ def compile_in_two_processes() -> None:
             process.wait()
 
 
-def _started(end: str) -> subprocess.Popen[bytes]:
+def _started(*words: str) -> subprocess.Popen[bytes]:
     place = str(Path(__file__).resolve().parents[2])
     paths = os.pathsep.join(filter(None, (place, os.environ.get("PYTHONPATH"))))
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", __spec__.name, end],  # no module of the working folder
+        [sys.executable, "-P", "-m", __spec__.name, *words],  # no module of the working folder
         env=os.environ | {"PYTHONPATH": paths},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
 
 
-def compile_parts(end: str) -> None:
-    """Compile the parts of the kernel that a trial of the paper needs, beginning at one end.
+def compile_parts(end: str, everything: bool) -> None:
+    """Compile the parts of the kernel, beginning at one end of their list.
 
     The two processes meet: what the other has compiled is only loaded.
     """
-    spec = TrialSpec.from_names({"name": "pendulum", "grid_points": [2, 2]}, "d_optimal")
-    trial = KernelTrial(spec)
-    plan, learn = signatures(trial.trial)
-    parts: list[Callable[[], object]] = [
-        lambda: compiled_loop(trial.trial, trial.constants[3]),
-        lambda: function_of(spec.learner, learn),
-        *(functools.partial(compiled_equations, system()) for system in SYSTEMS.values()),
-        lambda: function_of(spec.policy, plan),
-        lambda: compile_information(trial.trial),
-    ]
+    parts = kernel_parts(everything)
     for part in parts if end == "first" else reversed(parts):
         part()
 
 
+class Choices(NamedTuple):
+    """Paths of the functions of policies and learners, and modules of forms of M, to compile."""
+
+    plans: list[str]
+    learns: list[str]
+    forms: list[ModuleType]
+
+    def n_parts(self) -> int:
+        """Return how many parts they are, with the loop and the equations of every system."""
+        return 1 + len(SYSTEMS) + len(self.plans) + len(self.learns) + 2 * len(self.forms)
+
+
+def choices(everything: bool) -> Choices:
+    """Return what a trial of the paper needs, or all that the package holds."""
+    if not everything:
+        return Choices([DOptimal.kernel_function], [Adam.kernel_function], [primal_network])
+    return Choices(
+        sorted({policy.kernel_function for policy in POLICIES.values() if policy.compiled}),
+        sorted({learner.kernel_function for learner in LEARNERS.values() if learner.compiled}),
+        [absent, primal_network, primal_linear, dual, sketch],
+    )
+
+
+def kernel_parts(everything: bool) -> list[Callable[[], object]]:
+    """Return what compiles each part."""
+    spec = TrialSpec.from_names({"name": "pendulum", "grid_points": [2, 2]}, "d_optimal")
+    trial, chosen = KernelTrial(spec), choices(everything)
+    plan, learn = signatures(trial.trial)
+    forms = [Information(module.add_rows, module.planning_forms) for module in chosen.forms]
+    return [
+        partial(compiled_loop, trial.trial, trial.constants[3]),
+        *(partial(compiled_at, path, learn) for path in chosen.learns),
+        *(partial(compiled_equations, system()) for system in SYSTEMS.values()),
+        *(partial(compile_information, trial.trial, form) for form in forms),
+        *(partial(compiled_at, path, plan) for path in chosen.plans),
+    ]
+
+
 if __name__ == "__main__":
-    compile_parts(sys.argv[1])
+    compile_parts(sys.argv[1], everything="everything" in sys.argv)

@@ -11,7 +11,7 @@ import numpy as np
 
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.primal import quadratic_forms, rank_update
-from dopt.kernel.model import all_components, linearization_at, network_gradients, network_rows
+from dopt.kernel.model import gradients_along_inputs, network_jacobian
 from dopt.kernel.structs import Network, Plant, Sketch, State
 from dopt.types import Matrix, Vector
 
@@ -30,10 +30,8 @@ def sketched(sketch: Sketch, rows: Matrix) -> Matrix:
 def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
     """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
     value = np.zeros(plant.learned_rows.shape[0])
-    phi, hidden, deltas = all_components(network, state.theta, x, value)
-    rows = network_rows(network, phi, hidden, deltas, state.theta.shape[0])
-    projected = sketched(state.sketch, rows)
-    rank_update(state.covariance, projected, np.zeros(rows.shape[0]), np.empty(projected.shape))
+    rows = sketched(state.sketch, network_jacobian(network, state.theta, x, value))
+    rank_update(state.covariance, rows, value, np.empty(rows.shape))  # no residuals: θ stays
 
 
 @compiled
@@ -41,7 +39,7 @@ def planning_forms(
     plant: Plant, network: Network, state: State, bar: Vector, columns: Matrix, component: int
 ) -> Matrix:
     """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
-    m, value = columns.shape[0], np.empty(plant.learned_rows.shape[0])
-    point = linearization_at(network, state.theta, bar, columns, component, value)
-    G = sketched(state.sketch, network_gradients(network, point, component, state.theta.shape[0]))
+    m = columns.shape[0]
+    gradients = gradients_along_inputs(plant, network, state.theta, bar, columns, component)
+    G = sketched(state.sketch, gradients)
     return quadratic_forms(state.covariance, G[: 1 if m == 1 else 1 + m], G)

@@ -7,7 +7,7 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.primal import rank_update
-from dopt.kernel.model import add_linear, all_components, network_rows, regressors
+from dopt.kernel.model import add_linear, network_jacobian, regressors
 from dopt.kernel.structs import Covariance, Network, Plant
 from dopt.types import Matrix, Vector
 
@@ -20,8 +20,7 @@ def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: 
         regressors(plant, x, rows, value)
         add_linear(rows, theta, value)
         return rows
-    phi, hidden, deltas = all_components(network, theta, x, value)
-    return network_rows(network, phi, hidden, deltas, theta.shape[0])
+    return network_jacobian(network, theta, x, value)
 
 
 @compiled

@@ -22,6 +22,11 @@ from dopt.kernel import cache, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import compiled, contracted, squared, vectorized
 from dopt.kernel.equations import compiled_equations
+from dopt.kernel.from_spec import MODULES
+from dopt.kernel.information import absent, primal_linear
+from dopt.kernel.warming import choices
+from dopt.learning import LEARNERS
+from dopt.policies import POLICIES
 from dopt.systems import SYSTEMS, Chain, Pendulum, System
 from tests.paths import ROOT
 
@@ -157,6 +162,16 @@ def test_a_warm_cache_is_seen_without_the_compiler() -> None:
         "import sys; from dopt.kernel import warm_up; warm_up(); assert 'numba' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
+def test_everything_is_what_any_shipped_choice_calls() -> None:
+    chosen = choices(everything=True)
+    assert {one.kernel_function for one in POLICIES.values() if one.compiled} == set(chosen.plans)
+    assert {one.kernel_function for one in LEARNERS.values() if one.compiled} == set(chosen.learns)
+    assert {*MODULES.values(), primal_linear, absent} == set(chosen.forms)
+    few = choices(everything=False)
+    assert set(few.plans) < set(chosen.plans)
+    assert few.n_parts() < chosen.n_parts()
 
 
 def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:
