@@ -21,7 +21,7 @@ from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
 from dopt.kernel.loop import advance
 from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Trial
-from dopt.kernel.user_code import compiled_here
+from dopt.kernel.user_code import compiled_own
 from dopt.learning.base import CompiledLearner, Learner
 from dopt.policies.base import CompiledPolicy, Policy
 from dopt.types import CompiledFunction, NumbaType
@@ -126,9 +126,8 @@ def _own(
     part: Policy | Learner, function: Callable[..., None], signature: NumbaType
 ) -> CompiledFunction:
     """Compile the function of a user's own policy or learner."""
-    compiled = compiled_here(function)
     try:
-        compiled.compile(signature)
+        return compiled_own(function, signature)
     except NumbaError as error:
         reason = next((line for line in str(error).splitlines()[1:] if line.strip()), str(error))
         raise SpecificationError(
@@ -136,7 +135,6 @@ def _own(
             f"({reason.strip()}): write it with numbers, arrays and loops that Numba compiles, and "
             f"functions of dopt.kernel."
         ) from error
-    return compiled
 
 
 def kind_of(value: object) -> NumbaType:

@@ -22,7 +22,7 @@ from dopt.kernel.cache import CACHE_FOLDER
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-class _Place(_CacheLocator):  # type: ignore[misc]  # numba has no types
+class Place(_CacheLocator):  # type: ignore[misc]  # numba has no types
     """Folder of a function's machine code, named by its file's path within the package."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
@@ -47,7 +47,7 @@ class _Place(_CacheLocator):  # type: ignore[misc]  # numba has no types
 
 
 class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = (_Place,)
+    _locator_classes = (Place,)
 
 
 class StoredCode(FunctionCache):  # type: ignore[misc]
