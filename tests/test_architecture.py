@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from dopt.kernel.cache import COMPILED_SOURCES
-from tests.paths import ROOT
+from tests.paths import ROOT, without_coverage
 
 PACKAGES = ("dopt", "orchestrate", "analysis", "hydra_plugins")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
@@ -135,7 +135,12 @@ def loaded_by(module: str) -> set[str]:
     """Return the top-level modules that are loaded once ``module`` is, in a fresh process."""
     program = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        env=without_coverage(),
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return {name.split(".")[0] for name in json.loads(done.stdout)}
 

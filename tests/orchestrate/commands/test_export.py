@@ -19,7 +19,7 @@ from orchestrate.export import streams, tables
 from orchestrate.store import Claim, Store
 from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, run_now
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, assessed, diverged, result
-from tests.paths import ROOT
+from tests.paths import ROOT, without_coverage
 
 Run = Callable[..., Answer]
 FORMATS = ("csv", "parquet", "npz")
@@ -208,7 +208,12 @@ class TestWholeOrNotAtAll:
         before = out.read_bytes()
         program = [sys.executable, "-c", NO_ROOM, "export", "curves", "--out", str(out)]
         done = subprocess.run(
-            [*program, "--db", url], cwd=ROOT, capture_output=True, text=True, check=False
+            [*program, "--db", url],
+            cwd=ROOT,
+            env=without_coverage(),  # which writes files of its own
+            capture_output=True,
+            text=True,
+            check=False,
         )
         assert done.returncode == 2
         assert "cannot be written" in done.stderr
