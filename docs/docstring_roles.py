@@ -17,11 +17,11 @@ ROLE = re.compile(r":(?:func|class|meth|mod|attr|data|exc|obj):`(~?)([\w.]+)`")
 class DocstringRoles(griffe.Extension):
     """Rewrites the roles in every docstring that griffe collects."""
 
-    def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:  # noqa: ARG002
+    def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:  # noqa: ARG002  # griffe passes more
         """Rewrite the docstring of a module, class, function or attribute."""
         _rewrite(obj)
 
-    def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:  # noqa: ARG002
+    def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:  # noqa: ARG002  # griffe passes more
         """Rewrite the docstring of a whole package, which is no object to griffe."""
         _rewrite(pkg)
 

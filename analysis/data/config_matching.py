@@ -21,7 +21,7 @@ from analysis.errors import AnalysisError
 from dopt.errors import SpecificationError
 from dopt.spec.label import flatten
 from dopt.spec.trial import TrialSpec
-from orchestrate.store import ConfigRow
+from orchestrate.store import CONFIG_COLUMNS, ConfigRow
 
 REFERENCE = "d_optimal"
 """The policy that all others are compared with, unless another one is asked for."""
@@ -29,7 +29,7 @@ REFERENCE = "d_optimal"
 USUAL = {"model": "mlp", "learner": "adam_window"}
 """Names of what a launch takes by itself."""
 
-CONFIG_COLUMNS = ("policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
+COLUMNS = tuple(name for name in CONFIG_COLUMNS if name not in ("env", "label"))
 """Settings that have a column of their own."""
 
 Setting = tuple[str, str, str]
@@ -128,7 +128,7 @@ def choose_by(
 
 def setting_value(config: ConfigRow, key: str) -> object:
     """Return a value by column (``width``) or by dotted path (``env.gamma``), None without one."""
-    if key in CONFIG_COLUMNS:
+    if key in COLUMNS:
         return getattr(config, key)
     return flatten(config.config).get(key)
 
@@ -138,7 +138,7 @@ def check_keys(keys: Sequence[str], configs: Sequence[ConfigRow]) -> None:
     for key in keys:
         if all(setting_value(config, key) is None for config in configs):
             known = {
-                *CONFIG_COLUMNS,
+                *COLUMNS,
                 *(path for config in configs for path in flatten(config.config)),
             }
             near = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.4)

@@ -24,23 +24,11 @@ from analysis.data.config_matching import Candidate, Filter, choose
 from analysis.data.learned_model import LearnedModel, learned_model
 from analysis.data.trial_selection import environment_rank, newest, policy_rank
 from analysis.errors import AnalysisError
-from orchestrate.store import ConfigRow, Curves, Reader, default_url
+from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
 
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 _MEASURED = ("seed", "t", "measure", "value", "diverged")
-_OF_CONFIG = (
-    "env",
-    "policy",
-    "model",
-    "learner",
-    "width",
-    "depth",
-    "horizon",
-    "dt",
-    "gamma",
-    "label",
-)
 
 
 @dataclass(frozen=True)
@@ -174,7 +162,7 @@ class Results:
             for measure in (measures or self.reader.measures(config.config_key))
         ]
         if not parts:
-            return pd.DataFrame(columns=[*_OF_CONFIG, "config_key", *_MEASURED])
+            return pd.DataFrame(columns=[*CONFIG_COLUMNS, "config_key", *_MEASURED])
         return pd.concat(parts, ignore_index=True)
 
     def _measured(self, config: ConfigRow, measure: str) -> pd.DataFrame:
@@ -261,7 +249,7 @@ class Results:
 
 def _labelled(frame: pd.DataFrame, config: ConfigRow) -> pd.DataFrame:
     """Put what tells the configuration in front."""
-    for place, name in enumerate(_OF_CONFIG):
+    for place, name in enumerate(CONFIG_COLUMNS):
         frame.insert(place, name, getattr(config, name))
-    frame.insert(len(_OF_CONFIG), "config_key", config.config_key)
+    frame.insert(len(CONFIG_COLUMNS), "config_key", config.config_key)
     return frame

@@ -25,18 +25,10 @@ def warm_up(everything: bool = False) -> None:
 
     if is_complete(MARKS[everything]):
         return
-    from dopt.kernel.equations import compiled_equations
-    from dopt.kernel.run import run_trial_in_kernel
-    from dopt.kernel.warming import compile_in_two_processes
-    from dopt.spec.trial import TrialSpec
-    from dopt.systems import SYSTEMS
+    from dopt.kernel.warming import compile_in_two_processes, kernel_parts
 
     compile_in_two_processes(everything)
-    for system in SYSTEMS.values():
-        compiled_equations(system())
-    section = {"name": "pendulum", "horizon": 2, "grid_points": [2, 2]}
-    names = {"policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
-    sections = {key: {"name": name} for key, name in names.items()}
-    run_trial_in_kernel(TrialSpec.from_mapping({"env": section, **sections, "seed": 0}))
+    for part in kernel_parts(everything):  # also what no other process could compile
+        part()
     for mark in {False, everything}:
         mark_complete(MARKS[mark])

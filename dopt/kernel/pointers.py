@@ -58,8 +58,8 @@ def layout_of(value: object) -> Hashable:
     return type(value) if isinstance(value, (int, float)) else value
 
 
-def _source(part: Policy | Learner) -> Hashable:
-    """Return what tells the compiled function of a policy or a learner from others."""
+def _source(part: Policy | Learner) -> str | Callable[..., None]:
+    """Return the path of the function of a policy or a learner, or a user's own function."""
     if isinstance(part, CompiledPolicy):
         return part.plan
     return part.learn if isinstance(part, CompiledLearner) else part.kernel_function
@@ -100,17 +100,15 @@ def function_of(part: Policy | Learner, signature: NumbaType) -> CompiledFunctio
     SpecificationError
         If its class names none, or one that does not exist or does not compile.
     """
-    if isinstance(part, CompiledPolicy):
-        return _own(part, part.plan, signature)
-    if isinstance(part, CompiledLearner):
-        return _own(part, part.learn, signature)
+    source = _source(part)
+    if not isinstance(source, str):
+        return _own(part, source, signature)
     try:
-        return compiled_at(part.kernel_function, signature)
+        return compiled_at(source, signature)
     except (ImportError, AttributeError, ValueError) as error:
         raise SpecificationError(
-            f"{part.section} '{part.name}' names the kernel function '{part.kernel_function}', "
-            f"which cannot be imported ({error}): set kernel_function in its class to the path of "
-            f"one."
+            f"{part.section} '{part.name}' names the kernel function '{source}', which cannot be "
+            f"imported ({error}): set kernel_function in its class to the path of one."
         ) from error
 
 

@@ -58,7 +58,7 @@ def content_digest(function: Callable[..., None]) -> str | None:
         digest = hashlib.sha256(Path(inspect.getfile(function)).read_bytes())
     except (OSError, TypeError):  # typed into an interpreter or a notebook
         return None
-    for name, value in sorted(_globals_of(function, {})):
+    for name, value in sorted(_globals_of(function, set())):
         content = _content(value, function.__module__)
         if content is None:
             return None
@@ -66,11 +66,11 @@ def content_digest(function: Callable[..., None]) -> str | None:
     return digest.hexdigest()[:16]
 
 
-def _globals_of(function: Callable[..., Any], seen: dict[str, None]) -> Iterator[tuple[str, Any]]:
+def _globals_of(function: Callable[..., Any], seen: set[str]) -> Iterator[tuple[str, Any]]:
     """Yield the names and values that a function and its helpers in the same file read."""
     for name in _names(function.__code__):
         if name in function.__globals__ and name not in seen:
-            seen[name] = None
+            seen.add(name)
             value = function.__globals__[name]
             yield name, value
             helper = getattr(value, "py_func", value)  # also one that the user has compiled

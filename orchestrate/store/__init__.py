@@ -39,10 +39,11 @@ from orchestrate.store.records import (
     Registration,
     Result,
 )
-from orchestrate.store.schema import FINISHED, RETRIED
+from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
 from orchestrate.store.store import Store
 
 __all__ = [
+    "CONFIG_COLUMNS",
     "DEFAULT_URL",
     "FINISHED",
     "LEASE_SECONDS",
