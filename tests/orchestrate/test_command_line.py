@@ -16,7 +16,7 @@ import pytest
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.runner.run_grid import Work
-from orchestrate.store import Reader, default_url
+from orchestrate.store import Reader
 from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.standins import quick, raising
 
@@ -25,7 +25,6 @@ Command = Callable[..., tuple[int, str, str]]
 OPTIONS = ROOT / "docs" / "example" / "conf"
 
 SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
-FROM_VARIABLE = "The database URL in the environment variable DOPT_DB cannot be read"
 
 
 @pytest.mark.parametrize(
@@ -164,88 +163,6 @@ def test_a_grid_runs_once_and_the_default_is_a_hundred_seeds(command_line: Comma
     assert "0 of 700 already done, 700 to run" in output
     assert "700 of 700 done, 0 failed" in output
     assert "700 of 700 already done, nothing to run" in command_line(*grid)[1]
-
-
-def test_a_dry_run_shows_the_grid_and_makes_no_database(
-    command_line: Command, tmp_path: Path
-) -> None:
-    grid = ("-m", "policy=random", "width=8,16", "seed=range(4)", *SHORT)
-    code, output, _ = command_line(*grid, "launch.dry_run=true")
-    assert code == 0
-    assert list(tmp_path.iterdir()) == []
-    assert re.search(r"pendulum +random +8 +4 +0 +0 +4\n", output)
-    assert "8 trials, 0 done, 8 to run" in output
-    command_line(*grid, "seed=range(3)")
-    assert "8 trials, 6 done, 2 to run" in command_line(*grid, "launch.dry_run=true")[1]
-
-
-def test_a_dry_run_counts_trials_that_run_again(
-    command_line: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Failed(dict[str, str]):
-        def get(self, _key: str, _default: object = None) -> str:  # type: ignore[override]
-            return "failed"
-
-    monkeypatch.setattr("orchestrate.runner.dry_run._statuses", lambda _: Failed())
-    grid = ("-m", "policy=random", "seed=range(4)", "launch.dry_run=true", *SHORT)
-    assert "4 trials, 0 done, 0 to run" in command_line(*grid)[1]
-    assert "4 trials, 0 done, 4 to run" in command_line(*grid, "launch.retry=failed")[1]
-
-
-def test_a_dry_run_tells_its_configs_apart(command_line: Command) -> None:
-    _, output, _ = command_line(
-        "-m", "env=arm,pendulum", "policy=random", "env.mass=2,3", "env.dt=0.01,0.02", "seed=0",
-        "launch.dry_run=true",
-    )  # fmt: skip
-    assert "env.mass applies to env=pendulum only\n" in output
-    assert re.search(r"env +policy +env.dt +env.mass +trials", output)
-    assert re.search(r"arm +random +0.01 +- +1", output)
-    assert re.search(r"pendulum +random +0.02 +3.0 +1", output)
-    assert "6 trials" in output
-
-
-def test_width_reaches_the_model_and_a_model_without_width_runs_once(
-    command_line: Command,
-) -> None:
-    _, output, _ = command_line(
-        "-m", "policy=random,oracle", "width=4,8", "seed=0", "launch.dry_run=true"
-    )
-    assert re.search(r"random +mlp .* 4 .* 1\n", output)
-    assert re.search(r"random +mlp .* 8 .* 1\n", output)
-    assert len(re.findall("oracle", output)) == 1
-
-
-def test_the_database_of_the_environment(
-    command_line: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/mine.db")
-    assert command_line(*SHORT)[0] == 0
-    assert (tmp_path / "mine.db").exists()
-
-
-def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
-    command_line: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DOPT_DB", "mine/x.db")
-    code, _, errors = command_line(*SHORT)
-    assert code == 2
-    assert f"{FROM_VARIABLE}: write it as sqlite:///mine/x.db." in errors
-    monkeypatch.setenv("DOPT_DB", "me:secret@host/x.db")
-    _, _, errors = command_line(*SHORT)
-    assert f"{FROM_VARIABLE}: write it as sqlite:///results/results.db or " in errors
-    assert "secret" not in errors
-    _, _, errors = command_line(*SHORT, "store.url=mine/x.db")
-    assert "The database URL cannot be read: write it as sqlite:///mine/x.db." in errors
-
-
-def test_an_empty_variable_counts_as_unset(
-    command_line: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DOPT_DB", "")
-    code, output, errors = command_line(*SHORT)
-    assert (code, errors) == (0, "")
-    assert "sqlite:///results/results.db" in output
-    assert default_url() == "sqlite:///results/results.db"
 
 
 def test_a_failed_trial_says_how_to_run_it_again(

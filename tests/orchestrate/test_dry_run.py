@@ -1,0 +1,59 @@
+"""What ``launch.dry_run=true`` shows of a grid."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.orchestrate.test_command_line import SHORT, Command
+
+
+def test_a_dry_run_shows_the_grid_and_makes_no_database(
+    command_line: Command, tmp_path: Path
+) -> None:
+    grid = ("-m", "policy=random", "width=8,16", "seed=range(4)", *SHORT)
+    code, output, _ = command_line(*grid, "launch.dry_run=true")
+    assert code == 0
+    assert list(tmp_path.iterdir()) == []
+    assert re.search(r"pendulum +random +8 +4 +0 +0 +4\n", output)
+    assert "8 trials, 0 done, 8 to run" in output
+    command_line(*grid, "seed=range(3)")
+    assert "8 trials, 6 done, 2 to run" in command_line(*grid, "launch.dry_run=true")[1]
+
+
+def test_a_dry_run_counts_trials_that_run_again(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Failed(dict[str, str]):
+        def get(self, _key: str, _default: object = None) -> str:  # type: ignore[override]
+            return "failed"
+
+    monkeypatch.setattr("orchestrate.runner.dry_run._statuses", lambda _: Failed())
+    grid = ("-m", "policy=random", "seed=range(4)", "launch.dry_run=true", *SHORT)
+    assert "4 trials, 0 done, 0 to run" in command_line(*grid)[1]
+    assert "4 trials, 0 done, 4 to run" in command_line(*grid, "launch.retry=failed")[1]
+
+
+def test_a_dry_run_tells_its_configs_apart(command_line: Command) -> None:
+    _, output, _ = command_line(
+        "-m", "env=arm,pendulum", "policy=random", "env.mass=2,3", "env.dt=0.01,0.02", "seed=0",
+        "launch.dry_run=true",
+    )  # fmt: skip
+    assert "env.mass applies to env=pendulum only\n" in output
+    assert re.search(r"env +policy +env.dt +env.mass +trials", output)
+    assert re.search(r"arm +random +0.01 +- +1", output)
+    assert re.search(r"pendulum +random +0.02 +3.0 +1", output)
+    assert "6 trials" in output
+
+
+def test_width_reaches_the_model_and_a_model_without_width_runs_once(
+    command_line: Command,
+) -> None:
+    _, output, _ = command_line(
+        "-m", "policy=random,oracle", "width=4,8", "seed=0", "launch.dry_run=true"
+    )
+    assert re.search(r"random +mlp .* 4 .* 1\n", output)
+    assert re.search(r"random +mlp .* 8 .* 1\n", output)
+    assert len(re.findall("oracle", output)) == 1

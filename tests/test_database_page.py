@@ -1,0 +1,81 @@
+"""The page of the database is true: its queries answer, its tables and views are all there are."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from orchestrate.store import Reader
+from orchestrate.store.schema import SCHEMA_VERSION, metadata
+from orchestrate.store.views import VIEWS
+from tests.analysis.synthetic import fill, make_grid
+from tests.pages import PAGES, blocks
+from tests.test_docs import SHORT, TASK
+
+DATABASE = "docs/database.md"
+QUERIES = [
+    (question, query)
+    for block in blocks(PAGES[DATABASE], "sql")
+    for question, query in [block.removeprefix("-- ").split("\n", 1)]
+]
+EMPTY = {
+    "which trials were run more than once, and what ended the other attempts?",
+    "what failed, and why?",
+}
+"""Questions to which a grid without faults has no answer."""
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def small(request: pytest.FixtureRequest) -> str:
+    """Return a small grid in a database of each kind."""
+    url = str(request.getfixturevalue(f"{request.param}_url"))
+    fill(url, make_grid(("pendulum", "cartpole"), seeds=range(8), **SHORT))
+    fill(url, make_grid(("pendulum",), ("random",), seeds=range(8), **SHORT, **TASK))
+    return url
+
+
+def _answers(url: str) -> dict[str, tuple[list[str], list[tuple[object, ...]]]]:
+    """Return the columns and rows of every query of the page, numbers to nine digits."""
+    with Reader.open(url) as reader:
+        tables = {question: reader.query(query) for question, query in QUERIES}
+    return {
+        question: (list(table.columns), [tuple(map(_rounded, row)) for row in table])
+        for question, table in tables.items()
+    }
+
+
+def _rounded(value: object) -> object:
+    return f"{value:.9g}" if isinstance(value, float) else value
+
+
+def test_every_query_answers_and_mixes_no_configurations(small: str) -> None:
+    """A second configuration of a policy adds rows, but changes none and doubles no step."""
+    before = _answers(small)
+    for question, (_, rows) in before.items():
+        assert rows or question in EMPTY, question
+    other = {"env": {"horizon": 40, "gamma": 3.0}}
+    fill(small, make_grid(("pendulum", "cartpole"), seeds=range(6), **other))
+    fill(
+        small,
+        make_grid(("cartpole",), ("d_optimal",), range(6), policy={"regularization": 0.1}, **SHORT),
+    )
+    for question, (columns, rows) in _answers(small).items():
+        assert set(before[question][1]) <= set(rows), question
+        assert len(set(rows)) == len(rows), question
+        if "t" in columns and "config_key" not in columns:
+            steps = [row[columns.index("t")] for row in rows]
+            assert len(set(steps)) == len(steps), question
+
+
+def test_the_page_counts_its_queries() -> None:
+    numbers = {"Eleven": 11, "Twelve": 12, "Thirteen": 13}
+    (said,) = re.findall(r"^## (\w+) useful queries$", PAGES[DATABASE], flags=re.MULTILINE)
+    assert numbers[said] == len(QUERIES)
+
+
+def test_every_table_and_view_is_described() -> None:
+    page = PAGES[DATABASE]
+    for name in (*metadata.tables, *VIEWS):
+        assert f"`{name}`" in page or name == "alembic_version", name
+    assert f"The schema is version {SCHEMA_VERSION}." in page
