@@ -46,6 +46,13 @@ INVARIANT = 1e-9
 """A Krylov direction shorter than this beside its origin is rounding: the space is invariant."""
 
 
+SMALLEST_SHARE = 1.0 / 64.0
+"""Smallest share of a Gauss-Newton step that is tried."""
+
+NO_GROWTH = 1.0 + 1e-10
+"""Growth of a sum of squares that counts as none: at its minimum rounding must not decide."""
+
+
 def switch_step(steps: int) -> int:
     """Return the step at which a plan of so many steps may switch its input, ``steps`` if never."""
     return steps // 2 if steps > 1 else steps

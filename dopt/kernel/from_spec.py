@@ -146,6 +146,7 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
     window = spec.learner.samples_kept(system.horizon)
     return args.State(
         weights.copy(),
+        weights.copy(),
         np.zeros(len(weights)),
         np.zeros(len(weights)),
         *_information(spec, len(weights)),

@@ -147,6 +147,7 @@ class State(NamedTuple):
     """Everything that changes from step to step; written in place."""
 
     theta: Vector  # (q,) parameters
+    prior: Vector  # (q,) parameters before the first step
     moment_1: Vector  # (q,) of Adam
     moment_2: Vector  # (q,)
     covariance: Covariance

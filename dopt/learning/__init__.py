@@ -7,6 +7,8 @@ from dopt.learning.adam_replay import AdamReplay
 from dopt.learning.base import Learner
 from dopt.learning.conditioning import Conditioning
 from dopt.learning.extended_kalman import ExtendedKalman
+from dopt.learning.gauss_newton import GaussNewton
+from dopt.learning.information_learner import InformationLearner
 from dopt.learning.recursive_least_squares import RecursiveLeastSquares
 
 LEARNERS: dict[str, type[Learner]] = {
@@ -17,6 +19,7 @@ LEARNERS: dict[str, type[Learner]] = {
         AdamReplay,
         RecursiveLeastSquares,
         ExtendedKalman,
+        GaussNewton,
         Conditioning,
     )
 }
@@ -29,6 +32,8 @@ __all__ = [
     "AdamWindow",
     "Conditioning",
     "ExtendedKalman",
+    "GaussNewton",
+    "InformationLearner",
     "Learner",
     "RecursiveLeastSquares",
 ]

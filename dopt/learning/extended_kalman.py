@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 from dopt.declare.validated_fields import parameter
-from dopt.learning.base import Learner
+from dopt.learning.information_learner import InformationLearner
 
 
 class Renewal(NamedTuple):
@@ -45,15 +45,13 @@ class Renewal(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExtendedKalman(Learner):
+class ExtendedKalman(InformationLearner):
     """θ += K e with K = M⁻¹Jᵀ (ρI + J M⁻¹ Jᵀ)⁻¹, and M += JᵀJ/ρ.
 
-    There is one information matrix. With a policy that plans by M the filter takes that of the
-    policy, with its λ; with any other it holds one of its own. In both cases a sample enters M with
-    the J that its learning step was taken with, hence at the parameters before that step, so that θ
-    and M⁻¹ stay the mean and the covariance of one filter; for a model that is linear in θ this is
-    recursive least squares. (With other learners the planner adds J at the parameters after the
-    step, as the paper does.)
+    A sample enters M with the J that its learning step was taken with, hence at the parameters
+    before that step, so that θ and M⁻¹ stay the mean and the covariance of one filter; for a model
+    that is linear in θ this is recursive least squares. (With other learners the planner adds J at
+    the parameters after the step, as the paper does.)
 
     With f < 1 the past fades, M_{t+1} = f M_t + D_t + JᵀJ/ρ. The diagonal D_t gives back what the
     prior loses, so that M never falls below λ/2 I: directions that nothing excites do not wind up,
@@ -61,11 +59,6 @@ class ExtendedKalman(Learner):
 
     Parameters
     ----------
-    regularization : float
-        λ of a filter with a matrix of its own; with ρ = 1 it is the ratio of the variance of the
-        observations to that of the initial parameters.
-    noise_variance : float
-        ρ, in the units in which the parameters have the variance 1/λ.
     forgetting : float
         f, above 0 and at most 1: samples of 1/(1 - f) steps ago count 1/e. 1 forgets nothing.
     """
@@ -73,10 +66,7 @@ class ExtendedKalman(Learner):
     name: ClassVar[str] = "ekf"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn"
-    updates_information: ClassVar[bool] = True
 
-    regularization: float = parameter(1e-3, bound="positive")
-    noise_variance: float = parameter(1.0, bound="positive")
     forgetting: float = parameter(1.0, bound="share")
 
     def renewal(self, n_parameters: int, regularization: float) -> Renewal:

@@ -12,6 +12,7 @@ from torch.func import jacrev, vmap
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
+from dopt.learning import InformationLearner
 from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.reference.black_box import episodes_for, initial_states, stepped
@@ -19,7 +20,7 @@ from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.gaussian_process import Posterior
 from dopt.reference.learner_registry import batch_learner
-from dopt.reference.learning import KalmanLearner
+from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.planner_registry import plan_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
 from dopt.reference.search import searched_inputs
@@ -98,7 +99,7 @@ class Lockstep(BatchState):
         """Update the parameters with the samples up to time t; diverged trials keep theirs."""
         before = self.theta.clone()
         seen = (self.states[:, : t + 1], self.targets[:, : t + 1])
-        if isinstance(self.learner, KalmanLearner):
+        if isinstance(self.learner, (KalmanLearner, GaussNewtonLearner)):
             assert self.information is not None
             self.information = self.learner.filtered(*seen, self.information)
         else:
@@ -112,10 +113,11 @@ class Lockstep(BatchState):
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t.
 
-        A Kalman filter has done so in its learning step.
+        A learner that shares M has done so in its learning step.
         """
         observe(self, self.planners, t)
-        if self.information is not None and not isinstance(self.learner, KalmanLearner):
+        shared = isinstance(self.config.learner, InformationLearner)
+        if self.information is not None and not shared:
             J = self.rows(t)
             self.information = self.information + J.mT @ J
         if self.own_plan is not None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from dopt.learning import ExtendedKalman, RecursiveLeastSquares
+from dopt.learning import ExtendedKalman, GaussNewton, RecursiveLeastSquares
 from dopt.learning.base import CustomLearner
 from dopt.models import GaussianProcess
 from dopt.reference.custom_plugins import OwnLearner
 from dopt.reference.gaussian_process import Posterior
 from dopt.reference.learning import (
     BatchLearner,
+    GaussNewtonLearner,
     KalmanLearner,
     LeastSquaresLearner,
     learner_for,
@@ -18,7 +19,9 @@ from dopt.reference.learning import (
 from dopt.reference.state import BatchState
 
 
-def batch_learner(batch: BatchState, points: Tensor) -> BatchLearner | KalmanLearner:
+def batch_learner(
+    batch: BatchState, points: Tensor
+) -> BatchLearner | KalmanLearner | GaussNewtonLearner:
     """Return the learner of a batch; it writes into the parameters of the batch.
 
     ``points``, (N, d), are the states at which the model is evaluated at each step.
@@ -31,6 +34,9 @@ def batch_learner(batch: BatchState, points: Tensor) -> BatchLearner | KalmanLea
     if isinstance(learner, ExtendedKalman):
         assert batch.held is not None
         return KalmanLearner(learner, batch.model, batch.theta, batch.held.regularization)
+    if isinstance(learner, GaussNewton):
+        assert batch.held is not None
+        return GaussNewtonLearner(learner, batch.model, batch.theta, batch.held.regularization)
     if isinstance(learner, RecursiveLeastSquares):
         ridge = float(getattr(batch.config.policy, "regularization", learner.regularization))
         return LeastSquaresLearner(batch.model, batch.theta, ridge, batch.n_learned)

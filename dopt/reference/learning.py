@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
 
+from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
 from dopt.errors import SpecificationError
-from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, Learner
+from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, GaussNewton, Learner
 from dopt.reference.models import Accelerations
 
 
@@ -121,8 +122,7 @@ class KalmanLearner:
         given_back = torch.diag(self._given_back(states.shape[1] - 1))
         information = self._learner.forgetting * information + given_back + J.mT @ J / noise
         slope = J.mT @ (y - self._model(self._theta, x)).unsqueeze(-1) / noise
-        factor, _ = torch.linalg.cholesky_ex(information)
-        self._theta.add_(torch.cholesky_solve(slope, factor).squeeze(-1))
+        self._theta.add_(_solved(information, slope))
         return information
 
     def _given_back(self, t: int) -> Tensor:
@@ -132,6 +132,66 @@ class KalmanLearner:
         turn = torch.arange(t * k, (t + 1) * k, device=diagonal.device)
         diagonal[turn % len(diagonal)] = weight
         return diagonal
+
+
+class GaussNewtonLearner:
+    """Gauss-Newton on the samples of the buffer: M is summed over all rows, and solved afresh.
+
+    Between two fits it is the Kalman filter.
+    """
+
+    def __init__(
+        self, learner: GaussNewton, model: Accelerations, theta: Tensor, regularization: float
+    ) -> None:
+        self._learner, self._theta, self._prior = learner, theta, theta.clone()
+        self._ridge = regularization * learner.noise_variance
+        self._model = vmap(vmap(model, in_dims=(None, 0)))
+        self._rows = vmap(vmap(jacrev(model), in_dims=(None, 0)))
+
+    def filtered(self, states: Tensor, targets: Tensor, information: Tensor) -> Tensor:
+        """Learn from the states (n, t + 1, d) and targets (n, t + 1, r); return M."""
+        noise, newest = self._learner.noise_variance, slice(-self._learner.capacity, None)
+        if (states.shape[1] - 1) % self._learner.refit_every:
+            J, e = self._linearized(states[:, -1:], targets[:, -1:])
+            information = information + J.mT @ J / noise
+            self._theta.add_(_solved(information, J.mT @ e / noise))
+            return information
+        for _ in range(self._learner.steps):
+            information = self._stepped(states[:, newest], targets[:, newest]) / noise
+        return information
+
+    def _linearized(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Return J, (n, N r, q), and e, (n, N r, 1), for N samples of each trial."""
+        J = self._rows(self._theta, x).flatten(1, 2)
+        return J, (y - self._model(self._theta, x)).flatten(1).unsqueeze(-1)
+
+    def _stepped(self, x: Tensor, y: Tensor) -> Tensor:
+        """Take one damped step on (n, N, d) and (n, N, r); return ρM before it."""
+        J, e = self._linearized(x, y)
+        distance = (self._prior - self._theta).unsqueeze(-1)
+        matrix = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
+        step = _solved(matrix, J.mT @ e + self._ridge * distance)
+        before, share = self._theta.clone(), torch.ones_like(self._theta[:, :1])
+        bound = self._objective(before, x, y) * NO_GROWTH
+        while True:
+            self._theta.copy_(before + share * step)
+            worse = ~(self._objective(self._theta, x, y) <= bound) & (share > 0)
+            if not worse.any():
+                return matrix
+            smaller = torch.where(share > SMALLEST_SHARE, share / 2, 0.0)
+            share = torch.where(worse, smaller, share)
+
+    def _objective(self, theta: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Return ‖e‖² + λρ ‖θ - θ₀‖², (n, 1)."""
+        squares = (y - self._model(theta, x)).square().sum(dim=(1, 2))
+        whole = squares + self._ridge * (theta - self._prior).square().sum(dim=1)
+        return whole.unsqueeze(1)
+
+
+def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+    """Return the solutions, (n, q), for positive definite matrices and columns, (n, q, 1)."""
+    factor, _ = torch.linalg.cholesky_ex(matrix)
+    return torch.cholesky_solve(right, factor).squeeze(-1)
 
 
 def learner_for(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dopt.errors import IncompatibleError
-from dopt.learning import LEARNERS, Adam, ExtendedKalman, Learner
+from dopt.learning import LEARNERS, Adam, ExtendedKalman, InformationLearner, Learner
 from dopt.models import MODELS, GaussianProcess, Linear, LinearState, Model
 from dopt.policies import InformationPolicy, Oracle, Policy
 from dopt.policies.disagreement import Disagreement
@@ -23,8 +23,7 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
     if isinstance(policy, Disagreement) and not isinstance(learner, Adam):
         expected = "learner 'adam' or 'adam_window', which can learn for many networks"
         raise mismatch(f"policy '{policy.name}'", expected, f"learner '{learner.name}'")
-    kalman = isinstance(learner, ExtendedKalman)
-    _check_model(system, policy, model, kalman)
+    _check_model(system, policy, model, learner)
     if not _teaches(type(learner), type(model)):
         raise mismatch(
             f"learner '{learner.name}'",
@@ -62,20 +61,20 @@ _MODELS_OF: dict[type[Policy], type[Model]] = {
 }
 
 
-def _check_model(system: System, policy: Policy, model: Model, kalman: bool) -> None:
-    """Check a model with a policy, and whether the learner is a Kalman filter.
+def _check_model(system: System, policy: Policy, model: Model, learner: Learner) -> None:
+    """Check a model with a policy, and a learner that updates M.
 
     A filter that holds M itself teaches the linear model without a policy that plans by M. It needs
     a variance of each parameter, hence M in the primal form, as least squares do.
     """
-    given = f"policy '{policy.name}'"
-    if isinstance(model, Linear) and not (kalman or isinstance(policy, InformationPolicy)):
+    given, sharing = f"policy '{policy.name}'", isinstance(learner, InformationLearner)
+    if isinstance(model, Linear) and not (sharing or isinstance(policy, InformationPolicy)):
         raise mismatch("model 'linear'", "policy 'oracle'", given)
     if isinstance(model, Linear) and not system.linear_parameters:
         raise mismatch("model 'linear'", "linear parameters", f"env '{system.name}'")
     form = getattr(policy, "form", "auto")
-    if (kalman or model.structure == "least_squares") and form not in ("auto", "primal"):
-        what = "learner 'ekf'" if kalman else f"model '{model.name}'"
+    if (sharing or model.structure == "least_squares") and form not in ("auto", "primal"):
+        what = f"learner '{learner.name}'" if sharing else f"model '{model.name}'"
         raise mismatch(what, "policy.form 'primal' or 'auto'", f"policy.form '{form}'")
     if model.structure == "conditioning" and hasattr(policy, "regularization"):
         expected = "a policy that needs no information matrix of parameters"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from dopt.learning import ExtendedKalman, Learner
+from dopt.learning import InformationLearner, Learner
 from dopt.policies import InformationPolicy, Policy
 
 
@@ -28,11 +28,11 @@ def held_information(
 ) -> Information | None:
     """Return what M a trial holds for q parameters and N rows; None where nothing needs one.
 
-    A policy that plans by M shares it with a Kalman filter, which needs the gain in the space of
-    the parameters and hence the primal form.
+    A policy that plans by M shares it with a learner that updates it, which needs the gain in the
+    space of the parameters and hence the primal form.
     """
-    kalman = learner if isinstance(learner, ExtendedKalman) else None
+    sharing = learner if isinstance(learner, InformationLearner) else None
     if isinstance(policy, InformationPolicy):
-        form = "primal" if kalman else policy.chosen_form(n_parameters, n_rows)
+        form = "primal" if sharing else policy.chosen_form(n_parameters, n_rows)
         return Information(form, policy.regularization)
-    return Information("primal", kalman.regularization) if kalman else None
+    return Information("primal", sharing.regularization) if sharing else None

@@ -10,7 +10,7 @@ import math
 
 from dopt.control import Control
 from dopt.control.free_run import STARTS
-from dopt.learning import Adam, AdamReplay, Learner
+from dopt.learning import Adam, AdamReplay, GaussNewton, Learner
 from dopt.learning.base import CompiledLearner
 from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
@@ -67,6 +67,12 @@ def memory_by_setting(
         numbers["env.horizon"] += min(learner.capacity, T) * (p + r)
         drawn = T * learner.steps * learner.batch
         numbers["learner.batch"] = drawn + learner.batch * (p + r + (L + 3) * max(w, r))
+    if isinstance(learner, GaussNewton):
+        # the samples kept, the pairs of units of one block, and JᵀJ, its factor and C⁻¹ in blocks
+        kept = learner.samples_kept(T)
+        numbers["env.horizon"] += kept * (p + r)
+        pairs = kept * (2 * max(w, p) ** 2 + (L + r * L) * w)
+        numbers[_size_of(model)] += pairs + 4 * q**2
     for own in (policy, learner):
         if isinstance(own, (CompiledPolicy, CompiledLearner)):
             numbers[_size_of(model)] += own.memory_size(system, q)

@@ -18,8 +18,20 @@ from dopt.types import Matrix, Vector
 def learn(trial: Trial, t: int, target: Vector) -> None:
     """Filter the observed accelerations, (r,): update θ and M."""
     numbers = trial.algorithm.learner
-    noise_variance, forgetting = numbers[0], numbers[1]
-    renewed, renewal = int(numbers[2]), numbers[3]
+    filter_sample(trial, t, target, numbers[0], numbers[1], int(numbers[2]), numbers[3])
+
+
+@compiled
+def filter_sample(
+    trial: Trial,
+    t: int,
+    target: Vector,
+    noise_variance: float,
+    forgetting: float,
+    renewed: int,
+    renewal: float,
+) -> None:
+    """Update θ and M by the sample of step t, after M has faded by a factor."""
     theta, covariance = trial.state.theta, trial.state.covariance
     residuals = np.empty(target.shape[0])
     rows = model_rows(trial.plant, trial.network, theta, trial.record.states[t], residuals)

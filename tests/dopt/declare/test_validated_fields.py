@@ -30,7 +30,16 @@ POSITIVE = {
     *("ensemble", "lookahead", "candidates", "starts", "n_features", "lengthscale", "amplitude"),
     *("regularization", "sketch_size", "hold", "iterations", "frequency", "band"),
     *("subspace", "count", "radius", "stride"),
-    *("n_links", "time_constant", "capacity", "batch", "steps", "noise_variance", "forgetting"),
+    *(
+        "n_links",
+        "time_constant",
+        "capacity",
+        "refit_every",
+        "batch",
+        "steps",
+        "noise_variance",
+        "forgetting",
+    ),
 }
 NONNEGATIVE = {
     *("noise", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),

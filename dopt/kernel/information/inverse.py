@@ -1,0 +1,80 @@
+"""The inverse of a positive definite matrix from its Cholesky factor, in compiled code."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.kernel.compiler import compiled, vectorized
+from dopt.types import Matrix, Stack
+
+BLOCK = 48
+"""Rows and columns of a block: three of them fit into the first-level cache."""
+
+
+@compiled
+def write_inverse(factor: Matrix, upper: Matrix) -> None:
+    """Write the upper triangle of (C Cᵀ)⁻¹, (q, q), for a lower triangular C, (q, q).
+
+    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications.
+    """
+    q = factor.shape[0]
+    n = (q + BLOCK - 1) // BLOCK
+    X = np.zeros((n, n, BLOCK, BLOCK))
+    _invert_blocks(factor, X)
+    for i in range(n):
+        for j in range(i, n):
+            block = np.zeros((BLOCK, BLOCK))
+            for k in range(j, n):
+                block += np.dot(X[k, i].T, X[k, j])
+            _write_block(block, i * BLOCK, j * BLOCK, upper)
+
+
+@compiled
+def _invert_blocks(factor: Matrix, X: Stack) -> None:
+    """Write the blocks of C⁻¹ on and below the diagonal, padded by the identity."""
+    n = X.shape[0]
+    C = np.zeros(X.shape)
+    for i in range(n):
+        for j in range(i + 1):
+            _read_block(factor, i * BLOCK, j * BLOCK, C[i, j])
+        _invert_triangle(C[i, i], X[i, i])
+    for j in range(n):
+        for i in range(j + 1, n):
+            total = np.zeros((BLOCK, BLOCK))
+            for k in range(j, i):
+                total += np.dot(C[i, k], X[k, j])
+            X[i, j] = -np.dot(X[i, i], total)
+
+
+@compiled
+def _read_block(factor: Matrix, first: int, left: int, block: Matrix) -> None:
+    q = factor.shape[0]
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            if first + i < q and left + j < q and left + j <= first + i:
+                block[i, j] = factor[first + i, left + j]
+        if first == left and first + i >= q:
+            block[i, i] = 1.0
+
+
+@vectorized
+def _invert_triangle(C: Matrix, X: Matrix) -> None:
+    """Write the inverse of a lower triangular block, row by row."""
+    for i in range(C.shape[0]):
+        row = X[i]
+        for k in range(i):
+            other, factor = X[k], C[i, k]
+            for j in range(k + 1):
+                row[j] -= factor * other[j]
+        for j in range(i):
+            row[j] /= C[i, i]
+        row[i] = 1.0 / C[i, i]
+
+
+@compiled
+def _write_block(block: Matrix, first: int, left: int, upper: Matrix) -> None:
+    q = upper.shape[0]
+    for i in range(min(BLOCK, q - first)):
+        for j in range(min(BLOCK, q - left)):
+            if left + j >= first + i:
+                upper[first + i, left + j] = block[i, j]

@@ -1,0 +1,96 @@
+"""Gauss-Newton steps on all samples in compiled code (:mod:`dopt.learning.gauss_newton`).
+
+Its numbers are λ, ρ, the steps from one fit to the next and the Gauss-Newton steps of a fit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
+from dopt.kernel.compiler import compiled, squared
+from dopt.kernel.information.inverse import write_inverse
+from dopt.kernel.information.normal_equations import errors_of, normal_equations
+from dopt.kernel.information.primal import symmetric_product
+from dopt.kernel.learners.kalman import filter_sample
+from dopt.kernel.learners.samples import store_sample
+from dopt.kernel.structs import Covariance, Network, Trial
+from dopt.types import Matrix, Vector
+
+
+@compiled
+def learn(trial: Trial, t: int, target: Vector) -> None:
+    """Fit all samples, or filter the newest one between two fits."""
+    numbers, state = trial.algorithm.learner, trial.state
+    noise_variance, refit_every, steps = numbers[1], int(numbers[2]), int(numbers[3])
+    seen, observed = state.window_features, state.window_targets
+    store_sample(trial.network, seen, observed, t, trial.record.states[t], target)
+    if t % refit_every != 0:
+        filter_sample(trial, t, target, noise_variance, 1.0, 0, 0.0)
+        return
+    n = min(t + 1, seen.shape[1])
+    features, targets = seen[:, :n].copy(), observed[:, :n].copy()
+    for _ in range(steps):
+        take_step(
+            trial.network,
+            state.theta,
+            state.prior,
+            numbers[0] * noise_variance,
+            features,
+            targets,
+            state.covariance,
+        )
+    _scale(state.covariance.upper, noise_variance)
+
+
+@compiled
+def take_step(
+    network: Network,
+    theta: Vector,
+    prior: Vector,
+    ridge: float,
+    features: Matrix,
+    targets: Matrix,
+    covariance: Covariance,
+) -> None:
+    """Take a damped step to the minimum of ‖e‖² + ridge ‖θ - θ₀‖²; write (JᵀJ + ridge I)⁻¹.
+
+    ``features`` (p, N), ``targets`` (r, N), θ and θ₀ (q,).
+    """
+    q = theta.shape[0]
+    normal, slope, step = np.empty((q, q)), np.empty(q), np.empty(q)
+    squares = normal_equations(network, theta, features, targets, normal, slope)
+    squares += ridge * squared_distance(theta, prior)
+    for i in range(q):
+        normal[i, i] += ridge
+        slope[i] += ridge * (prior[i] - theta[i])
+    normal[:] = np.linalg.cholesky(normal)
+    write_inverse(normal, covariance.upper)
+    covariance.n_pending[0] = 0
+    symmetric_product(covariance.upper, slope, step)
+    share, before = 1.0, theta.copy()
+    while share >= SMALLEST_SHARE:
+        for i in range(q):
+            theta[i] = before[i] + share * step[i]
+        after = errors_of(network, theta, features, targets)[0]
+        if after + ridge * squared_distance(theta, prior) <= squares * NO_GROWTH:
+            return
+        share *= 0.5
+    theta[:] = before
+
+
+@compiled
+def squared_distance(a: Vector, b: Vector) -> float:
+    """Return ‖a - b‖²."""
+    total = 0.0
+    for i in range(a.shape[0]):
+        total += squared(a[i] - b[i])
+    return total
+
+
+@compiled
+def _scale(upper: Matrix, factor: float) -> None:
+    """Multiply the upper triangle of a matrix, (q, q)."""
+    for i in range(upper.shape[0]):
+        for j in range(i, upper.shape[0]):
+            upper[i, j] *= factor
