@@ -37,8 +37,10 @@ def situation(
     widths[list(system.grid_indices)] = torch.tensor(system.grid_half_widths, dtype=torch.float64)
     states = widths * (2 * torch.rand(seen + 1, system.n_states, generator=rng).double() - 1)
     M = regularization * torch.eye(len(theta), dtype=torch.float64)
-    J = vmap(jacrev(model), (None, 0))(theta, states[1:]).flatten(0, 1)
-    return Situation(model, theta, states[0], M + J.mT @ J)
+    if seen:
+        J = vmap(jacrev(model), (None, 0))(theta, states[1:]).flatten(0, 1)
+        M = M + J.mT @ J
+    return Situation(model, theta, states[0], M)
 
 
 def step_from(spec: TrialSpec, now: Situation, u: Tensor) -> Tensor:
