@@ -71,7 +71,7 @@ def _log_det(
 
 
 def test_the_estimate_tends_to_the_true_matrix() -> None:
-    spec = linear_trial("linear", 1, horizon=400)
+    spec = linear_trial("linear", 1, horizon=200)
     system = spec.system
     assert system.name == "mass_spring"
     found = run_trials([spec])[0].parameters.reshape(2, 4) / np.array(system.feature_scales)
