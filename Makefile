@@ -15,6 +15,9 @@ CONTROLLED := d_optimal lookahead uniform periodic random random_held
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
+# Python keeps the bytecode of the libraries: without it every program that a test starts compiles
+# their sources for seconds.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 # One worker for each of two cores: tests with limits of seconds fail where more processes compete.

@@ -14,7 +14,7 @@ from orchestrate import __main__ as orchestrate
 from orchestrate.runner import launch
 from tests.paths import ROOT
 
-STEPS, STEPS_OF_TASK = "env.horizon=60", "env.horizon=100"
+STEPS, STEPS_OF_TASK = "env.horizon=20", "env.horizon=100"
 """Added to each launch: what a page shows does not depend on how long its trials are."""
 
 

@@ -131,14 +131,15 @@ def test_where_a_black_box_can_be_driven_is_not_known() -> None:
 
 
 def test_the_seed_decides_about_the_start_and_policies_share_it() -> None:
-    first, second = (run_trial(specification(policy=p)) for p in ("random", "d_optimal"))
-    other = run_trial(specification(seed=1))
+    short: dict[str, Any] = {"horizon": 20}
+    first, second = (run_trial(specification(policy=p, **short)) for p in ("random", "d_optimal"))
+    other = run_trial(specification(seed=1, **short))
     assert first.states[0, 0] == second.states[0, 0] != other.states[0, 0]
-    np.testing.assert_array_equal(second.states, run_trial(specification()).states)
+    np.testing.assert_array_equal(second.states, run_trial(specification(**short)).states)
 
 
 def test_black_boxes_in_lockstep_are_those_run_alone() -> None:
-    specs = [specification(seed=seed) for seed in range(3)]
+    specs = [specification(seed=seed, horizon=20) for seed in range(3)]
     for together, spec in zip(run_trials(specs), specs, strict=True):
         np.testing.assert_allclose(together.states, run_trial(spec).states, rtol=1e-9)
 

@@ -16,8 +16,8 @@ from tests.dopt.kernel.test_information import run
 from tests.dopt.kernel.twin import relative_gap, transplant
 from tests.dopt.trials import PAIRS, trial
 
-WINDOW = {"name": "adam_window", "window": 7}
-"""Shorter than the trials, so that the kernel's ring of samples goes round."""
+WINDOW = {"name": "adam_window", "window": 4}
+"""Shorter than the trials, so that the kernel's ring of samples goes round twice."""
 NEWEST = {"name": "adam"}
 LOSS = 1e-5
 """The kernel judges a model in single precision, down to a floor; what it decides by is double."""
@@ -45,7 +45,7 @@ def check_agreement(spec: TrialSpec) -> tuple[TrialResult, TrialResult]:
 
 @pytest.mark.parametrize(("env", "policy", "learner"), CASES)
 def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str, Any]) -> None:
-    spec = trial(env, policy, 3, env={"horizon": 15}, learner=learner)
+    spec = trial(env, policy, 3, env={"horizon": 9}, learner=learner)
     fast, plain = check_agreement(spec)
     if policy != "oracle":
         assert relative_gap(fast.parameters, plain.parameters) < 1e-8

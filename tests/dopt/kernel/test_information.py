@@ -11,6 +11,7 @@ from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
 from dopt.reference.models import model_function
 from dopt.spec.trial import TrialSpec
+from tests.close import assert_close
 from tests.dopt.trials import trial
 
 
@@ -38,7 +39,7 @@ def test_it_is_the_inverse_of_the_sum_of_all_rows(env: str, policy: str) -> None
     J = jacobians(spec, parameters, fast.record.states[:-1]).reshape(-1, parameters.shape[1])
     M = 1e-2 * np.eye(J.shape[1]) + J.T @ J
     product = dense(fast.state.covariance) @ M
-    assert product == pytest.approx(np.eye(len(M)), abs=1e-9)
+    assert_close(product, np.eye(len(M)), abs=1e-9)
 
 
 def test_information_never_decreases() -> None:

@@ -33,7 +33,7 @@ def open_loop(env: str, policy: str, horizon: int, **fields: Any) -> np.ndarray:
 
 @pytest.mark.parametrize(("env", "policy"), BOUNDED)
 def test_inputs_obey_the_bound(env: str, policy: str) -> None:
-    spec = trial(env, policy, 1)
+    spec = trial(env, policy, 1, env={"horizon": 12})
     norms = np.linalg.norm(run_trial(spec).inputs, axis=1)
     assert norms.max() <= spec.system.gamma * (1 + 1e-12)
     if spec.policy.uses_full_amplitude:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.func import jacrev
+from torch.func import jacrev, vmap
 
 from dopt.randomness import draw
 from dopt.reference.models import Accelerations, model_function
@@ -22,6 +23,7 @@ class Situation(NamedTuple):
     information: Tensor  # (q, q)
 
 
+@functools.cache
 def situation(
     spec: TrialSpec, seed: int, seen: int = 20, regularization: float = 1e-2
 ) -> Situation:
@@ -35,8 +37,8 @@ def situation(
     widths[list(system.grid_indices)] = torch.tensor(system.grid_half_widths, dtype=torch.float64)
     states = widths * (2 * torch.rand(seen + 1, system.n_states, generator=rng).double() - 1)
     M = regularization * torch.eye(len(theta), dtype=torch.float64)
-    for x in states[1:]:
-        J = jacrev(model)(theta, x)
+    if seen:
+        J = vmap(jacrev(model), (None, 0))(theta, states[1:]).flatten(0, 1)
         M = M + J.mT @ J
     return Situation(model, theta, states[0], M)
 

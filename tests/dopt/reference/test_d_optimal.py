@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import pytest
 import torch
 from torch import Tensor
-from torch.func import jacrev
+from torch.func import jacrev, vmap
 
 from dopt.math.sphere import maximize_on_sphere
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem
@@ -19,14 +20,15 @@ from tests.dopt.trials import PAIRS, trial
 CASES = [(env, policy) for env, policy in PAIRS if policy in ("d_optimal", "oracle")]
 
 
-def gradient_of(now: Situation, component: int, x: Tensor) -> Tensor:
-    """Return g = ∂a_k/∂θ, (q,)."""
-    return jacrev(now.model)(now.theta, x)[component]
+def gradients(now: Situation, x: Tensor) -> Tensor:
+    """Return J = ∂a/∂θ at n states, (n, r, q)."""
+    return vmap(jacrev(now.model), (None, 0))(now.theta, x)
 
 
-def pieces(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tensor]:
-    """Return g, (q,), and D B, (q, m), at x̄, both of D and B by central differences."""
-    system = spec.system
+@functools.cache
+def pieces(spec: TrialSpec, seed: int) -> tuple[Tensor, Tensor]:
+    """Return J, (r, q), and D B, (r, q, m), at x̄, both of D and B by central differences."""
+    system, now = spec.system, situation(spec, seed)
     zero = torch.zeros(system.n_inputs, dtype=torch.float64)
     bar = step_from(spec, now, zero)
     at_bar = now._replace(state=bar)
@@ -34,15 +36,9 @@ def pieces(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Ten
         [(step_from(spec, at_bar, e) - step_from(spec, at_bar, -e)) / 2 for e in _axes(zero)], dim=1
     )
     step = 1e-5
-    D = torch.stack(
-        [
-            (gradient_of(now, component, bar + e) - gradient_of(now, component, bar - e))
-            / (2 * step)
-            for e in step * _axes(bar)
-        ],
-        dim=1,
-    )
-    return gradient_of(now, component, bar), D @ B
+    moved = step * _axes(bar)
+    D = (gradients(now, bar + moved) - gradients(now, bar - moved)) / (2 * step)
+    return gradients(now, bar[None])[0], D.permute(1, 2, 0) @ B
 
 
 def _axes(like: Tensor) -> Tensor:
@@ -77,9 +73,8 @@ def test_the_problem_is_made_of_finite_differences_of_the_gradient(
 ) -> None:
     spec = trial(env, policy)
     now = situation(spec, seed)
-    for component in range(spec.system.n_learned):
-        g, DB = pieces(spec, now, component)
-        inverse = torch.linalg.inv(now.information)
+    inverse = torch.linalg.inv(now.information)
+    for component, (g, DB) in enumerate(zip(*pieces(spec, seed), strict=True)):
         Q, v, _ = solve(spec, now, component)
         # Difference quotients of |v| v and of products lose half of the digits.
         scale = float((DB.mT @ inverse @ DB).abs().max() + (DB.mT @ inverse @ g).abs().max())
@@ -94,12 +89,14 @@ def test_no_input_on_the_sphere_has_a_larger_linearised_gain(
 ) -> None:
     spec = trial(env, policy)
     now, gamma = situation(spec, seed), spec.system.gamma
-    for component in range(spec.system.n_learned):
-        g, DB = pieces(spec, now, component)
+    for component, (g, DB) in enumerate(zip(*pieces(spec, seed), strict=True)):
+        columns = torch.column_stack([g, DB])
+        form = columns.mT @ torch.linalg.solve(now.information, columns)
 
-        def gain(u: Tensor, g: Tensor = g, DB: Tensor = DB) -> Tensor:
-            rows = g + u @ DB.mT
-            return (rows * torch.linalg.solve(now.information, rows.mT).mT).sum(-1)
+        def gain(u: Tensor, form: Tensor = form) -> Tensor:
+            """Return rowᵀ M⁻¹ row for the row g + D B u, of each of the inputs."""
+            weights = torch.cat([torch.ones(len(u), 1, dtype=torch.float64), u], dim=1)
+            return ((weights @ form) * weights).sum(-1)
 
         u = solve(spec, now, component)[2]
         scan = sphere(gamma, spec.system.n_inputs)
@@ -123,14 +120,16 @@ def _gap_and_effect(env: str, dt: float) -> tuple[float, float]:
     system = dataclasses.replace(spec.system, dt=dt)
     spec = TrialSpec(TrialConfig(system, spec.policy, spec.model, spec.learner))
     now, component = situation(spec, 6), system.n_learned - 1
-    g, DB = pieces(spec, now, component)
+    J, DBs = pieces(spec, 6)
+    g, DB = J[component], DBs[component]
     u = torch.full((system.n_inputs,), system.gamma / system.n_inputs**0.5, dtype=torch.float64)
 
     def logdet(row: Tensor) -> float:
         return float(torch.logdet(now.information + torch.outer(row, row)))
 
     exact, opposite = (
-        logdet(gradient_of(now, component, step_from(spec, now, sign * u))) for sign in (1, -1)
+        logdet(gradients(now, step_from(spec, now, sign * u)[None])[0, component])
+        for sign in (1, -1)
     )
     return abs(exact - logdet(g + DB @ u)), abs(exact - opposite)
 

@@ -21,6 +21,7 @@ from dopt.reference.exact_gain import (
 )
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
+from tests.close import assert_close
 from tests.dopt.reference.batch import circle, situation, step_from
 from tests.dopt.trials import trial
 
@@ -129,7 +130,7 @@ def test_the_plan_goes_by_the_information_of_all_steps(
         for t in range(8):
             batch.step(t)
             if t:
-                assert (seen[-1] @ M).numpy() == pytest.approx(np.eye(len(M)), abs=1e-7)
+                assert_close((seen[-1] @ M).numpy(), np.eye(len(M)), abs=1e-7)
             assert batch.information is not None
             if learner == "ekf":
                 M = batch.information[0].clone()
@@ -173,12 +174,12 @@ def test_an_input_drawn_at_random_falls_short_for_sure() -> None:
 def test_the_shortfall_vanishes_with_the_time_step(env: str) -> None:
     """Even as a share of what the input can change, which itself falls with dt."""
     missed = []
-    for dt in (0.1, 0.01, 1e-3, 1e-4):
+    for dt in (0.1, 1e-4):
         spec = trial(env, "d_optimal", 1, env=SHORT)
         system = dataclasses.replace(spec.system, dt=dt, noise=0.0)
         spec = TrialSpec(TrialConfig(system, spec.policy, spec.model, spec.learner, "reference"))
         one, _ = linearisation_gaps([spec.with_seed(seed) for seed in range(2)], SEARCH)
         missed.append(float(np.mean(one.of_range)))
-    assert missed[3] < 1e-6
+    assert missed[-1] < 1e-6
     if env == "arm":  # the others' inputs act along a line: only its sign is chosen
-        assert missed[0] > 10 * missed[3] > 0.0
+        assert missed[0] > 10 * missed[-1] > 0.0

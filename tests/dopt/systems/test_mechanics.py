@@ -34,7 +34,7 @@ def test_every_registered_system_is_held_against_masses(name: str) -> None:
     assert name in FRICTION
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_energy_changes_by_input_power_less_friction_power(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
@@ -63,7 +63,7 @@ def test_friction_never_feeds_energy(name: str, data: st.DataObject) -> None:
     assert rate <= 1e-12 * (1.0 + size)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(data=st.data())
 def test_equations_are_those_of_euler_and_lagrange(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
