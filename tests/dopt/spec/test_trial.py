@@ -208,7 +208,8 @@ def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
             "mlp",
             "recursive_least_squares",
             "learner 'recursive_least_squares' goes with model 'linear', 'linear_state' or 'rff' "
-            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf' or 'gauss_newton', but",
+            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf' or "
+            "'gauss_newton', but",
         ),
     ],
 )
