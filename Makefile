@@ -16,6 +16,9 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
 
+# Python keeps the bytecode of libraries: without it each new process spends most of its start on it.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 # One worker for each of two cores: tests with limits of seconds fail where more processes compete.
 # tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
