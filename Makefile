@@ -74,7 +74,7 @@ coverage: setup  ## run the test suite and require that 90 % of the lines are ru
 
 test-machines: setup  ## run grids on hosts that are lost and cut off, as root, in namespaces
 	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up(everything=True)'
-	$(BIN)/python -m pytest -m machines tests/machines
+	$(BIN)/python -m pytest --numprocesses 2 -m machines tests/machines
 
 soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases
 	$(BIN)/python -m pytest -m soak tests/soak
