@@ -19,6 +19,9 @@ export MKL_NUM_THREADS := 1
 # their sources for seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
+# Python keeps the bytecode of libraries: without it each new process spends most of its start on it.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 # One worker for each of two cores: tests with limits of seconds fail where more processes compete.
 # tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
@@ -74,7 +77,7 @@ coverage: setup  ## run the test suite and require that 90 % of the lines are ru
 
 test-machines: setup  ## run grids on hosts that are lost and cut off, as root, in namespaces
 	$(BIN)/python -c 'from dopt.kernel import warm_up; warm_up(everything=True)'
-	$(BIN)/python -m pytest -m machines tests/machines
+	$(BIN)/python -m pytest --numprocesses 2 -m machines tests/machines
 
 soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases
 	$(BIN)/python -m pytest -m soak tests/soak

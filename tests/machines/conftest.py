@@ -17,7 +17,6 @@ from tests.machines.outcome import Outcome
 
 HERE = Path(__file__).parent
 SECONDS = 600
-_measured: list[tuple[str, float]] = []
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -25,18 +24,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if HERE in item.path.parents:
             item.add_marker(pytest.mark.machines)
             item.add_marker(pytest.mark.timeout(SECONDS))
-            item.add_marker(pytest.mark.xdist_group("machines"))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    for what, seconds in _measured:
-        terminalreporter.write_line(f"{seconds:6.1f} s  {what}")
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if getattr(report, "when", None) == "call":
+                for what, seconds in report.user_properties:
+                    terminalreporter.write_line(f"{seconds:6.1f} s  {what}")
 
 
 @pytest.fixture
-def measured() -> Callable[[str, float], None]:
-    """Return a function that keeps a time for the end of the report."""
-    return lambda what, seconds: _measured.append((what, seconds))
+def measured(record_property: Callable[[str, object], None]) -> Callable[[str, float], None]:
+    """Return a function that keeps a time for the end of the report, also from another process."""
+    return record_property
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tests.machines import servers
@@ -38,11 +39,16 @@ class Lab:
         return self.network.hosts[name] if name in self.network.hosts else self.network.add(name)
 
     def start_cluster(self, *workers: str, **environment: str) -> None:
-        """Start the head, let the desk join it, and the workers with a core each."""
+        """Start the head, then let the desk and the workers, with a core each, join it at once."""
         self.address = servers.start_head(self.host("head"), 0, **environment)
-        servers.join(self.host("desk"), self.address, 0, **environment)
-        for worker in workers:
-            self.add_worker(worker, **environment)
+        cores = {self.host("desk"): 0} | {self.host(worker): 1 for worker in workers}
+        with ThreadPoolExecutor() as threads:
+            joined = [
+                threads.submit(servers.join, host, self.address, count, **environment)
+                for host, count in cores.items()
+            ]
+        for one in joined:
+            one.result()
 
     def add_worker(self, name: str, **environment: str) -> None:
         servers.join(self.host(name), self.address, 1, **environment)

@@ -10,7 +10,7 @@ from pathlib import Path
 from tests.machines.hosts import Host, Process
 from tests.paths import ROOT
 
-BIN = Path(sys.executable).parent
+RAY = (sys.executable, "-m", "ray.scripts.scripts")
 LAUNCH = (str(ROOT / "orchestrate/launch.py"),)
 WITNESS = ("-m", "tests.machines.witness")
 RAY_PORT = 6379
@@ -27,7 +27,7 @@ def ray_settings() -> dict[str, str]:
 def start_head(host: Host, cpus: int = 1, **environment: str) -> str:
     """Start the head of a cluster on a host and return the address that others join."""
     _ray_start(host, cpus, "--head", f"--port={RAY_PORT}", "--include-dashboard=false",
-               **environment)  # fmt: skip
+               "--no-monitor", **environment)  # fmt: skip
     return f"{host.address}:{RAY_PORT}"
 
 
@@ -38,9 +38,9 @@ def join(host: Host, address: str, cpus: int = 1, **environment: str) -> None:
 
 def _ray_start(host: Host, cpus: int, *words: str, **environment: str) -> None:
     host.run(
-        str(BIN / "ray"), "start", *words, f"--node-ip-address={host.address}",
+        *RAY, "start", *words, f"--node-ip-address={host.address}",
         f"--num-cpus={cpus}", f"--object-store-memory={OBJECT_STORE_BYTES}",
-        "--disable-usage-stats", **{**ray_settings(), **environment},
+        "--disable-usage-stats", "--include-log-monitor=false", **{**ray_settings(), **environment},
     )  # fmt: skip
 
 
@@ -78,7 +78,7 @@ class Database:
 
 def leave(host: Host) -> None:
     """End all that runs of Ray on a host."""
-    host.run(str(BIN / "ray"), "stop", "--force")
+    host.run(*RAY, "stop", "--force")
 
 
 def launch(host: Host, program: Sequence[str], *words: str, **environment: str) -> Process:

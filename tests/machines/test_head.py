@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -37,8 +38,8 @@ def test_without_its_head_a_launch_ends_and_a_new_cluster_completes_it(
     if fault != "power off":
         lab.network.power_off(lab.host("head"))
     lab.network.replace(lab.host("head"))
-    for name in ("desk", "w1", "w2"):
-        servers.leave(lab.host(name))
+    with ThreadPoolExecutor() as threads:
+        list(threads.map(servers.leave, map(lab.host, ("desk", "w1", "w2"))))
     lab.start_cluster("w1", "w2")
     again = lab.launch()
     assert again.wait() == 0, again.output

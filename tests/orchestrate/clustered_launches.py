@@ -35,9 +35,9 @@ RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
 ADDRESSES = [f"10.77.1.{number}" for number in range(1, 17)]
 LONG_SEED = 3
 LOSSES = 2
-NEW_CORES = 3
-CORES = 2 + NEW_CORES
-"""More than the chunks that are handed out ahead to two nodes of one core each."""
+NEW_CORES = 2
+CORES = 1 + NEW_CORES
+"""More than the chunks that are handed out ahead to one node of one core."""
 
 SECONDS = 60.0
 
@@ -98,7 +98,9 @@ class Nodes:
     def __init__(self) -> None:
         self._cluster = Cluster(shutdown_at_exit=False)  # its signals are not for threads
         self._addresses = iter(ADDRESSES)
-        self.head = self._add(num_cpus=0, include_dashboard=False)
+        self.head = self._add(
+            num_cpus=0, include_dashboard=False, include_log_monitor=False, no_monitor=True
+        )
         self.address = self._cluster.address
         self._nodes: dict[str, Any] = {}
 
@@ -162,8 +164,15 @@ class Launches:
 def run_all(folder: Path) -> None:
     """Launch undisturbed, then with each fault."""
     launch = Launches(folder)
-    nodes, notes = launch.nodes, launch.notes
+    nodes_with_faults(launch)
+    nodes_that_differ(launch)
+    no_head(launch)
+    (folder / "report.json").write_text(json.dumps(launch.report))
 
+
+def nodes_with_faults(launch: Launches) -> None:
+    """Launch on two nodes; lose two of three; launch on one that is left, and a new one."""
+    nodes, notes = launch.nodes, launch.notes
     two = {nodes.add(), nodes.add()}
     launch("plain", partial(tenth_of_a_second, notes, "plain"))
     launch.report["plain"]["both nodes"] = set(notes.nodes("plain")) == two
@@ -172,7 +181,8 @@ def run_all(folder: Path) -> None:
     def lose_nodes() -> None:
         for number in range(1, LOSSES + 1):
             until(lambda: len(notes.nodes("long")) == number)  # noqa: B023  # called at once
-            nodes.add()
+            if number == 1:
+                nodes.add()
             nodes.remove(notes.nodes("long")[-1])
 
     launch("lost", partial(one_takes_long, notes), lose_nodes)
@@ -183,13 +193,22 @@ def run_all(folder: Path) -> None:
 
     launch("added", partial(until_many_work, notes), add_node)
 
+
+def nodes_that_differ(launch: Launches) -> None:
+    """Launch on a node of other code, and on one of other settings."""
+    nodes = launch.nodes
     nodes.remove_all()
-    nodes.add(PYTHONPATH=str(other_code(folder)))
+    nodes.add(PYTHONPATH=str(other_code(launch.folder)))
     launch("other_code", quick)
     nodes.remove_all()
     nodes.add(RAY_health_check_period_ms="2000")
     launch("other_settings", quick)
     nodes.remove_all()
+
+
+def no_head(launch: Launches) -> None:
+    """Lose the head while a node works."""
+    nodes, notes = launch.nodes, launch.notes
     nodes.add()
 
     def kill_head() -> None:
@@ -197,7 +216,6 @@ def run_all(folder: Path) -> None:
         nodes.head.kill_gcs_server()
 
     launch("headless", partial(tenth_of_a_second, notes, "headless"), kill_head)
-    (folder / "report.json").write_text(json.dumps(launch.report))
 
 
 def other_code(folder: Path) -> Path:

@@ -207,10 +207,14 @@ def test_one_trial_of_an_experiment_is_one_whose_sweeps_are_all_decided(
 
 
 def test_every_experiment_is_a_grid(command_line: Command) -> None:
+    """And a setting of one of its grids is not said to hold for the others."""
+    said = {}
     for path in (ROOT / "conf" / "experiment").glob("*.yaml"):
         code, output, errors = command_line("-m", f"experiment={path.stem}", "launch.dry_run=true")
         assert code == 0, errors
         assert re.search(r"[1-9][\d,]* trials, 0 done", output)
+        said[path.stem] = output
+    assert said["beyond"].startswith("learner.forgetting applies to learner=ekf only\n")
 
 
 def test_provenance_is_written_without_passwords(command_line: Command, tmp_path: Path) -> None:

@@ -8,23 +8,18 @@ from pathlib import Path
 
 import pytest
 
+from orchestrate.runner import launch
 from orchestrate.store import Reader
 from tests.paths import ROOT
 
 
-def losses(executor: str, folder: Path) -> list[float]:
-    """Launch two short trials of two systems, one of which changes with time."""
-    url = f"sqlite:///{folder}/{executor}.db"
-    grid = ("-m", "env=pendulum,beyond/drifting_pendulum", "policy=d_optimal", "seed=range(2)")
-    words = (*grid, "env.horizon=12", f"executor={executor}", f"store.url={url}")
-    done = subprocess.run(
-        [sys.executable, "orchestrate/launch.py", *words],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+def words(executor: str, url: str) -> list[str]:
+    """Return the words that launch two short trials of two systems, one of which changes."""
+    grid = ["-m", "env=pendulum,beyond/drifting_pendulum", "policy=d_optimal", "seed=range(2)"]
+    return [*grid, "env.horizon=12", f"executor={executor}", f"store.url={url}"]
+
+
+def losses(url: str) -> list[float]:
     with Reader.open(url) as reader:
         configs = sorted(reader.configs(), key=lambda config: config.config_key)
         return [
@@ -36,8 +31,13 @@ def losses(executor: str, folder: Path) -> list[float]:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> list[float]:
-    """Return the losses of the trials one after the other in one process."""
-    return losses("inprocess", tmp_path_factory.mktemp("alone"))
+    """Return the losses of the trials one after the other in this process."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('alone') / 'results.db'}"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("DOPT_DB", raising=False)
+        patch.setattr(sys, "argv", ["launch.py", *words("inprocess", url)])
+        assert launch.main() == 0
+    return losses(url)
 
 
 @pytest.mark.parametrize("executor", ["local", "ray"])
@@ -45,5 +45,14 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> list[float]:
 def test_every_executor_stores_the_same_losses(
     executor: str, alone: list[float], tmp_path: Path
 ) -> None:
+    url = f"sqlite:///{tmp_path / executor}.db"
+    done = subprocess.run(
+        [sys.executable, "orchestrate/launch.py", *words(executor, url)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
     assert len(alone) == 48
-    assert losses(executor, tmp_path) == alone
+    assert losses(url) == alone

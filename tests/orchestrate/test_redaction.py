@@ -117,7 +117,7 @@ def test_neither_a_row_nor_a_word_of_a_launch_holds_a_password(
 ) -> None:
     quoted = quote(password, safe="")
     server = f"postgresql://me:{quoted}@127.0.0.1:1/db?application_name=dopt"
-    short = ("env.horizon=5", "executor=inprocess", "launch.patience=1")
+    short = ("env.horizon=5", "executor=inprocess", "launch.patience=0.3")
     code, output, errors = command_line("-m", "seed=1,2", f"store.url='{server}'", *short)
     assert code == 75, errors
     address = f"launch.ray.address='ray://me:{quoted}@host:1'"

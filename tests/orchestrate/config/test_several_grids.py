@@ -74,9 +74,3 @@ def test_a_setting_holds_for_the_grids_that_have_it(
     code, _, errors = command_line("-m", *several, "policy.iteratons=3", "launch.dry_run=true")
     assert code == 2
     assert "did you mean 'iterations'? Choose one of iterations." in errors
-
-
-def test_a_setting_of_one_grid_is_not_said_to_hold_for_the_others(command_line: Command) -> None:
-    code, output, _ = command_line("-m", "experiment=beyond", "launch.dry_run=true")
-    assert code == 0
-    assert output.startswith("learner.forgetting applies to learner=ekf only\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import os
 import signal
 import subprocess
@@ -20,11 +21,12 @@ from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, Wor
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.executors.local import LocalExecutor
 from orchestrate.records import Failure
+from tests.orchestrate.executors.names import ALL, WITH_PROCESSES, WORKERS
 from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
 
 Make = Callable[[Run], Executor]
 
-pytestmark = pytest.mark.xdist_group("executors")  # one Ray for all of them
+for_all = pytest.mark.parametrize("executor", ALL, indirect=True)
 
 
 def tasks(seeds: Sequence[int]) -> list[Task]:
@@ -49,34 +51,31 @@ def report_threads(_: TrialSpec) -> TrialResult:
     raise RuntimeError(os.environ.get("OMP_NUM_THREADS", "none"))
 
 
-@pytest.fixture(scope="module")
-def ray_executor() -> Iterator[Executor]:
-    from orchestrate.executors.ray.executor import RayExecutor
-
-    with RayExecutor(quick, workers=2) as executor:
-        yield executor
-
-
-@pytest.fixture(params=["inprocess", "local", "ray"])
-def make(request: pytest.FixtureRequest) -> Iterator[Make]:
+@pytest.fixture
+def make(executor: str) -> Iterator[Make]:
     """Return a function that gives a started executor for a stand-in."""
     started: list[Executor] = []
 
     def start(run: Run) -> Executor:
-        if request.param == "ray":
-            executor = request.getfixturevalue("ray_executor")
-            executor._run = run
-            return executor  # type: ignore[no-any-return]
-        local = request.param == "local"
-        started.append(LocalExecutor(run, workers=2) if local else InProcessExecutor(run))
+        started.append(new(executor, run))
         started[-1].start()
         return started[-1]
 
     yield start
-    for executor in started:
-        executor.stop()
+    for one in started:
+        one.stop()
 
 
+def new(name: str, run: Run) -> Executor:
+    if name == "inprocess":
+        return InProcessExecutor(run)
+    if name == "local":
+        return LocalExecutor(run, workers=WORKERS)
+    ray = importlib.import_module("orchestrate.executors.ray.executor")
+    return ray.RayExecutor(run, workers=WORKERS)  # type: ignore[no-any-return]
+
+
+@for_all
 def test_every_task_gets_its_result(make: Make) -> None:
     executor = make(quick)
     for seeds in ([0, 1, 2], [3], [], [4, 5]):
@@ -95,6 +94,7 @@ def test_every_task_gets_its_result(make: Make) -> None:
         assert event.run.started <= event.run.ended
 
 
+@for_all
 def test_an_exception_comes_back_with_its_traceback_and_the_rest_runs(make: Make) -> None:
     executor = make(raising)
     executor.submit(tasks(range(5)))
@@ -106,12 +106,14 @@ def test_an_exception_comes_back_with_its_traceback_and_the_rest_runs(make: Make
     assert sorted(outcomes) == [0, 1, 3, 4]
 
 
+@for_all
 def test_waiting_ends_in_time_and_without_work_returns_nothing(make: Make) -> None:
     executor = make(slow)
     assert executor.wait(0.01) == []
     assert executor.pending == 0
 
 
+@for_all
 def test_one_thread_for_each_worker(make: Make) -> None:
     executor = make(report_threads)
     executor.submit(tasks([0]))
@@ -121,7 +123,7 @@ def test_one_thread_for_each_worker(make: Make) -> None:
     assert event.outcome.message == "1"
 
 
-@pytest.mark.parametrize("make", ["local", "ray"], indirect=True)
+@pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
 def test_the_chunk_of_a_killed_worker_is_lost_and_the_others_are_not(make: Make) -> None:
     executor = make(deadly)
     for seeds in ([0, 1], [BROKEN_SEED, 3], [4, 5], [6, 7]):
@@ -150,19 +152,6 @@ def _unknown_elsewhere() -> Run:
     run.__module__, run.__qualname__ = "os", "getpid_of_nobody"
     vars(os)["getpid_of_nobody"] = run
     return run
-
-
-def test_the_end_of_ray_itself_is_no_fault_of_a_trial(ray_executor: Executor) -> None:
-    """The last test of this file, because it takes the Ray of the others."""
-    import ray
-
-    node: Any = ray._private.worker._global_node
-    ray_executor._run = slow  # type: ignore[attr-defined]
-    ray_executor.submit(tasks(range(20)))
-    os.kill(node.all_processes["raylet"][0].process.pid, signal.SIGKILL)
-    with pytest.raises(InfrastructureError, match="Ray's raylet has ended"):
-        drain(ray_executor)
-    ray_executor.stop()
 
 
 def test_a_pool_that_cannot_start_all_its_workers_keeps_none(

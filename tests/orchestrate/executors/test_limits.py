@@ -25,13 +25,12 @@ from orchestrate.executors.task import run_task
 from orchestrate.records import Failure
 from tests.dopt.trials import trial
 from tests.orchestrate.conftest import ROOT, Launches
+from tests.orchestrate.executors.names import ALL, WITH_PROCESSES
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.standins import BROKEN_SEED, quick
 from tests.orchestrate.unruly import deaf, empty, faulty, greedy, greedy_in_a_group, hanging
 
 SEEDS = 6
-EXECUTORS = ("inprocess", "local", "ray")
-WORKERS = ("local", "ray")
 
 
 def failures(launches: Launches) -> list[tuple[object, ...]]:
@@ -43,7 +42,7 @@ def only_the_broken_one_failed(launches: Launches) -> bool:
     return statuses.pop(BROKEN_SEED) == "failed" and set(statuses.values()) == {"done"}
 
 
-@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize("executor", ALL, indirect=True)
 def test_a_hanging_trial_is_interrupted_and_says_where_it_hung(
     launches: Launches, executor: str
 ) -> None:
@@ -57,7 +56,7 @@ def test_a_hanging_trial_is_interrupted_and_says_where_it_hung(
     assert "1 failed: timeout after 1 s" in launches.said[-1]
 
 
-@pytest.mark.parametrize("executor", WORKERS)
+@pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
 def test_native_code_that_heeds_no_signal_ends_with_its_worker(
     launches: Launches, executor: str
 ) -> None:
@@ -72,7 +71,7 @@ def test_native_code_that_heeds_no_signal_ends_with_its_worker(
         assert "in sleep_natively" in text
 
 
-@pytest.mark.parametrize("executor", WORKERS)
+@pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
 def test_the_rest_of_its_chunk_runs_without_being_charged(executor: str) -> None:
     limits = Limits(seconds=1.0)
     kind: Executor
@@ -100,9 +99,12 @@ def test_a_timeout_is_tried_again_only_when_asked(launches: Launches) -> None:
     assert launches.statuses()[BROKEN_SEED] == "done"
 
 
-def test_a_long_trial_of_the_kernel_heeds_its_limit(launches: Launches) -> None:
-    spec = trial("quadrotor", "d_optimal", env={"horizon": 4000}, model={"width": 64})
-    launches(run_trial, seeds=1)  # what is compiled on first use is not part of the limit
+def test_a_long_trial_of_the_kernel_heeds_its_limit() -> None:
+    short, spec = (
+        trial("quadrotor", "d_optimal", env={"horizon": steps}, model={"width": 64})
+        for steps in (2, 4000)
+    )
+    run_trial(short)  # what is compiled or loaded on first use is not part of the limit
     finished = run_task(run_trial, Task(spec.trial_key, spec), Limits(seconds=2.0))
     assert isinstance(finished.outcome, Failure)
     assert finished.outcome.cause == "timeout"
@@ -128,7 +130,7 @@ def test_somebody_elses_timer_goes_on() -> None:
         signal.setitimer(signal.ITIMER_REAL, *timer)
 
 
-@pytest.mark.parametrize("executor", WORKERS)
+@pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
 def test_a_greedy_trial_fails_by_itself(launches: Launches, executor: str) -> None:
     code = launches(greedy, seeds=SEEDS, executor=executor, memory_gib=1.0)
     assert code == ExitCode.SOME_FAILED
@@ -166,20 +168,6 @@ def test_a_trial_that_the_kernel_kills_for_want_of_memory_fails_after_two_attemp
     [(_, cause, kind, message, attempt)] = failures(launches)
     assert (cause, kind, attempt) == ("out of memory", "WorkerLost", 2)
     assert "killed by the kernel: out of memory" in str(message)
-
-
-def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("RAY_memory_usage_threshold", "0.0001")
-    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
-    ray = importlib.import_module("orchestrate.executors.ray.executor")
-    with ray.RayExecutor(hanging, 1) as executor:
-        executor.submit(tasks([BROKEN_SEED, 3]))
-        [lost] = drain(executor)
-    assert isinstance(lost, WorkerLost)
-    assert (lost.cause, lost.node_lost) == ("out of memory", False)
-    assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED, 3]
 
 
 def test_a_broken_access_to_memory_says_where_it_was(launches: Launches) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Row
             folder = tmp_path_factory.mktemp("undisturbed")
             url = f"sqlite:///{folder}/results.db"
             order = Order(url, executor="inprocess", trials=trials, seconds=0.0)
-            with Laboratory(folder, order, {}).launched() as launched:
+            with Laboratory(folder, order, dict).launched() as launched:
                 assert launched.end(TRIAL_SECONDS * trials + PATIENCE_SECONDS) == 0, launched.errors
             known[trials] = results(url)
         return known[trials]
@@ -69,7 +70,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Row
 @pytest.fixture
 def laboratory_at(tmp_path: Path, undisturbed: Callable[[int], Rows]) -> Callable[..., Laboratory]:
     def build(url: str, trials: int = TRIALS, **order: Any) -> Laboratory:
-        return Laboratory(tmp_path, Order(url, trials=trials, **order), undisturbed(trials))
+        expected = partial(undisturbed, trials)
+        return Laboratory(tmp_path, Order(url, trials=trials, **order), expected)
 
     return build
 

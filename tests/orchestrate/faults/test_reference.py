@@ -13,6 +13,7 @@ import pytest
 
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
+from orchestrate.runner import launch
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.faults.outcome import Rows, flaws, results
@@ -24,24 +25,39 @@ TRIALS = 6
 PATIENCE_SECONDS = 200.0
 
 
-def command(url: str) -> list[str]:
-    """Return the command of a grid of a policy and a network that only the reference runs."""
-    words = ["--config-dir", str(EXAMPLE / "conf"), "-m", "env=boat", "env.horizon=30"]
-    words += ["policy=curiosity", "model=residual", f"seed=range({TRIALS})"]
-    words += ["executor=local", "launch.workers=1", "launch.chunk_seconds=0.1"]
-    return [sys.executable, str(ROOT / "orchestrate" / "launch.py"), *words, f"store.url={url}"]
+def words(url: str) -> list[str]:
+    """Return the words of a grid of a policy and a network that only the reference runs."""
+    grid = ["--config-dir", str(EXAMPLE / "conf"), "-m", "env=boat", "env.horizon=30"]
+    return [
+        *grid,
+        "policy=curiosity",
+        "model=residual",
+        f"seed=range({TRIALS})",
+        f"store.url={url}",
+    ]
 
 
 def started(url: str) -> subprocess.Popen[str]:
+    """Start a launch with a worker, which takes one trial at a time."""
     path = os.pathsep.join([str(ROOT), str(EXAMPLE)])
+    program = [sys.executable, str(ROOT / "orchestrate" / "launch.py"), *words(url)]
     return subprocess.Popen(
-        command(url),
+        [*program, "executor=local", "launch.workers=1", "launch.chunk_seconds=0.1"],
         env={**os.environ, "PYTHONPATH": path},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
     )
+
+
+def launched_here(url: str) -> int:
+    """Launch in this process, which has imported everything; return the exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLE))
+        patch.delenv("DOPT_DB", raising=False)
+        patch.setattr(sys, "argv", ["launch.py", *words(url), "executor=inprocess"])
+        return int(launch.main())
 
 
 def done(url: str) -> int:
@@ -62,12 +78,14 @@ def numbers(url: str) -> Rows:
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return a database of the grid that nothing disturbed."""
     url = f"sqlite:///{tmp_path_factory.mktemp('whole') / 'results'}.db"
-    said, _ = started(url).communicate(timeout=PATIENCE_SECONDS)
-    assert done(url) == TRIALS, said
+    assert launched_here(url) == 0
+    assert done(url) == TRIALS
     return url
 
 
-def test_a_killed_launch_of_reference_trials_goes_on(tmp_path: Path, undisturbed: str) -> None:
+def test_a_killed_launch_of_reference_trials_goes_on(
+    tmp_path: Path, undisturbed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     url = f"sqlite:///{tmp_path / 'killed'}.db"
     process, end = started(url), time.monotonic() + PATIENCE_SECONDS
     while done(url) < 2:
@@ -79,10 +97,9 @@ def test_a_killed_launch_of_reference_trials_goes_on(tmp_path: Path, undisturbed
     before = done(url)
     assert 2 <= before < TRIALS
     assert flaws(url) == []
-    again = started(url)
-    said, _ = again.communicate(timeout=PATIENCE_SECONDS)
-    assert again.returncode == 0, said
-    assert f"{before} of {TRIALS} already done" in said
+    capsys.readouterr()
+    assert launched_here(url) == 0
+    assert f"{before} of {TRIALS} already done" in capsys.readouterr().out
     assert flaws(url) == []
     assert done(url) == TRIALS
     assert numbers(url) == numbers(undisturbed)

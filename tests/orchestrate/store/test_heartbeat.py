@@ -20,8 +20,8 @@ from tests.orchestrate.losses import lose
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import hear, running
 
-LEASE = 3.0
-LONG_LEASE = 10.0
+LEASE = 2.0
+LONG_LEASE = 4.0
 
 
 @pytest.fixture

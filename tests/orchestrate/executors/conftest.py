@@ -1,0 +1,42 @@
+"""Executors by name, of which those on Ray share one instance of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.orchestrate.executors.names import WORKERS
+
+
+@pytest.fixture
+def shared_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let executors on Ray join one instance in this process, which the first of them starts.
+
+    Its start takes longer than all that a test does with it. A test that undoes ``monkeypatch``
+    ends the instance with its executor, and the next test starts another.
+    """
+    import ray
+
+    from orchestrate.executors.ray.local import OwnRay
+
+    start = OwnRay._init
+
+    def start_once(address: str, **options: Any) -> None:
+        if not ray.is_initialized():
+            start(address, **{**options, "num_cpus": WORKERS})
+
+    def disconnect(_: OwnRay, *, lost: bool) -> None:
+        assert not lost
+
+    monkeypatch.setattr(OwnRay, "_init", staticmethod(start_once))
+    monkeypatch.setattr(OwnRay, "disconnect", disconnect)
+
+
+@pytest.fixture
+def executor(request: pytest.FixtureRequest) -> str:
+    """Return the name of an executor, for which there is a Ray if it needs one."""
+    name = str(request.param)
+    if name == "ray":
+        request.getfixturevalue("shared_ray")
+    return name
