@@ -15,11 +15,8 @@ CONTROLLED := d_optimal lookahead uniform periodic random random_held
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 export MKL_NUM_THREADS := 1
-# Python keeps the bytecode of the libraries: without it every program that a test starts compiles
-# their sources for seconds.
-unexport PYTHONDONTWRITEBYTECODE
-
-# Python keeps the bytecode of libraries: without it each new process spends most of its start on it.
+# Python keeps the bytecode of the libraries, which are installed without it: otherwise every process
+# that is started compiles their sources again, for seconds.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help

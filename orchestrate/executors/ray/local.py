@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import ray
@@ -20,13 +18,6 @@ OBJECT_STORE_BYTES = 256 * 2**20
 """Size of the store for outcomes in transfer; by default Ray takes a third of the memory."""
 
 
-_UNUSED_SERVICES = ("start_monitor", "start_log_monitor", "start_api_server")
-"""Methods of Ray's node that start the autoscaler, the log monitor and the server of the dashboard.
-
-Nothing reads what they give, and they took half of the time in which Ray starts.
-"""
-
-
 class OwnRay(Connection):
     """Ray with ``workers`` processes, by default one on each core."""
 
@@ -37,13 +28,12 @@ class OwnRay(Connection):
         # Workers inherit this environment, which is seconds faster than a runtime environment.
         os.environ.update({**ONE_THREAD, **module_path()})
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-        with _no_unused_services():
-            self._init(
-                "local",
-                num_cpus=self._workers,
-                object_store_memory=OBJECT_STORE_BYTES,
-                include_dashboard=False,
-            )
+        self._init(
+            "local",
+            num_cpus=self._workers,
+            object_store_memory=OBJECT_STORE_BYTES,
+            include_dashboard=False,
+        )
         self._task = ray.remote(**TASK_OPTIONS)(run_chunk)
         resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
         self._cores = int(resources.get("CPU", 1.0))
@@ -69,23 +59,3 @@ class OwnRay(Connection):
 
     def disconnect(self, *, lost: bool) -> None:  # noqa: ARG002  # there is always a process to end
         ray.shutdown()
-
-
-@contextmanager
-def _no_unused_services() -> Iterator[None]:
-    """Let Ray start no unused service in the block: it has no option for that.
-
-    A version of Ray that names a method otherwise starts that service.
-    """
-    node = ray._private.node.Node
-    methods = {name: vars(node)[name] for name in _UNUSED_SERVICES if name in vars(node)}
-    for name in methods:
-        setattr(node, name, _start_nothing)
-    try:
-        yield
-    finally:
-        for name, method in methods.items():
-            setattr(node, name, method)
-
-
-def _start_nothing(*_: object, **__: object) -> None: ...

@@ -21,17 +21,6 @@ pytestmark = ON_RAY  # after the tests that share the instance which this ends
 
 
 @pytest.mark.usefixtures("shared_ray")
-def test_an_instance_has_no_process_that_nothing_uses() -> None:
-    executor = RayExecutor(slow, workers=WORKERS)
-    executor.start()
-    node: Any = ray._private.worker._global_node
-    started = {kind for kind, processes in node.all_processes.items() if processes}
-    assert started >= {"gcs_server", "raylet"}
-    assert started.isdisjoint({"monitor", "log_monitor", "dashboard"})
-    executor.stop()
-
-
-@pytest.mark.usefixtures("shared_ray")
 def test_the_end_of_ray_itself_is_no_fault_of_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     executor = RayExecutor(slow, workers=WORKERS)
     executor.start()
