@@ -48,6 +48,7 @@ def parameter(
     *,
     size: int | None = None,
     choices: tuple[str, ...] = (),
+    added: bool = False,
 ) -> Any:
     """Declare a field with a unit and a bound.
 
@@ -63,10 +64,12 @@ def parameter(
         Number of entries that a tuple has to have.
     choices : tuple of str
         Valid texts, all if empty.
+    added : bool
+        Whether trials were stored before the field existed. It is then left out of sections, and
+        of trial keys, where it has its default.
     """
-    return dataclasses.field(
-        default=default, metadata={"unit": unit, "bound": bound, "size": size, "choices": choices}
-    )
+    about = {"unit": unit, "bound": bound, "size": size, "choices": choices, "added": added}
+    return dataclasses.field(default=default, metadata=about)
 
 
 @dataclasses.dataclass(frozen=True)
