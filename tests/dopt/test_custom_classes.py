@@ -39,7 +39,7 @@ class Thief(ClosedLoop):
 def on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(EXAMPLE))
     yield
-    for name in ("vehicle", "gauss_newton"):
+    for name in ("vehicle", "batch_gauss_newton"):
         sys.modules.pop(name, None)
 
 
@@ -153,9 +153,9 @@ def test_a_learner_of_ones_own_learns() -> None:
     mapping = specification(policy={"name": "random"}).to_mapping()
     del mapping["path"]
     env = {**option("env", "boat"), "horizon": 100}
-    learner = option("learner", "gauss_newton")
+    learner = option("learner", "batch_gauss_newton")
     spec = TrialSpec.from_mapping({**mapping, "env": env, "learner": learner})
-    assert spec.columns()["learner"] == "gauss_newton"
+    assert spec.columns()["learner"] == "batch_gauss_newton"
     loss = run_trial(spec).loss
     assert loss[-1] < 0.7 * loss[0]
     np.testing.assert_array_equal(run_trial(spec).loss, loss)

@@ -14,7 +14,7 @@ from dopt.trial_view import TrialView
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussNewton(CustomLearner):
+class BatchGaussNewton(CustomLearner):
     """θ ← θ + Jᵀ(J Jᵀ + δ I)⁻¹(y - a_θ(x)), for the samples x, y that are drawn at a step.
 
     Parameters
@@ -25,7 +25,7 @@ class GaussNewton(CustomLearner):
         δ, which bounds the step where the samples say little about the parameters.
     """
 
-    name: ClassVar[str] = "gauss_newton"
+    name: ClassVar[str] = "batch_gauss_newton"
 
     batch: int = parameter(8, "samples", "positive")
     damping: float = parameter(1.0, bound="positive")
