@@ -103,7 +103,8 @@ def _row_sums(values: Matrix, out: Vector) -> None:
 
 
 @contracted
-def _through_tanh(delta: Matrix, activations: Matrix) -> None:
+def through_tanh(delta: Matrix, activations: Matrix) -> None:
+    """Multiply δ, (w, n), by the derivative of tanh, given the activations, (w, n)."""
     for i in range(delta.shape[0]):
         row, h = delta[i], activations[i]
         for n in range(row.shape[0]):
@@ -143,7 +144,7 @@ def loss_gradient(
             np.dot(delta, values.T, dW)
             below = units_by_points(deltas[index % 2], width, n)
             np.dot(W.T, delta, below)
-            _through_tanh(below, values)
+            through_tanh(below, values)
             delta = below
 
 

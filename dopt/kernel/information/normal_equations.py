@@ -108,16 +108,8 @@ def _signals(network: Network, theta: Vector, hidden: Matrix, r: int, n: int) ->
             else:
                 W, _ = nn.layer(network, theta, index + 1)
                 np.dot(W.T, out[k * depth + index + 1], signal)
-            _through(signal, h)
+            nn.through_tanh(signal, h)
     return out
-
-
-@contracted
-def _through(delta: Matrix, activations: Matrix) -> None:
-    for i in range(delta.shape[0]):
-        row, h = delta[i], activations[i]
-        for n in range(row.shape[0]):
-            row[n] *= 1.0 - h[n] * h[n]
 
 
 @compiled
