@@ -189,9 +189,13 @@ class GaussNewtonLearner:
 
 
 def _solved(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return the solutions, (n, q), for positive definite matrices and columns, (n, q, 1)."""
-    factor, _ = torch.linalg.cholesky_ex(matrix)
-    return torch.cholesky_solve(right, factor).squeeze(-1)
+    """Return the solutions, (n, q), for matrices and columns, (n, q, 1).
+
+    NaN where rounding has left a matrix indefinite.
+    """
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    solution = torch.cholesky_solve(right, factor).squeeze(-1)
+    return torch.where(failed.unsqueeze(-1) > 0, torch.nan, solution)
 
 
 def learner_for(

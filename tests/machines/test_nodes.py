@@ -81,7 +81,7 @@ def test_a_host_that_lost_head_and_launch_ends_its_trial_in_vain(
     lab: Lab, undisturbed: Outcome, measured: Measured
 ) -> None:
     """It reaches all others, the database too, and goes on: its trial ends twice, counts once."""
-    lab.start_cluster("w1", "w2", **{PAUSE: "12"})
+    lab.start_cluster("w1", "w2", **{PAUSE: "20"})
     launched = lab.launch(seeds=4, on="head", witness=True)
     seed = begun(lab, launched)
     with lab.network.cut_between(lab.host("head"), lab.host("w1")):
@@ -103,7 +103,7 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     lab: Lab, undisturbed: Outcome
 ) -> None:
     """The launch still hears its worker, so that nothing is lost or run again."""
-    lab.start_cluster("w1", "w2", **{PAUSE: "12"})
+    lab.start_cluster("w1", "w2", **{PAUSE: "20"})
     launched = lab.launch(seeds=4, witness=True)
     seed = begun(lab, launched)
     with lab.network.cut_between(lab.host("head"), lab.host("w1")):

@@ -18,7 +18,10 @@ __all__ = ["add_rows", "planning_forms"]
 
 @compiled
 def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
-    """Add a state; sum the rows of all at their turn (:data:`dopt.kernel.structs.AddRows`)."""
+    """Add a state; sum the rows of all at their turn (:data:`dopt.kernel.structs.AddRows`).
+
+    θ is NaN afterwards, which ends the trial as diverged, where rounding has left M indefinite.
+    """
     visited, covariance = state.visited, state.covariance
     n, q = visited.n_states[0], state.theta.shape[0]
     phi = np.empty(network.sizes[0])
@@ -33,6 +36,6 @@ def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
     normal_matrix(network, state.theta, visited.features[:, : n + 1].copy(), r, normal)
     for i in range(q):
         normal[i, i] += visited.regularization
-    normal[:] = np.linalg.cholesky(normal)
-    write_inverse(normal, covariance.upper)
+    if not write_inverse(normal, covariance.upper):
+        state.theta[:] = np.nan
     covariance.n_pending[0] = 0

@@ -1,4 +1,4 @@
-"""The inverse of a positive definite matrix from its Cholesky factor, in compiled code."""
+"""The inverse of a positive definite matrix by its Cholesky factor, in compiled code."""
 
 from __future__ import annotations
 
@@ -12,21 +12,34 @@ BLOCK = 48
 
 
 @compiled
-def write_inverse(factor: Matrix, upper: Matrix) -> None:
-    """Write the upper triangle of (C Cᵀ)⁻¹, (q, q), for a lower triangular C, (q, q).
+def write_inverse(matrix: Matrix, upper: Matrix) -> bool:
+    """Write the upper triangle of the inverse of a matrix, (q, q), which its factor C overwrites.
 
-    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications.
+    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications. Nothing
+    is written, and False returned, where rounding has left the matrix indefinite.
     """
-    q = factor.shape[0]
-    n = (q + BLOCK - 1) // BLOCK
+    if not _factorize(matrix):
+        return False
+    n = (matrix.shape[0] + BLOCK - 1) // BLOCK
     X = np.zeros((n, n, BLOCK, BLOCK))
-    _invert_blocks(factor, X)
+    _invert_blocks(matrix, X)
     for i in range(n):
         for j in range(i, n):
             block = np.zeros((BLOCK, BLOCK))
             for k in range(j, n):
                 block += np.dot(X[k, i].T, X[k, j])
             _write_block(block, i * BLOCK, j * BLOCK, upper)
+    return True
+
+
+@compiled
+def _factorize(matrix: Matrix) -> bool:
+    """Replace a matrix by its Cholesky factor; tell whether it is positive definite."""
+    try:
+        matrix[:] = np.linalg.cholesky(matrix)
+    except Exception:  # compiled code catches all exceptions or none
+        return False
+    return True
 
 
 @compiled

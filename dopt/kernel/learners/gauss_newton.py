@@ -55,7 +55,8 @@ def take_step(
 ) -> None:
     """Take a damped step to the minimum of ‖e‖² + ridge ‖θ - θ₀‖²; write (JᵀJ + ridge I)⁻¹.
 
-    ``features`` (p, N), ``targets`` (r, N), θ and θ₀ (q,).
+    ``features`` (p, N), ``targets`` (r, N), θ and θ₀ (q,). θ is NaN, which ends the trial as
+    diverged, where rounding has left the matrix indefinite.
     """
     q = theta.shape[0]
     normal, slope, step = np.empty((q, q)), np.empty(q), np.empty(q)
@@ -64,8 +65,9 @@ def take_step(
     for i in range(q):
         normal[i, i] += ridge
         slope[i] += ridge * (prior[i] - theta[i])
-    normal[:] = np.linalg.cholesky(normal)
-    write_inverse(normal, covariance.upper)
+    if not write_inverse(normal, covariance.upper):
+        theta[:] = np.nan
+        return
     covariance.n_pending[0] = 0
     symmetric_product(covariance.upper, slope, step)
     share, before = 1.0, theta.copy()

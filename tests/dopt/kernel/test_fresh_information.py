@@ -71,6 +71,11 @@ def test_both_paths_plan_by_it(env: str, policy: str, refresh_every: int) -> Non
     check_agreement(trial(env, policy, 3, env={"horizon": 9}, policy=given, learner=NEWEST))
 
 
+def test_a_prior_below_rounding_ends_the_trial_as_diverged() -> None:
+    policy = FRESH | {"regularization": 1e-300}
+    assert run_trial(trial("arm", "d_optimal", 1, policy=policy)).diverged_at is not None
+
+
 def test_it_is_the_accumulated_one_for_a_model_that_is_linear_in_its_parameters() -> None:
     fresh, old = (
         run_trial(trial("arm", "oracle", 1, policy={"information": information}))

@@ -15,6 +15,7 @@ from dopt.kernel.information.inverse import BLOCK
 from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
 from dopt.reference.models import model_function
+from dopt.run import run_trial
 from dopt.types import Array
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import observed, relative_gap, transplant
@@ -131,6 +132,14 @@ def test_it_explains_all_samples_better_than_the_window(env: str) -> None:
         fast = advanced(learner, 40, env, "random")
         errors.append(np.sqrt(np.mean(linearized(fast, fast.state.theta)[1] ** 2)))
     assert errors[0] < 0.1 * errors[1]
+
+
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+def test_a_prior_below_rounding_ends_the_trial_as_diverged(path: str) -> None:
+    spec = trial("arm", "random", 1, learner=GAUSS_NEWTON | {"regularization": 1e-300})
+    result = run_trial(spec, path)
+    assert result.diverged_at is not None
+    assert np.isnan(result.loss[result.diverged_at :]).all()
 
 
 def test_it_needs_the_primal_form_and_a_network() -> None:
