@@ -53,11 +53,7 @@ def section_of(item: Validated) -> dict[str, object]:
     """Return the configuration section that :func:`build` turns into ``item``."""
     if isinstance(item, Wrapper):
         return item.to_section()
-    fields = {
-        field.name: value
-        for field in dataclasses.fields(item)
-        if (value := getattr(item, field.name)) != field.default or not field.metadata.get("added")
-    }
+    fields = {field.name: getattr(item, field.name) for field in dataclasses.fields(item)}
     listed = {key: list(v) if isinstance(v, tuple) else v for key, v in fields.items()}
     return {"name": getattr(item, "name", None), **_origin(type(item)), **listed}
 

@@ -48,7 +48,6 @@ def parameter(
     *,
     size: int | None = None,
     choices: tuple[str, ...] = (),
-    added: bool = False,
 ) -> Any:
     """Declare a field with a unit and a bound.
 
@@ -64,12 +63,10 @@ def parameter(
         Number of entries that a tuple has to have.
     choices : tuple of str
         Valid texts, all if empty.
-    added : bool
-        Whether trials were stored before the field existed. It is then left out of sections, and
-        of trial keys, where it has its default.
     """
-    about = {"unit": unit, "bound": bound, "size": size, "choices": choices, "added": added}
-    return dataclasses.field(default=default, metadata=about)
+    return dataclasses.field(
+        default=default, metadata={"unit": unit, "bound": bound, "size": size, "choices": choices}
+    )
 
 
 @dataclasses.dataclass(frozen=True)

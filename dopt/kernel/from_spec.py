@@ -12,7 +12,7 @@ from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
-from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
+from dopt.kernel.information import absent, dual, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
 from dopt.learning import Learner
 from dopt.learning.base import CompiledLearner
@@ -96,19 +96,10 @@ def information_of(config: TrialConfig) -> args.Information:
     if not isinstance(config.policy, InformationPolicy):
         return args.Information(absent.add_rows, absent.planning_forms)
     module = primal_linear if isinstance(config.model, Linear) else MODULES[Form(_form(config))]
-    if _is_fresh(config):
-        module = fresh
     return args.Information(
         absent.add_rows if config.learner.updates_information else module.add_rows,
         absent.planning_forms if isinstance(config.policy, Search) else module.planning_forms,
     )
-
-
-def _is_fresh(config: TrialConfig) -> bool:
-    """Tell whether rows of J at the present parameters are summed for the policy."""
-    policy, linear = config.policy, isinstance(config.model, Linear)
-    wanted = isinstance(policy, InformationPolicy) and policy.information == "fresh"
-    return wanted and not linear and not config.learner.updates_information
 
 
 def _search(config: TrialConfig) -> args.Search:
@@ -159,7 +150,6 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
         np.zeros(len(weights)),
         np.zeros(len(weights)),
         *_information(spec, len(weights)),
-        _visited(spec),
         np.zeros((len(system.features), window)),
         np.zeros((system.n_learned, window)),
         *(
@@ -201,19 +191,6 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, a
         np.zeros(1, dtype=np.int64),
     )
     return covariance, rows, args.Sketch(*projection, size)
-
-
-def _visited(spec: TrialSpec) -> args.Visited:
-    """Return the empty store of states for fresh information; without a place where M is summed."""
-    policy, fresh_rows = spec.policy, _is_fresh(spec.config)
-    refresh_every = policy.refresh_every if isinstance(policy, InformationPolicy) else 1
-    places = spec.system.horizon if fresh_rows else 0
-    return args.Visited(
-        np.empty((len(spec.system.features), places)),
-        np.zeros(1, dtype=np.int64),
-        refresh_every,
-        _regularization(spec.config),
-    )
 
 
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:

@@ -132,18 +132,6 @@ class Sketch(NamedTuple):
     size: int
 
 
-class Visited(NamedTuple):
-    """States visited, for fresh information (:mod:`dopt.kernel.information.fresh`).
-
-    Empty where M is summed as the trial goes on.
-    """
-
-    features: Matrix  # (p, T)
-    n_states: Integers  # (1,)
-    refresh_every: int
-    regularization: float  # λ of M₀ = λI
-
-
 class Linearization(NamedTuple):
     """Passes of the network at one state for one component, and along m directions."""
 
@@ -165,7 +153,6 @@ class State(NamedTuple):
     covariance: Covariance
     dual: Dual
     sketch: Sketch
-    visited: Visited
     window_features: Matrix  # (p, window) newest samples, a ring
     window_targets: Matrix  # (r, window)
     policy_memory: Vector  # what a compiled policy of a user's own keeps

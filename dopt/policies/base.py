@@ -77,25 +77,15 @@ class InformationPolicy(ClosedLoop):
     """A closed-loop policy that plans with the information matrix M of the parameters.
 
     M₀ = λI, and M_{t+1} = M_t + JᵀJ with J at x_t and the parameters after the learning step
-    of time t: each row belongs to the parameters of its own time. Fresh information is
-    λI + Σ JᵀJ over all states visited, with all rows at the present parameters; between two such
-    sums rows are added as above. For a model that is linear in its parameters both are the same. A
-    learner that updates M decides about it (:class:`dopt.learning.InformationLearner`). The first
-    input is uniform on the sphere.
+    of time t. The first input is uniform on the sphere.
 
     Parameters
     ----------
     regularization : float
         λ.
-    information : {"accumulated", "fresh"}
-        At which parameters the rows of M are taken. Fresh information needs M as a q × q matrix.
-    refresh_every : int
-        Steps from one sum of fresh rows to the next.
     """
 
     regularization: float = parameter(1e-3, bound="positive")
-    information: str = parameter("accumulated", choices=("accumulated", "fresh"), added=True)
-    refresh_every: int = parameter(1, "steps", "positive", added=True)
 
     @abstractmethod
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:

@@ -13,7 +13,7 @@ from torch.func import jacrev, vmap
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.learning import InformationLearner
-from dopt.policies import DOptimal, InformationPolicy, Search, TraceLinearized, Uniform
+from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
@@ -118,21 +118,10 @@ class Lockstep(BatchState):
         observe(self, self.planners, t)
         shared = isinstance(self.config.learner, InformationLearner)
         if self.information is not None and not shared:
-            self.information = self._informed(self.information, t)
+            J = self.rows(t)
+            self.information = self.information + J.mT @ J
         if self.own_plan is not None:
             self.own_plan.inform(t)
-
-    def _informed(self, information: Tensor, t: int) -> Tensor:
-        """Return M after step t: with the rows at x_t, or with those of all states afresh."""
-        policy = self.config.policy
-        assert self.held is not None
-        assert isinstance(policy, InformationPolicy)
-        if policy.information == "fresh" and (t + 1) % policy.refresh_every == 0:
-            over_states = vmap(self._rows, in_dims=(None, 1), out_dims=1)
-            J = self.project(over_states(self.theta, self.states[:, : t + 1])).flatten(1, 2)
-            return self.held.regularization * torch.eye(J.shape[-1]).to(J) + J.mT @ J
-        J = self.rows(t)
-        return information + J.mT @ J
 
     def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
         """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""

@@ -76,20 +76,9 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
     if (sharing or model.structure == "least_squares") and form not in ("auto", "primal"):
         what = f"learner '{learner.name}'" if sharing else f"model '{model.name}'"
         raise mismatch(what, "policy.form 'primal' or 'auto'", f"policy.form '{form}'")
-    if isinstance(policy, InformationPolicy) and policy.information == "fresh":
-        _check_fresh(form, learner)
     if model.structure == "conditioning" and hasattr(policy, "regularization"):
         expected = "a policy that needs no information matrix of parameters"
         raise mismatch(f"model '{model.name}'", expected, given)
-
-
-def _check_fresh(form: str, learner: Learner) -> None:
-    """Check fresh information with the form of M and with a filter, whose M is its covariance."""
-    what = "policy.information 'fresh'"
-    if form not in ("auto", "primal"):
-        raise mismatch(what, "policy.form 'primal' or 'auto'", f"policy.form '{form}'")
-    if isinstance(learner, ExtendedKalman):
-        raise mismatch(what, "a learner that leaves M to the policy", f"learner '{learner.name}'")
 
 
 def _models(structure: str) -> str:

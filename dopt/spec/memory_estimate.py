@@ -18,7 +18,6 @@ from dopt.policies import (
     DOptimal,
     EOptimal,
     GradientDOptimal,
-    InformationPolicy,
     Lookahead,
     Policy,
     Search,
@@ -68,10 +67,9 @@ def memory_by_setting(
         numbers["env.horizon"] += min(learner.capacity, T) * (p + r)
         drawn = T * learner.steps * learner.batch
         numbers["learner.batch"] = drawn + learner.batch * (p + r + (L + 3) * max(w, r))
-    fresh = isinstance(policy, InformationPolicy) and policy.information == "fresh"
-    kept = learner.samples_kept(T) if isinstance(learner, GaussNewton) else T if fresh else 0
-    if kept:
+    if isinstance(learner, GaussNewton):
         # the samples kept, the pairs of units of one block, and JᵀJ, its factor and C⁻¹ in blocks
+        kept = learner.samples_kept(T)
         numbers["env.horizon"] += kept * (p + r)
         pairs = kept * (2 * max(w, p) ** 2 + (L + r * L) * w)
         numbers[_size_of(model)] += pairs + 4 * q**2

@@ -35,7 +35,6 @@ POSITIVE = {
         "time_constant",
         "capacity",
         "refit_every",
-        "refresh_every",
         "batch",
         "steps",
         "noise_variance",
@@ -48,7 +47,7 @@ NONNEGATIVE = {
 }
 FRACTIONS = {"beta_1", "beta_2"}
 SHARES = {"forgetting", "band"}
-TEXTS = {"form", "criterion", "states", "information"}
+TEXTS = {"form", "criterion", "states"}
 OF_ANY_SIZE = {"goal"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)
 
