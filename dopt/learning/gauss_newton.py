@@ -30,10 +30,10 @@ class GaussNewton(InformationLearner):
 
     A fit takes damped Gauss-Newton steps θ += s M⁻¹ (Jᵀe/ρ + λ(θ₀ - θ)): s is 1, or the first of
     1/2, 1/4, ... 1/64 at which the objective does not grow; where it grows at all of them, θ stays.
-    M is then that of the last step, with the rows of all samples at its parameters: what the
-    samples say about the model as it is now. (With other learners M sums rows at the parameters of
-    their own time.) Between two fits the newest sample is filtered
-    (:class:`dopt.learning.ExtendedKalman`).
+    M is then that of the last step: the rows of all samples in the buffer at the parameters before
+    it. (With other learners M sums rows at the parameters of their own time.) Between two fits the
+    newest sample is filtered (:class:`dopt.learning.ExtendedKalman`). A λ so small that rounding
+    leaves M indefinite ends the trial as diverged.
 
     Parameters
     ----------

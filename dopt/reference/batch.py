@@ -12,7 +12,6 @@ from torch.func import jacrev, vmap
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.learning import InformationLearner
 from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.reference.black_box import episodes_for, initial_states, stepped
@@ -116,7 +115,7 @@ class Lockstep(BatchState):
         A learner that shares M has done so in its learning step.
         """
         observe(self, self.planners, t)
-        shared = isinstance(self.config.learner, InformationLearner)
+        shared = isinstance(self.learner, (KalmanLearner, GaussNewtonLearner))
         if self.information is not None and not shared:
             J = self.rows(t)
             self.information = self.information + J.mT @ J

@@ -71,8 +71,9 @@ def memory_by_setting(
         # the samples kept, the pairs of units of one block, and JᵀJ, its factor and C⁻¹ in blocks
         kept = learner.samples_kept(T)
         numbers["env.horizon"] += kept * (p + r)
-        pairs = kept * (2 * max(w, p) ** 2 + (L + r * L) * w)
-        numbers[_size_of(model)] += pairs + 4 * q**2
+        pairs = kept * (2 * (max(w, p) + 1) ** 2 + (r + 3) * (L + 1) * (max(w, p) + 1))
+        rows = 3 * kept * r * q if path == "reference" else 0  # J itself, and copies of it
+        numbers[_size_of(model)] += pairs + rows + 4 * q**2
     for own in (policy, learner):
         if isinstance(own, (CompiledPolicy, CompiledLearner)):
             numbers[_size_of(model)] += own.memory_size(system, q)

@@ -15,8 +15,8 @@ BLOCK = 48
 def write_inverse(matrix: Matrix, upper: Matrix) -> bool:
     """Write the upper triangle of the inverse of a matrix, (q, q), which its factor C overwrites.
 
-    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications. Nothing
-    is written, and False returned, where rounding has left the matrix indefinite.
+    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications. False
+    is returned where rounding has left the matrix indefinite, or the inverse overflows.
     """
     if not _factorize(matrix):
         return False
@@ -29,7 +29,7 @@ def write_inverse(matrix: Matrix, upper: Matrix) -> bool:
             for k in range(j, n):
                 block += np.dot(X[k, i].T, X[k, j])
             _write_block(block, i * BLOCK, j * BLOCK, upper)
-    return True
+    return bool(np.isfinite(np.diag(upper)).all())
 
 
 @compiled

@@ -7,8 +7,8 @@ block of JᵀJ that belongs to layers a and b is then
     Σ_n (Σ_k δᵏ_a,n δᵏ_b,nᵀ) ⊗ (h_a,n h_b,nᵀ),
 
 one product of two matrices with N columns whose rows are pairs of units. The sum over the outputs
-is taken before the product, and where a = b pairs are symmetric on both sides. That takes about
-(q/2)² N multiplications for any r, where JᵀJ from J takes q² N r.
+is taken before the product, so that the blocks of hidden layers cost the same for any r, and where
+a = b pairs are symmetric on both sides.
 """
 
 from __future__ import annotations
