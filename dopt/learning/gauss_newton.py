@@ -56,5 +56,5 @@ class GaussNewton(InformationLearner):
     def samples_kept(self, horizon: int) -> int:
         return min(self.capacity, horizon)
 
-    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # numbers of samples and steps alone
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
         return regularization, self.noise_variance, float(self.refit_every), float(self.steps)

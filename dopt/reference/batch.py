@@ -19,7 +19,7 @@ from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.gaussian_process import Posterior
 from dopt.reference.learner_registry import batch_learner
-from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
+from dopt.reference.learning import KalmanLearner
 from dopt.reference.planner_registry import plan_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
 from dopt.reference.search import searched_inputs
@@ -98,7 +98,7 @@ class Lockstep(BatchState):
         """Update the parameters with the samples up to time t; diverged trials keep theirs."""
         before = self.theta.clone()
         seen = (self.states[:, : t + 1], self.targets[:, : t + 1])
-        if isinstance(self.learner, (KalmanLearner, GaussNewtonLearner)):
+        if isinstance(self.learner, KalmanLearner):
             assert self.information is not None
             self.information = self.learner.filtered(*seen, self.information)
         else:
@@ -115,8 +115,7 @@ class Lockstep(BatchState):
         A learner that shares M has done so in its learning step.
         """
         observe(self, self.planners, t)
-        shared = isinstance(self.learner, (KalmanLearner, GaussNewtonLearner))
-        if self.information is not None and not shared:
+        if self.information is not None and not isinstance(self.learner, KalmanLearner):
             J = self.rows(t)
             self.information = self.information + J.mT @ J
         if self.own_plan is not None:

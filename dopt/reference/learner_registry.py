@@ -19,9 +19,7 @@ from dopt.reference.learning import (
 from dopt.reference.state import BatchState
 
 
-def batch_learner(
-    batch: BatchState, points: Tensor
-) -> BatchLearner | KalmanLearner | GaussNewtonLearner:
+def batch_learner(batch: BatchState, points: Tensor) -> BatchLearner | KalmanLearner:
     """Return the learner of a batch; it writes into the parameters of the batch.
 
     ``points``, (N, d), are the states at which the model is evaluated at each step.

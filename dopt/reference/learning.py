@@ -134,42 +134,35 @@ class KalmanLearner:
         return diagonal
 
 
-class GaussNewtonLearner:
-    """Gauss-Newton on the samples of the buffer: M is summed over all rows, and solved afresh.
-
-    Between two fits it is the Kalman filter.
-    """
+class GaussNewtonLearner(KalmanLearner):
+    """Gauss-Newton on the samples of the buffer, and the Kalman filter between two fits."""
 
     def __init__(
         self, learner: GaussNewton, model: Accelerations, theta: Tensor, regularization: float
     ) -> None:
-        self._learner, self._theta, self._prior = learner, theta, theta.clone()
+        between = ExtendedKalman(noise_variance=learner.noise_variance)
+        super().__init__(between, model, theta, regularization)
+        self._fit, self._prior = learner, theta.clone()
         self._ridge = regularization * learner.noise_variance
-        self._model = vmap(vmap(model, in_dims=(None, 0)))
-        self._rows = vmap(vmap(jacrev(model), in_dims=(None, 0)))
+        self._models = vmap(vmap(model, in_dims=(None, 0)))
+        self._all_rows = vmap(vmap(jacrev(model), in_dims=(None, 0)))
 
     def filtered(self, states: Tensor, targets: Tensor, information: Tensor) -> Tensor:
         """Learn from the states (n, t + 1, d) and targets (n, t + 1, r); return M."""
-        noise, newest = self._learner.noise_variance, slice(-self._learner.capacity, None)
-        if (states.shape[1] - 1) % self._learner.refit_every:
-            J, e = self._linearized(states[:, -1:], targets[:, -1:])
-            information = information + J.mT @ J / noise
-            self._theta.add_(_solved(information, J.mT @ e / noise))
-            return information
-        for _ in range(self._learner.steps):
-            information = self._stepped(states[:, newest], targets[:, newest]) / noise
-        return information
-
-    def _linearized(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Return J, (n, N r, q), and e, (n, N r, 1), for N samples of each trial."""
-        J = self._rows(self._theta, x).flatten(1, 2)
-        return J, (y - self._model(self._theta, x)).flatten(1).unsqueeze(-1)
+        if (states.shape[1] - 1) % self._fit.refit_every:
+            return super().filtered(states, targets, information)
+        newest = slice(-self._fit.capacity, None)
+        for _ in range(self._fit.steps):
+            information = self._stepped(states[:, newest], targets[:, newest])
+        scaled: Tensor = information / self._fit.noise_variance
+        return scaled
 
     def _stepped(self, x: Tensor, y: Tensor) -> Tensor:
         """Take one damped step on (n, N, d) and (n, N, r); return ρM before it."""
-        J, e = self._linearized(x, y)
+        J = self._all_rows(self._theta, x).flatten(1, 2)
+        e = (y - self._models(self._theta, x)).flatten(1).unsqueeze(-1)
         distance = (self._prior - self._theta).unsqueeze(-1)
-        matrix = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
+        matrix: Tensor = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
         step = _solved(matrix, J.mT @ e + self._ridge * distance)
         before, share = self._theta.clone(), torch.ones_like(self._theta[:, :1])
         bound = self._objective(before, x, y) * NO_GROWTH
@@ -183,7 +176,7 @@ class GaussNewtonLearner:
 
     def _objective(self, theta: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Return ‖e‖² + λρ ‖θ - θ₀‖², (n, 1)."""
-        squares = (y - self._model(theta, x)).square().sum(dim=(1, 2))
+        squares = (y - self._models(theta, x)).square().sum(dim=(1, 2))
         whole = squares + self._ridge * (theta - self._prior).square().sum(dim=1)
         return whole.unsqueeze(1)
 

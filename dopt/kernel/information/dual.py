@@ -68,7 +68,7 @@ def _forms(dual: Dual, point: Linearization, component: int) -> Matrix:
     """Return xᵀM⁻¹y, (1 + m, 1 + m), for x and y among g and the columns of D B."""
     n, r = dual.n_states[0], dual.deltas.shape[0]
     products = _products(dual, n, point, component)
-    _solve_lower(dual.factor, n * r, products)
+    solve_lower(dual.factor, n * r, products)
     out = _own_products(point)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -89,7 +89,7 @@ def _rank_update(dual: Dual, phi: Vector, hidden: Matrix, deltas: Stack) -> None
         products = _products(dual, n + 1, point, k)
         for i in range(N + r):
             rows[k, i] = products[0, i]
-    _solve_lower(dual.factor, N, rows)
+    solve_lower(dual.factor, N, rows)
     for k in range(r):
         R = N + k
         for i in range(N, R):
@@ -159,7 +159,7 @@ def _add_output_layer(
 
 
 @compiled
-def _solve_lower(factor: Matrix, n_rows: int, right: Matrix) -> None:
+def solve_lower(factor: Matrix, n_rows: int, right: Matrix) -> None:
     """Replace the first entries of each right-hand side, (k, ·), by those of C⁻¹ times it."""
     for i in range(n_rows):
         row = factor[i]

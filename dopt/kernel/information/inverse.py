@@ -1,28 +1,47 @@
-"""The inverse of a positive definite matrix by its Cholesky factor, in compiled code."""
+"""Cholesky factor of a positive definite matrix, its inverse and solutions, in compiled code."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dopt.kernel.compiler import compiled, vectorized
-from dopt.types import Matrix, Stack
+from dopt.kernel.information.dual import solve_lower
+from dopt.kernel.information.primal import add_multiple
+from dopt.types import Matrix, Stack, Vector
 
 BLOCK = 48
 """Rows and columns of a block: three of them fit into the first-level cache."""
 
 
 @compiled
-def write_inverse(matrix: Matrix, upper: Matrix) -> bool:
-    """Write the upper triangle of the inverse of a matrix, (q, q), which its factor C overwrites.
-
-    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications. False
-    is returned where rounding has left the matrix indefinite, or the inverse overflows.
-    """
-    if not _factorize(matrix):
+def factorize(matrix: Matrix) -> bool:
+    """Replace a matrix, (q, q), by its factor C; tell whether it is positive definite."""
+    try:
+        matrix[:] = np.linalg.cholesky(matrix)
+    except Exception:  # compiled code catches all exceptions or none
         return False
-    n = (matrix.shape[0] + BLOCK - 1) // BLOCK
+    return True
+
+
+@vectorized
+def solve(factor: Matrix, right: Vector) -> None:
+    """Replace a right-hand side, (q,), by (C Cᵀ)⁻¹ times it."""
+    q = right.shape[0]
+    solve_lower(factor, q, right.reshape(1, q))
+    for i in range(q - 1, -1, -1):
+        right[i] /= factor[i, i]
+        add_multiple(right[:i], -right[i], factor[i, :i])
+
+
+@compiled
+def write_inverse(factor: Matrix, upper: Matrix) -> bool:
+    """Write the upper triangle of (C Cᵀ)⁻¹, (q, q); tell whether it is finite.
+
+    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications.
+    """
+    n = (factor.shape[0] + BLOCK - 1) // BLOCK
     X = np.zeros((n, n, BLOCK, BLOCK))
-    _invert_blocks(matrix, X)
+    _invert_blocks(factor, X)
     for i in range(n):
         for j in range(i, n):
             block = np.zeros((BLOCK, BLOCK))
@@ -30,16 +49,6 @@ def write_inverse(matrix: Matrix, upper: Matrix) -> bool:
                 block += np.dot(X[k, i].T, X[k, j])
             _write_block(block, i * BLOCK, j * BLOCK, upper)
     return bool(np.isfinite(np.diag(upper)).all())
-
-
-@compiled
-def _factorize(matrix: Matrix) -> bool:
-    """Replace a matrix by its Cholesky factor; tell whether it is positive definite."""
-    try:
-        matrix[:] = np.linalg.cholesky(matrix)
-    except Exception:  # compiled code catches all exceptions or none
-        return False
-    return True
 
 
 @compiled

@@ -9,12 +9,11 @@ import numpy as np
 
 from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
 from dopt.kernel.compiler import compiled, squared
-from dopt.kernel.information.inverse import write_inverse
+from dopt.kernel.information.inverse import factorize, solve, write_inverse
 from dopt.kernel.information.normal_equations import errors_of, normal_equations
-from dopt.kernel.information.primal import symmetric_product
 from dopt.kernel.learners.kalman import filter_sample
 from dopt.kernel.learners.samples import store_sample
-from dopt.kernel.structs import Covariance, Network, Trial
+from dopt.kernel.structs import Network, Trial
 from dopt.types import Matrix, Vector
 
 
@@ -28,19 +27,19 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     if t % refit_every != 0:
         filter_sample(trial, t, target, noise_variance, 1.0, 0, 0.0)
         return
-    n = min(t + 1, seen.shape[1])
+    n, q = min(t + 1, seen.shape[1]), state.theta.shape[0]
     features, targets = seen[:, :n].copy(), observed[:, :n].copy()
+    ridge, factor = numbers[0] * noise_variance, np.empty((q, q))
+    definite = True
     for _ in range(steps):
-        take_step(
-            trial.network,
-            state.theta,
-            state.prior,
-            numbers[0] * noise_variance,
-            features,
-            targets,
-            state.covariance,
+        definite = definite and take_step(
+            trial.network, state.theta, state.prior, ridge, features, targets, factor
         )
-    _scale(state.covariance.upper, noise_variance)
+    covariance = state.covariance
+    if not (definite and write_inverse(factor, covariance.upper)):
+        state.theta[:] = np.nan  # which ends the trial as diverged
+    _scale(covariance.upper, noise_variance)
+    covariance.n_pending[0] = 0
 
 
 @compiled
@@ -51,34 +50,33 @@ def take_step(
     ridge: float,
     features: Matrix,
     targets: Matrix,
-    covariance: Covariance,
-) -> None:
-    """Take a damped step to the minimum of ‖e‖² + ridge ‖θ - θ₀‖²; write (JᵀJ + ridge I)⁻¹.
+    normal: Matrix,
+) -> bool:
+    """Take a damped step to the minimum of ‖e‖² + ridge ‖θ - θ₀‖².
 
-    ``features`` (p, N), ``targets`` (r, N), θ and θ₀ (q,). θ is NaN, which ends the trial as
-    diverged, where rounding has left the matrix indefinite.
+    ``features`` (p, N), ``targets`` (r, N), θ and θ₀ (q,). The Cholesky factor of JᵀJ + ridge I
+    before the step is written, (q, q). False, and no step, where rounding has left it indefinite.
     """
     q = theta.shape[0]
-    normal, slope, step = np.empty((q, q)), np.empty(q), np.empty(q)
-    squares = normal_equations(network, theta, features, targets, normal, slope)
+    step = np.empty(q)
+    squares = normal_equations(network, theta, features, targets, normal, step)
     squares += ridge * squared_distance(theta, prior)
     for i in range(q):
         normal[i, i] += ridge
-        slope[i] += ridge * (prior[i] - theta[i])
-    if not write_inverse(normal, covariance.upper):
-        theta[:] = np.nan
-        return
-    covariance.n_pending[0] = 0
-    symmetric_product(covariance.upper, slope, step)
+        step[i] += ridge * (prior[i] - theta[i])
+    if not factorize(normal):
+        return False
+    solve(normal, step)
     share, before = 1.0, theta.copy()
     while share >= SMALLEST_SHARE:
         for i in range(q):
             theta[i] = before[i] + share * step[i]
         after = errors_of(network, theta, features, targets)[0]
         if after + ridge * squared_distance(theta, prior) <= squares * NO_GROWTH:
-            return
+            return True
         share *= 0.5
     theta[:] = before
+    return True
 
 
 @compiled
