@@ -52,6 +52,9 @@ SMALLEST_SHARE = 1.0 / 64.0
 NO_GROWTH = 1.0 + 1e-10
 """Growth of a sum of squares that counts as none: at its minimum rounding must not decide."""
 
+SPREAD_KEPT = 0.1
+"""Share of the mean and the spread of one iteration of the cross-entropy method in the next."""
+
 
 def switch_step(steps: int) -> int:
     """Return the step at which a plan of so many steps may switch its input, ``steps`` if never."""

@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.learning import AdamReplay, Learner
-from dopt.policies.base import ROUNDING, OpenLoop, on_sphere
+from dopt.policies import ICEM
+from dopt.policies.base import ROUNDING, OpenLoop, Policy, on_sphere
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 
@@ -32,6 +33,8 @@ _STREAMS = {
     "control_plans": 8,
     "replay": 9,
     "environment": 10,
+    "sampled_plans": 11,
+    "sampled_parameters": 12,
 }
 
 
@@ -59,6 +62,9 @@ class Draws:
         Unit vectors that decide between inputs of equal value.
     replay : (T, steps, batch)
         Places of the buffer that make the minibatches of a learner with replay; otherwise empty.
+    plans, parameters : (blocks, ·), (q, s)
+        Standard normal numbers of the sampling planner (:class:`dopt.policies.ICEM`); otherwise
+        empty.
     """
 
     noise: Array
@@ -67,6 +73,8 @@ class Draws:
     components: npt.NDArray[np.int64]
     ties: Array
     replay: npt.NDArray[np.int64]
+    plans: Array
+    parameters: Array
 
 
 def draw(spec: TrialSpec) -> Draws:
@@ -85,7 +93,23 @@ def draw(spec: TrialSpec) -> Draws:
         components=stream(seed, "components").integers(system.n_learned, size=system.horizon),
         ties=on_sphere(stream(seed, "ties").standard_normal(sphere), 1.0),
         replay=_replay(spec.learner, system.horizon, seed),
+        plans=_plans(policy, system, seed),
+        parameters=_parameters(spec),
     )
+
+
+def _plans(policy: Policy, system: System, seed: int) -> Array:
+    if isinstance(policy, ICEM):
+        numbers = policy.draw_plans(system, stream(seed, "sampled_plans"))
+        return numbers.reshape(len(numbers), -1)
+    return np.zeros((0, 0))
+
+
+def _parameters(spec: TrialSpec) -> Array:
+    if isinstance(spec.policy, ICEM):
+        q = spec.model.n_parameters(spec.system)
+        return spec.policy.draw_parameters(q, stream(spec.seed, "sampled_parameters"))
+    return np.zeros((0, 0))
 
 
 def _open_loop(policy: OpenLoop, system: System, rng: np.random.Generator) -> Array:

@@ -14,20 +14,26 @@ from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
 from dopt.kernel.information import absent, dual, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
-from dopt.learning import Learner
-from dopt.learning.base import CompiledLearner
+from dopt.learning import GaussNewton, Learner
 from dopt.models import MLP, Linear
 from dopt.models.base import Model
-from dopt.policies import DOptimal, EOptimal, InformationPolicy, Lookahead, Search, TaskOptimal
-from dopt.policies.base import CompiledPolicy, Policy
+from dopt.policies import (
+    ICEM,
+    DOptimal,
+    EOptimal,
+    InformationPolicy,
+    Lookahead,
+    Search,
+    TaskOptimal,
+)
 from dopt.policies.d_optimal import count_sketch
 from dopt.policies.search import score_code
-from dopt.policies.task_states import task_states
+from dopt.policies.task_states import box_states, task_states
 from dopt.spec.config import TrialConfig
 from dopt.spec.information_form import Information, held_information
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.types import Vector
+from dopt.types import Matrix, Vector
 
 MODULES = {Form.PRIMAL: primal_network, Form.DUAL: dual, Form.SKETCH: sketch}
 FEATURE_KINDS = {"identity": FeatureKind.IDENTITY, "cos": FeatureKind.COS, "sin": FeatureKind.SIN}
@@ -96,9 +102,10 @@ def information_of(config: TrialConfig) -> args.Information:
     if not isinstance(config.policy, InformationPolicy):
         return args.Information(absent.add_rows, absent.planning_forms)
     module = primal_linear if isinstance(config.model, Linear) else MODULES[Form(_form(config))]
+    searches = isinstance(config.policy, (Search, ICEM))
     return args.Information(
         absent.add_rows if config.learner.updates_information else module.add_rows,
-        absent.planning_forms if isinstance(config.policy, Search) else module.planning_forms,
+        absent.planning_forms if searches else module.planning_forms,
     )
 
 
@@ -113,6 +120,8 @@ def _search(config: TrialConfig) -> args.Search:
     states = np.zeros((0, system.n_states))
     if isinstance(policy, TaskOptimal):
         states = task_states(system, policy)
+    if isinstance(policy, ICEM) and policy.task_count:
+        states = box_states(system)
     return args.Search(
         candidates,
         int(score),
@@ -152,18 +161,8 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
         *_information(spec, len(weights)),
         np.zeros((len(system.features), window)),
         np.zeros((system.n_learned, window)),
-        *(
-            np.zeros(_memory_size(part, system, len(weights)))
-            for part in (spec.policy, spec.learner)
-        ),
+        *(np.zeros(part.memory_size(system, len(weights))) for part in (spec.policy, spec.learner)),
     )
-
-
-def _memory_size(part: Policy | Learner, system: System, n_parameters: int) -> int:
-    """Return how many numbers a policy or a learner of a user's own keeps from step to step."""
-    if isinstance(part, (CompiledPolicy, CompiledLearner)):
-        return part.memory_size(system, n_parameters)
-    return 0
 
 
 def empty_scratch(spec: TrialSpec, network: args.Network) -> args.Scratch:
@@ -173,12 +172,13 @@ def empty_scratch(spec: TrialSpec, network: args.Network) -> args.Scratch:
     return args.Scratch(np.empty((depth, room)), np.empty((3, room)), np.empty(q))
 
 
-def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, args.Sketch]:
+def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, Matrix, args.Dual, args.Sketch]:
     """Return the initial information in the chosen form; the other forms are empty."""
     policy = spec.policy
     form = _form(spec.config)
     size, rows, projection = 0, _empty_dual(spec, 0), count_sketch(0, 1)
-    if form == Form.PRIMAL and _held(spec.config):
+    factored = q if isinstance(policy, ICEM) and _is_fitted(spec.learner) else 0
+    if form == Form.PRIMAL and _needs_inverse(spec.config):
         size = q
     elif form == Form.DUAL:
         rows = _empty_dual(spec, spec.system.horizon)
@@ -190,7 +190,20 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, a
         np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
         np.zeros(1, dtype=np.int64),
     )
-    return covariance, rows, args.Sketch(*projection, size)
+    factor = np.eye(factored) * _regularization(spec.config) ** 0.5
+    return covariance, factor, rows, args.Sketch(*projection, size)
+
+
+def _needs_inverse(config: TrialConfig) -> bool:
+    """Tell whether the policy or the learner reads M⁻¹: a learner that fits M anew may not."""
+    policy = config.policy
+    reads = isinstance(policy, InformationPolicy) and not isinstance(policy, ICEM)
+    return _held(config) is not None and (reads or not _is_fitted(config.learner))
+
+
+def _is_fitted(learner: Learner) -> bool:
+    """Tell whether a learner makes M anew at each step."""
+    return isinstance(learner, GaussNewton) and learner.refit_every == 1
 
 
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:

@@ -15,7 +15,7 @@ from dopt.algorithm import FeatureKind
 from dopt.kernel.compiler import compiled, contracted, squared, vectorized
 from dopt.kernel.structs import Network
 from dopt.kernel.tanh import tanh
-from dopt.types import Matrix, Real, Vector
+from dopt.types import Matrix, Real, Stack, Vector
 
 
 @compiled
@@ -198,6 +198,26 @@ def back_signals(
         _transposed_product(W, deltas[index], deltas[index - 1])
         for i in range(deltas.shape[1]):
             deltas[index - 1, i] *= 1.0 - squared(hidden[index - 1, i])
+
+
+@compiled
+def batch_back_signals(network: Network, theta: Vector, hidden: Matrix, r: int, n: int) -> Stack:
+    """Return δ of every output and hidden layer, (r L, w, N), layer by layer of an output."""
+    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
+    out = np.empty((r * depth, width, n))
+    last, _ = layer(network, theta, depth)
+    for k in range(r):
+        for index in range(depth - 1, -1, -1):
+            h = units_by_points(hidden[index], width, n)
+            signal = out[k * depth + index]
+            if index == depth - 1:
+                for i in range(width):
+                    signal[i] = last[k, i]
+            else:
+                W, _ = layer(network, theta, index + 1)
+                np.dot(W.T, out[k * depth + index + 1], signal)
+            through_tanh(signal, h)
+    return out
 
 
 @contracted

@@ -78,6 +78,8 @@ class Randomness(NamedTuple):
     components: Integers  # (T,)
     ties: Matrix  # (T, m)
     replay: Integers  # (T, steps, batch), empty without replay
+    plans: Matrix  # (blocks, numbers) of the sampling planner
+    parameters: Matrix  # (q, s) of its draws of the parameters; both empty in other policies
 
 
 class Evaluation(NamedTuple):
@@ -151,6 +153,7 @@ class State(NamedTuple):
     moment_1: Vector  # (q,) of Adam
     moment_2: Vector  # (q,)
     covariance: Covariance
+    factor: Matrix  # (q, q), the Cholesky factor of M of a learner that leaves it in place of M⁻¹
     dual: Dual
     sketch: Sketch
     window_features: Matrix  # (p, window) newest samples, a ring

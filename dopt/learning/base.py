@@ -37,6 +37,10 @@ class Learner(KernelPart):
         """Return the most samples that the kernel takes a gradient of at once."""
         return 1
 
+    def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of learners that keep nothing
+        """Return how many numbers the learner keeps from step to step; they start at zero."""
+        return 0
+
 
 class Updater(ABC):
     """The learning of one trial; it may keep moments, samples or covariances."""
@@ -88,7 +92,3 @@ class CompiledLearner(Learner):
         target : (r,)
             Accelerations observed at x_t.
         """
-
-    def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of learners that keep nothing
-        """Return how many numbers the learner keeps from step to step; they start at zero."""
-        return 0

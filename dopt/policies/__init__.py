@@ -12,6 +12,7 @@ from dopt.policies.exact import Exact
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.gradient import GradientDOptimal
 from dopt.policies.greedy_linear import GreedyLinear
+from dopt.policies.icem import ICEM
 from dopt.policies.lookahead import Lookahead
 from dopt.policies.multisine import Multisine
 from dopt.policies.oracle import Oracle
@@ -44,6 +45,7 @@ POLICIES: dict[str, type[Policy]] = {
         EOptimal,
         TaskOptimal,
         Lookahead,
+        ICEM,
         Disagreement,
         GaussianProcessEntropy,
         GradientDOptimal,
@@ -52,6 +54,7 @@ POLICIES: dict[str, type[Policy]] = {
 }
 
 __all__ = [
+    "ICEM",
     "POLICIES",
     "PRBS",
     "AOptimal",

@@ -50,6 +50,10 @@ class Policy(KernelPart):
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
 
+    def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of policies that keep nothing
+        """Return how many numbers the policy keeps from step to step; they start at zero."""
+        return 0
+
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoop(Policy):
@@ -154,10 +158,6 @@ class CompiledPolicy(ClosedLoop):
         u : (m,)
             Where the input is written. One that is not finite ends the trial as diverged.
         """
-
-    def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of policies that keep nothing
-        """Return how many numbers the policy keeps from step to step; they start at zero."""
-        return 0
 
 
 def check_norms(name: str, inputs: Array, first: int, gamma: float) -> None:

@@ -28,6 +28,12 @@ def task_states(system: System, task: TaskOptimal) -> Array:
     return np.ascontiguousarray(states[np.sort(chosen)])
 
 
+@functools.lru_cache(maxsize=64)
+def box_states(system: System) -> Array:
+    """Return states, (4096, d), uniform in the evaluation box; always the same."""
+    return _box(system, np.random.default_rng(_SEED))
+
+
 def _box(system: System, rng: np.random.Generator) -> Array:
     """Return states, (4096, d), uniform in the evaluation box; the other components are zero."""
     low, high = np.array(list(system.grid_box().values())).T

@@ -18,6 +18,7 @@ TITLES: dict[str, str] = {
     "gradient": "D-optimal, by gradient",
     "linear": "D-optimal, linear",
     "lookahead": "look-ahead",
+    "icem": "iCEM",
     "exact": "exact gain",
     "trace": "trace",
     "trace_linearized": "trace, linearised",

@@ -11,10 +11,12 @@ from dopt.policies.disagreement import Disagreement
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.gradient import GradientDOptimal
 from dopt.policies.greedy_linear import GreedyLinear
+from dopt.policies.icem import ICEM
 from dopt.reference.ensemble import EnsemblePlan
 from dopt.reference.exact_gain import GradientPlan
 from dopt.reference.gaussian_process import EntropyPlan, Posterior
 from dopt.reference.greedy_linear import GreedyLinearPlan
+from dopt.reference.sampling import SampledPlan
 from dopt.reference.state import BatchState
 
 
@@ -32,6 +34,7 @@ PLANS: dict[type, Callable[[BatchState, Any], Plan]] = {
     Disagreement: EnsemblePlan,
     GradientDOptimal: GradientPlan,
     GreedyLinear: GreedyLinearPlan,
+    ICEM: SampledPlan,
 }
 
 

@@ -46,7 +46,7 @@ class BatchState:
         Form and λ of M.
     diverged : (n, 1) tensor
         Whether a trial has ended.
-    noise, open_loop, ties, components, replay : tensors
+    noise, open_loop, ties, components, replay, plans, parameters : tensors
         Numbers of :class:`dopt.randomness.Draws` with the trials along the first axis.
 
     Raises
@@ -84,6 +84,8 @@ class BatchState:
         self.noise = self.tensor(np.stack([d.noise for d in draws]))
         self.open_loop = self.tensor(np.stack([d.inputs for d in draws]))
         self.ties = self.tensor(np.stack([d.ties for d in draws]))
+        self.plans = self.tensor(np.stack([d.plans for d in draws]))
+        self.parameters = self.tensor(np.stack([d.parameters for d in draws]))
         self.theta = self.tensor(np.stack([d.weights for d in draws]))
         self.components = torch.tensor(np.stack([d.components for d in draws]), device=self.device)
         self.replay = torch.tensor(np.stack([d.replay for d in draws]), device=self.device)

@@ -11,9 +11,9 @@ import math
 from dopt.control import Control
 from dopt.control.free_run import STARTS
 from dopt.learning import Adam, AdamReplay, GaussNewton, Learner
-from dopt.learning.base import CompiledLearner
 from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
+    ICEM,
     Disagreement,
     DOptimal,
     EOptimal,
@@ -23,7 +23,7 @@ from dopt.policies import (
     Search,
     TaskOptimal,
 )
-from dopt.policies.base import CompiledPolicy
+from dopt.policies.icem import BLOCKS
 from dopt.spec.information_form import held_information
 from dopt.systems import System
 
@@ -74,9 +74,8 @@ def memory_by_setting(
         pairs = kept * (2 * (max(w, p) + 1) ** 2 + (r + 3) * (L + 1) * (max(w, p) + 1))
         rows = 3 * kept * r * q if path == "reference" else 0  # J itself, and copies of it
         numbers[_size_of(model)] += pairs + rows + 4 * q**2
-    for own in (policy, learner):
-        if isinstance(own, (CompiledPolicy, CompiledLearner)):
-            numbers[_size_of(model)] += own.memory_size(system, q)
+    kept = policy.memory_size(system, q) + learner.memory_size(system, q)
+    numbers[_size_of(model)] += kept
     held = held_information(policy, learner, q, r * T)
     form = held.form if held else "none"
     if path == "kernel":
@@ -130,9 +129,12 @@ def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str
 
     The kernel holds one path at a time, the reference all of them.
     """
+    q, r = model.n_parameters(system), system.n_learned
+    if isinstance(policy, ICEM):
+        return _sampling(policy, system, q)
     if not isinstance(policy, Search):
         return {}
-    q, r, steps = model.n_parameters(system), system.n_learned, policy.steps(system)
+    steps = policy.steps(system)
     rows = r * (steps // policy.stride_of(system) if isinstance(policy, Lookahead) else steps)
     count = policy.count if isinstance(policy, TaskOptimal) else 0
     subspace = min(q, policy.subspace) if isinstance(policy, EOptimal) else 0
@@ -142,6 +144,22 @@ def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str
         "policy.candidates": policy.candidates**2 * (1 if path == "kernel" else 2 * rows * q),
         "policy.count": count * (r * q + system.n_states),
         "policy.subspace": subspace * (2 * q + 2 * subspace) + (r + 1) * q,
+    }
+
+
+def _sampling(policy: ICEM, system: System, q: int) -> dict[str, int]:
+    """Return the numbers of the sampling planner: its plans, their paths and the rows along them.
+
+    The factor of M⁻¹ and the draws of the parameters belong to the model.
+    """
+    d, m, r, count = system.n_states, system.n_inputs, system.n_learned, policy.task_count
+    plans, states = policy.plans + policy.elites, policy.lookahead // policy.stride
+    drawn, directions = BLOCKS * policy.iterations * policy.plans, policy.samples + r * count
+    return {
+        "policy.plans": plans * (states * (d + r * directions) + 2 * policy.segments * m),
+        "policy.lookahead": drawn * policy.segments * m,
+        "policy.samples": q * (policy.samples + 3 * directions),
+        "model.width": q**2,
     }
 
 

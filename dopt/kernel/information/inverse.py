@@ -34,6 +34,40 @@ def solve(factor: Matrix, right: Vector) -> None:
 
 
 @compiled
+def solve_columns(factor: Matrix, right: Matrix) -> None:
+    """Replace right-hand sides, (q, k), by C⁻¹ times them, block by block."""
+    q = factor.shape[0]
+    for start in range(0, q, BLOCK):
+        stop = min(start + BLOCK, q)
+        if start > 0:
+            right[start:stop] -= np.dot(factor[start:stop, :start].copy(), right[:start])
+        for i in range(start, stop):
+            for j in range(start, i):
+                add_multiple(right[i], -factor[i, j], right[j])
+            _divide(right[i], factor[i, i])
+
+
+@compiled
+def solve_transposed_columns(factor: Matrix, right: Matrix) -> None:
+    """Replace right-hand sides, (q, k), by C⁻ᵀ times them, block by block."""
+    q = factor.shape[0]
+    for start in range((q - 1) // BLOCK * BLOCK, -1, -BLOCK):
+        stop = min(start + BLOCK, q)
+        if stop < q:
+            right[start:stop] -= np.dot(factor[stop:, start:stop].T.copy(), right[stop:])
+        for i in range(stop - 1, start - 1, -1):
+            for j in range(i + 1, stop):
+                add_multiple(right[i], -factor[j, i], right[j])
+            _divide(right[i], factor[i, i])
+
+
+@compiled
+def _divide(row: Vector, by: float) -> None:
+    for j in range(row.shape[0]):
+        row[j] /= by
+
+
+@compiled
 def write_inverse(factor: Matrix, upper: Matrix) -> bool:
     """Write the upper triangle of (C Cᵀ)⁻¹, (q, q); tell whether it is finite.
 

@@ -31,7 +31,7 @@ def normal_equations(
     """
     depth = network.offsets.shape[0] - 1
     total, errors, hidden = errors_of(network, theta, inputs, targets)
-    signals = _signals(network, theta, hidden, targets.shape[0], inputs.shape[1])
+    signals = nn.batch_back_signals(network, theta, hidden, targets.shape[0], inputs.shape[1])
     below = _completed(network, inputs, hidden)
     _write_slope(network, below, signals, errors, slope)
     for a in range(depth):
@@ -73,26 +73,6 @@ def _completed(network: Network, inputs: Matrix, hidden: Matrix) -> Stack:
             below[index, i] = values[i]
         below[index, units] = 1.0
     return below
-
-
-@compiled
-def _signals(network: Network, theta: Vector, hidden: Matrix, r: int, n: int) -> Stack:
-    """Return δ of every output and hidden layer, (r L, w, N), layer by layer of an output."""
-    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    out = np.empty((r * depth, width, n))
-    last, _ = nn.layer(network, theta, depth)
-    for k in range(r):
-        for index in range(depth - 1, -1, -1):
-            h = nn.units_by_points(hidden[index], width, n)
-            signal = out[k * depth + index]
-            if index == depth - 1:
-                for i in range(width):
-                    signal[i] = last[k, i]
-            else:
-                W, _ = nn.layer(network, theta, index + 1)
-                np.dot(W.T, out[k * depth + index + 1], signal)
-            nn.through_tanh(signal, h)
-    return out
 
 
 @compiled

@@ -13,7 +13,7 @@ from dopt.kernel.information.inverse import factorize, solve, write_inverse
 from dopt.kernel.information.normal_equations import errors_of, normal_equations
 from dopt.kernel.learners.kalman import filter_sample
 from dopt.kernel.learners.samples import store_sample
-from dopt.kernel.structs import Network, Trial
+from dopt.kernel.structs import Network, State, Trial
 from dopt.types import Matrix, Vector
 
 
@@ -35,11 +35,24 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
         definite = definite and take_step(
             trial.network, state.theta, state.prior, ridge, features, targets, factor
         )
-    covariance = state.covariance
-    if not (definite and write_inverse(factor, covariance.upper)):
+    if not (definite and _write_information(state, factor, noise_variance)):
         state.theta[:] = np.nan  # which ends the trial as diverged
-    _scale(covariance.upper, noise_variance)
-    covariance.n_pending[0] = 0
+
+
+@compiled
+def _write_information(state: State, factor: Matrix, noise_variance: float) -> bool:
+    """Write M⁻¹ and the factor of M, where they are held; tell whether M⁻¹ is finite.
+
+    Given is the factor of ρ M.
+    """
+    finite, covariance = True, state.covariance
+    if state.factor.shape[0] > 0:
+        state.factor[:] = factor / np.sqrt(noise_variance)
+    if covariance.upper.shape[0] > 0:
+        finite = write_inverse(factor, covariance.upper)
+        _scale(covariance.upper, noise_variance)
+        covariance.n_pending[0] = 0
+    return finite
 
 
 @compiled

@@ -1,0 +1,215 @@
+"""Sampling planner in compiled code (:mod:`dopt.policies.icem`).
+
+Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, K inputs of it, P plans, n states of
+its path whose rows count, g + s directions of :mod:`dopt.kernel.search.posterior`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dopt.algorithm import SPREAD_KEPT, TIE_MARGIN, Score
+from dopt.kernel.checks import within
+from dopt.kernel.compiler import compiled, squared, vectorized
+from dopt.kernel.information.primal import add_multiple, inner
+from dopt.kernel.model import euler_step
+from dopt.kernel.search.posterior import (
+    Directions,
+    accelerations_at,
+    changes_along,
+    directions,
+    rows_at,
+)
+from dopt.kernel.structs import Trial
+from dopt.types import Booleans, Matrix, Stack, Vector
+
+
+class Settings(NamedTuple):
+    """Numbers of the policy."""
+
+    steps: int  # H
+    hold: int
+    stride: int
+    plans: int
+    iterations: int
+    elites: int
+    score: int  # dopt.algorithm.Score
+    task_count: int  # states of the evaluation box
+
+
+@compiled
+def settings_of(numbers: Vector) -> Settings:
+    """Return the numbers of the policy by name."""
+    return Settings(
+        int(numbers[0]),
+        int(numbers[1]),
+        int(numbers[2]),
+        int(numbers[3]),
+        int(numbers[4]),
+        int(numbers[5]),
+        int(numbers[6]),
+        int(numbers[7]),
+    )
+
+
+@compiled
+def plan(trial: Trial, t: int, u: Vector) -> None:
+    """Write the first input of the best plan, (m,); NaN where M is not positive definite."""
+    settings, gamma, m = settings_of(trial.algorithm.policy), trial.plant.gamma, u.shape[0]
+    E, K = settings.elites, (settings.steps + settings.hold - 1) // settings.hold + 1
+    memory = trial.state.policy_memory.reshape(1 + E, K, m)  # the mean, then the elites
+    definite, draws = _directions(trial, settings, t)
+    if not definite:
+        u[:] = np.nan
+        return
+    if t % settings.hold == 0:
+        _shift(memory)
+    inputs, values = np.empty((E + settings.plans, K, m)), np.full(E + settings.plans, -np.inf)
+    mean, spread = memory[0], np.full((K, m), gamma)
+    inputs[:E] = memory[1:]
+    blocks = trial.randomness.plans.shape[0]
+    normals = trial.randomness.plans[t % blocks].reshape(settings.iterations, settings.plans, K, m)
+    for iteration in range(settings.iterations):
+        for p in range(settings.plans):
+            inputs[E + p] = mean + spread * normals[iteration, p]
+            _scale_inputs(inputs[E + p], gamma)
+        # The elites of the step before are scored anew, by what is known now; there are none first.
+        first = 0 if iteration == 0 and t > 1 else E
+        _score(trial, settings, t, draws, inputs[first:], values[first:])
+        best = np.argsort(-rounded(values), kind="mergesort")[:E]
+        inputs[:E], values[:E] = inputs[best].copy(), values[best].copy()
+        for k in range(K):
+            for j in range(m):
+                elites = inputs[:E, k, j]
+                mean[k, j] = SPREAD_KEPT * mean[k, j] + (1.0 - SPREAD_KEPT) * elites.mean()
+                spread[k, j] = SPREAD_KEPT * spread[k, j] + (1.0 - SPREAD_KEPT) * elites.std()
+    memory[1:] = inputs[:E]
+    u[:] = inputs[0, 0] if values[0] > -np.inf else gamma * trial.randomness.ties[t]
+
+
+@compiled
+def rounded(values: Vector) -> Vector:
+    """Return scores rounded to a share of the largest: among equal plans rounding must not choose.
+
+    Plans that differ only after their end have equal scores.
+    """
+    largest = 0.0
+    for value in values:
+        if np.isfinite(value):
+            largest = max(largest, abs(value))
+    out = np.empty_like(values)
+    for p in range(values.shape[0]):
+        steps = np.rint(values[p] / (TIE_MARGIN * largest)) if largest > 0.0 else values[p]
+        out[p] = steps if np.isfinite(values[p]) else values[p]
+    return out
+
+
+@compiled
+def _shift(memory: Stack) -> None:
+    """Drop the first input of every plan, which has been held to its end; repeat the last."""
+    for k in range(memory.shape[1] - 1):
+        memory[:, k] = memory[:, k + 1]
+
+
+@compiled
+def _scale_inputs(inputs: Matrix, gamma: float) -> None:
+    """Give every input of a plan, (K, m), the norm γ."""
+    for k in range(inputs.shape[0]):
+        norm = np.sqrt(inner(inputs[k], inputs[k]))
+        for j in range(inputs.shape[1]):
+            inputs[k, j] *= gamma / norm
+
+
+@compiled
+def _directions(trial: Trial, settings: Settings, t: int) -> tuple[bool, Directions]:
+    """Return the directions of the parameters of step t, exact for the rows at task states."""
+    states, count = trial.algorithm.search.task_states, settings.task_count
+    chosen = np.empty((count, states.shape[1]))
+    for i in range(count):
+        chosen[i] = states[(t * count + i) % states.shape[0]]
+    rows = rows_at(trial.plant, trial.network, trial.state.theta, chosen)
+    return directions(trial.state, trial.randomness.parameters, rows)
+
+
+@compiled
+def _score(
+    trial: Trial, settings: Settings, t: int, draws: Directions, inputs: Stack, values: Vector
+) -> None:
+    """Write the scores of plans, (P, K, m); -∞ where a path leaves the bounds of a state."""
+    plant, network, theta = trial.plant, trial.network, trial.state.theta
+    P, n, r = inputs.shape[0], settings.steps // settings.stride, plant.learned_rows.shape[0]
+    inside, states = _paths(trial, settings, t, inputs)
+    changes = np.empty((r, draws.rows.shape[0], P * n))
+    changes_along(plant, network, theta, states, draws.rows, changes)
+    rows, factor = np.empty((n * r, draws.rows.shape[0])), np.empty((n * r, n * r))
+    joint = settings.score in (Score.JOINT, Score.TASK)
+    scale = np.sqrt(settings.stride) if joint else 1.0
+    for p in range(P):
+        for i in range(n):
+            for k in range(r):
+                for j in range(rows.shape[1]):
+                    rows[i * r + k, j] = scale * changes[k, j, p * n + i]
+        value = score_of_rows(settings.score, rows, draws.exact, r, factor)
+        values[p] = value if inside[p] and np.isfinite(value) else -np.inf
+
+
+@compiled
+def _paths(trial: Trial, settings: Settings, t: int, inputs: Stack) -> tuple[Booleans, Matrix]:
+    """Return which paths stay in bounds, and their states that count, (P n, d), path by path."""
+    plant, network, theta = trial.plant, trial.network, trial.state.theta
+    P, d, stride = inputs.shape[0], trial.record.states.shape[1], settings.stride
+    n = settings.steps // stride
+    kept, inside = np.empty((P * n, d)), np.ones(P, np.bool_)
+    states, flow, value = np.empty((P, d)), np.empty(d), np.empty(plant.learned_rows.shape[0])
+    outputs = np.empty((value.shape[0], P))
+    following = np.empty(d)
+    states[:] = trial.record.states[t]
+    for i in range(n * stride):
+        accelerations_at(plant, network, theta, states, outputs)
+        k = (t + i) // settings.hold - t // settings.hold
+        for p in range(P):
+            for j in range(value.shape[0]):
+                value[j] = outputs[j, p]
+            euler_step(plant, states[p], inputs[p, k], value, flow, following)
+            inside[p] = inside[p] and within(following, plant.state_limit)
+            states[p] = following
+            if (i + 1) % stride == 0:
+                kept[p * n + (i + 1) // stride - 1] = following
+    return inside, kept
+
+
+@vectorized
+def score_of_rows(score: int, rows: Matrix, exact: Matrix, r: int, factor: Matrix) -> float:
+    """Return the score of a path from J W, (N, g + s), r rows for each state.
+
+    ``factor``, (N, N), is overwritten by the Cholesky factor of I + J M⁻¹ Jᵀ, whose blocks beside
+    the diagonal the sum over states leaves out.
+    """
+    N, g, total = rows.shape[0], exact.shape[0], 0.0
+    if score == Score.TRACE:
+        for i in range(N):
+            total += inner(rows[i], rows[i])
+        return total
+    block = r if score == Score.SUM else N
+    for i in range(N):
+        start = i - i % block
+        for j in range(start, i + 1):
+            value = inner(rows[i], rows[j]) - inner(factor[i, start:j], factor[j, start:j])
+            factor[i, j] = np.sqrt(1.0 + value) if i == j else value / factor[j, j]
+        total += 2.0 * np.log(factor[i, i])
+    if score != Score.TASK:
+        return total
+    for i in range(N):  # L⁻¹ of the exact products
+        row = rows[i, :g]
+        for j in range(i):
+            add_multiple(row, -factor[i, j], rows[j, :g])
+        for j in range(g):
+            row[j] /= factor[i, i]
+    products = np.dot(rows[:, :g].copy(), exact)
+    total = 0.0
+    for i in range(N):
+        for j in range(products.shape[1]):
+            total += squared(products[i, j])
+    return total
