@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,12 @@ def section_in(path: Path) -> dict[str, object]:
     )
 
 
+def comment_of(path: Path) -> str:
+    """Return the reasons that a file gives for its numbers, on one line."""
+    lines = [line.lstrip("# ") for line in path.read_text().splitlines() if line.startswith("#")]
+    return " ".join(lines)
+
+
 def system_in(path: Path) -> System:
     return system_from_mapping(section_in(path))
 
@@ -50,8 +57,15 @@ def test_every_field_of_a_system_is_shown_in_its_file(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
-def test_the_euler_map_creates_no_energy(path: Path) -> None:
+def test_the_euler_map_is_stable_at_rest(path: Path) -> None:
     assert euler_spectral_radius(system_in(path)) <= 1.0 + 1e-12
+
+
+@pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
+def test_the_spectral_radius_is_the_stated_one(path: Path) -> None:
+    stated = re.search(r"spectral radius (0\.\d+) at rest", comment_of(path))
+    if stated:
+        assert stated[1] == f"{euler_spectral_radius(system_in(path)):.3f}"
 
 
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
