@@ -68,6 +68,20 @@ def test_the_spectral_radius_is_the_stated_one(path: Path) -> None:
         assert stated[1] == f"{euler_spectral_radius(system_in(path)):.3f}"
 
 
+@pytest.mark.parametrize(("name", "field"), [("chain", "friction"), ("cartpole", "pivot_friction")])
+def test_the_least_friction_of_a_stable_euler_map_is_the_stated_one(name: str, field: str) -> None:
+    (path,) = (one for one in ENVS if one.stem == name)
+    stated = re.search(r"takes (0\.\d+) at least", comment_of(path))
+    assert stated
+    bound, last_digit = float(stated[1]), 10.0 ** -(len(stated[1]) - 2)
+    radii = [
+        euler_spectral_radius(dataclasses.replace(system_in(path), **{field: friction}))
+        for friction in (bound - last_digit, bound)
+    ]
+    assert radii[0] > 1.0 + 1e-9
+    assert radii[1] <= 1.0 + 1e-12
+
+
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
 def test_a_trial_starts_close_to_rest(path: Path) -> None:
     system = system_in(path)
