@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from dopt.declare.registry import build
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
-from dopt.systems import SYSTEMS, System, system_from_mapping
+from dopt.systems import SYSTEMS, Quadrotor, System, system_from_mapping
 from dopt.systems.equilibrium import euler_spectral_radius
 from tests.paths import CONF
 
@@ -80,6 +81,24 @@ def test_the_least_friction_of_a_stable_euler_map_is_the_stated_one(name: str, f
     ]
     assert radii[0] > 1.0 + 1e-9
     assert radii[1] <= 1.0 + 1e-12
+
+
+def test_the_thrust_of_the_quadrotor_is_the_stated_one() -> None:
+    """The bound is one of the norm of both thrusts: equal ones have the largest sum."""
+    (path,) = (one for one in ENVS if one.stem == "quadrotor")
+    system = system_in(path)
+    assert isinstance(system, Quadrotor)
+    thrust, weight = math.sqrt(2.0) * system.gamma, system.mass * system.gravity
+    fall, climb = (math.sqrt(force / system.drag) for force in (weight, thrust - weight))
+    change = system.dt * (thrust + weight) / system.mass
+    comment = comment_of(path)
+    for phrase in (
+        f"{system.gamma:.0f} N is the norm of the two thrusts, whose sum reaches {thrust:.1f} N",
+        f"weight of {weight:.0f} N",
+        f"terminal speeds of {fall:.1f} m/s in free fall and {climb:.1f} m/s in a climb",
+        f"change the speeds by at most {change:.2f} m/s in a step",
+    ):
+        assert phrase in comment
 
 
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
