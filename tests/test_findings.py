@@ -16,6 +16,7 @@ FINDINGS, METHOD, README = (
 CLAIMS = pd.read_csv(DOCS / "claims/report.csv").set_index(["env", "variant"])
 BEYOND = pd.read_csv(DOCS / "beyond/report.csv").set_index(["env", "variant"])
 CONTROL = pd.read_csv(DOCS / "claims/report_control.csv").set_index(["variant", "t"])
+PERIODIC = pd.read_csv(DOCS / "periodic.csv").set_index(["policy", "env"])
 SUMMARY = pd.read_csv(DOCS / "summary.csv").set_index(["env", "policy"])
 
 RATIO = ("loss_ratio",)
@@ -219,6 +220,24 @@ def test_numbers_of_the_control_table_are_rounded_once(name: str, variant: str) 
         loss = f"{row.loss:.{3 if row.loss < 1 else 2}f}"
         cells.append(f"{success}{star}, {loss}")
     assert f"| {name} | {' | '.join(cells)} |" in FINDINGS
+
+
+@pytest.mark.parametrize(
+    ("name", "policy", "column"),
+    [
+        ("sine, grid", "periodic", "loss"),
+        ("square wave, grid", "periodic_square", "loss"),
+        ("sine, reachable set", "periodic", "reachable_loss"),
+        ("square wave, reachable set", "periodic_square", "reachable_loss"),
+    ],
+)
+def test_numbers_of_the_periodic_inputs_are_rounded_once(
+    name: str, policy: str, column: str
+) -> None:
+    cells = [(policy, env) for env in ("pendulum", "cartpole", "arm")]
+    columns = tuple(f"{column}_{part}" for part in ("ratio", "low", "high"))
+    row = "| {} |" + " {:.2f} [{:.2f}, {:.2f}] |" * len(cells)
+    assert row.format(name, *numbers(PERIODIC, *cells, columns=columns)) in FINDINGS
 
 
 def test_numbers_of_the_filter_on_the_method_page_are_rounded_once() -> None:

@@ -15,7 +15,7 @@ from dopt.policies.greedy_linear import GreedyLinear
 from dopt.policies.lookahead import Lookahead
 from dopt.policies.multisine import Multisine
 from dopt.policies.oracle import Oracle
-from dopt.policies.periodic import Periodic
+from dopt.policies.periodic import Periodic, PeriodicSquare
 from dopt.policies.prbs import PRBS
 from dopt.policies.random import RandomGaussian, RandomHeld, RandomSphere
 from dopt.policies.search import Search
@@ -33,6 +33,7 @@ POLICIES: dict[str, type[Policy]] = {
         PRBS,
         Multisine,
         Chirp,
+        PeriodicSquare,
         Uniform,
         Periodic,
         DOptimal,
@@ -68,6 +69,7 @@ __all__ = [
     "Multisine",
     "Oracle",
     "Periodic",
+    "PeriodicSquare",
     "Policy",
     "RandomGaussian",
     "RandomHeld",
