@@ -44,6 +44,7 @@ _POLICIES: dict[str, tuple[str, Dashes, float]] = {
     "prbs": (WINE, (0, (1.2, 2.4)), 1.2),
     "multisine": (INDIGO, (0, (4, 1.2, 1.2, 1.2, 1.2, 1.2)), 1.2),
     "chirp": (OLIVE, (0, (6, 2.4)), 1.2),
+    "periodic_square": (SEA, (0, (5, 1.2)), 1.2),
     "lookahead": (BLACK, (0, (9, 1)), 1.6),
     "icem": (BLUE, (0, (9, 1)), 1.6),
     "exact": (BROWN, (0, (5, 1)), 1.2),

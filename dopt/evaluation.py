@@ -81,6 +81,8 @@ def reachable_states(system: System) -> Array:
 
     The inputs are random ones held for 5, 10, 20 and 40 steps, square waves at and around the
     eigenfrequency and one of rising frequency, each over the whole horizon without process noise.
+    They are of the kind of two baselines, ``random_held`` and ``periodic_square``, which visit
+    states like those of the set.
     The sample is drawn without replacement from all states visited, with a fixed seed.
     """
     rng = np.random.default_rng(_SEED)

@@ -43,7 +43,7 @@ def maximize_on_sphere(Q: Array, v: Array, radius: float, tie: Array) -> Array:
     v : (m,)
         Linear term.
     radius : float
-        γ > 0.
+        γ > 0. γ|Q| may overflow or underflow.
     tie : (m,)
         Any vector, normally random: decides between maximisers of equal value.
 
@@ -62,31 +62,34 @@ def maximize_on_sphere(Q: Array, v: Array, radius: float, tie: Array) -> Array:
             "the quadratic problem on the sphere has entries that are not finite, finite ones are "
             "expected: the model or the information matrix has diverged."
         )
-    return sphere_maximizer(np.asarray(Q, float), np.asarray(v, float), radius, np.asarray(tie))
+    with np.errstate(over="ignore", under="ignore"):
+        return sphere_maximizer(np.asarray(Q, float), np.asarray(v, float), radius, np.asarray(tie))
 
 
 def sphere_maximizer(Q: Array, v: Array, radius: float, tie: Array) -> Array:
-    """Return the maximiser for finite arguments (see :func:`maximize_on_sphere`)."""
+    """Return the maximiser (see :func:`maximize_on_sphere`); NaN where Q is not finite."""
     m = v.shape[0]
-    scale = 0.0
-    for i in range(m):
-        scale = max(scale, abs(v[i]))
-        for j in range(m):
-            scale = max(scale, radius * abs(Q[i, j]))
+    largest = _largest(Q)
+    if not np.isfinite(largest):
+        return np.full(m, np.nan)
+    divisor, scale = 1.0, _scale(Q, v, radius, 1.0)
+    if largest > 0.0 and not 0.0 < scale < np.inf:
+        # γ|Q| is no number of double precision: the objective is divided by |Q|.
+        divisor, scale = largest, _scale(Q, v, radius, largest)
     if scale == 0.0:
         return _with_norm(tie.copy(), radius)
     A = np.empty((m, m))
     for i in range(m):
         for j in range(m):
             # Divided one by one: the inverse of a denormal scale is infinite.
-            A[i, j] = 0.5 * radius * (Q[i, j] / scale + Q[j, i] / scale)
+            A[i, j] = 0.5 * radius * (Q[i, j] / divisor / scale + Q[j, i] / divisor / scale)
     values, axes = np.linalg.eigh(A)
     w, preferred, gaps = np.zeros(m), np.zeros(m), np.zeros(m)
     largest = max(abs(values[0]), abs(values[m - 1]))
     top = 0.0
     for i in range(m):
         for j in range(m):
-            w[i] += axes[j, i] * (v[j] / scale)
+            w[i] += axes[j, i] * (v[j] / divisor / scale)
             preferred[i] += axes[j, i] * tie[j]
         # Eigenvalues that differ from the largest by rounding errors only count as equal to it.
         gaps[i] = values[m - 1] - values[i]
@@ -102,6 +105,27 @@ def sphere_maximizer(Q: Array, v: Array, radius: float, tie: Array) -> Array:
         for j in range(m):
             u[i] += axes[i, j] * unit[j]
     return _with_norm(u, radius)
+
+
+def _scale(Q: Array, v: Array, radius: float, divisor: float) -> float:
+    """Return the largest of |v| and γ|Q| in multiples of ``divisor``."""
+    scale = 0.0
+    for i in range(v.shape[0]):
+        scale = max(scale, abs(v[i]) / divisor)
+        for j in range(v.shape[0]):
+            scale = max(scale, radius * (abs(Q[i, j]) / divisor))
+    return scale
+
+
+def _largest(Q: Array) -> float:
+    """Return the largest |Q|, NaN if an entry is NaN."""
+    largest = 0.0
+    for i in range(Q.shape[0]):
+        for j in range(Q.shape[1]):
+            if np.isnan(Q[i, j]):
+                return np.nan
+            largest = max(largest, abs(Q[i, j]))
+    return largest
 
 
 def _easy_case(w: Array, gaps: Array, top: float) -> Array:

@@ -16,7 +16,7 @@ from dopt.policies.icem import ICEM
 from dopt.policies.lookahead import Lookahead
 from dopt.policies.multisine import Multisine
 from dopt.policies.oracle import Oracle
-from dopt.policies.periodic import Periodic
+from dopt.policies.periodic import Periodic, PeriodicSquare
 from dopt.policies.prbs import PRBS
 from dopt.policies.random import RandomGaussian, RandomHeld, RandomSphere
 from dopt.policies.search import Search
@@ -34,6 +34,7 @@ POLICIES: dict[str, type[Policy]] = {
         PRBS,
         Multisine,
         Chirp,
+        PeriodicSquare,
         Uniform,
         Periodic,
         DOptimal,
@@ -71,6 +72,7 @@ __all__ = [
     "Multisine",
     "Oracle",
     "Periodic",
+    "PeriodicSquare",
     "Policy",
     "RandomGaussian",
     "RandomHeld",

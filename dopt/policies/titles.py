@@ -13,6 +13,7 @@ TITLES: dict[str, str] = {
     "prbs": "PRBS",
     "multisine": "multisine",
     "chirp": "chirp",
+    "periodic_square": "periodic, square wave",
     "max": "ensemble disagreement",
     "gaussian_process": "Gaussian process",
     "gradient": "D-optimal, by gradient",

@@ -103,7 +103,8 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
     Q, v = problem
     finite = torch.cat([Q, v.unsqueeze(-1)], dim=-1).isfinite().all(-1).all(-1, keepdim=True)
     if v.shape[1] == 1:
-        chosen = gamma * torch.where(v == 0, ties, -v).sign()
+        up = (v < 0) | ((v == 0) & (ties > 0))
+        chosen = torch.where(up, gamma, -gamma).to(v)
     else:
         Q, v = torch.where(finite.unsqueeze(-1), Q, 0.0), torch.where(finite, v, 0.0)
         chosen = maximize_on_spheres(Q, v, gamma, ties)

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from dopt.evaluation import evaluation_set, reachable_states, simulate
+from dopt.policies import PeriodicSquare
 from dopt.randomness import draw
 from dopt.systems import SYSTEMS, Pendulum, Quadrotor
+from dopt.systems.equilibrium import eigenmode
 from tests.dopt.trials import trial
 
 NAMES = sorted(SYSTEMS)
@@ -33,6 +35,20 @@ def test_reachable_states_are_wider_than_what_white_noise_visits(name: str) -> N
     plane = list(spec.system.phase_plane)
     reached = reachable_states(spec.system)[:, plane]
     assert np.all(np.ptp(reached, axis=0) > np.ptp(white[:, plane], axis=0))
+
+
+@pytest.mark.parametrize("name", ["pendulum", "cartpole", "arm"])
+def test_the_reachable_set_has_states_that_the_square_wave_visits(name: str) -> None:
+    """One of its eight sequences is that of the policy, but for steps where the sine is zero."""
+    system = SYSTEMS[name]()
+    mode = eigenmode(system)
+    assert mode is not None
+    inputs = PeriodicSquare().inputs(system, np.random.default_rng(0))
+    inputs[np.sin(mode.frequency * system.dt * np.arange(len(inputs))) == 0.0] = 0.0
+    wave = simulate(system, inputs[:, None])[1:, 0]
+    reached = {state.tobytes() for state in reachable_states(system)}
+    shared = sum(state.tobytes() in reached for state in wave)
+    assert 0.05 * len(reached) < shared < 0.25 * len(reached)
 
 
 def test_a_pendulum_is_never_faster_than_its_terminal_speed() -> None:

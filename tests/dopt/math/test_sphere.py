@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dopt.errors import DoptError
-from dopt.math.sphere import maximize_on_sphere
+from dopt.math.sphere import maximize_on_sphere, sphere_maximizer
 
 TINIEST = 5e-324
 
@@ -204,6 +204,38 @@ def test_the_largest_numbers_are_no_obstacle(unit: float) -> None:
         unit * np.diag([1.0, 4.0]), unit * np.array([0.0, -1.0]), 10.0, np.ones(2)
     )
     assert u == pytest.approx([0.0, 10.0])
+
+
+@settings(max_examples=100)
+@given(problems(), st.integers(-900, 900), st.integers(-900, 900))
+@example((np.diag([1.0, 4.0]), np.zeros(2), 1.0, np.array([0.9, 0.1])), -700, -700)
+@example((np.diag([1.0, 4.0]), np.zeros(2), 1.0, np.array([0.9, 0.1])), 900, 900)
+def test_the_sizes_of_radius_and_objective_do_not_matter(
+    problem: tuple[np.ndarray, np.ndarray, float, np.ndarray], power: int, radius_power: int
+) -> None:
+    """Powers of two are exact: γ|Q| overflows or underflows with them, γQ : v does not change."""
+    Q, v, radius, tie = problem
+    c = 2.0**radius_power
+    large_Q, large_v = 2.0**power * Q, scaled(v, power + radius_power)
+    assume(np.array_equal(scaled(large_v, -power - radius_power), v))
+    assume(np.array_equal(large_Q / 2.0**power, Q))
+    plain = maximize_on_sphere(Q, v, radius, tie)
+    found = maximize_on_sphere(large_Q, large_v, c * radius, tie) / c
+    best, bound = value(Q, v, plain), 1e-12 * size(Q, v, radius)
+    assert value(Q, v, found) == pytest.approx(best, rel=0.0, abs=bound)
+
+
+def scaled(v: np.ndarray, power: int) -> np.ndarray:
+    """Return 2^power v, where a power of more than 1023 takes two steps."""
+    with np.errstate(over="ignore", under="ignore"):
+        return np.asarray(np.ldexp(v, power))
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.diag([1.0, np.nan]), np.diag([1.0, np.inf]), np.diag([-np.inf, 1.0])]
+)
+def test_the_compiled_solver_returns_no_input_for_what_is_not_finite(wrong: np.ndarray) -> None:
+    assert np.isnan(sphere_maximizer(wrong, np.array([0.0, 1.0]), 2.0, np.ones(2))).all()
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])

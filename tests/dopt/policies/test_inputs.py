@@ -95,6 +95,43 @@ def test_a_periodic_input_takes_another_frequency() -> None:
     assert np.abs(u[:, 0]) == pytest.approx(np.abs(3.0 * np.sin(5.0 * times)), abs=1e-12)
 
 
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm"])
+def test_the_square_wave_has_the_signs_of_the_sine_and_twice_its_energy(env: str) -> None:
+    sine, square = (open_loop(env, name, 4_000) for name in ("periodic", "periodic_square"))
+    assert np.linalg.norm(square, axis=1) == pytest.approx(3.0, rel=1e-12)
+    assert np.all((sine * square).sum(axis=1) >= 0.0)
+    along, size = (sine * square).sum(axis=1) / 3.0, np.linalg.norm(sine, axis=1)
+    assert along == pytest.approx(size, abs=1e-12)
+    energies = [(u**2).sum(axis=1).mean() for u in (sine, square)]
+    assert energies == pytest.approx([4.5, 9.0], rel=0.01)
+
+
+def test_the_square_wave_takes_another_frequency() -> None:
+    u = open_loop("pendulum", "periodic_square", 1_000, frequency=5.0)
+    signs = np.where(np.sin(5.0 * 0.02 * np.arange(1_000)) >= 0.0, 1.0, -1.0)
+    assert np.array_equal(np.abs(u[:, 0]), np.full(1_000, 3.0))
+    assert abs(float(signs @ u[:, 0])) == pytest.approx(3_000.0)
+
+
+@pytest.mark.parametrize(
+    ("policy", "env", "share"),
+    [
+        ("multisine", "pendulum", 1 / 3),
+        ("multisine", "arm", 1 / 3),
+        ("chirp", "pendulum", 0.5),
+        ("chirp", "arm", 1.0),
+        ("prbs", "arm", 1.0),
+        ("random_held", "arm", 1.0),
+    ],
+)
+def test_the_mean_square_of_inputs_is_the_stated_share(policy: str, env: str, share: float) -> None:
+    energies = [
+        (draw(trial(env, policy, seed, env={"horizon": 500, "gamma": 3.0})).inputs ** 2).sum(axis=1)
+        for seed in range(10)
+    ]
+    assert np.mean(energies) == pytest.approx(9.0 * share, rel=0.1)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_no_two_inputs_of_a_short_binary_sequence_are_the_same(seed: int) -> None:
     spec = trial("chain", "prbs", seed, env={"horizon": 30}, policy={"hold": 10})

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from dopt.declare.registry import build
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
-from dopt.systems import SYSTEMS, System, system_from_mapping
+from dopt.systems import SYSTEMS, Quadrotor, System, system_from_mapping
 from dopt.systems.equilibrium import euler_spectral_radius
 from tests.paths import CONF
 
@@ -35,6 +37,12 @@ def section_in(path: Path) -> dict[str, object]:
     )
 
 
+def comment_of(path: Path) -> str:
+    """Return the reasons that a file gives for its numbers, on one line."""
+    lines = [line.lstrip("# ") for line in path.read_text().splitlines() if line.startswith("#")]
+    return " ".join(lines)
+
+
 def system_in(path: Path) -> System:
     return system_from_mapping(section_in(path))
 
@@ -50,8 +58,47 @@ def test_every_field_of_a_system_is_shown_in_its_file(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
-def test_the_euler_map_creates_no_energy(path: Path) -> None:
+def test_the_euler_map_is_stable_at_rest(path: Path) -> None:
     assert euler_spectral_radius(system_in(path)) <= 1.0 + 1e-12
+
+
+@pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
+def test_the_spectral_radius_is_the_stated_one(path: Path) -> None:
+    stated = re.search(r"spectral radius (0\.\d+) at rest", comment_of(path))
+    if stated:
+        assert stated[1] == f"{euler_spectral_radius(system_in(path)):.3f}"
+
+
+@pytest.mark.parametrize(("name", "field"), [("chain", "friction"), ("cartpole", "pivot_friction")])
+def test_the_least_friction_of_a_stable_euler_map_is_the_stated_one(name: str, field: str) -> None:
+    (path,) = (one for one in ENVS if one.stem == name)
+    stated = re.search(r"takes (0\.\d+) at least", comment_of(path))
+    assert stated
+    bound, last_digit = float(stated[1]), 10.0 ** -(len(stated[1]) - 2)
+    radii = [
+        euler_spectral_radius(dataclasses.replace(system_in(path), **{field: friction}))
+        for friction in (bound - last_digit, bound)
+    ]
+    assert radii[0] > 1.0 + 1e-9
+    assert radii[1] <= 1.0 + 1e-12
+
+
+def test_the_thrust_of_the_quadrotor_is_the_stated_one() -> None:
+    """The bound is one of the norm of both thrusts: equal ones have the largest sum."""
+    (path,) = (one for one in ENVS if one.stem == "quadrotor")
+    system = system_in(path)
+    assert isinstance(system, Quadrotor)
+    thrust, weight = math.sqrt(2.0) * system.gamma, system.mass * system.gravity
+    fall, climb = (math.sqrt(force / system.drag) for force in (weight, thrust - weight))
+    change = system.dt * (thrust + weight) / system.mass
+    comment = comment_of(path)
+    for phrase in (
+        f"{system.gamma:.0f} N is the norm of the two thrusts, whose sum reaches {thrust:.1f} N",
+        f"weight of {weight:.0f} N",
+        f"terminal speeds of {fall:.1f} m/s in free fall and {climb:.1f} m/s in a climb",
+        f"change the speeds by at most {change:.2f} m/s in a step",
+    ):
+        assert phrase in comment
 
 
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)

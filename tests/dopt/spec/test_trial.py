@@ -229,3 +229,9 @@ def test_the_linear_model_also_goes_with_d_optimal_inputs() -> None:
     mapping: dict[str, Any] = spec.to_mapping()
     mixed = TrialSpec.from_mapping(mapping | {"policy": {"name": "d_optimal"}})
     assert mixed.columns()["width"] is None
+
+
+def test_the_key_of_a_stored_periodic_trial_stays() -> None:
+    """Its section has held these entries since the first release."""
+    spec = TrialSpec.from_names(env="pendulum", policy="periodic")
+    assert '"policy":{"frequency":null,"name":"periodic"}' in spec.canonical_json()

@@ -89,5 +89,5 @@ def test_the_arm_mode_is_a_normal_mode_driven_along_its_best_direction() -> None
     assert np.linalg.norm(mode.direction) == pytest.approx(1.0)
 
 
-def test_euler_steps_of_a_frictionless_pendulum_create_energy() -> None:
+def test_euler_steps_of_a_frictionless_pendulum_are_unstable_at_rest() -> None:
     assert euler_spectral_radius(Pendulum(friction=0.0)) > 1.0
