@@ -77,7 +77,7 @@ test-machines: setup  ## run grids on hosts that are lost and cut off, as root, 
 	$(BIN)/python -m pytest --numprocesses 2 -m machines tests/machines
 
 soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases
-	$(BIN)/python -m pytest -m soak tests/soak
+	PYTEST_DEBUG_TEMPROOT=$${TMPDIR:-/tmp} $(BIN)/python -m pytest -m soak tests/soak
 
 image: setup  ## build the image and run its services (root on Debian)
 	.ci/image
