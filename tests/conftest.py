@@ -10,7 +10,8 @@ import os
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
-import shutil  # noqa: E402  all of these after the threads are set
+import gc  # noqa: E402  all of these after the threads are set
+import shutil  # noqa: E402
 import signal  # noqa: E402
 import uuid  # noqa: E402
 from collections.abc import Iterator  # noqa: E402
@@ -53,6 +54,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.get_closest_marker("xdist_group") is None,
         )
     )
+
+
+def pytest_collection_finish() -> None:
+    """Let the collector of garbage pass over the modules and tests, which stay to the end."""
+    gc.freeze()
 
 
 @pytest.fixture
