@@ -20,9 +20,9 @@ export MKL_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-# One worker for each of two cores: tests with limits of seconds fail where more processes compete.
-# tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
-ALL := --numprocesses 2 --dist loadgroup --no-loadscope-reorder -m 'not soak and not machines and not image'
+# Three workers for two cores: a part of the tests waits, for leases, for processes and for Ray. More
+# would compete with tests that have limits of seconds. tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
+ALL := --numprocesses 3 --dist loadgroup --no-loadscope-reorder -m 'not soak and not machines and not image'
 # Tests of pure functions, of the configuration and of the architecture: no trial, no database server,
 # no cluster and no browser. Two files compile, or compose many grids, and are left to `make test`.
 FAST := tests/test_architecture.py tests/test_release.py tests/dopt/declare tests/dopt/math \
@@ -77,7 +77,7 @@ test-machines: setup  ## run grids on hosts that are lost and cut off, as root, 
 	$(BIN)/python -m pytest --numprocesses 2 -m machines tests/machines
 
 soak: setup  ## run thousands of short trials with a fault every few seconds, on both databases
-	$(BIN)/python -m pytest -m soak tests/soak
+	PYTEST_DEBUG_TEMPROOT=$${TMPDIR:-/tmp} $(BIN)/python -m pytest -m soak tests/soak
 
 image: setup  ## build the image and run its services (root on Debian)
 	.ci/image

@@ -10,7 +10,9 @@ import os
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
-import signal  # noqa: E402  all of these after the threads are set
+import gc  # noqa: E402  all of these after the threads are set
+import shutil  # noqa: E402
+import signal  # noqa: E402
 import uuid  # noqa: E402
 from collections.abc import Iterator  # noqa: E402
 from pathlib import Path  # noqa: E402
@@ -29,9 +31,16 @@ settings.register_profile(
 )
 settings.load_profile("suite")
 
-SERVER = os.environ.get(
-    "DOPT_TEST_POSTGRES", "postgresql+psycopg://postgres@127.0.0.1:5432/postgres"
-)
+RUNNING_SERVER = "postgresql+psycopg://postgres@127.0.0.1:5432/postgres"
+"""Server that is asked where none is named, and none can be started."""
+
+MEMORY = Path("/dev/shm")
+MEMORY_BYTES = 2 * 2**30
+
+# No test cuts the power: none needs what the disk, and not the kernel, holds of a database, and
+# SQLite waits for the disk at every commit.
+if os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MEMORY_BYTES:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -47,14 +56,37 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     )
 
 
+def pytest_collection_finish() -> None:
+    """Let the collector of garbage pass over the modules and tests, which stay to the end."""
+    gc.freeze()
+
+
 @pytest.fixture
 def sqlite_url(tmp_path: Path) -> str:
     return f"sqlite:///{tmp_path}/results/results.db"
 
 
 @pytest.fixture(scope="session")
-def server() -> Iterator[Engine]:
-    engine = create_engine(SERVER, connect_args={"connect_timeout": 3})
+def server_url() -> Iterator[str]:
+    """URL of the server that is named, or of one of our own, which does not wait for the disk."""
+    from tests.orchestrate.faults.servers import Server, binaries
+
+    named = os.environ.get("DOPT_TEST_POSTGRES")
+    try:
+        binaries()
+    except FileNotFoundError:
+        named = named or RUNNING_SERVER
+    if named:
+        yield named
+        return
+    server = Server()
+    yield server.url
+    server.remove()
+
+
+@pytest.fixture(scope="session")
+def server(server_url: str) -> Iterator[Engine]:
+    engine = create_engine(server_url, connect_args={"connect_timeout": 3})
     try:
         engine.connect().close()
     except OperationalError as error:
@@ -64,12 +96,12 @@ def server() -> Iterator[Engine]:
 
 
 @pytest.fixture
-def postgresql_url(server: Engine) -> Iterator[str]:
-    """URL of a new schema on a running server, dropped afterwards."""
+def postgresql_url(server: Engine, server_url: str) -> Iterator[str]:
+    """URL of a new schema on the server, dropped afterwards."""
     schema = f"test_{uuid.uuid4().hex}"
     with server.begin() as connection:
         connection.execute(text(f"CREATE SCHEMA {schema}"))
-    yield f"{SERVER}?options=-csearch_path%3D{schema}"
+    yield f"{server_url}?options=-csearch_path%3D{schema}"
     with server.begin() as connection:
         connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-from scipy import stats
 
 from analysis.data.config_matching import Candidate, choose
 from analysis.data.trial_selection import (
@@ -222,6 +221,8 @@ def _rate(successes: Array) -> Interval:
     known = successes[np.isfinite(successes)]
     if not len(known):
         return np.nan, np.nan, np.nan
+    from scipy import stats  # its import takes longer than most commands
+
     test = stats.binomtest(int(np.sum(known)), len(known))
     interval = test.proportion_ci(confidence_level=CONFIDENCE, method="wilson")
     return float(np.mean(known)), float(interval.low), float(interval.high)

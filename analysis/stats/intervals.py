@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
 Array = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.integer[Any]]
@@ -92,10 +91,17 @@ def band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
         nothing = np.full_like(middle, np.nan)
         return Band(middle, nothing, nothing, n)
     if statistic is Statistic.MEAN:
-        half = stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1) * standard_error(values)
+        half = student_quantile(n - 1) * standard_error(values)
         return Band(middle, middle - half, middle + half, n)
     low, high = _bootstrap(values, statistic)
     return Band(middle, low, high, n)
+
+
+def student_quantile(freedom: int) -> float:
+    """Return how many standard errors Student's two-sided interval reaches to each side."""
+    from scipy.special import stdtrit  # what scipy.stats calls, whose import takes longer
+
+    return float(stdtrit(freedom, 0.5 + CONFIDENCE / 2))
 
 
 def _bootstrap(values: Array, statistic: Statistic) -> tuple[Array, Array]:
@@ -152,6 +158,8 @@ def _draws(n: int) -> Counts:
 
 
 def _interquartile_mean(values: Array, axis: int) -> Array:
+    from scipy import stats
+
     return np.asarray(stats.trim_mean(values, 0.25, axis=axis))
 
 

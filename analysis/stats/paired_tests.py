@@ -1,4 +1,8 @@
-"""Paired comparison of two policies: same environment, same seeds, common random numbers."""
+"""Paired comparison of two policies: same environment, same seeds, common random numbers.
+
+The import of scipy.stats takes longer than most commands: it is done where a test or a bootstrap
+is made.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
 
-from analysis.stats.intervals import CONFIDENCE, standard_error
+from analysis.stats.intervals import CONFIDENCE, standard_error, student_quantile
 
 Array = npt.NDArray[np.float64]
 
@@ -85,8 +88,10 @@ def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, fl
     if np.ptp(values) == 0:
         return float(values[0]), float(values[0])
     if len(values) < FEWEST_BOOTSTRAP_PAIRS:
-        half = stats.t.ppf(0.5 + CONFIDENCE / 2, len(values) - 1) * float(standard_error(values))
+        half = student_quantile(len(values) - 1) * float(standard_error(values))
         return float(np.mean(values)) - half, float(np.mean(values)) + half
+    from scipy import stats
+
     found = stats.bootstrap(
         (values,), np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, rng=rng
     ).confidence_interval
@@ -97,6 +102,8 @@ def signed_rank(differences: Array) -> float:
     """Return the two-sided Wilcoxon signed-rank p of (n,); 1 when nothing differs."""
     if not np.any(differences):
         return 1.0
+    from scipy import stats
+
     return float(stats.wilcoxon(differences).pvalue)
 
 
@@ -106,6 +113,8 @@ def benjamini_hochberg(p_values: Sequence[float]) -> list[float]:
     tested = np.isfinite(p)
     adjusted = np.full(p.shape, np.nan)
     if tested.any():
+        from scipy import stats
+
         adjusted[tested] = stats.false_discovery_control(p[tested], method="bh")
     return [float(value) for value in adjusted]
 
@@ -170,4 +179,8 @@ def censored_median(steps: Array) -> float:
 
 def sign_test(wins: int, losses: int) -> float:
     """Return the two-sided p of the sign test; 1 when nothing differs."""
-    return float(stats.binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
+    if not wins + losses:
+        return 1.0
+    from scipy import stats
+
+    return float(stats.binomtest(wins, wins + losses).pvalue)

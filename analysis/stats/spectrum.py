@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
 
 Array = npt.NDArray[np.float64]
 
@@ -39,6 +38,8 @@ def periodogram(inputs: Array, dt: float) -> tuple[Array, Array]:
     Neither window nor detrending: the sum of S times the spacing of f is the mean square of u
     (Parseval).
     """
+    from scipy import signal  # its import takes longer than most commands
+
     frequency, density = signal.periodogram(
         inputs, fs=1 / dt, window="boxcar", detrend=False, scaling="density", axis=1
     )

@@ -15,7 +15,6 @@ from starlette.testclient import TestClient
 from analysis.serve.app import create_app
 from orchestrate.store import Reader
 from tests.analysis.browser import grids
-from tests.conftest import SERVER
 from tests.paths import ROOT
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ def postgresql_grid(request: pytest.FixtureRequest) -> Iterator[str]:
     schema = f"test_{uuid.uuid4().hex}"
     with server.begin() as connection:
         connection.execute(text(f"CREATE SCHEMA {schema}"))
-    url = f"{SERVER}?options=-csearch_path%3D{schema}"
+    url = f"{request.getfixturevalue('server_url')}?options=-csearch_path%3D{schema}"
     grids.mixed(url)
     yield url
     with server.begin() as connection:

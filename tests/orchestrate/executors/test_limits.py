@@ -101,7 +101,7 @@ def test_a_timeout_is_tried_again_only_when_asked(launches: Launches) -> None:
 
 def test_a_long_trial_of_the_kernel_heeds_its_limit() -> None:
     short, spec = (
-        trial("quadrotor", "d_optimal", env={"horizon": steps}, model={"width": 64})
+        trial("quadrotor", "d_optimal", env={"horizon": steps}, model={"width": 48})
         for steps in (2, 4000)
     )
     run_trial(short)  # what is compiled or loaded on first use is not part of the limit

@@ -33,6 +33,10 @@ class Server:
         self.start()
 
     @property
+    def url(self) -> str:
+        return f"postgresql+psycopg://{ACCOUNT}@127.0.0.1:{self.port}/postgres"
+
+    @property
     def _data(self) -> str:
         return str(self.folder / "data")
 
@@ -62,8 +66,7 @@ class Server:
         """Return the URL of a new, empty schema."""
         schema = f"lab_{uuid.uuid4().hex[:8]}"
         self.query(f"CREATE SCHEMA {schema}")
-        place = f"{ACCOUNT}@127.0.0.1:{self.port}/postgres"
-        return f"postgresql+psycopg://{place}?options=-csearch_path%3D{schema}"
+        return f"{self.url}?options=-csearch_path%3D{schema}"
 
     def query(self, sql: str) -> list[tuple[Any, ...]]:
         address = f"host=127.0.0.1 port={self.port} user={ACCOUNT} dbname=postgres"

@@ -27,7 +27,7 @@ PATIENCE_SECONDS = 200.0
 
 def words(url: str) -> list[str]:
     """Return the words of a grid of a policy and a network that only the reference runs."""
-    grid = ["--config-dir", str(EXAMPLE / "conf"), "-m", "env=boat", "env.horizon=30"]
+    grid = ["--config-dir", str(EXAMPLE / "conf"), "-m", "env=boat", "env.horizon=15"]
     return [
         *grid,
         "policy=curiosity",

@@ -21,7 +21,8 @@ from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, res
 
 # Forked from a process that has imported everything and opened nothing: starts in milliseconds.
 CLEAN = multiprocessing.get_context("forkserver")
-CLEAN.set_forkserver_preload(["pytest", "psycopg", "orchestrate.runner.launch", __name__])
+_LATER = ("llvmlite.binding", "numpy.random")  # a launch imports them on its way
+CLEAN.set_forkserver_preload(["pytest", "psycopg", "orchestrate.runner.launch", *_LATER, __name__])
 PATIENCE_SECONDS = 60.0
 NOBODY = 65534
 

@@ -21,7 +21,7 @@ from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import hear, running
 
 LEASE = 2.0
-LONG_LEASE = 4.0
+LONG_LEASE = 3.0
 
 
 @pytest.fixture
