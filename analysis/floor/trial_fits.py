@@ -82,13 +82,16 @@ def fit_trials(
 
     The fits run side by side in threads: compiled code leaves the interpreter free.
     """
-    with ThreadPoolExecutor(workers) as pool:
+    pool = ThreadPoolExecutor(workers)
+    try:
         fits = _Fits(pool, ridge)
         waiting = [(entry, list(_submit(reader, entry, fits))) for entry in selection.entries]
         rows = []
         for entry, trials in waiting:
             rows += [trial().row() for trial in trials]
             say(f"{entry.config.env}, {entry.label}: {len(trials)} trials fitted")
+    finally:  # after an interruption or an error nobody waits for what has not begun
+        pool.shutdown(cancel_futures=True)
     return pd.DataFrame(rows)
 
 

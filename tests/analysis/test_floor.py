@@ -195,7 +195,7 @@ def test_a_learner_that_is_better_than_the_offline_fit_is_drawn_to_the_left() ->
     assert isinstance(figure, Figure)
     xs = [line.get_xdata() for line in figure.axes[0].lines]
     assert any(np.allclose(x, (0.5, 0.4)) for x in xs if len(x) == 2)
-    assert "Of 1 trials a fit did not converge" in plot.caption(found, 1e-4)
+    assert "Trials of which a fit did not converge: 1." in plot.caption(found, 1e-4)
 
 
 def test_a_loss_of_zero_has_no_geometric_mean() -> None:

@@ -122,7 +122,7 @@ def caption(budgets: Sequence[Budget], ridge: float) -> str:
         for env in environments
     )
     unconverged = sum(budget.n_unconverged for budget in budgets)
-    fits = f" Of {unconverged} trials a fit did not converge." if unconverged else ""
+    fits = f" Trials of which a fit did not converge: {unconverged}." if unconverged else ""
     return (
         "Error budget: loss on the evaluation grid, on a logarithmic axis. Floor: the model of the "
         "trial fitted offline (damped Gauss-Newton to convergence, from its initial parameters, "
