@@ -19,6 +19,7 @@ from analysis.data.divergence import DivergenceRule
 from analysis.data.trial_selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.figures.loss_curves.data import Axis
+from analysis.floor import command as offline
 from analysis.outputs.registry import NAMES, build, partial_warning
 from analysis.plot_options import PlotOptions, Spread
 from analysis.report import command as report
@@ -79,7 +80,9 @@ def parser() -> Parser:
     compare.add_argument(
         "--measure", choices=list(Measure), default=Measure.FINAL, help="what a trial is judged by"
     )
-    for table in (summary, compare):
+    floor = _command(commands, "floor", _floor, offline.HELP, diverged=False)
+    offline.add_arguments(floor)
+    for table in (summary, compare, floor):
         table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
     for command in (figures, compare):
         command.add_argument(
@@ -93,7 +96,7 @@ def parser() -> Parser:
             metavar="POLICY",
             help=f"what all others are compared with ({REFERENCE}); with --group-by a value",
         )
-    for command in (figures, summary, compare):
+    for command in (figures, summary, compare, floor):
         command.add_argument(
             "--group-by",
             nargs="+",
@@ -122,6 +125,8 @@ def _command(
     name: str,
     run: object,
     help_text: str,
+    *,
+    diverged: bool = True,
 ) -> Parser:
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run)
@@ -135,12 +140,13 @@ def _command(
         metavar="PATH=VALUE",
         help="only configurations with this value, such as model.width=32",
     )
-    command.add_argument(
-        "--diverged",
-        choices=list(DivergenceRule),
-        default=DivergenceRule.EXCLUDE,
-        help="what a diverged trial counts as",
-    )
+    if diverged:
+        command.add_argument(
+            "--diverged",
+            choices=list(DivergenceRule),
+            default=DivergenceRule.EXCLUDE,
+            help="what a diverged trial counts as",
+        )
     command.add_argument("--allow-partial", action="store_true", help="go on without the missing")
     return command
 
@@ -203,6 +209,12 @@ def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) 
     kind = comparison(options.column, Measure(options.measure))
     plot_options = PlotOptions(DivergenceRule(options.diverged), epsilon=options.epsilon)
     return _print_table(kind, reader, selection, plot_options, options.format)
+
+
+def _floor(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    text_table, table = offline.run(reader, selection, options)
+    sys.stdout.write(_text(text_table, table, options.format))
+    return 0
 
 
 def _print_table(

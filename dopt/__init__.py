@@ -15,6 +15,7 @@ shows the equations, units and defaults of one.
 
 ======================  ========================================================================
 ``run_trial``           run one trial, in compiled code where there is some for its parts
+``fit_offline``         fit the model of a trial to samples, all at once
 ``TrialSpec``           one trial: system, policy, model, learner and seed
 ``TrialResult``         losses, states, inputs and model parameters of one trial
 ``SYSTEMS``             physical systems by name
@@ -34,6 +35,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from dopt.learning import LEARNERS as LEARNERS
     from dopt.models import MODELS as MODELS
+    from dopt.offline_fit import fit_offline as fit_offline
     from dopt.policies import POLICIES as POLICIES
     from dopt.result import TrialResult as TrialResult
     from dopt.run import run_trial as run_trial
@@ -50,6 +52,7 @@ __all__ = [
     "TrialResult",
     "TrialSpec",
     "__version__",
+    "fit_offline",
     "run_trial",
 ]
 
@@ -60,6 +63,7 @@ _MODULES = {
     "SYSTEMS": "dopt.systems",
     "TrialResult": "dopt.result",
     "TrialSpec": "dopt.spec.trial",
+    "fit_offline": "dopt.offline_fit",
     "run_trial": "dopt.run",
 }
 

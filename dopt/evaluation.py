@@ -56,13 +56,23 @@ def evaluation_set(system: System) -> EvaluationSet:
 
 def _held_out(system: BlackBox) -> EvaluationSet:
     """Return transitions of runs that no trial sees, with fixed seeds."""
-    rng, wanted = np.random.default_rng(_SEED), math.prod(system.grid_points)
-    rounds = math.ceil(2 * wanted / (len(HELD_STEPS) * system.horizon))
-    held = [sequence for _ in range(rounds) for sequence in _held(system, rng)]
-    grid = _sampled(system, held, wanted, rng)
+    rng = np.random.default_rng(_SEED)
+    grid = random_transitions(system, math.prod(system.grid_points), rng)
     waves = _sampled(system, _waves(system), REACHABLE_POINTS, rng)
     states, accelerations = (np.concatenate(parts) for parts in zip(grid, waves, strict=True))
     return EvaluationSet(states, accelerations, len(grid[0]))
+
+
+def random_transitions(
+    system: BlackBox, wanted: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return states (N, d) and accelerations (N, r) of at most the wanted transitions.
+
+    They are drawn without replacement from runs under random inputs of the strength of a trial's.
+    """
+    rounds = math.ceil(2 * wanted / (len(HELD_STEPS) * system.horizon))
+    held = [sequence for _ in range(rounds) for sequence in _held(system, rng)]
+    return _sampled(system, held, wanted, rng)
 
 
 def _sampled(

@@ -33,8 +33,9 @@ _STREAMS = {
     "control_plans": 8,
     "replay": 9,
     "environment": 10,
-    "sampled_plans": 11,
-    "sampled_parameters": 12,
+    "sampled_plans": 12,
+    "sampled_parameters": 13,
+    "uniform_states": 11,
 }
 
 
@@ -85,10 +86,9 @@ def draw(spec: TrialSpec) -> Draws:
         inputs = _open_loop(policy, system, stream(seed, "inputs"))
     else:
         inputs = on_sphere(stream(seed, "inputs").standard_normal(sphere), system.gamma)
-    noise = stream(seed, "noise").standard_normal((system.horizon, system.n_states))
     return Draws(
-        noise=np.sqrt(system.dt) * system.noise * noise,
-        weights=spec.model.initial_parameters(system, stream(seed, "weights")),
+        noise=process_noise(system, seed),
+        weights=initial_weights(spec),
         inputs=np.ascontiguousarray(inputs),
         components=stream(seed, "components").integers(system.n_learned, size=system.horizon),
         ties=on_sphere(stream(seed, "ties").standard_normal(sphere), 1.0),
@@ -110,6 +110,18 @@ def _parameters(spec: TrialSpec) -> Array:
         q = spec.model.n_parameters(spec.system)
         return spec.policy.draw_parameters(q, stream(spec.seed, "sampled_parameters"))
     return np.zeros((0, 0))
+
+
+def process_noise(system: System, seed: int) -> Array:
+    """Return w_t of equation 2, (T, d), variance dt σ²."""
+    noise = stream(seed, "noise").standard_normal((system.horizon, system.n_states))
+    scaled: Array = np.sqrt(system.dt) * system.noise * noise
+    return scaled
+
+
+def initial_weights(spec: TrialSpec) -> Array:
+    """Return the initial parameters of the model of a trial, (q,)."""
+    return spec.model.initial_parameters(spec.system, stream(spec.seed, "weights"))
 
 
 def _open_loop(policy: OpenLoop, system: System, rng: np.random.Generator) -> Array:

@@ -201,7 +201,8 @@ def test_every_figure_has_a_line_and_a_command_that_draws_it() -> None:
 def test_every_command_of_the_analysis_works(
     command: Command, typed: Callable[[Command], str]
 ) -> None:
-    extra = {"animate": ("--frames", "2"), "summary": (), "compare": (), "report": ()}
+    extra = {"animate": ("--frames", "2"), "floor": ("--where", "model.width=16")}
+    extra |= {"summary": (), "compare": (), "report": ()}
     if command.words[0] == "serve":  # which does not end; its own tests start it
         assert cli.parser().read(command.words)
     else:

@@ -62,6 +62,15 @@ def errors_of(
 
 
 @compiled
+def write_products(
+    network: Network, theta: Vector, inputs: Matrix, hidden: Matrix, weights: Matrix, out: Vector
+) -> None:
+    """Write Jᵀv, (q,), for v (r, N), given the activations of :func:`errors_of`."""
+    signals = nn.batch_back_signals(network, theta, hidden, weights.shape[0], inputs.shape[1])
+    _write_slope(network, _completed(network, inputs, hidden), signals, weights, out)
+
+
+@compiled
 def _completed(network: Network, inputs: Matrix, hidden: Matrix) -> Stack:
     """Return the activations below every layer and a row of ones, (L + 1, units + 1, N)."""
     depth, width, n = network.offsets.shape[0] - 1, network.sizes[1], inputs.shape[1]

@@ -1,0 +1,1 @@
+"""Error budgets of systems: floor, exploration and learner."""

@@ -1,0 +1,112 @@
+"""``python -m analysis floor``: offline fits of stored trials, and the error budgets from them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from analysis.data import provenance
+from analysis.data.trial_selection import Selection
+from analysis.errors import AnalysisError
+from analysis.figures.error_budget import plot
+from analysis.figures.error_budget.data import Budget, budgets, tabulate
+from analysis.figures.style import styled
+from analysis.floor.trial_fits import fit_trials, with_offline_fit
+from analysis.outputs import publish
+from analysis.outputs.registry import partial_warning
+from analysis.tables.error_budget import budget_table
+from analysis.tables.rendering import TextTable
+from analysis.units import loss_unit
+from dopt.offline_fit import RIDGE
+from dopt.systems import system_from_mapping
+from orchestrate.store import Reader
+
+HELP = "fit the models of stored trials offline: how much exploration and learner lose"
+NAME = "error_budget"
+TRIALS = f"{NAME}_trials"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that only this command has."""
+    parser.add_argument("--out", type=Path, default=Path("floor"), help="folder (floor/)")
+    parser.add_argument(
+        "--ridge",
+        type=float,
+        default=RIDGE,
+        help=f"weight that draws a fit to the initial parameters ({RIDGE:g})",
+    )
+    parser.add_argument(
+        "--workers", type=int, default=_cores(), help="fits at a time (one for each core)"
+    )
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def run(
+    reader: Reader, selection: Selection, options: argparse.Namespace
+) -> tuple[TextTable, pd.DataFrame]:
+    """Fit, write the picture, the CSV files and the provenance; return the table of budgets."""
+    if options.workers < 1:
+        raise AnalysisError(
+            f"--workers is {options.workers}, but at least 1 is expected: raise it."
+        )
+    fitted = with_offline_fit(selection)
+    for note in fitted.notes[len(selection.notes) :]:
+        _progress(f"note: {note}")
+    trials = fit_trials(reader, fitted, options.ridge, options.workers, _progress)
+    if trials.empty:
+        raise AnalysisError(
+            "Every selected trial diverged, but an error budget needs some that did not: run "
+            "others, or ask for more."
+        )
+    found = budgets(trials)
+    request = {"ridge": options.ridge}
+    facts = provenance.describe(reader, fitted) | {"request": request, "name": NAME}
+    options.out.mkdir(parents=True, exist_ok=True)
+    publish.write_table(trials, options.out, TRIALS)
+    facts |= _draw(found, fitted, options, facts)
+    table = tabulate(found)
+    publish.write_table(table, options.out, NAME)
+    publish.write_provenance(facts, options.out, NAME)
+    _progress(f"{options.out / NAME}: written")
+    return budget_table(table), table
+
+
+def _draw(
+    found: tuple[Budget, ...],
+    selection: Selection,
+    options: argparse.Namespace,
+    facts: Mapping[str, Any],
+) -> dict[str, str]:
+    """Write the picture and its caption; return what the provenance says of them."""
+    mark = publish.fingerprint({key: facts[key] for key in ("selection", "request", "versions")})
+    warning = partial_warning(selection) if selection.gaps else ""
+    with styled():
+        figure = plot.draw(found, _units(selection))
+        if warning:
+            figure.suptitle(warning, fontsize=8, color="#b00020", weight="bold")
+        publish.write_pictures(figure, options.out, NAME, plot.TITLE, mark)
+    caption = f"{warning} {plot.caption(found, options.ridge)}".strip()
+    publish.write_text(caption + "\n", options.out / f"{NAME}.txt")
+    words = {"title": plot.TITLE, "statistic": plot.STATISTIC, "band": plot.BAND}
+    return words | {"caption": caption, "fingerprint": mark}
+
+
+def _units(selection: Selection) -> dict[str, str]:
+    """Return the unit of the loss by environment."""
+    return {
+        entry.config.env: loss_unit(system_from_mapping(entry.config.config["env"]))
+        for entry in selection.entries
+    }
+
+
+def _progress(text: str) -> None:
+    sys.stderr.write(f"{text}\n")  # the output may be a CSV

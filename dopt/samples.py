@@ -1,0 +1,65 @@
+"""Samples to which a model can be fitted: drawn over the evaluation box, or recorded by a trial."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.evaluation import random_transitions
+from dopt.randomness import process_noise, stream
+from dopt.spec.trial import TrialSpec
+from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """States and the accelerations that were observed there.
+
+    Attributes
+    ----------
+    states : (N, d)
+    accelerations : (N, r)
+        Per second what the learned rows of the state are measured in, noise included.
+    """
+
+    states: Array
+    accelerations: Array
+
+
+def uniform_samples(spec: TrialSpec) -> Samples:
+    """Return as many samples as a trial has steps, at states drawn uniformly from its grid's box.
+
+    The noise is that of the trial, w_t of equation 2. One step from a state x under any input is
+    observed as y = a(x) + w/dt in the learned rows: the known part, and with it the input, cancels.
+    State components without an axis in the grid are zero, as they are there. Of a system that
+    changes, the accelerations are those of the last step, by which the final loss is judged.
+
+    A black box cannot be put into a state. Its samples are transitions under random inputs, as
+    those of its loss are, from runs of other inputs; there may be fewer.
+    """
+    system, rng = spec.system, stream(spec.seed, "uniform_states")
+    if isinstance(system, BlackBox):
+        return Samples(*random_transitions(system, system.horizon, rng))
+    states = np.zeros((system.horizon, system.n_states))
+    for index, (low, high) in system.grid_box().items():
+        states[:, index] = rng.uniform(low, high, system.horizon)
+    noise = process_noise(system, spec.seed)[:, list(system.learned_rows)] / system.dt
+    return Samples(states, system.learned(states, system.horizon - 1) + noise)
+
+
+def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
+    """Return the samples of a trial, from its states (T + 1, d) and inputs (T, m).
+
+    The observed accelerations are those that its learner was given: (x_{t+1} - x_t)/dt less the
+    known part at x_t and u_t, in the learned rows.
+    """
+    before, after = states[:-1], states[1:]
+    known = system.known(tuple(before.T), tuple(inputs.T), system.parameters)
+    flow = np.stack(np.broadcast_arrays(*known, before[:, 0])[:-1], axis=-1)
+    observed = (after - before) / system.dt - flow
+    return Samples(before, observed[:, list(system.learned_rows)])
