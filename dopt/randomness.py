@@ -33,9 +33,9 @@ _STREAMS = {
     "control_plans": 8,
     "replay": 9,
     "environment": 10,
+    "uniform_states": 11,
     "sampled_plans": 12,
     "sampled_parameters": 13,
-    "uniform_states": 11,
 }
 
 
