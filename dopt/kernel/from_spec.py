@@ -12,7 +12,7 @@ from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
-from dopt.kernel.information import absent, dual, primal_linear, primal_network, sketch
+from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
 from dopt.learning import Learner
 from dopt.learning.base import CompiledLearner
@@ -24,7 +24,7 @@ from dopt.policies.d_optimal import count_sketch
 from dopt.policies.search import score_code
 from dopt.policies.task_states import task_states
 from dopt.spec.config import TrialConfig
-from dopt.spec.information_form import Information, held_information
+from dopt.spec.information_form import Information, held_information, is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Vector
@@ -96,6 +96,8 @@ def information_of(config: TrialConfig) -> args.Information:
     if not isinstance(config.policy, InformationPolicy):
         return args.Information(absent.add_rows, absent.planning_forms)
     module = primal_linear if isinstance(config.model, Linear) else MODULES[Form(_form(config))]
+    if is_fresh(config.policy):
+        module = fresh  # which goes with a network and the primal form
     return args.Information(
         absent.add_rows if config.learner.updates_information else module.add_rows,
         absent.planning_forms if isinstance(config.policy, Search) else module.planning_forms,
@@ -150,6 +152,7 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
         np.zeros(len(weights)),
         np.zeros(len(weights)),
         *_information(spec, len(weights)),
+        _visited(spec),
         np.zeros((len(system.features), window)),
         np.zeros((system.n_learned, window)),
         *(
@@ -191,6 +194,19 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, args.Dual, a
         np.zeros(1, dtype=np.int64),
     )
     return covariance, rows, args.Sketch(*projection, size)
+
+
+def _visited(spec: TrialSpec) -> args.Visited:
+    """Return the empty store of states; it has no room where information is accumulated."""
+    places, refresh_every = 0, 1
+    if is_fresh(spec.policy):
+        places, refresh_every = spec.system.horizon, spec.policy.refresh_every
+    return args.Visited(
+        np.empty((len(spec.system.features), places)),
+        np.zeros(1, dtype=np.int64),
+        refresh_every,
+        _regularization(spec.config),
+    )
 
 
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:

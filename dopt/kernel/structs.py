@@ -132,6 +132,18 @@ class Sketch(NamedTuple):
     size: int
 
 
+class Visited(NamedTuple):
+    """States visited, for fresh information (:mod:`dopt.kernel.information.fresh`).
+
+    Empty where information is accumulated.
+    """
+
+    features: Matrix  # (p, T) at the states, of which n_states are filled
+    n_states: Integers  # (1,)
+    refresh_every: int  # steps
+    regularization: float  # λ of M₀ = λI
+
+
 class Linearization(NamedTuple):
     """Passes of the network at one state for one component, and along m directions."""
 
@@ -153,6 +165,7 @@ class State(NamedTuple):
     covariance: Covariance
     dual: Dual
     sketch: Sketch
+    visited: Visited
     window_features: Matrix  # (p, window) newest samples, a ring
     window_targets: Matrix  # (r, window)
     policy_memory: Vector  # what a compiled policy of a user's own keeps

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 from dopt.learning import InformationLearner, Learner
 from dopt.policies import InformationPolicy, Policy
@@ -36,3 +36,8 @@ def held_information(
         form = "primal" if sharing else policy.chosen_form(n_parameters, n_rows)
         return Information(form, policy.regularization)
     return Information("primal", sharing.regularization) if sharing else None
+
+
+def is_fresh(policy: Policy) -> TypeGuard[InformationPolicy]:
+    """Tell whether M is summed from the rows of all states at the present parameters."""
+    return isinstance(policy, InformationPolicy) and policy.information == "fresh"
