@@ -107,7 +107,7 @@ def information_of(config: TrialConfig) -> args.Information:
 def _search(config: TrialConfig) -> args.Search:
     """Return the plans of a policy that searches."""
     policy, system, q = config.policy, config.system, config.model.n_parameters(config.system)
-    steps, score = 0, Score.JOINT
+    steps, score, held = 0, Score.JOINT, _held(config)
     candidates = np.zeros((0, system.n_inputs))
     if isinstance(policy, Search):
         steps, score = policy.steps(system), score_code(policy)
@@ -125,6 +125,7 @@ def _search(config: TrialConfig) -> args.Search:
         states,
         policy.starts(q, system.n_learned) if isinstance(policy, EOptimal) else np.zeros((0, q)),
         policy.subspace if isinstance(policy, EOptimal) else 0,
+        held.noise_variance**-0.5 if held else 1.0,
     )
 
 

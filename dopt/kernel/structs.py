@@ -60,6 +60,7 @@ class Search(NamedTuple):
     task_states: Matrix  # (n, d)
     starts: Matrix  # (b, q) of the Krylov space
     subspace: int
+    row_scale: float  # 1/√ρ, by which the rows of a path are multiplied: a sample adds JᵀJ/ρ to M
 
 
 class Algorithm(NamedTuple):

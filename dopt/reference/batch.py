@@ -75,7 +75,8 @@ class Lockstep(BatchState):
             )
         given = (self.system, self.model, self.theta, self.information, x)
         if isinstance(policy, Search):
-            return searched_inputs(policy, *given, self.ties[:, t])
+            assert self.held is not None
+            return searched_inputs(policy, *given, self.ties[:, t], self.held.noise_variance)
         components = self.components[:, t : t + 1]
         if isinstance(policy, TraceLinearized):
             components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)

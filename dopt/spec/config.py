@@ -13,10 +13,10 @@ from dopt.control import Control
 from dopt.declare.registry import identifying_section, section_of
 from dopt.declare.validated_fields import Validated
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
-from dopt.learning import LEARNERS, Learner
+from dopt.learning import LEARNERS, InformationLearner, Learner
 from dopt.learning.base import CompiledLearner, CustomLearner
 from dopt.models import Model
-from dopt.policies import POLICIES, Policy, Search
+from dopt.policies import POLICIES, GradientDOptimal, Policy, Search
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop
 from dopt.spec.compatibility import check_together, mismatch
 from dopt.spec.custom_system_check import check_system
@@ -31,7 +31,10 @@ CODE_VERSION = 1
 ASSESSMENT_VERSION = 2
 """Raised whenever one changes the numbers of an assessment alone: for trials that have a task."""
 
-_VERSIONS = ("code_version", "assessment_version")
+CRITERION_VERSION = 2
+"""Raised whenever one changes the plans of searches with a noise variance ρ ≠ 1 alone."""
+
+_VERSIONS = ("code_version", "assessment_version", "criterion_version")
 
 LARGEST_HORIZON = 10_000_000
 """A trial is committed whole, one row for each step."""
@@ -172,7 +175,16 @@ class TrialConfig:
         if self.task is not None:
             content["task"] = written(self.task)
             content["assessment_version"] = ASSESSMENT_VERSION
+        if self._scales_criterion():
+            content["criterion_version"] = CRITERION_VERSION
         return content
+
+    def _scales_criterion(self) -> bool:
+        """Tell whether plans are compared by a criterion that depends on ρ, and ρ is not 1."""
+        if not isinstance(self.policy, (Search, GradientDOptimal)):
+            return False
+        learner = self.learner
+        return isinstance(learner, InformationLearner) and learner.noise_variance != 1.0
 
     @functools.cached_property
     def key(self) -> str:

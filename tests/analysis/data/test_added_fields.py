@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from analysis.__main__ import main
 from analysis.data.config_matching import Filter, defaults, nearness
-from analysis.data.trial_selection import select
+from analysis.data.trial_selection import newest, select
 from analysis.errors import AnalysisError
 from analysis.tables.comparisons import compare_policies
 from dopt.spec.trial import TrialSpec
@@ -109,3 +110,17 @@ def test_a_stored_configuration_gives_back_its_trial(stored: Reader) -> None:
     for config in stored.configs():
         content = {k: v for k, v in config.config.items() if k != "code_version"}
         assert TrialSpec.from_mapping(content).config_key == config.config_key
+
+
+def test_a_new_criterion_replaces_the_old_one_of_the_same_configuration(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    noisy = {"learner": {"name": "ekf", "noise_variance": 0.5}}
+    fill(url, make_grid(("pendulum",), ("exact", "d_optimal"), range(2), **SHORT, **noisy))
+    with Reader.open(url) as reader:
+        configs = reader.configs()
+    exact = next(config for config in configs if config.policy == "exact")
+    content = {k: v for k, v in exact.config.items() if k != "criterion_version"}
+    assert len(content) == len(exact.config) - 1
+    old = type(exact)(**{**vars(exact), "config": json.loads(json.dumps(content))})
+    assert newest([*configs, old]) == configs
+    assert newest([old]) == [old]
