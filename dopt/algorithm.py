@@ -52,6 +52,9 @@ SMALLEST_SHARE = 1.0 / 64.0
 NO_GROWTH = 1.0 + 1e-10
 """Growth of a sum of squares that counts as none: at its minimum rounding must not decide."""
 
+DOMAIN_MARGIN = 0.25
+"""Half-widths beyond the box at which a row of a state counts e^(-1/2) times."""
+
 SPREAD_KEPT = 0.1
 """Share of the mean and the spread of one iteration of the cross-entropy method in the next."""
 

@@ -16,6 +16,7 @@ from analysis.serve.query_params import QueryParams, truncated
 from analysis.serve.state import ServerState
 from analysis.stats.spectrum import periodogram
 from dopt.errors import SpecificationError
+from dopt.spec.added_fields import completed
 from dopt.spec.label import flatten
 from dopt.systems import System, system_from_mapping
 from dopt.systems.equilibrium import eigenmode
@@ -49,7 +50,7 @@ def trial(state: ServerState, params: QueryParams) -> dict[str, Any]:
     """Return everything that is stored of a trial except its arrays, see ``arrays``."""
     reader = state.database.reader()
     row = _row(reader, params)
-    config = json.loads(row.pop("config_json"))
+    config = completed(json.loads(row.pop("config_json")))
     return {
         "progress": read_progress(reader),
         "trial": row,

@@ -42,7 +42,10 @@ class KernelPart(KernelSupport):
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of most parts, the fields are enough
         """Return the numbers that the function takes, for q parameters and λ of M₀ = λI.
 
-        They are the numeric fields in the order of their declaration, base classes first.
+        They are the numeric fields in the order of their declaration, base classes first. Added
+        fields (:func:`dopt.declare.validated_fields.parameter`) are left out: the numbers of a
+        class that is derived from theirs keep their places.
         """
-        values = (getattr(self, field.name) for field in dataclasses.fields(self))
+        fields = [field for field in dataclasses.fields(self) if not field.metadata.get("added")]
+        values = (getattr(self, field.name) for field in fields)
         return tuple(float(value) for value in values if isinstance(value, (bool, int, float)))

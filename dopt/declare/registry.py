@@ -58,6 +58,24 @@ def section_of(item: Validated) -> dict[str, object]:
     return {"name": getattr(item, "name", None), **_origin(type(item)), **listed}
 
 
+def identifying_section(item: Validated) -> dict[str, object]:
+    """Return the section without the added fields that have their default.
+
+    It is what a trial's key is made of: :func:`section_of` as it was before the fields were added.
+    """
+    section, added = section_of(item), added_defaults(type(item))
+    return {key: v for key, v in section.items() if key not in added or v != added[key]}
+
+
+def added_defaults(cls: type[Validated]) -> dict[str, object]:
+    """Return the defaults of the fields of a class that were added after trials were stored."""
+    added = [field for field in dataclasses.fields(cls) if field.metadata.get("added")]
+    return {
+        field.name: list(field.default) if isinstance(field.default, tuple) else field.default
+        for field in added
+    }
+
+
 def name_of(given: Mapping[str, object]) -> str:
     """Return how a section is called in a message: its name, or its class where it gives none."""
     return str(given.get("name") or given.get(TARGET))

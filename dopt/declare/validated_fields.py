@@ -48,6 +48,7 @@ def parameter(
     *,
     size: int | None = None,
     choices: tuple[str, ...] = (),
+    added: bool = False,
 ) -> Any:
     """Declare a field with a unit and a bound.
 
@@ -63,10 +64,13 @@ def parameter(
         Number of entries that a tuple has to have.
     choices : tuple of str
         Valid texts, all if empty.
+    added : bool
+        Whether trials were stored before the field existed. Where it has its default it is then
+        left out of what a trial's key is made of, so that the keys of stored trials stay; a
+        stored configuration without the field has its default. It is no kernel number either.
     """
-    return dataclasses.field(
-        default=default, metadata={"unit": unit, "bound": bound, "size": size, "choices": choices}
-    )
+    about = {"unit": unit, "bound": bound, "size": size, "choices": choices, "added": added}
+    return dataclasses.field(default=default, metadata=about)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
-from dopt.kernel.information import absent, dual, primal_linear, primal_network, sketch
+from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
 from dopt.learning import GaussNewton, Learner
 from dopt.models import MLP, Linear
@@ -28,9 +28,9 @@ from dopt.policies import (
 )
 from dopt.policies.d_optimal import count_sketch
 from dopt.policies.search import score_code
-from dopt.policies.task_states import box_states, task_states
+from dopt.policies.task_states import box_states, domain_box, task_states
 from dopt.spec.config import TrialConfig
-from dopt.spec.information_form import Information, held_information
+from dopt.spec.information_form import Information, held_information, is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Matrix, Vector
@@ -102,6 +102,8 @@ def information_of(config: TrialConfig) -> args.Information:
     if not isinstance(config.policy, InformationPolicy):
         return args.Information(absent.add_rows, absent.planning_forms)
     module = primal_linear if isinstance(config.model, Linear) else MODULES[Form(_form(config))]
+    if is_fresh(config.policy):
+        module = fresh  # which goes with a network and the primal form
     searches = isinstance(config.policy, (Search, ICEM))
     return args.Information(
         absent.add_rows if config.learner.updates_information else module.add_rows,
@@ -112,7 +114,7 @@ def information_of(config: TrialConfig) -> args.Information:
 def _search(config: TrialConfig) -> args.Search:
     """Return the plans of a policy that searches."""
     policy, system, q = config.policy, config.system, config.model.n_parameters(config.system)
-    steps, score = 0, Score.JOINT
+    steps, score, held = 0, Score.JOINT, _held(config)
     candidates = np.zeros((0, system.n_inputs))
     if isinstance(policy, Search):
         steps, score = policy.steps(system), score_code(policy)
@@ -130,8 +132,10 @@ def _search(config: TrialConfig) -> args.Search:
         policy.stride_of(system) if isinstance(policy, Lookahead) else 1,
         policy.budget_us if isinstance(policy, Search) else 0.0,
         states,
+        domain_box(system, everywhere=not (isinstance(policy, ICEM) and policy.domain == "box")),
         policy.starts(q, system.n_learned) if isinstance(policy, EOptimal) else np.zeros((0, q)),
         policy.subspace if isinstance(policy, EOptimal) else 0,
+        held.noise_variance**-0.5 if held else 1.0,
     )
 
 
@@ -159,6 +163,7 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
         np.zeros(len(weights)),
         np.zeros(len(weights)),
         *_information(spec, len(weights)),
+        _visited(spec),
         np.zeros((len(system.features), window)),
         np.zeros((system.n_learned, window)),
         *(np.zeros(part.memory_size(system, len(weights))) for part in (spec.policy, spec.learner)),
@@ -204,6 +209,19 @@ def _needs_inverse(config: TrialConfig) -> bool:
 def _is_fitted(learner: Learner) -> bool:
     """Tell whether a learner makes M anew at each step."""
     return isinstance(learner, GaussNewton) and learner.refit_every == 1
+
+
+def _visited(spec: TrialSpec) -> args.Visited:
+    """Return the empty store of states; it has no room where information is accumulated."""
+    places, refresh_every = 0, 1
+    if is_fresh(spec.policy):
+        places, refresh_every = spec.system.horizon, spec.policy.refresh_every
+    return args.Visited(
+        np.empty((len(spec.system.features), places)),
+        np.zeros(1, dtype=np.int64),
+        refresh_every,
+        _regularization(spec.config),
+    )
 
 
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:

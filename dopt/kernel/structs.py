@@ -58,8 +58,10 @@ class Search(NamedTuple):
     stride: int
     budget_us: float
     task_states: Matrix  # (n, d)
+    domain: Matrix  # (2, d), half-widths of the box in which rows count, and periods (0: none)
     starts: Matrix  # (b, q) of the Krylov space
     subspace: int
+    row_scale: float  # 1/√ρ, by which the rows of a path are multiplied: a sample adds JᵀJ/ρ to M
 
 
 class Algorithm(NamedTuple):
@@ -134,6 +136,18 @@ class Sketch(NamedTuple):
     size: int
 
 
+class Visited(NamedTuple):
+    """States visited, for fresh information (:mod:`dopt.kernel.information.fresh`).
+
+    Empty where information is accumulated.
+    """
+
+    features: Matrix  # (p, T) at the states, of which n_states are filled
+    n_states: Integers  # (1,)
+    refresh_every: int  # steps
+    regularization: float  # λ of M₀ = λI
+
+
 class Linearization(NamedTuple):
     """Passes of the network at one state for one component, and along m directions."""
 
@@ -156,6 +170,7 @@ class State(NamedTuple):
     factor: Matrix  # (q, q), the Cholesky factor of M of a learner that leaves it in place of M⁻¹
     dual: Dual
     sketch: Sketch
+    visited: Visited
     window_features: Matrix  # (p, window) newest samples, a ring
     window_targets: Matrix  # (r, window)
     policy_memory: Vector  # what a compiled policy of a user's own keeps

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from dopt.kernel.cache import completed
 from dopt.kernel.equations import compiled_equations
-from dopt.kernel.information import absent, dual, primal_linear, primal_network, sketch
+from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.pointers import compile_information, compiled_at, compiled_loop, signatures
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.structs import Information
@@ -92,7 +92,8 @@ class Choices(NamedTuple):
 
     def n_parts(self) -> int:
         """Return how many parts they are, with the loop and the equations of every system."""
-        return 1 + len(SYSTEMS) + len(self.plans) + len(self.learns) + 2 * len(self.forms)
+        functions = {one for form in self.forms for one in (form.add_rows, form.planning_forms)}
+        return 1 + len(SYSTEMS) + len(self.plans) + len(self.learns) + len(functions)
 
 
 def choices(everything: bool) -> Choices:
@@ -102,7 +103,7 @@ def choices(everything: bool) -> Choices:
     return Choices(
         sorted({policy.kernel_function for policy in POLICIES.values() if policy.compiled}),
         sorted({learner.kernel_function for learner in LEARNERS.values() if learner.compiled}),
-        [absent, primal_network, primal_linear, dual, sketch],
+        [absent, primal_network, primal_linear, dual, sketch, fresh],
     )
 
 

@@ -80,16 +80,27 @@ class ClosedLoop(Policy):
 class InformationPolicy(ClosedLoop):
     """A closed-loop policy that plans with the information matrix M of the parameters.
 
-    M₀ = λI, and M_{t+1} = M_t + JᵀJ with J at x_t and the parameters after the learning step
-    of time t. The first input is uniform on the sphere.
+    M₀ = λI. Accumulated information is M_{t+1} = M_t + JᵀJ with J at x_t and the parameters after
+    the learning step of time t: each row belongs to the parameters of its own time. Fresh
+    information is M_{t+1} = λI + Σ JᵀJ over x_0 ... x_t with all rows at the parameters after the
+    learning step of time t, where t + 1 is a multiple of ``refresh_every``; at other times the
+    newest rows are added. For a model that is linear in its parameters both are the same, and a
+    learner that updates M decides about it: fresh information goes with neither
+    (:mod:`dopt.spec.compatibility`). The first input is uniform on the sphere.
 
     Parameters
     ----------
     regularization : float
         λ.
+    information : {"accumulated", "fresh"}
+        At which parameters the rows of M are taken. Fresh information is held as a q × q matrix.
+    refresh_every : int
+        Steps from one sum of fresh rows to the next; 1 where information is accumulated.
     """
 
     regularization: float = parameter(1e-3, bound="positive")
+    information: str = parameter("accumulated", choices=("accumulated", "fresh"), added=True)
+    refresh_every: int = parameter(1, "steps", "positive", added=True)
 
     @abstractmethod
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:

@@ -55,6 +55,8 @@ class DOptimal(InformationPolicy):
         """
         if self.form != "auto":
             return self.form
+        if self.information == "fresh":
+            return "primal"
         if n_parameters <= max(SMALL_PRIMAL, n_rows / 3**0.5):
             return "primal"
         return "dual" if n_rows <= LARGE_DUAL else "sketch"

@@ -28,6 +28,11 @@ class ICEM(InformationPolicy):
     this one. Reference: C. Pinneri et al., "Sample-efficient cross-entropy method for real-time
     planning" (2020).
 
+    The score of a plan is the mean of its scores over all horizons up to H, so that what is near
+    counts more. With ``domain`` "box" the rows of a state outside the evaluation box are multiplied
+    by exp(-δ²/2), δ its distance from the box in quarters of its half-widths: what is learned there
+    is of no use inside, and takes the network's capacity.
+
     What a plan is worth follows from the covariance J M⁻¹ Jᵀ of the accelerations along its path.
     It is estimated from ``samples`` draws of the parameters from the normal distribution with the
     covariance M⁻¹ about θ, so that it costs s products for each state and not q.
@@ -53,6 +58,8 @@ class ICEM(InformationPolicy):
         exploration of dynamical systems", 2023), ``variance`` the trace of J M⁻¹ Jᵀ (that of
         ensembles), and ``task`` the decrease of the variance summed over states of the
         evaluation box (:class:`dopt.policies.TaskOptimal`).
+    domain : {"everywhere", "box"}
+        Where a state's rows count.
     samples : int
         Draws of the parameters s.
     count : int
@@ -70,6 +77,7 @@ class ICEM(InformationPolicy):
     iterations: int = parameter(3, "iterations", "positive")
     elites: int = parameter(6, "plans", "positive")
     criterion: str = parameter("joint", choices=("joint", "sum", "variance", "task"))
+    domain: str = parameter("everywhere", choices=("everywhere", "box"))
     samples: int = parameter(32, "draws", "positive")
     count: int = parameter(24, "states", "positive")
 

@@ -25,6 +25,7 @@ from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed,
 from dopt.reference.search import searched_inputs
 from dopt.reference.state import BatchState
 from dopt.result import TrialResult
+from dopt.spec.information_form import is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 
@@ -74,7 +75,8 @@ class Lockstep(BatchState):
             )
         given = (self.system, self.model, self.theta, self.information, x)
         if isinstance(policy, Search):
-            return searched_inputs(policy, *given, self.ties[:, t])
+            assert self.held is not None
+            return searched_inputs(policy, *given, self.ties[:, t], self.held.noise_variance)
         components = self.components[:, t : t + 1]
         if isinstance(policy, TraceLinearized):
             components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)
@@ -112,14 +114,38 @@ class Lockstep(BatchState):
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t.
 
-        A learner that shares M has done so in its learning step.
+        A learner that shares M has done so in its learning step. Fresh information has the rows of
+        all states at these parameters instead.
         """
         observe(self, self.planners, t)
         if self.information is not None and not isinstance(self.learner, KalmanLearner):
-            J = self.rows(t)
-            self.information = self.information + J.mT @ J
+            self.information = self._informed(self.information, t)
         if self.own_plan is not None:
             self.own_plan.inform(t)
+
+    def _informed(self, information: Tensor, t: int) -> Tensor:
+        """Return M after step t: with the rows at x_t, or fresh, with those of all states."""
+        policy = self.config.policy
+        if is_fresh(policy) and (t + 1) % policy.refresh_every == 0:
+            return self._summed_anew(t)
+        J = self.rows(t)
+        return information + J.mT @ J
+
+    def _summed_anew(self, t: int) -> Tensor:
+        """Return λI + Σ JᵀJ over x_0 ... x_t at the current parameters.
+
+        θ is NaN afterwards, which ends the trial as diverged, where rounding has left the sum
+        indefinite or its inverse is not finite.
+        """
+        assert self.held is not None
+        over_states = vmap(self._rows, in_dims=(None, 1), out_dims=1)
+        J = self.project(over_states(self.theta, self.states[:, : t + 1])).flatten(1, 2)
+        total: Tensor = self.held.regularization * torch.eye(J.shape[-1]).to(J) + J.mT @ J
+        factor, failed = torch.linalg.cholesky_ex(total)
+        root = torch.linalg.solve_triangular(factor, torch.eye(J.shape[-1]).to(J), upper=False)
+        lost = (failed > 0) | ~root.square().sum(dim=1).isfinite().all(dim=1)
+        self.theta.masked_fill_(lost.unsqueeze(1) & ~self.diverged, torch.nan)
+        return total
 
     def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
         """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""

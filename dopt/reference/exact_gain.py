@@ -6,7 +6,7 @@ By the determinant lemma log det(M + JᵀJ) = log det M + log det(I + J M⁻¹ J
 symbol  meaning                                                  shape
 ======  =======================================================  =========
 M       information matrix, of the s dimensions that J has       s × s
-J       Jacobian of the learned accelerations at x(u)            r × s
+J       Jacobian of the learned accelerations at x(u), over √ρ   r × s
 u       input, here on the sphere ‖u‖ = γ                        m
 ======  =======================================================  =========
 """
@@ -57,10 +57,11 @@ class ExactGain:
 
     def __init__(self, batch: BatchState, *, single: bool = False) -> None:
         system, model, project = batch.system, batch.model, batch.project
+        scale = batch.held.noise_variance**-0.5 if batch.held else 1.0
 
         def gain(u: Tensor, theta: Tensor, covariance: Tensor, x: Tensor, k: Tensor) -> Tensor:
             following = x + system.dt * flow(system, x, u, model(theta, x))
-            rows = project(jacrev(model)(theta, following))
+            rows = scale * project(jacrev(model)(theta, following))
             return log_det_gain(rows.index_select(0, k.view(1)) if single else rows, covariance)
 
         over_inputs = (0, None, None, None, None)

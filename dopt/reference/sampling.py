@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from dopt.algorithm import SPREAD_KEPT, TIE_MARGIN, Score
+from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, Score
 from dopt.policies import ICEM
-from dopt.policies.task_states import box_states
+from dopt.policies.task_states import box_states, domain_box
 from dopt.reference.dynamics import flow
 from dopt.reference.state import BatchState
 
@@ -95,8 +95,18 @@ class SampledPlan:
         rows = (J @ W.unsqueeze(1)).view(n, P, S, -1, W.shape[-1])
         if policy.score in (Score.JOINT, Score.TASK):
             rows = rows * policy.stride**0.5
+        rows = rows * self._weights(states)[..., None, None]
         values = vmap(vmap(_score(policy.score), (0, None)))(rows, R)
         return torch.where(inside & values.isfinite(), values, -torch.inf)
+
+    def _weights(self, states: Tensor) -> Tensor:
+        """Return the factors of the rows at states, (..., d), (...)."""
+        batch = self._batch
+        assert batch.held is not None
+        domain = domain_box(batch.system, everywhere=self._policy.domain == "everywhere")
+        inside: Tensor = _domain_weights(torch.tensor(domain).to(states), states)
+        weights: Tensor = inside * batch.held.noise_variance**-0.5
+        return weights
 
     def _paths(self, t: int, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return the states that count, (n, P, ·, d), and which paths stay in bounds, (n, P)."""
@@ -126,29 +136,47 @@ def _shifted(inputs: Tensor) -> Tensor:
     return torch.cat([inputs[..., 1:, :], inputs[..., -1:, :]], dim=-2)
 
 
+def _domain_weights(domain: Tensor, states: Tensor) -> Tensor:
+    """Return the factors of the rows at states, (..., d): 1 in the box, less farther from it."""
+    turns = torch.where(domain[1] > 0, (states / domain[1]).round(), 0.0)
+    excess = ((states - domain[1] * turns).abs() / domain[0] - 1.0).clamp(min=0.0)
+    return torch.exp(-0.5 * (excess / DOMAIN_MARGIN).square().sum(dim=-1))
+
+
 def _score(score: Score) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return the score of one path from J W, (states, r, g + s), and R."""
+    """Return the score of one path from J W, (states, r, g + s), and R.
+
+    It is the mean over the horizons that end at one of the n states: the i-th adds its part (n - i)
+    / n times.
+    """
 
     def variance(rows: Tensor, R: Tensor) -> Tensor:  # noqa: ARG001  # one signature
-        return rows.square().sum()
+        return _mean_over_horizons(rows.square().sum(dim=(1, 2)))
 
     def separate(rows: Tensor, R: Tensor) -> Tensor:  # noqa: ARG001  # one signature
-        return _log_determinant(rows @ rows.mT).sum()
+        S = rows @ rows.mT
+        return _mean_over_horizons(torch.linalg.slogdet(torch.eye(S.shape[-1]).to(S) + S)[1])
 
     def joint(rows: Tensor, R: Tensor) -> Tensor:  # noqa: ARG001  # one signature
-        return _log_determinant(rows.flatten(0, 1) @ rows.flatten(0, 1).mT)
+        added = 2.0 * _factor(rows).diagonal().log()
+        return _mean_over_horizons(added.view(rows.shape[:2]).sum(dim=1))
 
     def task(rows: Tensor, R: Tensor) -> Tensor:
-        J = rows.flatten(0, 1)
-        G = J[:, : len(R)] @ R  # J M⁻¹ Gᵀ
-        value: Tensor = (G * torch.linalg.solve(torch.eye(len(J)).to(J) + J @ J.mT, G)).sum()
-        return value
+        G = rows.flatten(0, 1)[:, : len(R)] @ R  # J M⁻¹ Gᵀ
+        added = torch.linalg.solve_triangular(_factor(rows), G, upper=False).square().sum(dim=1)
+        return _mean_over_horizons(added.view(rows.shape[:2]).sum(dim=1))
 
     chosen = {Score.TRACE: variance, Score.SUM: separate, Score.JOINT: joint, Score.TASK: task}
     return chosen[score]
 
 
-def _log_determinant(S: Tensor) -> Tensor:
-    """Return log det(I + S) for S, (..., N, N)."""
-    value: Tensor = torch.linalg.slogdet(torch.eye(S.shape[-1]).to(S) + S)[1]
-    return value
+def _factor(rows: Tensor) -> Tensor:
+    """Return the Cholesky factor of I + J M⁻¹ Jᵀ for J W, (states, r, g + s)."""
+    J = rows.flatten(0, 1)
+    factor: Tensor = torch.linalg.cholesky_ex(torch.eye(len(J)).to(J) + J @ J.mT)[0]
+    return factor
+
+
+def _mean_over_horizons(added: Tensor) -> Tensor:
+    """Return the mean of the sums up to each state of what the states, (n,), add."""
+    return added.cumsum(dim=0).mean()

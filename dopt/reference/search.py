@@ -3,7 +3,7 @@
 ======  ==================================================  =============
 symbol  meaning                                             shape
 ======  ==================================================  =============
-J       rows along a path                                   (..., N, q)
+J       rows along a path, in the units of M: times 1/√ρ     (..., N, q)
 V       J M⁻¹                                               (..., N, q)
 S       J M⁻¹ Jᵀ                                            (..., N, N)
 ======  ==================================================  =============
@@ -35,10 +35,12 @@ def searched_inputs(
     information: Tensor,
     x: Tensor,
     ties: Tensor,
+    noise_variance: float = 1.0,
 ) -> Tensor:
     """Return the first inputs of the best plans, (n, m).
 
-    Given are parameters (n, q), M (n, q, q), states (n, d) and tie-breaking directions (n, m).
+    Given are parameters (n, q), M (n, q, q), states (n, d) and tie-breaking directions (n, m). A
+    sample adds JᵀJ/ρ to M, with ρ the ``noise_variance``.
     """
     candidates = torch.tensor(policy.compared_inputs(system)).to(x)
     pairs = plans(policy, system, len(candidates))
@@ -47,7 +49,7 @@ def searched_inputs(
     stride = policy.stride_of(system) if isinstance(policy, Lookahead) else 1
     seen = states[:, :, stride - 1 :: stride]
     rows = vmap(vmap(vmap(jacrev(model), (None, 0)), (None, 0)))(theta, seen)
-    rows = rows[..., : information.shape[1]]
+    rows = rows[..., : information.shape[1]] * noise_variance**-0.5
     if score_code(policy) == Score.JOINT:
         rows = rows * stride**0.5
     score = score_function(policy, system, model)

@@ -9,6 +9,7 @@ from dopt.policies import InformationPolicy, Oracle, Policy
 from dopt.policies.disagreement import Disagreement
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.greedy_linear import GreedyLinear
+from dopt.spec.information_form import is_fresh
 from dopt.systems import System
 
 
@@ -76,9 +77,36 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
     if (sharing or model.structure == "least_squares") and form not in ("auto", "primal"):
         what = f"learner '{learner.name}'" if sharing else f"model '{model.name}'"
         raise mismatch(what, "policy.form 'primal' or 'auto'", f"policy.form '{form}'")
+    if isinstance(policy, InformationPolicy):
+        _check_information(system, policy, model, learner)
     if model.structure == "conditioning" and hasattr(policy, "regularization"):
         expected = "a policy that needs no information matrix of parameters"
         raise mismatch(f"model '{model.name}'", expected, given)
+
+
+def _check_information(
+    system: System, policy: InformationPolicy, model: Model, learner: Learner
+) -> None:
+    """Check fresh information with the learner, the model and the form of M.
+
+    A learner that updates M decides about it. Where the model is linear in its parameters M is the
+    same, fresh or accumulated, and would be stored as two trials.
+    """
+    what, given = "policy.information 'fresh'", f"policy.information '{policy.information}'"
+    if not is_fresh(policy):
+        if policy.refresh_every != 1:
+            raise mismatch(f"policy.refresh_every {policy.refresh_every}", what, given)
+        return
+    if model.structure != "gradient":
+        raise mismatch(what, _models("gradient"), f"model '{model.name}'")
+    if learner.updates_information:
+        raise mismatch(what, "a learner that leaves M to the policy", f"learner '{learner.name}'")
+    q, n_rows = model.n_parameters(system), system.n_learned * system.horizon
+    form = policy.chosen_form(q, n_rows)
+    if form != "primal":
+        expected = "policy.form 'primal' or 'auto'" if hasattr(policy, "form") else "form 'primal'"
+        found = f"policy.form '{form}'" if hasattr(policy, "form") else f"form '{form}'"
+        raise mismatch(what, expected, found)
 
 
 def _models(structure: str) -> str:

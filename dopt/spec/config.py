@@ -6,16 +6,17 @@ import dataclasses
 import functools
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from dopt.control import Control
-from dopt.declare.registry import section_of
+from dopt.declare.registry import identifying_section, section_of
+from dopt.declare.validated_fields import Validated
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
-from dopt.learning import LEARNERS, Learner
+from dopt.learning import LEARNERS, InformationLearner, Learner
 from dopt.learning.base import CompiledLearner, CustomLearner
 from dopt.models import Model
-from dopt.policies import POLICIES, Policy, Search
+from dopt.policies import POLICIES, GradientDOptimal, Policy, Search
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop
 from dopt.spec.compatibility import check_together, mismatch
 from dopt.spec.custom_system_check import check_system
@@ -30,7 +31,10 @@ CODE_VERSION = 1
 ASSESSMENT_VERSION = 2
 """Raised whenever one changes the numbers of an assessment alone: for trials that have a task."""
 
-_VERSIONS = ("code_version", "assessment_version")
+CRITERION_VERSION = 2
+"""Raised whenever one changes the plans of searches with a noise variance ρ ≠ 1 alone."""
+
+_VERSIONS = ("code_version", "assessment_version", "criterion_version")
 
 LARGEST_HORIZON = 10_000_000
 """A trial is committed whole, one row for each step."""
@@ -153,13 +157,34 @@ class TrialConfig:
 
     @functools.cached_property
     def canonical_json(self) -> str:
-        """Sorted, compact JSON of the content and the code version, without the seed."""
-        content: dict[str, object] = {"code_version": CODE_VERSION, "path": self.path}
-        content |= {key: section_of(part) for key, part in zip(SECTIONS, self._parts, strict=True)}
-        if self.task is not None:
-            content["task"] = section_of(self.task)
-            content["assessment_version"] = ASSESSMENT_VERSION
+        """Sorted, compact JSON of what identifies the configuration: what the key is made of.
+
+        It is :meth:`content` without added fields that have their default
+        (:func:`dopt.spec.added_fields.completed` puts them back).
+        """
+        content = self._content(identifying_section)
         return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+    def content(self) -> dict[str, object]:
+        """Return every section with all its fields, and the code version, without the seed."""
+        return self._content(section_of)
+
+    def _content(self, written: Callable[[Validated], dict[str, object]]) -> dict[str, object]:
+        content: dict[str, object] = {"code_version": CODE_VERSION, "path": self.path}
+        content |= {key: written(part) for key, part in zip(SECTIONS, self._parts, strict=True)}
+        if self.task is not None:
+            content["task"] = written(self.task)
+            content["assessment_version"] = ASSESSMENT_VERSION
+        if self._scales_criterion():
+            content["criterion_version"] = CRITERION_VERSION
+        return content
+
+    def _scales_criterion(self) -> bool:
+        """Tell whether plans are compared by a criterion that depends on ρ, and ρ is not 1."""
+        if not isinstance(self.policy, (Search, GradientDOptimal)):
+            return False
+        learner = self.learner
+        return isinstance(learner, InformationLearner) and learner.noise_variance != 1.0
 
     @functools.cached_property
     def key(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeGuard
 
 from dopt.learning import InformationLearner, Learner
 from dopt.policies import InformationPolicy, Policy
@@ -17,10 +17,13 @@ class Information(NamedTuple):
         How it is held (:class:`dopt.policies.DOptimal`).
     regularization : float
         λ of M₀ = λI.
+    noise_variance : float
+        ρ: a sample adds JᵀJ/ρ to M.
     """
 
     form: str
     regularization: float
+    noise_variance: float = 1.0
 
 
 def held_information(
@@ -32,7 +35,13 @@ def held_information(
     space of the parameters and hence the primal form.
     """
     sharing = learner if isinstance(learner, InformationLearner) else None
+    noise_variance = sharing.noise_variance if sharing else 1.0
     if isinstance(policy, InformationPolicy):
         form = "primal" if sharing else policy.chosen_form(n_parameters, n_rows)
-        return Information(form, policy.regularization)
-    return Information("primal", sharing.regularization) if sharing else None
+        return Information(form, policy.regularization, noise_variance)
+    return Information("primal", sharing.regularization, noise_variance) if sharing else None
+
+
+def is_fresh(policy: Policy) -> TypeGuard[InformationPolicy]:
+    """Tell whether M is summed from the rows of all states at the present parameters."""
+    return isinstance(policy, InformationPolicy) and policy.information == "fresh"

@@ -7,31 +7,22 @@ configurations that are shown together with each other, such as ``Î³=2`` and ``Î
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
-from dopt.control import TASKS, Control
+from dopt.control import Control
 from dopt.declare.registry import SOURCE, TARGET, section_of
 from dopt.declare.validated_fields import Validated
 from dopt.errors import SpecificationError
-from dopt.learning import LEARNERS
-from dopt.models import MODELS
-from dopt.policies import POLICIES
 from dopt.policies.titles import policy_title
+from dopt.spec.added_fields import completed
 from dopt.spec.config import SECTIONS
-from dopt.systems import SYSTEMS, System
+from dopt.spec.named_classes import REGISTRIES, section_class, section_name
+from dopt.systems import System
 
 Flat = Mapping[str, object]
 """A configuration by dotted path, such as ``env.gamma``."""
 
-_REGISTRIES: Mapping[str, Mapping[str, type[Validated]]] = {
-    "env": SYSTEMS,
-    "policy": POLICIES,
-    "model": MODELS,
-    "learner": LEARNERS,
-    "task": TASKS,
-}
 _MODEL_OF = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}
 """Usual model of a policy; of the others it is the network."""
 
@@ -80,7 +71,7 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
     The policy is named where several are shown. Of the settings that differ, usual values are left
     out, unless the label would be empty or equal to that of another configuration.
     """
-    flats = [flatten(config) for config in configs]
+    flats = [flatten(completed(config)) for config in configs]
     titled = len({flat.get("policy.name") for flat in flats}) > 1
     places: dict[object, list[int]] = {}
     for place, flat in enumerate(flats):
@@ -122,7 +113,7 @@ def value_label(path: str, value: object) -> str:
         return f"no {path.rpartition('.')[2]}"
     if path in ("policy", "policy.name"):
         return policy_title(str(value))
-    if path in _REGISTRIES or path.endswith(".name"):
+    if path in REGISTRIES or path.endswith(".name"):
         return str(value)
     return _word(_COLUMNS.get(path, path), value)
 
@@ -132,14 +123,14 @@ def usual_values(config: Mapping[str, object]) -> dict[str, object]:
 
     Those of a user's class are known only where that class is loaded.
     """
-    classes = {key: _class(config, key) for key in _REGISTRIES}
+    classes = {key: section_class(config, key) for key in REGISTRIES}
     usual: dict[str, object] = {}
     for key, cls in classes.items():
         if cls is not None:
             own = _defaults(cls, classes["env"])
             usual |= {f"{key}.{name}": value for name, value in own.items()}
-    model = _MODEL_OF.get(_name(config, "policy"), "mlp")
-    learner = _LEARNER_OF.get(_name(config, "model"), "recursive_least_squares")
+    model = _MODEL_OF.get(section_name(config, "policy"), "mlp")
+    learner = _LEARNER_OF.get(section_name(config, "model"), "recursive_least_squares")
     usual |= {"model.name": model, "learner.name": learner, "task.name": None}
     parts = [classes[key] for key in SECTIONS]
     if None not in parts:
@@ -155,22 +146,6 @@ def flatten(config: Mapping[str, object], prefix: str = "") -> dict[str, object]
         path = f"{prefix}{key}"
         flat.update(flatten(value, f"{path}.") if isinstance(value, Mapping) else {path: value})
     return flat
-
-
-def _name(config: Mapping[str, object], key: str) -> str:
-    """Return the name in a section, or the text that stands in its place; empty without one."""
-    section = config.get(key)
-    return str(section.get("name")) if isinstance(section, Mapping) else str(section or "")
-
-
-def _class(config: Mapping[str, object], key: str) -> type[Validated] | None:
-    """Return the class of a section: a registered one, or a user's that is loaded already."""
-    section = config.get(key)
-    if not isinstance(section, Mapping) or TARGET not in section:
-        return _REGISTRIES[key].get(_name(config, key))
-    module, _, name = str(section[TARGET]).rpartition(".")
-    found = getattr(sys.modules.get(module), name, None)
-    return found if isinstance(found, type) and issubclass(found, Validated) else None
 
 
 def _defaults(cls: type[Validated], env: type[Validated] | None) -> Mapping[str, object]:

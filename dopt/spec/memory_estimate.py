@@ -24,7 +24,7 @@ from dopt.policies import (
     TaskOptimal,
 )
 from dopt.policies.icem import BLOCKS
-from dopt.spec.information_form import held_information
+from dopt.spec.information_form import held_information, is_fresh
 from dopt.systems import System
 
 NUMBER = 8
@@ -67,10 +67,9 @@ def memory_by_setting(
         numbers["env.horizon"] += min(learner.capacity, T) * (p + r)
         drawn = T * learner.steps * learner.batch
         numbers["learner.batch"] = drawn + learner.batch * (p + r + (L + 3) * max(w, r))
-    if isinstance(learner, GaussNewton):
+    if kept := _samples_of_normal_matrix(policy, model, learner, T):
         # the samples kept, the pairs of units of one block, and JᵀJ, its factor and C⁻¹ in blocks
-        kept = learner.samples_kept(T)
-        numbers["env.horizon"] += kept * (p + r)
+        numbers["env.horizon"] += 2 * kept * (p + r)
         pairs = kept * (2 * (max(w, p) + 1) ** 2 + (r + 3) * (L + 1) * (max(w, p) + 1))
         rows = 3 * kept * r * q if path == "reference" else 0  # J itself, and copies of it
         numbers[_size_of(model)] += pairs + rows + 4 * q**2
@@ -87,6 +86,13 @@ def memory_by_setting(
         for setting, count in part.items():
             numbers[setting] = numbers.get(setting, 0) + count
     return {setting: NUMBER * count for setting, count in numbers.items()}
+
+
+def _samples_of_normal_matrix(policy: Policy, model: Model, learner: Learner, horizon: int) -> int:
+    """Return over how many samples JᵀJ is summed at once; 0 where each one is added by itself."""
+    if isinstance(learner, GaussNewton):
+        return learner.samples_kept(horizon)
+    return horizon if is_fresh(policy) and model.structure == "gradient" else 0
 
 
 def _size_of(model: Model) -> str:

@@ -142,7 +142,7 @@ class TrialSpec(Validated):
 
     @property
     def config_json(self) -> str:
-        """Canonical JSON without the seed."""
+        """Canonical JSON without the seed (:attr:`dopt.spec.config.TrialConfig.canonical_json`)."""
         return self.config.canonical_json
 
     @property
@@ -161,7 +161,7 @@ class TrialSpec(Validated):
 
     def to_mapping(self) -> dict[str, object]:
         """Return the mapping that :meth:`from_mapping` turns into this trial."""
-        return without_versions(json.loads(self.canonical_json()))
+        return {**without_versions(self.config.content()), "seed": self.seed}
 
     def columns(self) -> dict[str, str | int | float | None]:
         """Return what a table of configurations shows in columns of its own."""

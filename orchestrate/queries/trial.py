@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from dopt.spec.added_fields import completed
 from orchestrate.redaction import without_password
 from orchestrate.store import Reader
 
@@ -32,7 +33,7 @@ class TrialReport:
     trial
         Row of ``v_trial``.
     config
-        The configuration without the seed.
+        The whole configuration without the seed.
     launches
         The launches that ran it, without passwords.
     attempts
@@ -55,7 +56,7 @@ def report(reader: Reader, trial_id: int) -> TrialReport:
     tried = {attempt["launch_id"] for attempt in attempts}
     return TrialReport(
         trial=trial,
-        config=json.loads(reader.rows(_CONFIG, config_key=trial["config_key"])[0][0]),
+        config=completed(json.loads(reader.rows(_CONFIG, config_key=trial["config_key"])[0][0])),
         launches=[
             {name: _public(value) for name, value in asdict(launch).items()}
             for launch in reader.launches()

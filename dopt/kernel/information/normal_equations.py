@@ -29,11 +29,29 @@ def normal_equations(
 
     ``inputs`` (p, N) are features, ``targets`` (r, N) accelerations, and e = y - a_θ(x).
     """
-    depth = network.offsets.shape[0] - 1
     total, errors, hidden = errors_of(network, theta, inputs, targets)
     signals = nn.batch_back_signals(network, theta, hidden, targets.shape[0], inputs.shape[1])
     below = _completed(network, inputs, hidden)
     _write_slope(network, below, signals, errors, slope)
+    _write_normal(network, below, signals, normal)
+    return total
+
+
+@compiled
+def normal_matrix(network: Network, theta: Vector, inputs: Matrix, r: int, normal: Matrix) -> None:
+    """Write JᵀJ, (q, q), of r outputs over all samples, whose features are ``inputs`` (p, N)."""
+    n = inputs.shape[1]
+    hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * n))
+    outputs = np.empty((r, n))
+    nn.forward(network, theta, inputs, hidden, outputs)
+    signals = nn.batch_back_signals(network, theta, hidden, r, n)
+    _write_normal(network, _completed(network, inputs, hidden), signals, normal)
+
+
+@compiled
+def _write_normal(network: Network, below: Stack, signals: Stack, normal: Matrix) -> None:
+    """Write JᵀJ, (q, q), given the activations and δ of all samples."""
+    depth = network.offsets.shape[0] - 1
     for a in range(depth):
         for b in range(a, depth):
             _hidden_block(network, below, signals, a, b, normal)
@@ -41,7 +59,6 @@ def normal_equations(
     for i in range(normal.shape[0]):
         for j in range(i):
             normal[i, j] = normal[j, i]
-    return total
 
 
 @compiled

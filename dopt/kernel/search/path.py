@@ -27,7 +27,7 @@ class Path(NamedTuple):
 
     states: Matrix  # (H + 1, d)
     outputs: Matrix  # (H + 1, r), a_θ at the states
-    rows: Matrix  # (n + r, q), J along the path; the last r are spare
+    rows: Matrix  # (n + r, q), J/√ρ along the path; the last r are spare
     products: Matrix  # (n, q), J M⁻¹, or L⁻¹ J M⁻¹ once a score has needed it
     factor: Matrix  # (n, n), the Cholesky factor L of I + J M⁻¹ Jᵀ in the lower triangle
     inverse: Matrix  # (q, q), A of M⁻¹ = A - VᵀV; empty where few products are needed
@@ -95,8 +95,8 @@ def rollout(
 ) -> bool:
     """Hold u from state ``first`` of the path to state ``last``; tell whether it stays in bounds.
 
-    x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written, for the
-    determinant of all of them together times the root of the stride.
+    x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written in the units
+    of M, for the determinant of all of them together times the root of the stride.
     """
     r, stride = plant.learned_rows.shape[0], search.stride
     spare = path.products.shape[0]
@@ -111,8 +111,11 @@ def rollout(
         count = r if wanted or network.kind == ModelKind.LINEAR else 0
         rows = path.rows[block : block + count]
         model_and_jacobian(plant, network, theta, path, i + 1, rows)
+        weight = search.row_scale
         if stride > 1 and search.score == Score.JOINT:
-            scale(rows, np.sqrt(stride))
+            weight *= np.sqrt(stride)
+        if weight != 1.0:
+            scale(rows, weight)
     return True
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import SPREAD_KEPT, TIE_MARGIN, Score
+from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, Score
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import add_multiple, inner
@@ -145,12 +145,13 @@ def _score(
     changes_along(plant, network, theta, states, draws.rows, changes)
     rows, factor = np.empty((n * r, draws.rows.shape[0])), np.empty((n * r, n * r))
     joint = settings.score in (Score.JOINT, Score.TASK)
-    scale = np.sqrt(settings.stride) if joint else 1.0
+    scale = trial.algorithm.search.row_scale * (np.sqrt(settings.stride) if joint else 1.0)
     for p in range(P):
         for i in range(n):
+            weight = scale * domain_weight(trial.algorithm.search.domain, states[p * n + i])
             for k in range(r):
                 for j in range(rows.shape[1]):
-                    rows[i * r + k, j] = scale * changes[k, j, p * n + i]
+                    rows[i * r + k, j] = weight * changes[k, j, p * n + i]
         value = score_of_rows(settings.score, rows, draws.exact, r, factor)
         values[p] = value if inside[p] and np.isfinite(value) else -np.inf
 
@@ -180,28 +181,42 @@ def _paths(trial: Trial, settings: Settings, t: int, inputs: Stack) -> tuple[Boo
     return inside, kept
 
 
+@compiled
+def domain_weight(domain: Matrix, x: Vector) -> float:
+    """Return the factor of the rows at a state, (d,): 1 in the box, less farther from it."""
+    total = 0.0
+    for j in range(x.shape[0]):
+        value, period = x[j], domain[1, j]
+        if period > 0.0:
+            value -= period * np.rint(value / period)
+        total += squared(max(abs(value) / domain[0, j] - 1.0, 0.0) / DOMAIN_MARGIN)
+    weight: float = np.exp(-0.5 * total)
+    return weight
+
+
 @vectorized
 def score_of_rows(score: int, rows: Matrix, exact: Matrix, r: int, factor: Matrix) -> float:
     """Return the score of a path from J W, (N, g + s), r rows for each state.
 
-    ``factor``, (N, N), is overwritten by the Cholesky factor of I + J M⁻¹ Jᵀ, whose blocks beside
-    the diagonal the sum over states leaves out.
+    It is the mean over the horizons that end at one of the states: what the i-th of n states adds
+    counts (n - i) / n times, i from 0. ``factor``, (N, N), is overwritten by the Cholesky factor L
+    of I + J M⁻¹ Jᵀ, and the exact products in ``rows`` by L⁻¹ times them.
     """
     N, g, total = rows.shape[0], exact.shape[0], 0.0
-    if score == Score.TRACE:
-        for i in range(N):
-            total += inner(rows[i], rows[i])
-        return total
     block = r if score == Score.SUM else N
     for i in range(N):
+        share = 1.0 - (i // r) / (N // r)
+        if score == Score.TRACE:
+            total += share * inner(rows[i], rows[i])
+            continue
         start = i - i % block
         for j in range(start, i + 1):
             value = inner(rows[i], rows[j]) - inner(factor[i, start:j], factor[j, start:j])
             factor[i, j] = np.sqrt(1.0 + value) if i == j else value / factor[j, j]
-        total += 2.0 * np.log(factor[i, i])
+        total += share * 2.0 * np.log(factor[i, i])
     if score != Score.TASK:
         return total
-    for i in range(N):  # L⁻¹ of the exact products
+    for i in range(N):
         row = rows[i, :g]
         for j in range(i):
             add_multiple(row, -factor[i, j], rows[j, :g])
@@ -210,6 +225,6 @@ def score_of_rows(score: int, rows: Matrix, exact: Matrix, r: int, factor: Matri
     products = np.dot(rows[:, :g].copy(), exact)
     total = 0.0
     for i in range(N):
-        for j in range(products.shape[1]):
-            total += squared(products[i, j])
+        share = 1.0 - (i // r) / (N // r)
+        total += share * inner(products[i], products[i])
     return total

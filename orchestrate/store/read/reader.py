@@ -14,6 +14,7 @@ import numpy as np
 from sqlalchemy import URL, Connection, CursorResult, Engine, select, text
 
 from dopt.errors import suggestion
+from dopt.spec.added_fields import completed
 from orchestrate.store import database_url, schema_version
 from orchestrate.store.backends import postgresql, sqlite
 from orchestrate.store.backends.driver_errors import translated, translated_query
@@ -237,7 +238,7 @@ def _kind(url: URL) -> ModuleType:
 
 
 def _config_row(*values: Any) -> ConfigRow:
-    return ConfigRow(*values[:-1], json.loads(values[-1]))  # type: ignore[call-arg]
+    return ConfigRow(*values[:-1], completed(json.loads(values[-1])))  # type: ignore[call-arg]
 
 
 def _names(row: ConfigRow) -> tuple[str | int, ...]:

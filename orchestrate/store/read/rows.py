@@ -30,7 +30,7 @@ class ConfigRow:
     label
         The policy's title and what is not the default, such as ``D-optimal, γ=3``.
     config
-        The configuration without the seed.
+        The whole configuration without the seed.
     """
 
     config_key: str

@@ -35,6 +35,7 @@ POSITIVE = {
         "time_constant",
         "capacity",
         "refit_every",
+        "refresh_every",
         "batch",
         "steps",
         "noise_variance",
@@ -47,7 +48,7 @@ NONNEGATIVE = {
 }
 FRACTIONS = {"beta_1", "beta_2"}
 SHARES = {"forgetting", "band"}
-TEXTS = {"form", "criterion", "states"}
+TEXTS = {"form", "criterion", "states", "information"}
 OF_ANY_SIZE = {"goal"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)
 

@@ -23,7 +23,7 @@ from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import compiled, contracted, squared, vectorized
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.from_spec import MODULES
-from dopt.kernel.information import absent, primal_linear
+from dopt.kernel.information import absent, fresh, primal_linear
 from dopt.kernel.warming import choices
 from dopt.learning import LEARNERS
 from dopt.policies import POLICIES
@@ -168,7 +168,7 @@ def test_everything_is_what_any_shipped_choice_calls() -> None:
     chosen = choices(everything=True)
     assert {one.kernel_function for one in POLICIES.values() if one.compiled} == set(chosen.plans)
     assert {one.kernel_function for one in LEARNERS.values() if one.compiled} == set(chosen.learns)
-    assert {*MODULES.values(), primal_linear, absent} == set(chosen.forms)
+    assert {*MODULES.values(), primal_linear, absent, fresh} == set(chosen.forms)
     few = choices(everything=False)
     assert set(few.plans) < set(chosen.plans)
     assert few.n_parts() < chosen.n_parts()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,14 @@ from torch.func import jacrev, vmap
 
 from dopt.errors import IncompatibleError
 from dopt.kernel.run import KernelTrial
+from dopt.kernel.search.sampling import domain_weight
 from dopt.policies import ICEM
-from dopt.policies.task_states import box_states
+from dopt.policies.task_states import box_states, domain_box
 from dopt.reference.batch import Lockstep
-from dopt.reference.sampling import SampledPlan
+from dopt.reference.sampling import SampledPlan, _domain_weights
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS
 from dopt.types import Array
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
@@ -107,19 +110,53 @@ def test_scores_are_those_of_dense_matrices(criterion: str) -> None:
     M, r = batch.information[0], batch.system.n_learned
     G = rows_at(batch, box_states(batch.system)[30:33])
     for path, value in zip(states, values, strict=True):
-        J = rows_at(batch, path.numpy())
-        S = J @ torch.linalg.solve(M, J.mT)
-        if criterion in ("joint", "task"):
-            J, S = J * 2**0.5, S * 2
-        blocks = [S[i : i + r, i : i + r] for i in range(0, len(S), r)]
+        J = rows_at(batch, path.numpy()) * (2**0.5 if criterion in ("joint", "task") else 1.0)
+        expected = [dense_score(criterion, M, J[: r * (i + 1)], G, r) for i in range(len(path))]
+        assert float(value) == pytest.approx(np.mean(expected), rel=0.05)
+
+
+def dense_score(criterion: str, M: torch.Tensor, J: torch.Tensor, G: torch.Tensor, r: int) -> float:
+    """Return the score of a path with the rows J, of which each state has r."""
+    S = J @ torch.linalg.solve(M, J.mT)
+    if criterion == "joint":
+        return float(torch.logdet(torch.eye(len(S)) + S))
+    if criterion == "variance":
+        return float(S.trace())
+    if criterion == "task":
         after = torch.linalg.inv(M + J.mT @ J)
-        expected = {
-            "joint": torch.logdet(torch.eye(len(S)) + S),
-            "sum": sum(torch.logdet(torch.eye(r) + block) for block in blocks),
-            "variance": S.trace(),
-            "task": (G @ (torch.linalg.inv(M) - after) @ G.mT).trace(),
-        }[criterion]
-        assert float(value) == pytest.approx(float(expected), rel=0.05)
+        return float((G @ (torch.linalg.inv(M) - after) @ G.mT).trace())
+    blocks = [S[i : i + r, i : i + r] for i in range(0, len(S), r)]
+    return float(sum(torch.logdet(torch.eye(r) + block) for block in blocks))
+
+
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+def test_outside_of_the_domain_rows_count_less(path: str) -> None:
+    """Beside a box that is never left nothing changes, and one that is does make a difference."""
+    inputs = {}
+    for name, half_widths in (("wide", (7.0, 1e6)), ("narrow", (0.02, 0.02))):
+        for domain in ("everywhere", "box"):
+            fields = SMALL | {"domain": domain, "lookahead": 28, "stride": 7}
+            env = {"grid_half_widths": half_widths}
+            spec = trial("pendulum", "icem", 3, env=env, policy=fields)
+            inputs[name, domain] = run_trial(spec, path).inputs
+    assert np.array_equal(inputs["wide", "box"], inputs["wide", "everywhere"])
+    assert not np.array_equal(inputs["narrow", "box"], inputs["narrow", "everywhere"])
+
+
+def test_the_weight_of_a_state_falls_with_its_distance_from_the_box_on_the_circle() -> None:
+    system = SYSTEMS["arm"]()
+    domain = torch.tensor(domain_box(system))
+    half = torch.tensor(system.grid_half_widths, dtype=torch.float64)
+    assert float(_domain_weights(domain, half)) == 1.0
+    assert float(_domain_weights(domain, half * torch.tensor([1.25, 1.0, 1.0, 1.0]))) == (
+        pytest.approx(math.exp(-0.5))
+    )
+    turned = half + torch.tensor([2 * math.pi, 0.0, -2 * math.pi, 0.0])
+    assert float(_domain_weights(domain, turned)) == pytest.approx(1.0)
+    for x in torch.randn(20, 4, dtype=torch.float64) * 2:
+        assert domain_weight(domain.numpy(), x.numpy()) == pytest.approx(
+            float(_domain_weights(domain, x)), rel=1e-12
+        )
 
 
 def test_the_first_input_is_that_of_the_best_plan_and_all_have_the_norm_gamma() -> None:

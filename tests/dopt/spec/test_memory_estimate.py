@@ -14,8 +14,10 @@ from dopt.control.free_run import free_run_error
 from dopt.control.prediction import forecast_by
 from dopt.errors import SpecificationError
 from dopt.kernel import from_spec
+from dopt.policies import DOptimal
 from dopt.randomness import draw
 from dopt.spec.config import LARGEST_HORIZON
+from dopt.spec.memory_estimate import memory_by_setting
 from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import PAIRS, trial
 
@@ -172,3 +174,37 @@ def test_a_horizon_has_a_bound() -> None:
     assert trial("pendulum", "random", env={"horizon": LARGEST_HORIZON}).system.horizon
     with pytest.raises(SpecificationError, match=r"env\.horizon is 10,000,001 steps, .* at most"):
         trial("pendulum", "random", env={"horizon": LARGEST_HORIZON + 1})
+
+
+FRESH = {"information": "fresh"}
+
+
+@pytest.mark.parametrize("width", [5, 16, 48])
+@pytest.mark.parametrize("policy", ["d_optimal", "exact"])
+def test_fresh_information_is_reckoned(policy: str, width: int) -> None:
+    fields = {"env": {"horizon": 400}, "model": {"width": width}}
+    fresh = trial("arm", policy, policy=FRESH, **fields)
+    plain = trial("arm", policy, policy={}, **fields)
+    T, q = 400, fresh.model.n_parameters(fresh.system)
+    p, r = len(fresh.system.features), fresh.system.n_learned
+    assert held(fresh) <= fresh.config.memory
+    pairs = 2 * T * (max(width, p) + 1) ** 2
+    assert fresh.config.memory - plain.config.memory >= 8 * (2 * T * p + pairs)
+    there = dataclasses.replace(fresh.config, path="reference")
+    assert there.memory >= 8 * (T * r * q + q**2)
+
+
+def test_a_linear_model_needs_no_memory_for_fresh_information() -> None:
+    system, learner = trial("arm", "oracle").system, trial("arm", "oracle").learner
+    model = trial("arm", "oracle").model
+    sizes = [
+        memory_by_setting(system, DOptimal(information=information), model, learner, path)
+        for information in ("accumulated", "fresh")
+        for path in ("kernel", "reference")
+    ]
+    assert sizes[:2] == sizes[2:]
+
+
+def test_fresh_information_that_no_machine_can_hold_is_refused_by_name() -> None:
+    with pytest.raises(SpecificationError, match=r"because of model\.width, .* smaller\.$"):
+        trial("arm", "d_optimal", policy=FRESH, env={"horizon": 10**7}, model={"width": 200})
