@@ -70,8 +70,8 @@ class ICEM(InformationPolicy):
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.search.sampling.plan"
 
-    lookahead: int = parameter(100, "steps", "positive")
-    hold: int = parameter(20, "steps", "positive")
+    lookahead: int = parameter(60, "steps", "positive")
+    hold: int = parameter(10, "steps", "positive")
     stride: int = parameter(10, "steps", "positive")
     plans: int = parameter(48, "plans", "positive")
     iterations: int = parameter(3, "iterations", "positive")
