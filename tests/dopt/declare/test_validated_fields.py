@@ -29,7 +29,7 @@ POSITIVE = {
     *("inertia", "half_span", "width", "depth", "learning_rate", "window", "epsilon"),
     *("ensemble", "lookahead", "candidates", "starts", "n_features", "lengthscale", "amplitude"),
     *("regularization", "sketch_size", "hold", "iterations", "frequency", "band"),
-    *("subspace", "count", "radius", "stride"),
+    *("subspace", "count", "radius", "stride", "plans", "elites", "samples"),
     *(
         "n_links",
         "time_constant",
@@ -48,7 +48,7 @@ NONNEGATIVE = {
 }
 FRACTIONS = {"beta_1", "beta_2"}
 SHARES = {"forgetting", "band"}
-TEXTS = {"form", "criterion", "states", "information"}
+TEXTS = {"form", "criterion", "states", "information", "domain"}
 OF_ANY_SIZE = {"goal"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)
 

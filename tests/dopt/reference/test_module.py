@@ -19,6 +19,7 @@ from dopt.rerun import rerun
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
+from tests.dopt.trials import SMALL_SEARCHES
 from tests.paths import EXAMPLE
 
 HERE = "tests.dopt.custom_networks"
@@ -67,8 +68,9 @@ def test_a_trial_with_it_is_that_of_the_shipped_network(policy: str) -> None:
 def test_every_policy_runs_with_it_or_says_why_not(policy: str) -> None:
     mapping = specification(policy="random", width=4).to_mapping()
     mapping["env"] = {"name": "pendulum", "horizon": 6, "grid_points": [4, 4]}
+    given = {"name": policy, **SMALL_SEARCHES.get(policy, {})}
     try:
-        spec = TrialSpec.from_mapping(mapping | {"policy": {"name": policy}})
+        spec = TrialSpec.from_mapping(mapping | {"policy": given})
     except IncompatibleError as error:
         assert str(error).startswith(f"policy '{policy}' ")  # noqa: PT017  # the rest runs
         return
