@@ -23,7 +23,7 @@ from dopt.kernel.search.posterior import (
     rows_at,
 )
 from dopt.kernel.structs import Trial
-from dopt.types import Booleans, Matrix, Stack, Vector
+from dopt.types import Booleans, Integers, Matrix, Stack, Vector
 
 
 class Settings(NamedTuple):
@@ -78,15 +78,21 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
         # The elites of the step before are scored anew, by what is known now; there are none first.
         first = 0 if iteration == 0 and t > 1 else E
         _score(trial, settings, t, draws, inputs[first:], values[first:])
-        best = np.argsort(-rounded(values), kind="mergesort")[:E]
+        best = largest_places(rounded(values), E)
         inputs[:E], values[:E] = inputs[best].copy(), values[best].copy()
-        for k in range(K):
-            for j in range(m):
-                elites = inputs[:E, k, j]
-                mean[k, j] = SPREAD_KEPT * mean[k, j] + (1.0 - SPREAD_KEPT) * elites.mean()
-                spread[k, j] = SPREAD_KEPT * spread[k, j] + (1.0 - SPREAD_KEPT) * elites.std()
+        _refit(mean, spread, inputs[:E])
     memory[1:] = inputs[:E]
     u[:] = inputs[0, 0] if values[0] > -np.inf else gamma * trial.randomness.ties[t]
+
+
+@compiled
+def _refit(mean: Matrix, spread: Matrix, elites: Stack) -> None:
+    """Move mean and spread, (K, m), to those of the elites, (E, K, m), but for a share kept."""
+    for k in range(mean.shape[0]):
+        for j in range(mean.shape[1]):
+            values = elites[:, k, j]
+            mean[k, j] = SPREAD_KEPT * mean[k, j] + (1.0 - SPREAD_KEPT) * values.mean()
+            spread[k, j] = SPREAD_KEPT * spread[k, j] + (1.0 - SPREAD_KEPT) * values.std()
 
 
 @compiled
@@ -104,6 +110,21 @@ def rounded(values: Vector) -> Vector:
         steps = np.rint(values[p] / (TIE_MARGIN * largest)) if largest > 0.0 else values[p]
         out[p] = steps if np.isfinite(values[p]) else values[p]
     return out
+
+
+@compiled
+def largest_places(values: Vector, count: int) -> Integers:
+    """Return the places of the largest values in falling order; of equal ones the first."""
+    places = np.empty(count, np.int64)
+    taken = np.zeros(values.shape[0], np.bool_)
+    for n in range(count):
+        best = -1
+        for p in range(values.shape[0]):
+            if not taken[p] and (best < 0 or values[p] > values[best]):
+                best = p
+        taken[best] = True
+        places[n] = best
+    return places
 
 
 @compiled
