@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pandas as pd
 import pytest
 
+from analysis.stats.intervals import band
 from tests.pages import DOCS, PAGES
 
 FINDINGS, METHOD, README = (
@@ -16,6 +18,7 @@ FINDINGS, METHOD, README = (
 CLAIMS = pd.read_csv(DOCS / "claims/report.csv").set_index(["env", "variant"])
 BEYOND = pd.read_csv(DOCS / "beyond/report.csv").set_index(["env", "variant"])
 CONTROL = pd.read_csv(DOCS / "claims/report_control.csv").set_index(["variant", "t"])
+BEST = pd.read_csv(DOCS / "best.csv")
 PERIODIC = pd.read_csv(DOCS / "periodic.csv").set_index(["policy", "env"])
 SUMMARY = pd.read_csv(DOCS / "summary.csv").set_index(["env", "policy"])
 
@@ -238,6 +241,22 @@ def test_numbers_of_the_periodic_inputs_are_rounded_once(
     columns = tuple(f"{column}_{part}" for part in ("ratio", "low", "high"))
     row = "| {} |" + " {:.2f} [{:.2f}, {:.2f}] |" * len(cells)
     assert row.format(name, *numbers(PERIODIC, *cells, columns=columns)) in FINDINGS
+
+
+def test_numbers_of_the_lowest_losses_are_rounded_once() -> None:
+    envs = ("pendulum", "quadrotor", "cartpole", "arm")
+    rows: list[list[str]] = [[], []]
+    for env in envs:
+        trials = BEST[BEST["env"] == env]
+        found = band(np.log(trials[["final_loss"]].to_numpy()))
+        digits = 4 if found.centre < np.log(0.1) else 3
+        mean, low, high = (
+            f"{np.exp(value[0]):.{digits}f}" for value in (found.centre, found.low, found.high)
+        )
+        rows[0].append(f"{mean} [{low}, {high}]")
+        rows[1].append(f"{trials['step_us'].median():,.0f}")
+    assert f"| loss | {' | '.join(rows[0])} |" in FINDINGS
+    assert f"| time of a step [µs] | {' | '.join(rows[1])} |" in FINDINGS
 
 
 def test_numbers_of_the_filter_on_the_method_page_are_rounded_once() -> None:
