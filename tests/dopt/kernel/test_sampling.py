@@ -45,9 +45,20 @@ def test_kernel_and_reference_choose_the_same_plans(env: str, criterion: str) ->
     assert len(np.unique(fast.inputs[1:].round(9), axis=0)) > 1 or spec.system.n_inputs == 1
 
 
-@pytest.mark.parametrize("criterion", ["joint", "task"])
-def test_they_agree_beside_a_learner_that_shares_the_matrix(criterion: str) -> None:
-    spec = spec_of("cartpole", criterion, GAUSS_NEWTON)
+@pytest.mark.parametrize(
+    ("criterion", "learner"),
+    [
+        ("joint", GAUSS_NEWTON),
+        ("task", GAUSS_NEWTON | {"noise_variance": 0.1}),
+        ("task", GAUSS_NEWTON | {"noise_variance": 0.1, "refit_every": 3}),
+        ("joint", {"name": "ekf", "noise_variance": 0.5}),
+    ],
+)
+def test_they_agree_beside_a_learner_that_shares_the_matrix(
+    criterion: str, learner: dict[str, Any]
+) -> None:
+    """It leaves the factor of M where it fits all samples at each step, and M⁻¹ otherwise."""
+    spec = spec_of("cartpole", criterion, learner, domain="box")
     fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
     assert relative_gap(fast.inputs, plain.inputs) < 1e-6
     assert relative_gap(fast.states, plain.states) < 1e-6
