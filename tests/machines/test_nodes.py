@@ -102,7 +102,11 @@ def test_a_host_that_lost_head_and_launch_ends_its_trial_in_vain(
 def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     lab: Lab, undisturbed: Outcome
 ) -> None:
-    """The launch still hears its worker, so that nothing is lost or run again."""
+    """The launch still hears its worker: the trial that runs there is not lost or run again.
+
+    Until the head sees the cut, which takes long on a busy machine, the host may be given more
+    trials; those that it then loses wait again.
+    """
     lab.start_cluster("w1", "w2", **{PAUSE: "20"})
     launched = lab.launch(seeds=4, witness=True)
     seed = begun(lab, launched)
@@ -111,7 +115,9 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     outcome = lab.outcome()
     outcome.check_complete(undisturbed, seeds=4)
     assert outcome.attempts_of("done")[seed][4] == "w1"
-    assert len(outcome.attempts) == 4
+    assert [attempt[1] for attempt in outcome.attempts if attempt[0] == seed] == [1]
+    lost = [attempt[2:4] for attempt in outcome.attempts if attempt[2] != "done"]
+    assert lost == [("released", "node lost")] * len(lost)
 
 
 def begun(lab: Lab, launched: Process) -> int:
