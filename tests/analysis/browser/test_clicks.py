@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.analysis.browser import chromium, grids
 from tests.analysis.browser.chromium import PATIENCE, ROOT
@@ -161,6 +162,7 @@ def test_comparisons_and_figures(page: Page) -> None:
     expect(page.locator("tbody tr")).to_have_count(8)
     expect(page.locator("svg.forest")).to_have_count(8)
     page.get_by_label("Reference").select_option("oracle")
+    expect(page).to_have_url(re.compile("reference=oracle"))
     expect(page.locator("tbody tr").first).to_contain_text("D-optimal")
     expect(page.get_by_label("Reference")).to_have_value("oracle")
     page.get_by_label("Judged by").select_option("steps")
@@ -172,6 +174,17 @@ def test_comparisons_and_figures(page: Page) -> None:
     assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") > 0
     page.get_by_text("Provenance").click()
     expect(page.get_by_text("statistic")).to_be_visible()
+
+
+def test_a_choice_while_the_page_loads_is_applied(page: Page) -> None:
+    def answer_late(route: Route) -> None:
+        time.sleep(0.5)
+        route.continue_()
+
+    page.route("**/forms.js", answer_late)
+    page.goto("/compare", wait_until="commit")
+    page.get_by_label("Reference").select_option("oracle")
+    expect(page).to_have_url(re.compile("reference=oracle"))
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
