@@ -10,6 +10,8 @@ class ModelKind(IntEnum):
 
     MLP = 0
     LINEAR = 1
+    RANDOM_FEATURES = 2
+    GAUSSIAN_PROCESS = 3
 
 
 class FeatureKind(IntEnum):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dopt.control.prediction import Array, Forecast, forecast_by
-from dopt.models.base import Model
+from dopt.models import MLP, Linear, Model
 from dopt.systems.base import System
 
 
@@ -17,8 +17,11 @@ def true_forecast(system: System) -> Forecast:
 
 
 def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
-    """Return the forecast by a model with parameters (q,) in place of the true accelerations."""
-    if not (system.compiled and model.compiled):
+    """Return the forecast by a model with parameters (q,) in place of the true accelerations.
+
+    In compiled code are those of networks and of the linear form of physics.
+    """
+    if not (system.compiled and model.compiled and isinstance(model, (MLP, Linear))):
         return forecast_by(system, lambda states: model.predict(system, parameters, states))
     from dopt.kernel import forecast
 

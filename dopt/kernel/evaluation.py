@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel.compiler import compiled, vectorized
-from dopt.kernel.network import forward
+from dopt.kernel.compiler import compiled, squared, vectorized
+from dopt.kernel.gaussian_process import kernel_value, mean_weights
+from dopt.kernel.network import features_at, forward
 from dopt.kernel.structs import Evaluation, Network, Plant
 from dopt.types import Matrix, Real, Singles, Vector
 
@@ -40,10 +41,18 @@ def model_error(
 ) -> float:
     """Return sqrt(mean ‖a_θ(x) - a(x)‖²) over the points from ``start`` to ``stop``.
 
-    The network's points come in blocks, and both bounds lie between blocks or at the end.
+    But for the linear model points come in blocks, and both bounds lie between blocks or at the
+    end.
     """
     if network.kind == ModelKind.LINEAR:
         return _linear_error(theta, points, start, stop)
+    r = buffers.outputs.shape[0]
+    if network.kind == ModelKind.RANDOM_FEATURES:
+        W = theta.reshape(r, points.basis.shape[1])
+        return _combination_error(W, points, start, stop, buffers.outputs)
+    if network.kind == ModelKind.GAUSSIAN_PROCESS:
+        alpha = mean_weights(network, theta, r)[: points.n_basis[0]]
+        return _combination_error(alpha.T.copy(), points, start, stop, buffers.outputs)
     hidden_single, outputs_single, hidden, outputs, theta_single = buffers
     for i in range(theta.shape[0]):
         theta_single[i] = np.float32(theta[i])
@@ -69,6 +78,20 @@ def _network_error(
     total, count = 0.0, 0
     for block in range(start, stop):
         forward(network, theta, features[block], hidden, outputs)
+        used = points.block_sizes[block]
+        total += _squared_errors(outputs, points.block_targets[block], used)
+        count += used
+    return float(np.sqrt(total / count)) if count else np.nan
+
+
+@compiled
+def _combination_error(
+    W: Matrix, points: Evaluation, start: int, stop: int, outputs: Matrix
+) -> float:
+    """Return the error of a linear combination, (r, n), of the first n functions of the basis."""
+    total, count = 0.0, 0
+    for block in range(start, stop):
+        np.dot(W, points.basis[block, : W.shape[1]], outputs)
         used = points.block_sizes[block]
         total += _squared_errors(outputs, points.block_targets[block], used)
         count += used
@@ -110,6 +133,22 @@ def evaluation_buffers(network: Network, q: int, r: int) -> Buffers:
         np.empty((r, BLOCK)),
         np.empty(q, np.float32),
     )
+
+
+@compiled
+def add_sample(network: Network, points: Evaluation, x: Vector) -> None:
+    """Write the kernel of a Gaussian process between a new sample, at a state, and all points."""
+    phi, n = np.empty(network.sizes[0]), points.n_basis[0]
+    features_at(network, x, phi)
+    for block in range(points.n_all):
+        features, out = points.features[block], points.basis[block, n]
+        out[:] = 0.0
+        for j in range(phi.shape[0]):
+            for i in range(out.shape[0]):
+                out[i] += squared(phi[j] - features[j, i])
+        for i in range(out.shape[0]):
+            out[i] = kernel_value(network, out[i])
+    points.n_basis[0] = n + 1
 
 
 @compiled

@@ -26,6 +26,8 @@ def evaluation_points(system: System, network: args.Network) -> args.Evaluation:
     return args.Evaluation(
         blocks.astype(np.float32),
         blocks,
+        np.zeros((0, 0, 0)),
+        np.zeros(1, dtype=np.int64),
         np.concatenate(targets),
         np.concatenate(sizes),
         np.zeros((0, 0, 0)),
@@ -42,11 +44,27 @@ def _followed(system: System, points: EvaluationSet) -> Array:
     return points.states if len(system.history) > 1 else points.states[:0]
 
 
-def own_targets(points: args.Evaluation) -> args.Evaluation:
-    """Return points whose targets a trial may write into, if the truth changes with time."""
-    if not len(points.states):
-        return points
-    return points._replace(block_targets=points.block_targets.copy(), targets=points.targets.copy())
+def points_of_trial(
+    points: args.Evaluation, network: args.Network, horizon: int
+) -> args.Evaluation:
+    """Return points with what a trial has for itself.
+
+    These are its random features at the points, or room for the kernel between the points and its
+    samples, and targets to write into if the truth changes with time.
+    """
+    if len(points.states):
+        own = (points.block_targets.copy(), points.targets.copy())
+        points = points._replace(block_targets=own[0], targets=own[1])
+    if network.kind == ModelKind.RANDOM_FEATURES:
+        values = network.waves.frequencies @ points.features
+        values += network.waves.phases[:, None]
+        np.cos(values, out=values)
+        values *= network.waves.scale
+        points = points._replace(basis=values, n_basis=np.array([values.shape[1]]))
+    elif network.kind == ModelKind.GAUSSIAN_PROCESS:
+        room = np.zeros((points.n_all, horizon, BLOCK))
+        points = points._replace(basis=room, n_basis=np.zeros(1, dtype=np.int64))
+    return points
 
 
 def _blocks(features: Array, targets: Array) -> tuple[Stack, Stack, Integers]:
@@ -72,6 +90,8 @@ def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation
     return args.Evaluation(
         np.zeros((0, 0, 0), dtype=np.float32),
         np.zeros((0, 0, 0)),
+        np.zeros((0, 0, 0)),
+        np.zeros(1, dtype=np.int64),
         np.zeros((0, 0, 0)),
         np.zeros(0, dtype=np.int64),
         np.ascontiguousarray(regressors),

@@ -15,7 +15,7 @@ from dopt.kernel.evaluation_points import evaluation_points
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
 from dopt.learning import GaussNewton, Learner
-from dopt.models import MLP, Linear
+from dopt.models import MLP, RFF, GaussianProcess, Linear
 from dopt.models.base import Model
 from dopt.policies import (
     ICEM,
@@ -27,8 +27,10 @@ from dopt.policies import (
     TaskOptimal,
 )
 from dopt.policies.d_optimal import count_sketch
+from dopt.policies.held_candidates import HeldCandidates
 from dopt.policies.search import score_code
 from dopt.policies.task_states import box_states, domain_box, task_states
+from dopt.randomness import Draws
 from dopt.spec.config import TrialConfig
 from dopt.spec.information_form import Information, held_information, is_fresh
 from dopt.spec.trial import TrialSpec
@@ -70,10 +72,14 @@ def network_of(system: System, model: Model) -> args.Network:
         kind, sizes = ModelKind.MLP, model.layer_sizes(system)
     elif isinstance(model, Linear):
         kind, sizes = ModelKind.LINEAR, (len(system.features), 1, system.n_learned)
+    elif isinstance(model, RFF):
+        kind, sizes = ModelKind.RANDOM_FEATURES, (len(system.features), 1, system.n_learned)
+    elif isinstance(model, GaussianProcess):
+        kind, sizes = ModelKind.GAUSSIAN_PROCESS, (len(system.features), 1, system.n_learned)
     else:
         raise SpecificationError(
-            f"model '{model.name}' says that it is compiled, but the kernel knows 'mlp' and "
-            f"'linear': set compiled = False in its class."
+            f"model '{model.name}' says that it is compiled, but the kernel knows 'mlp', 'linear', "
+            f"'rff' and 'gaussian_process': set compiled = False in its class."
         )
     lengths = [(n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes)]
     return args.Network(
@@ -83,12 +89,30 @@ def network_of(system: System, model: Model) -> args.Network:
         np.array([FEATURE_KINDS[feature.kind] for feature in system.features]),
         np.array([feature.index for feature in system.features]),
         np.array(system.feature_scales),
+        args.Waves(np.zeros((0, 0)), np.zeros(0), 1.0),
+        _process(system, model),
     )
+
+
+def _process(system: System, model: Model) -> args.Process:
+    if isinstance(model, GaussianProcess):
+        return args.Process(model.lengthscale, model.amplitude, model.noise_variance(system))
+    return args.Process(1.0, 1.0, 1.0)
+
+
+def network_of_trial(spec: TrialSpec, network: args.Network, weights: Vector) -> args.Network:
+    """Return the architecture with the random features that a trial has drawn in its weights."""
+    if not isinstance(spec.model, RFF):
+        return network
+    D, p = spec.model.n_features, len(spec.system.features)
+    frequencies, phases = weights[-D * (p + 1) : -D].reshape(D, p), weights[-D:]
+    waves = args.Waves(frequencies.copy(), phases.copy(), spec.model.scale)
+    return network._replace(waves=waves)
 
 
 def algorithm_of(config: TrialConfig) -> args.Algorithm:
     """Return the settings of the policy and the learner of a configuration."""
-    q, policy, learner = config.model.n_parameters(config.system), config.policy, config.learner
+    q, policy, learner = _n_learned(config), config.policy, config.learner
     regularization = _regularization(config)
     return args.Algorithm(
         np.array(policy.kernel_numbers(q, regularization)),
@@ -101,7 +125,8 @@ def information_of(config: TrialConfig) -> args.Information:
     """Return the functions for the form that holds M, which are compiled when a trial runs."""
     if not isinstance(config.policy, InformationPolicy):
         return args.Information(absent.add_rows, absent.planning_forms)
-    module = primal_linear if isinstance(config.model, Linear) else MODULES[Form(_form(config))]
+    linear = config.model.structure == "least_squares"
+    module = primal_linear if linear else MODULES[Form(_form(config))]
     if is_fresh(config.policy):
         module = fresh  # which goes with a network and the primal form
     searches = isinstance(config.policy, (Search, ICEM))
@@ -113,12 +138,14 @@ def information_of(config: TrialConfig) -> args.Information:
 
 def _search(config: TrialConfig) -> args.Search:
     """Return the plans of a policy that searches."""
-    policy, system, q = config.policy, config.system, config.model.n_parameters(config.system)
+    policy, system, q = config.policy, config.system, _n_learned(config)
     steps, score, held = 0, Score.JOINT, _held(config)
     candidates = np.zeros((0, system.n_inputs))
     if isinstance(policy, Search):
         steps, score = policy.steps(system), score_code(policy)
         candidates = policy.compared_inputs(system)
+    elif isinstance(policy, HeldCandidates):
+        steps, candidates = policy.lookahead, policy.compared_inputs(system)
     states = np.zeros((0, system.n_states))
     if isinstance(policy, TaskOptimal):
         states = task_states(system, policy)
@@ -132,7 +159,7 @@ def _search(config: TrialConfig) -> args.Search:
         policy.stride_of(system) if isinstance(policy, Lookahead) else 1,
         policy.budget_us if isinstance(policy, Search) else 0.0,
         states,
-        domain_box(system, everywhere=not (isinstance(policy, ICEM) and policy.domain == "box")),
+        domain_box(system, policy.domain) if isinstance(policy, ICEM) else np.zeros((2, 0)),
         policy.starts(q, system.n_learned) if isinstance(policy, EOptimal) else np.zeros((0, q)),
         policy.subspace if isinstance(policy, EOptimal) else 0,
         held.noise_variance**-0.5 if held else 1.0,
@@ -145,6 +172,12 @@ def _regularization(config: TrialConfig) -> float:
     return held.regularization if held else 1.0
 
 
+def _n_learned(config: TrialConfig) -> int:
+    """Return the number of parameters that are learned, the first ones."""
+    model, system = config.model, config.system
+    return model.n_parameters(system) - model.n_fixed_parameters(system)
+
+
 def _held(config: TrialConfig) -> Information | None:
     q, n_rows = (
         config.model.n_parameters(config.system),
@@ -154,26 +187,30 @@ def _held(config: TrialConfig) -> Information | None:
 
 
 def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
-    """Return the state of a trial before its first step, for its initial parameters, (q,)."""
-    system = spec.system
+    """Return the state of a trial before its first step.
+
+    ``weights`` are all initial parameters of the model; the state holds those that are learned.
+    """
+    system, q = spec.system, _n_learned(spec.config)
     window = spec.learner.samples_kept(system.horizon)
     return args.State(
-        weights.copy(),
-        weights.copy(),
-        np.zeros(len(weights)),
-        np.zeros(len(weights)),
-        *_information(spec, len(weights)),
+        weights[:q].copy(),
+        weights[:q].copy(),
+        np.zeros(q),
+        np.zeros(q),
+        *_information(spec, q),
         _visited(spec),
+        _posterior(spec),
         np.zeros((len(system.features), window)),
         np.zeros((system.n_learned, window)),
-        *(np.zeros(part.memory_size(system, len(weights))) for part in (spec.policy, spec.learner)),
+        *(np.zeros(part.memory_size(system, q)) for part in (spec.policy, spec.learner)),
     )
 
 
 def empty_scratch(spec: TrialSpec, network: args.Network) -> args.Scratch:
     """Return the memory that a learning step overwrites, for the largest batch of the learner."""
     room = int(max(network.sizes[1], spec.system.n_learned)) * spec.learner.largest_batch()
-    depth, q = len(network.offsets) - 1, spec.model.n_parameters(spec.system)
+    depth, q = len(network.offsets) - 1, _n_learned(spec.config)
     return args.Scratch(np.empty((depth, room)), np.empty((3, room)), np.empty(q))
 
 
@@ -224,6 +261,13 @@ def _visited(spec: TrialSpec) -> args.Visited:
     )
 
 
+def _posterior(spec: TrialSpec) -> args.Posterior:
+    """Return the room for the samples of a Gaussian process, none in other models."""
+    T = spec.system.horizon if isinstance(spec.model, GaussianProcess) else 0
+    solved = np.zeros((T, spec.system.n_learned))
+    return args.Posterior(np.zeros((T, T)), solved, np.zeros(1, dtype=np.int64))
+
+
 def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
     depth, width, r = 1, 1, spec.system.n_learned
     if isinstance(spec.model, MLP):
@@ -242,6 +286,12 @@ def _form(config: TrialConfig) -> int:
     """Return the form of the information matrix, PRIMAL where there is none."""
     held = _held(config)
     return int(Form[held.form.upper()] if held else Form.PRIMAL)
+
+
+def randomness_of(spec: TrialSpec, draws: Draws) -> args.Randomness:
+    """Return the numbers that a trial has drawn; draws of parameters are of the learned ones."""
+    drawn = args.Randomness(*(getattr(draws, name) for name in args.Randomness._fields))
+    return drawn._replace(parameters=drawn.parameters[: _n_learned(spec.config)])
 
 
 def empty_record(system: System) -> args.Record:

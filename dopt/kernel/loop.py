@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dopt.algorithm import ModelKind
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
-from dopt.kernel.evaluation import evaluation_buffers, follow_truth, model_error
+from dopt.kernel.evaluation import add_sample, evaluation_buffers, follow_truth, model_error
 from dopt.kernel.structs import Evaluation, Learn, Plan, Plant, Trial
 from dopt.types import Vector
 
@@ -61,6 +62,8 @@ def advance(
             return t
         trial.information.add_rows(plant, network, trial.state, x)
         clock_4 = monotonic_microseconds()
+        if network.kind == ModelKind.GAUSSIAN_PROCESS:
+            add_sample(network, points, x)
         if plant.history.shape[0] > 1:
             follow_truth(plant, network, points, t)
         loss = model_error(network, theta, points, 0, points.n_grid, buffers)

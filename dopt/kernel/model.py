@@ -1,7 +1,8 @@
-"""Accelerations of either model, rows of their Jacobian, and the change of these rows.
+"""Accelerations of every model, rows of their Jacobian, and the change of these rows.
 
-For the linear model the rows of J are the regressors Ψ(x) and their change along a direction is
-taken by a complex step through the system's own equations.
+Where a model is linear in its parameters the rows of J are the regressors Ψ(x). For the linear form
+of physics their change along a direction is taken by a complex step through the system's own
+equations, for random features by their derivative (:mod:`dopt.kernel.random_features`).
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import ModelKind
+from dopt.kernel import gaussian_process, random_features
 from dopt.kernel import network as nn
+from dopt.kernel import network_tangents as tangents
 from dopt.kernel.compiler import compiled
 from dopt.kernel.structs import Linearization, Network, Plant
 from dopt.types import Matrix, Stack, Vector
@@ -18,8 +21,19 @@ STEP = 1e-30
 
 
 @compiled
-def regressors(plant: Plant, x: Vector, rows: Matrix, offset: Vector) -> None:
-    """Write Ψ(x), (r, q), and the offset, (r,), of the linear model."""
+def regressors(plant: Plant, network: Network, x: Vector, rows: Matrix, offset: Vector) -> None:
+    """Write Ψ(x), (r, q), and the offset, (r,), of a model that is linear in its parameters.
+
+    Both are NaN for a Gaussian process, which has no such rows.
+    """
+    if network.kind == ModelKind.GAUSSIAN_PROCESS:
+        rows[:] = np.nan
+        offset[:] = np.nan
+        return
+    if network.kind == ModelKind.RANDOM_FEATURES:
+        random_features.write_rows(network, x, rows)
+        offset[:] = 0.0
+        return
     plant.accelerations(x, plant.linear_form[0], offset)
     value = np.empty_like(offset)
     for j in range(rows.shape[1]):
@@ -30,9 +44,12 @@ def regressors(plant: Plant, x: Vector, rows: Matrix, offset: Vector) -> None:
 
 @compiled
 def regressors_along(
-    plant: Plant, x: Vector, direction: Vector, component: int, out: Vector
+    plant: Plant, network: Network, x: Vector, direction: Vector, component: int, out: Vector
 ) -> None:
     """Write the derivative of row ``component`` of Ψ, (q,), along a direction of the state."""
+    if network.kind == ModelKind.RANDOM_FEATURES:
+        random_features.write_row_along(network, x, direction, component, out)
+        return
     z = np.empty(x.shape[0], np.complex128)
     for i in range(x.shape[0]):
         z[i] = complex(x[i], STEP * direction[i])
@@ -63,15 +80,47 @@ def model_accelerations(
     plant: Plant, network: Network, theta: Vector, x: Vector, out: Vector
 ) -> None:
     """Write a_θ(x), (r,)."""
-    if network.kind == ModelKind.LINEAR:
+    if network.kind == ModelKind.GAUSSIAN_PROCESS:
+        gaussian_process.write_mean(network, theta, x, out)
+        return
+    if network.kind != ModelKind.MLP:
         rows = np.empty((out.shape[0], theta.shape[0]))
-        regressors(plant, x, rows, out)
+        regressors(plant, network, x, rows, out)
         add_linear(rows, theta, out)
         return
     phi = np.empty(network.sizes[0])
     hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1]))
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
+
+
+@compiled
+def write_features(network: Network, states: Matrix, features: Matrix) -> None:
+    """Write the features of states, (N, d), one state to a column, (p, N)."""
+    phi = np.empty(features.shape[0])
+    for n in range(states.shape[0]):
+        nn.features_at(network, states[n], phi)
+        for j in range(phi.shape[0]):
+            features[j, n] = phi[j]
+
+
+@compiled
+def accelerations_at(
+    plant: Plant, network: Network, theta: Vector, states: Matrix, outputs: Matrix
+) -> None:
+    """Write a_θ, (r, N), at states, (N, d)."""
+    N, r = states.shape[0], outputs.shape[0]
+    if network.kind != ModelKind.MLP:
+        rows, value = np.empty((r, theta.shape[0])), np.empty(r)
+        for n in range(N):
+            regressors(plant, network, states[n], rows, value)
+            add_linear(rows, theta, value)
+            outputs[:, n] = value
+        return
+    features = np.empty((network.sizes[0], N))
+    hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * N))
+    write_features(network, states, features)
+    nn.forward(network, theta, features, hidden, outputs)
 
 
 @compiled
@@ -108,8 +157,8 @@ def linearization_at(
     nn.activations_at(network, theta, point.phi, point.hidden, out)
     nn.back_signals(network, theta, point.hidden, component, point.deltas)
     for j in range(m):
-        nn.features_along(network, x, directions[j], point.phi_dots[j])
-        nn.tangents_at(
+        tangents.features_along(network, x, directions[j], point.phi_dots[j])
+        tangents.tangents_at(
             network,
             theta,
             point.phi_dots[j],
@@ -147,7 +196,7 @@ def network_gradients(network: Network, point: Linearization, component: int, q:
     out = np.empty((1 + m, q))
     nn.parameter_gradient(network, point.phi, point.hidden, point.deltas, component, out[0])
     for j in range(m):
-        nn.gradient_along(
+        tangents.gradient_along(
             network,
             point.phi,
             point.phi_dots[j],
@@ -178,6 +227,19 @@ def network_jacobian(network: Network, theta: Vector, x: Vector, value: Vector) 
 
 
 @compiled
+def rows_at(plant: Plant, network: Network, theta: Vector, states: Matrix) -> Matrix:
+    """Return the rows of J at states, (n, d), as a matrix, (n r, q)."""
+    n, r = states.shape[0], plant.learned_rows.shape[0]
+    rows, value = np.empty((n * r, theta.shape[0])), np.empty(r)
+    for i in range(n):
+        if network.kind != ModelKind.MLP:
+            regressors(plant, network, states[i], rows[r * i : r * (i + 1)], value)
+        else:
+            rows[r * i : r * (i + 1)] = network_jacobian(network, theta, states[i], value)
+    return rows
+
+
+@compiled
 def gradients_along_inputs(
     plant: Plant, network: Network, theta: Vector, bar: Vector, columns: Matrix, component: int
 ) -> Matrix:
@@ -190,17 +252,18 @@ def gradients_along_inputs(
 @compiled
 def linear_gradients(
     plant: Plant,
+    network: Network,
     q: int,
     x: Vector,
     directions: Matrix,
     component: int,
 ) -> Matrix:
-    """Return g and the columns of D B of the linear model as rows, (1 + m, q)."""
+    """Return g and the columns of D B of a linear model as rows, (1 + m, q)."""
     m, r = directions.shape[0], plant.learned_rows.shape[0]
     out, rows = np.empty((1 + m, q)), np.empty((r, q))
-    regressors(plant, x, rows, np.empty(r))
+    regressors(plant, network, x, rows, np.empty(r))
     for i in range(q):
         out[0, i] = rows[component, i]
     for j in range(m):
-        regressors_along(plant, x, directions[j], component, out[1 + j])
+        regressors_along(plant, network, x, directions[j], component, out[1 + j])
     return out

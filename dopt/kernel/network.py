@@ -1,8 +1,7 @@
 """The model in compiled code: values and gradients, for batches and single states.
 
 Twin of the ``torch.nn.Module`` of the reference. In the backward passes δ is the derivative of an
-output with respect to the pre-activations of a layer, h the activations, and a dot marks the
-derivative along a direction of the state (forward over reverse).
+output with respect to the pre-activations of a layer, and h the activations.
 """
 
 from __future__ import annotations
@@ -29,20 +28,6 @@ def features_at(network: Network, x: Vector, out: Vector) -> None:
         elif kind == FeatureKind.SIN:
             value = math.sin(value)
         out[i] = value / network.feature_scales[i]
-
-
-@compiled
-def features_along(network: Network, x: Vector, direction: Vector, out: Vector) -> None:
-    """Write the derivative of the features along a direction of the state."""
-    for i in range(out.shape[0]):
-        index = network.feature_indices[i]
-        kind = network.feature_kinds[i]
-        slope = 1.0
-        if kind == FeatureKind.COS:
-            slope = -math.sin(x[index])
-        elif kind == FeatureKind.SIN:
-            slope = math.cos(x[index])
-        out[i] = slope * direction[index] / network.feature_scales[i]
 
 
 @compiled
@@ -176,7 +161,7 @@ def _affine(W: Matrix, b: Vector, x: Vector, out: Vector) -> None:
 
 
 @contracted
-def _transposed_product(W: Matrix, delta: Vector, out: Vector) -> None:
+def transposed_product(W: Matrix, delta: Vector, out: Vector) -> None:
     for j in range(out.shape[0]):
         out[j] = 0.0
     for i in range(delta.shape[0]):
@@ -195,7 +180,7 @@ def back_signals(
         deltas[depth - 1, i] = W[component, i] * (1.0 - squared(hidden[depth - 1, i]))
     for index in range(depth - 1, 0, -1):
         W, _ = layer(network, theta, index)
-        _transposed_product(W, deltas[index], deltas[index - 1])
+        transposed_product(W, deltas[index], deltas[index - 1])
         for i in range(deltas.shape[1]):
             deltas[index - 1, i] *= 1.0 - squared(hidden[index - 1, i])
 
@@ -240,72 +225,3 @@ def parameter_gradient(
         db[k] = chosen
         for j in range(dW.shape[1]):
             dW[k, j] = chosen * hidden[depth - 1, j]
-
-
-@contracted
-def tangents_at(
-    network: Network,
-    theta: Vector,
-    phi_dot: Vector,
-    hidden: Matrix,
-    component: int,
-    deltas: Matrix,
-    hidden_dot: Matrix,
-    deltas_dot: Matrix,
-) -> None:
-    """Write the derivatives of the activations and of δ, (L, w) each, along a direction."""
-    depth, width = network.offsets.shape[0] - 1, hidden.shape[1]
-    below = phi_dot
-    for index in range(depth):
-        W, _ = layer(network, theta, index)
-        for i in range(width):
-            total = 0.0
-            for j in range(below.shape[0]):
-                total += W[i, j] * below[j]
-            hidden_dot[index, i] = (1.0 - squared(hidden[index, i])) * total
-        below = hidden_dot[index]
-    W, _ = layer(network, theta, depth)
-    for i in range(width):
-        bend = -2.0 * hidden[depth - 1, i] * hidden_dot[depth - 1, i]
-        deltas_dot[depth - 1, i] = W[component, i] * bend
-    for index in range(depth - 1, 0, -1):
-        W, _ = layer(network, theta, index)
-        _transposed_product(W, deltas_dot[index], deltas_dot[index - 1])
-        for j in range(width):
-            back = 0.0
-            for i in range(width):
-                back += W[i, j] * deltas[index, i]
-            h = hidden[index - 1, j]
-            bend = -2.0 * h * hidden_dot[index - 1, j]
-            deltas_dot[index - 1, j] = deltas_dot[index - 1, j] * (1.0 - h * h) + back * bend
-
-
-@contracted
-def gradient_along(
-    network: Network,
-    phi: Vector,
-    phi_dot: Vector,
-    hidden: Matrix,
-    hidden_dot: Matrix,
-    deltas: Matrix,
-    deltas_dot: Matrix,
-    component: int,
-    out: Vector,
-) -> None:
-    """Write the derivative of g, (q,), along a direction: one column of D B."""
-    depth = network.offsets.shape[0] - 1
-    for index in range(depth):
-        below = phi if index == 0 else hidden[index - 1]
-        below_dot = phi_dot if index == 0 else hidden_dot[index - 1]
-        dW, db = layer(network, out, index)
-        for i in range(db.shape[0]):
-            delta, delta_dot = deltas[index, i], deltas_dot[index, i]
-            db[i] = delta_dot
-            for j in range(below.shape[0]):
-                dW[i, j] = delta_dot * below[j] + delta * below_dot[j]
-    dW, db = layer(network, out, depth)
-    for k in range(db.shape[0]):
-        chosen = 1.0 if k == component else 0.0
-        db[k] = 0.0
-        for j in range(dW.shape[1]):
-            dW[k, j] = chosen * hidden_dot[depth - 1, j]

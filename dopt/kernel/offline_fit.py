@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.kernel.compiler import called_from_python, compiled, squared
-from dopt.kernel.information.inverse import factorize, solve
+from dopt.kernel.information.cholesky import factorize, solve
 from dopt.kernel.information.normal_equations import errors_of, normal_equations, write_products
 from dopt.kernel.learners.gauss_newton import squared_distance
 from dopt.kernel.structs import Network

@@ -9,7 +9,7 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import called_from_python
-from dopt.kernel.model import euler_step
+from dopt.kernel.model import euler_step, write_features
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Stack, Vector
 
@@ -31,14 +31,11 @@ def follow_network(
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m)."""
     n, r = inputs.shape[1], plant.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    flow, value, phi = np.empty(states.shape[2]), np.empty(r), np.empty(network.sizes[0])
+    flow, value = np.empty(states.shape[2]), np.empty(r)
     features, outputs = np.empty((network.sizes[0], n)), np.empty((r, n))
     hidden = np.empty((depth, width * n))
     for t in range(inputs.shape[0]):
-        for i in range(n):
-            nn.features_at(network, states[t, i], phi)
-            for j in range(phi.shape[0]):
-                features[j, i] = phi[j]
+        write_features(network, states[t], features)
         nn.forward(network, theta, features, hidden, outputs)
         for i in range(n):
             for k in range(r):

@@ -9,13 +9,15 @@ import numpy as np
 
 from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
-from dopt.kernel.evaluation_points import own_targets
+from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import (
     constants,
     empty_record,
     empty_scratch,
     information_of,
     initial_state,
+    network_of_trial,
+    randomness_of,
 )
 from dopt.kernel.pointers import Compiled, compiled_trial
 from dopt.policies.base import CompiledPolicy, check_norms
@@ -47,26 +49,33 @@ class KernelTrial:
     def __init__(self, spec: TrialSpec) -> None:
         self.spec = spec
         plant, network, algorithm, points = constants(spec.config)
-        self.constants = (plant, network, algorithm, own_targets(points))
         draws = draw(spec)
+        network = network_of_trial(spec, network, draws.weights)
+        self.constants = (
+            plant,
+            network,
+            algorithm,
+            points_of_trial(points, network, spec.system.horizon),
+        )
         self.trial = args.Trial(
             plant,
             network,
             algorithm,
             information_of(spec.config),
-            args.Randomness(*(getattr(draws, name) for name in args.Randomness._fields)),
+            randomness_of(spec, draws),
             initial_state(spec, draws.weights),
             empty_scratch(spec, network),
             empty_record(spec.system),
         )
         self.state, self.record = self.trial.state, self.trial.record
+        self._fixed = draws.weights[len(self.state.theta) :]
         self.done = 0
         self.diverged_at: int | None = None
 
     @property
     def parameters(self) -> Array:
-        """Parameters of the model, (q,)."""
-        return self.state.theta
+        """Parameters of the model, (q,), those that stay as they were drawn included."""
+        return np.concatenate([self.state.theta, self._fixed])
 
     @property
     def states(self) -> Array:
@@ -115,7 +124,7 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     for step in spec.assessed_steps:
         _advance_in_pieces(trial, step)
         if trial.diverged_at is None:
-            checkpoints[step] = trial.state.theta.copy()
+            checkpoints[step] = trial.parameters
     _advance_in_pieces(trial, spec.system.horizon)
     record, end = trial.record, trial.diverged_at
     if end is not None:
@@ -123,7 +132,7 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
             rows[end:] = np.nan
     return TrialResult(
         **record._asdict(),
-        parameters=trial.state.theta.copy(),
+        parameters=trial.parameters,
         diverged_at=end,
         wall_seconds=time.perf_counter() - wall,
         cpu_seconds=time.process_time() - cpu,

@@ -1,7 +1,7 @@
 """Structures that compiled functions receive: constants, mutable state and records, by name.
 
 Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
-w units in each hidden layer, L hidden layers, N evaluation points.
+w units in each hidden layer, L hidden layers, N evaluation points, D random features.
 """
 
 from __future__ import annotations
@@ -37,6 +37,22 @@ class Plant(NamedTuple):
     state_limit: float
 
 
+class Waves(NamedTuple):
+    """Random features (:mod:`dopt.kernel.random_features`); empty in other models."""
+
+    frequencies: Matrix  # (D, p), Ω
+    phases: Vector  # (D,), b
+    scale: float  # s √(2/D)
+
+
+class Process(NamedTuple):
+    """Gaussian process (:mod:`dopt.kernel.gaussian_process`); ones in other models."""
+
+    lengthscale: float  # ℓ
+    amplitude: float  # s
+    noise_variance: float  # of an observed acceleration
+
+
 class Network(NamedTuple):
     """Architecture of the model."""
 
@@ -46,10 +62,12 @@ class Network(NamedTuple):
     feature_kinds: Integers  # (p,) dopt.algorithm.FeatureKind
     feature_indices: Integers  # (p,)
     feature_scales: Vector  # (p,)
+    waves: Waves
+    process: Process
 
 
 class Search(NamedTuple):
-    """Plans among which a policy searches (:mod:`dopt.policies.search`); none in others."""
+    """Plans among which a policy chooses (:mod:`dopt.policies.search`); none in others."""
 
     candidates: Matrix  # (C, m)
     score: int  # dopt.algorithm.Score
@@ -87,12 +105,14 @@ class Randomness(NamedTuple):
 class Evaluation(NamedTuple):
     """Points at which the model is compared with the truth, the grid's first.
 
-    For the network they come in blocks of a fixed size, one point to a column, the last block of
-    the grid and that of the reachable set padded; for the linear model one after the other.
+    They come in blocks of a fixed size, one point to a column, the last block of the grid and that
+    of the reachable set padded; for the linear model one after the other.
     """
 
     single: Singles  # (blocks, p, block size), features in single precision
     features: Stack  # (blocks, p, block size)
+    basis: Stack  # (blocks, D or T, block size), random features, or the kernel with the samples
+    n_basis: Integers  # (1,) rows of a block of ``basis`` that are filled
     block_targets: Stack  # (blocks, r, block size)
     block_sizes: Integers  # (blocks,) points that count
     regressors: Stack  # (N, r, q) of the linear model
@@ -148,6 +168,17 @@ class Visited(NamedTuple):
     regularization: float  # λ of M₀ = λI
 
 
+class Posterior(NamedTuple):
+    """Samples of a Gaussian process (:mod:`dopt.kernel.learners.conditioning`).
+
+    Empty in other models.
+    """
+
+    factor: Matrix  # (T, T), L in the lower triangle
+    solved: Matrix  # (T, r), z
+    n_samples: Integers  # (1,)
+
+
 class Linearization(NamedTuple):
     """Passes of the network at one state for one component, and along m directions."""
 
@@ -171,6 +202,7 @@ class State(NamedTuple):
     dual: Dual
     sketch: Sketch
     visited: Visited
+    posterior: Posterior
     window_features: Matrix  # (p, window) newest samples, a ring
     window_targets: Matrix  # (r, window)
     policy_memory: Vector  # what a compiled policy of a user's own keeps

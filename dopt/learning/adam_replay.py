@@ -36,10 +36,10 @@ class AdamReplay(AdamRule):
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.replay.learn"
 
-    learning_rate: float = parameter(1e-2, bound="positive")
+    learning_rate: float = parameter(3e-3, bound="positive")
     capacity: int = parameter(10_000, "samples", "positive")
     batch: int = parameter(100, "samples", "positive")
-    steps: int = parameter(1, "steps", "positive")
+    steps: int = parameter(30, "steps", "positive")
 
     def samples_kept(self, horizon: int) -> int:
         return min(self.capacity, horizon)

@@ -17,4 +17,5 @@ class Conditioning(Learner):
 
     name: ClassVar[str] = "conditioning"
     structure: ClassVar[str] = "conditioning"
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.conditioning.learn"

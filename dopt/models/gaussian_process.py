@@ -39,7 +39,7 @@ class GaussianProcess(Model):
 
     name: ClassVar[str] = "gaussian_process"
     structure: ClassVar[str] = "conditioning"
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
 
     lengthscale: float = parameter(1.0, bound="positive")
     amplitude: float = parameter(10.0, bound="positive")

@@ -37,7 +37,7 @@ class RFF(Model):
 
     name: ClassVar[str] = "rff"
     structure: ClassVar[str] = "least_squares"
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
 
     n_features: int = parameter(100, "features", "positive")
     lengthscale: float = parameter(1.0, bound="positive")

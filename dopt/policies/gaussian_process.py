@@ -20,4 +20,5 @@ class GaussianProcessEntropy(HeldCandidates):
     """
 
     name: ClassVar[str] = "gaussian_process"
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.gaussian_process.plan"

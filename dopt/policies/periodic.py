@@ -59,8 +59,7 @@ class Periodic(AtEigenfrequency):
     Parameters
     ----------
     frequency : float or None
-        Angular frequency ω [rad/s]; None takes the damped eigenfrequency of the least damped
-        oscillation about the stable equilibrium.
+        As of :class:`AtEigenfrequency`.
     """
 
     name: ClassVar[str] = "periodic"
@@ -81,8 +80,7 @@ class PeriodicSquare(AtEigenfrequency):
     Parameters
     ----------
     frequency : float or None
-        Angular frequency ω [rad/s]; None takes the damped eigenfrequency of the least damped
-        oscillation about the stable equilibrium.
+        As of :class:`AtEigenfrequency`.
     """
 
     name: ClassVar[str] = "periodic_square"

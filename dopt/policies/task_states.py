@@ -42,15 +42,15 @@ def _box(system: System, rng: np.random.Generator) -> Array:
     return states
 
 
-def domain_box(system: System, *, everywhere: bool = False) -> Array:
+def domain_box(system: System, domain: str) -> Array:
     """Return half-widths and periods of the components of a state, (2, d).
 
-    The half-widths are those of the evaluation box, ∞ for the components that it leaves free or
-    ``everywhere``; the period is 2π for angles and 0 for all others.
+    With ``domain`` "box" the half-widths are those of the evaluation box, and ∞ for the components
+    that it leaves free; with "everywhere" all are ∞. The period is 2π for angles, 0 for all others.
     """
     out = np.zeros((2, system.n_states))
     out[0] = np.inf
-    if not everywhere:
+    if domain == "box":
         out[0, list(system.grid_indices)] = system.grid_half_widths
     out[1, list(system.angle_indices)] = 2 * np.pi
     return out

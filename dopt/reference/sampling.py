@@ -103,7 +103,7 @@ class SampledPlan:
         """Return the factors of the rows at states, (..., d), (...)."""
         batch = self._batch
         assert batch.held is not None
-        domain = domain_box(batch.system, everywhere=self._policy.domain == "everywhere")
+        domain = domain_box(batch.system, self._policy.domain)
         inside: Tensor = _domain_weights(torch.tensor(domain).to(states), states)
         weights: Tensor = inside * batch.held.noise_variance**-0.5
         return weights

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from dopt.errors import SpecificationError
-from dopt.policies import DOptimal
+from dopt.learning import InformationLearner
+from dopt.policies import DOptimal, InformationPolicy
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.reference.models import model_function, network_function
@@ -107,11 +108,16 @@ class BatchState:
         self.held = held_information(self.config.policy, self.config.learner, q, n_rows)
         self.project: Callable[[Tensor], Tensor] = lambda rows: rows[..., : self.n_learned]
         self.information: Tensor | None = None
-        if self.held:
+        if self.held and self._reads_information():
             self._choose_form(self.held.form)
             size = self.project(self.theta).shape[1]
             prior = self.held.regularization * torch.eye(size).to(self.theta)
             self.information = prior.repeat(len(self.specs), 1, 1)
+
+    def _reads_information(self) -> bool:
+        """Tell whether a policy or a filter reads M; least squares sum their own here."""
+        parts = (self.config.policy, self.config.learner)
+        return any(isinstance(part, (InformationPolicy, InformationLearner)) for part in parts)
 
     def _choose_form(self, form: str) -> None:
         """Plan in the space of a sketch where the specification says so.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, TypeGuard
 
-from dopt.learning import InformationLearner, Learner
+from dopt.learning import InformationLearner, Learner, RecursiveLeastSquares
 from dopt.policies import InformationPolicy, Policy
 
 
@@ -34,8 +34,8 @@ def held_information(
     A policy that plans by M shares it with a learner that updates it, which needs the gain in the
     space of the parameters and hence the primal form.
     """
-    sharing = learner if isinstance(learner, InformationLearner) else None
-    noise_variance = sharing.noise_variance if sharing else 1.0
+    sharing = learner if isinstance(learner, (InformationLearner, RecursiveLeastSquares)) else None
+    noise_variance = sharing.noise_variance if isinstance(sharing, InformationLearner) else 1.0
     if isinstance(policy, InformationPolicy):
         form = "primal" if sharing else policy.chosen_form(n_parameters, n_rows)
         return Information(form, policy.regularization, noise_variance)

@@ -91,11 +91,17 @@ def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[
     for flat, own in zip(flats, usual, strict=True):
         title = [_title(flat)] if titled or not paths else []
         words = _words(flat, [path for path in paths if _is_unusual(path, flat, own)])
-        brief = title + words or _words(flat, common) or [_title(flat)]
+        brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
         whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
         rows.append((", ".join(brief), ", ".join(whole)))
     counts = Counter(brief for brief, _ in rows)
     return [brief if counts[brief] == 1 else whole for brief, whole in rows]
+
+
+def _telling(paths: Sequence[str]) -> list[str]:
+    """Return the paths without the settings of sections whose names are among them."""
+    named = {path.partition(".")[0] for path in paths if path.endswith(".name")}
+    return [path for path in paths if path.endswith(".name") or path.partition(".")[0] not in named]
 
 
 def _is_unusual(path: str, flat: Flat, usual: Flat) -> bool:

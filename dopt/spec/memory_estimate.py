@@ -30,6 +30,9 @@ from dopt.systems import System
 NUMBER = 8
 """Bytes of a double."""
 
+OTHER_POINTS = 768
+"""Evaluation points beside the grid: 512 of the reachable set, and at most 256 of padding."""
+
 STRONG_INPUTS = 8
 """Simulated sequences from which the reachable set is drawn (:mod:`dopt.evaluation`)."""
 
@@ -78,9 +81,12 @@ def memory_by_setting(
     held = held_information(policy, learner, q, r * T)
     form = held.form if held else "none"
     if path == "kernel":
-        information = _information(policy, form, q, r * T, T * (p + L * w * (1 + r)))
+        information = _information(policy, form, model, q, r * T, T * (p + L * w * (1 + r)))
     else:
         information = _information_of_reference(policy, form, model, q)
+    if isinstance(model, RFF) and path == "kernel":
+        # the features at the evaluation points
+        numbers[_size_of(model)] += model.n_features * (N + OTHER_POINTS)
     parts = (information, _search(policy, system, model, path), _beyond(policy, system, model))
     for part in (*parts, _task(task, system, q) if task else {}):
         for setting, count in part.items():
@@ -101,7 +107,9 @@ def _size_of(model: Model) -> str:
     return names.get(type(model), "model")
 
 
-def _information(policy: Policy, form: str, q: int, n_rows: int, n_factors: int) -> dict[str, int]:
+def _information(
+    policy: Policy, form: str, model: Model, q: int, n_rows: int, n_factors: int
+) -> dict[str, int]:
     """Return the numbers of the information matrix, in the form in which it is held.
 
     The inverse is made from an identity matrix, which makes two of them for a moment.
@@ -109,7 +117,7 @@ def _information(policy: Policy, form: str, q: int, n_rows: int, n_factors: int)
     if form == "none":
         return {}
     if form == "primal":
-        return {"model.width": 2 * q**2 + 16 * q}
+        return {_size_of(model): 2 * q**2 + 16 * q}
     if form == "dual":
         return {"env.horizon": n_rows**2 + n_factors}
     size = policy.sketch_size if isinstance(policy, DOptimal) else 0
@@ -184,7 +192,7 @@ def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
         return {"policy.candidates": policy.candidates * 2 * r * q, _size_of(model): q**2}
     if isinstance(model, GaussianProcess):
         # the factor, and the kernel between all samples and all evaluation points
-        return {"env.horizon": 2 * T**2, "env.grid_points": 2 * N * T}
+        return {"env.horizon": 2 * T**2 + OTHER_POINTS * T, "env.grid_points": 2 * N * T}
     return {}
 
 

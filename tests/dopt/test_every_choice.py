@@ -1,4 +1,4 @@
-"""Every registered policy and learner, in every form of M, on both paths: nothing is left out.
+"""Every registered policy, learner and model, in every form of M, on both paths: none is left out.
 
 The cases come from the registries. What says that it is compiled has to agree with the reference;
 what does not has to be refused by the kernel and to run on the reference.
@@ -6,6 +6,7 @@ what does not has to be refused by the kernel and to run on the reference.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -79,6 +80,12 @@ def cases() -> Iterator[tuple[str, TrialSpec]]:
         spec = next((one for one in fitting if one is not None), None)
         assert spec is not None, f"policy '{policy}' goes with no model and learner"
         yield policy, spec
+    for model in MODELS:
+        pairs = itertools.product(ENVS, POLICIES, LEARNERS)
+        made = (combined(env, policy, model, learner, "auto") for env, policy, learner in pairs)
+        spec = next((one for one in made if one is not None), None)
+        assert spec is not None, f"model '{model}' goes with no policy and learner"
+        yield f"model-{model}", spec
 
 
 CASES = dict(cases())
@@ -104,6 +111,7 @@ def test_the_cases_cover_the_registries_and_the_forms() -> None:
     specs = list(CASES.values())
     assert {spec.policy.name for spec in specs} == set(POLICIES)
     assert {spec.learner.name for spec in specs} == set(LEARNERS)
+    assert {spec.model.name for spec in specs} == set(MODELS)
     held = {
         held_information(spec.policy, spec.learner, 1, 1)
         for spec in specs

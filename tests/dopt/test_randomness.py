@@ -9,7 +9,7 @@ import pytest
 
 from dopt.randomness import _STREAMS, draw, stream
 from dopt.systems import SYSTEMS
-from tests.dopt.trials import PAIRS, trial
+from tests.dopt.trials import MODELS, PAIRS, trial
 
 NAMES = ("noise", "weights", "inputs", "components", "ties")
 STREAMS = tuple(_STREAMS)
@@ -17,14 +17,15 @@ STREAMS = tuple(_STREAMS)
 
 @pytest.mark.parametrize("env", SYSTEMS)
 def test_policies_that_are_compared_share_noise_and_initial_weights(env: str) -> None:
-    specs = [trial(env, policy, 11) for e, policy in PAIRS if e == env and policy != "oracle"]
+    policies = [policy for e, policy in PAIRS if e == env]
+    specs = [trial(env, policy, 11) for policy in policies if policy not in MODELS]
     first, *others = (draw(spec) for spec in specs)
     assert len(others) > 2
     for other in others:
         for name in ("noise", "weights", "components", "ties"):
             assert np.array_equal(getattr(first, name), getattr(other, name)), name
-    oracle = draw(trial(env, "oracle", 11))
-    assert np.array_equal(first.noise, oracle.noise)
+    for policy in {"oracle", *policies} & set(MODELS):  # whose models are no networks
+        assert np.array_equal(first.noise, draw(trial(env, policy, 11)).noise)
 
 
 @pytest.mark.parametrize("env", SYSTEMS)

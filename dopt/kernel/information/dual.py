@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled, vectorized
+from dopt.kernel.information.cholesky import solve_lower
 from dopt.kernel.information.primal import inner
 from dopt.kernel.model import all_components, linearization_at
 from dopt.kernel.structs import Dual, Linearization, Network, Plant, State
@@ -156,15 +157,6 @@ def _add_output_layer(
         out[0, s * stride + component] += values[s] + 1.0
         for j in range(slopes.shape[0]):
             out[1 + j, s * stride + component] += slopes[j, s]
-
-
-@compiled
-def solve_lower(factor: Matrix, n_rows: int, right: Matrix) -> None:
-    """Replace the first entries of each right-hand side, (k, ·), by those of C⁻¹ times it."""
-    for i in range(n_rows):
-        row = factor[i]
-        for k in range(right.shape[0]):
-            right[k, i] = (right[k, i] - inner(row[:i], right[k, :i])) / row[i]
 
 
 @compiled

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled
-from dopt.kernel.information.inverse import factorize, write_inverse
+from dopt.kernel.information.cholesky import factorize, write_inverse
 from dopt.kernel.information.normal_equations import normal_matrix
 from dopt.kernel.information.primal_network import add_rows as add_newest_rows
 from dopt.kernel.information.primal_network import planning_forms

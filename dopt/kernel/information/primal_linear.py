@@ -1,4 +1,4 @@
-"""The q × q information matrix of the linear model in compiled code."""
+"""The q × q information matrix of a model linear in its parameters in compiled code."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from dopt.types import Matrix, Vector
 
 
 @compiled
-def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:  # noqa: ARG001  # one signature for all forms
+def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
     """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
     r = plant.learned_rows.shape[0]
     rows = np.empty((r, state.theta.shape[0]))
-    regressors(plant, x, rows, np.empty(r))
+    regressors(plant, network, x, rows, np.empty(r))
     rank_update(state.covariance, rows, np.zeros(r), np.empty(rows.shape))
 
 
 @compiled
 def planning_forms(
     plant: Plant,
-    network: Network,  # noqa: ARG001
+    network: Network,
     state: State,
     bar: Vector,
     columns: Matrix,
@@ -31,5 +31,5 @@ def planning_forms(
 ) -> Matrix:
     """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
     m = columns.shape[0]
-    G = linear_gradients(plant, state.theta.shape[0], bar, columns, component)
+    G = linear_gradients(plant, network, state.theta.shape[0], bar, columns, component)
     return quadratic_forms(state.covariance, G[: 1 if m == 1 else 1 + m], G)

@@ -1,4 +1,4 @@
-"""Rows of J for either model, and the filter step of the learners that use them."""
+"""Rows of J for every model, and the filter step of the learners that use them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from dopt.types import Matrix, Vector
 @compiled
 def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
     """Return J, (r, q), at a state, and write a_θ(x), (r,)."""
-    if network.kind == ModelKind.LINEAR:
+    if network.kind != ModelKind.MLP:
         rows = np.empty((value.shape[0], theta.shape[0]))
-        regressors(plant, x, rows, value)
+        regressors(plant, network, x, rows, value)
         add_linear(rows, theta, value)
         return rows
     return network_jacobian(network, theta, x, value)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
 from dopt.kernel.compiler import compiled, squared
-from dopt.kernel.information.inverse import factorize, solve, write_inverse
+from dopt.kernel.information.cholesky import factorize, solve, write_inverse
 from dopt.kernel.information.normal_equations import errors_of, normal_equations
 from dopt.kernel.learners.kalman import filter_sample
 from dopt.kernel.learners.samples import store_sample

@@ -71,8 +71,8 @@ def model_and_jacobian(
 ) -> None:
     """Write a_θ and J, (r, q), at state i of the path."""
     x, out = path.states[i], path.outputs[i]
-    if network.kind == ModelKind.LINEAR:
-        regressors(plant, x, rows, out)
+    if network.kind != ModelKind.MLP:
+        regressors(plant, network, x, rows, out)
         add_linear(rows, theta, out)
         return
     nn.features_at(network, x, path.phi)
@@ -107,8 +107,8 @@ def rollout(
             return False
         wanted = (i + 1) % stride == 0
         block = r * ((i + 1) // stride - 1) if wanted else spare
-        # A network's output comes without rows; those of the linear model are its output.
-        count = r if wanted or network.kind == ModelKind.LINEAR else 0
+        # A network's output comes without rows; those of a linear model are its output.
+        count = r if wanted or network.kind != ModelKind.MLP else 0
         rows = path.rows[block : block + count]
         model_and_jacobian(plant, network, theta, path, i + 1, rows)
         weight = search.row_scale

@@ -16,12 +16,12 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, contracted
-from dopt.kernel.information.inverse import (
+from dopt.kernel.information.cholesky import (
     factorize,
     solve_columns,
     solve_transposed_columns,
 )
-from dopt.kernel.model import add_linear, network_jacobian, regressors
+from dopt.kernel.model import regressors, write_features
 from dopt.kernel.structs import Covariance, Network, Plant, State
 from dopt.types import Matrix, Stack, Vector
 
@@ -105,57 +105,15 @@ def _write_reversed(covariance: Covariance, out: Matrix) -> None:
 
 
 @compiled
-def rows_at(plant: Plant, network: Network, theta: Vector, states: Matrix) -> Matrix:
-    """Return the rows of J at states, (n, d), as a matrix, (n r, q)."""
-    n, r = states.shape[0], plant.learned_rows.shape[0]
-    rows, value = np.empty((n * r, theta.shape[0])), np.empty(r)
-    for i in range(n):
-        if network.kind == ModelKind.LINEAR:
-            regressors(plant, states[i], rows[r * i : r * (i + 1)], value)
-        else:
-            rows[r * i : r * (i + 1)] = network_jacobian(network, theta, states[i], value)
-    return rows
-
-
-@compiled
-def write_features(network: Network, states: Matrix, features: Matrix) -> None:
-    """Write the features of states, (N, d), one state to a column, (p, N)."""
-    phi = np.empty(features.shape[0])
-    for n in range(states.shape[0]):
-        nn.features_at(network, states[n], phi)
-        for j in range(phi.shape[0]):
-            features[j, n] = phi[j]
-
-
-@compiled
-def accelerations_at(
-    plant: Plant, network: Network, theta: Vector, states: Matrix, outputs: Matrix
-) -> None:
-    """Write a_θ, (r, N), at states, (N, d)."""
-    N, r = states.shape[0], outputs.shape[0]
-    if network.kind == ModelKind.LINEAR:
-        rows, value = np.empty((r, theta.shape[0])), np.empty(r)
-        for n in range(N):
-            regressors(plant, states[n], rows, value)
-            add_linear(rows, theta, value)
-            outputs[:, n] = value
-        return
-    features = np.empty((network.sizes[0], N))
-    hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * N))
-    write_features(network, states, features)
-    nn.forward(network, theta, features, hidden, outputs)
-
-
-@compiled
 def changes_along(
     plant: Plant, network: Network, theta: Vector, states: Matrix, along: Matrix, out: Stack
 ) -> None:
     """Write J W, (r, s, N), at states, (N, d), for directions Wᵀ, (s, q)."""
     N, r = states.shape[0], out.shape[0]
-    if network.kind == ModelKind.LINEAR:
+    if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)
         for n in range(N):
-            regressors(plant, states[n], rows, value)
+            regressors(plant, network, states[n], rows, value)
             for k in range(r):
                 out[k, :, n] = np.dot(along, rows[k])
         return

@@ -14,14 +14,8 @@ from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, Score
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import add_multiple, inner
-from dopt.kernel.model import euler_step
-from dopt.kernel.search.posterior import (
-    Directions,
-    accelerations_at,
-    changes_along,
-    directions,
-    rows_at,
-)
+from dopt.kernel.model import accelerations_at, euler_step, rows_at
+from dopt.kernel.search.posterior import Directions, changes_along, directions
 from dopt.kernel.structs import Trial
 from dopt.types import Booleans, Integers, Matrix, Stack, Vector
 

@@ -156,7 +156,7 @@ def test_outside_of_the_domain_rows_count_less(path: str) -> None:
 
 def test_the_weight_of_a_state_falls_with_its_distance_from_the_box_on_the_circle() -> None:
     system = SYSTEMS["arm"]()
-    domain = torch.tensor(domain_box(system))
+    domain = torch.tensor(domain_box(system, "box"))
     half = torch.tensor(system.grid_half_widths, dtype=torch.float64)
     assert float(_domain_weights(domain, half)) == 1.0
     assert float(_domain_weights(domain, half * torch.tensor([1.25, 1.0, 1.0, 1.0]))) == (

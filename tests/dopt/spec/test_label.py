@@ -33,7 +33,7 @@ def config(system: str, name: str, **sections: Mapping[str, object]) -> Config:
 
 PLAIN = config("pendulum", "d_optimal")
 BOUND = config("pendulum", "d_optimal", env={"gamma": 3})
-REPLAY = config("pendulum", "d_optimal", learner={"name": "adam_replay", "steps": 30})
+REPLAY = config("pendulum", "d_optimal", learner={"name": "adam_replay", "steps": 60})
 WIDE = config("pendulum", "d_optimal", model={"width": 64})
 ORACLE = config("pendulum", "oracle")
 RANDOM = config("pendulum", "random")
@@ -46,7 +46,7 @@ ALL = (PLAIN, BOUND, REPLAY, WIDE, ORACLE, RANDOM, TASK)
     [
         (PLAIN, "D-optimal"),
         (BOUND, "D-optimal, γ=3"),
-        (REPLAY, "D-optimal, adam_replay ×30"),
+        (REPLAY, "D-optimal, adam_replay ×60"),
         (WIDE, "D-optimal, width 64"),
         (ORACLE, "oracle"),
         (TASK, "random, task control"),
@@ -62,7 +62,7 @@ def test_a_stored_label_says_what_is_not_the_default(one: Config, label: str) ->
         ([PLAIN], ["D-optimal"]),
         ([BOUND], ["D-optimal"]),
         ([PLAIN, BOUND], ["γ=2", "γ=3"]),
-        ([PLAIN, REPLAY], ["adam_window", "adam_replay ×30"]),
+        ([PLAIN, REPLAY], ["adam_window", "adam_replay ×60"]),
         ([PLAIN, RANDOM], ["D-optimal", "random"]),
         ([PLAIN, RANDOM, BOUND], ["D-optimal", "random", "D-optimal, γ=3"]),
         ([RANDOM, TASK], ["random", "task control"]),

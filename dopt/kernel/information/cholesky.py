@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled, vectorized
-from dopt.kernel.information.dual import solve_lower
-from dopt.kernel.information.primal import add_multiple
+from dopt.kernel.information.primal import add_multiple, inner
 from dopt.types import Matrix, Stack, Vector
 
 BLOCK = 48
@@ -23,14 +22,31 @@ def factorize(matrix: Matrix) -> bool:
     return True
 
 
+@compiled
+def solve_lower(factor: Matrix, n_rows: int, right: Matrix) -> None:
+    """Replace the first entries of each right-hand side, (k, ·), by those of C⁻¹ times it."""
+    for i in range(n_rows):
+        row = factor[i]
+        for k in range(right.shape[0]):
+            right[k, i] = (right[k, i] - inner(row[:i], right[k, :i])) / row[i]
+
+
+@vectorized
+def solve_lower_transposed(factor: Matrix, n_rows: int, right: Matrix) -> None:
+    """Replace right-hand sides, (k, n), by C⁻ᵀ times them, with C the first n rows and columns."""
+    for i in range(n_rows - 1, -1, -1):
+        row = factor[i]
+        for k in range(right.shape[0]):
+            right[k, i] /= row[i]
+            add_multiple(right[k, :i], -right[k, i], row[:i])
+
+
 @vectorized
 def solve(factor: Matrix, right: Vector) -> None:
     """Replace a right-hand side, (q,), by (C Cᵀ)⁻¹ times it."""
     q = right.shape[0]
     solve_lower(factor, q, right.reshape(1, q))
-    for i in range(q - 1, -1, -1):
-        right[i] /= factor[i, i]
-        add_multiple(right[:i], -right[i], factor[i, :i])
+    solve_lower_transposed(factor, q, right.reshape(1, q))
 
 
 @compiled

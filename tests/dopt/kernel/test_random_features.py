@@ -1,0 +1,138 @@
+"""Random Fourier features in the compiled kernel: against the reference and their definition."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt.errors import IncompatibleError
+from dopt.forecasts import model_forecast
+from dopt.kernel.evaluation_points import points_of_trial
+from dopt.kernel.from_spec import constants
+from dopt.kernel.information.primal import dense
+from dopt.kernel.model import rows_at
+from dopt.kernel.random_features import write_row_along
+from dopt.kernel.run import KernelTrial
+from dopt.policies import POLICIES
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+from tests.close import assert_close
+from tests.dopt.kernel.test_agreement import check_agreement
+from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.trials import trial
+
+FEATURES = {"name": "rff", "n_features": 30}
+
+
+def features(env: str, policy: str = "d_optimal", /, **fields: Any) -> TrialSpec:
+    """Return a small trial that learns random features."""
+    sections: dict[str, Any] = {
+        "model": FEATURES,
+        "learner": {"name": "recursive_least_squares"},
+        "env": {"horizon": 9},
+    }
+    merged = {key: sections.get(key, {}) | entries for key, entries in fields.items()}
+    return trial(env, policy, 3, **(sections | merged))
+
+
+def together(env: str) -> list[str]:
+    """Return the names of the compiled policies that go with random features."""
+    found = []
+    for name, policy in POLICIES.items():
+        try:
+            features(env, name)
+        except IncompatibleError:
+            continue
+        found += [name] * policy.compiled
+    return found
+
+
+CASES = [(env, policy) for env in ("arm", "pendulum") for policy in together(env)]
+
+
+@pytest.mark.parametrize(("env", "policy"), CASES)
+def test_both_paths_agree_with_every_policy(env: str, policy: str) -> None:
+    spec = features(env, policy)
+    assert spec.config.path == "kernel"
+    fast, plain = check_agreement(spec)
+    assert relative_gap(fast.parameters, plain.parameters) < 1e-5
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_both_paths_agree_over_many_steps(env: str) -> None:
+    spec = features(env, env={"horizon": 60}, policy={"regularization": 1e-2})
+    fast, plain = check_agreement(spec)
+    assert relative_gap(fast.parameters, plain.parameters) < 1e-5
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "random_held"])
+def test_the_inverse_information_is_that_of_all_rows_of_the_learned_parameters(policy: str) -> None:
+    """With the ridge of a policy that plans by it, or that of the learner."""
+    ridges = {"learner": {"regularization": 3e-2}}
+    if policy == "d_optimal":
+        ridges["policy"] = {"regularization": 1e-2}
+    fast = KernelTrial(features("arm", policy, env={"horizon": 37}, **ridges))
+    fast.advance(37)
+    spec, drawn = fast.spec, fast.parameters[60:]
+    units = np.concatenate([np.eye(60), np.tile(drawn, (60, 1))], axis=1)
+    states = fast.states[:-1]
+    columns = [spec.model.predict(spec.system, unit, states).ravel() for unit in units]
+    J = np.stack(columns, axis=1)
+    M = (1e-2 if policy == "d_optimal" else 3e-2) * np.eye(60) + J.T @ J
+    assert_close(dense(fast.state.covariance) @ M, np.eye(60), abs=1e-8)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "arm", "quadrotor"])
+def test_change_of_the_rows_is_that_of_finite_differences(env: str) -> None:
+    fast, rng = KernelTrial(features(env)), np.random.default_rng(0)
+    plant, network = fast.constants[:2]
+    theta, d, h = fast.state.theta, fast.spec.system.n_states, 1e-5
+    for _ in range(5):
+        x, direction = rng.normal(size=d), rng.normal(size=d)
+        ends = np.stack([x + h * direction, x - h * direction])
+        ahead, behind = np.split(rows_at(plant, network, theta, ends), 2)
+        differences = (ahead - behind) / (2.0 * h)
+        for k, expected in enumerate(differences):
+            change = np.empty(len(theta))
+            write_row_along(network, x, direction, k, change)
+            assert relative_gap(change, expected) < 1e-8
+
+
+def test_stored_parameters_give_the_last_loss_and_keep_what_was_drawn() -> None:
+    spec = features("arm")
+    result, before = run_trial(spec), KernelTrial(spec).parameters
+    grid = spec.system.grid()
+    errors = spec.model.predict(spec.system, result.parameters, grid) - spec.system.learned(grid)
+    assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(result.final_loss, rel=1e-9)
+    assert np.array_equal(result.parameters[60:], before[60:])
+    assert np.all(result.parameters[:60] != 0.0)
+    other = KernelTrial(spec.with_seed(4)).parameters
+    assert np.all(other[60:] != before[60:])
+
+
+def test_a_truth_that_changes_is_followed() -> None:
+    check_agreement(features("drifting_pendulum", env={"horizon": 30}))
+
+
+def test_an_assessment_predicts_with_all_parameters() -> None:
+    spec = features("arm", env={"horizon": 20})
+    parameters = run_trial(spec).parameters
+    rng = np.random.default_rng(1)
+    states = rng.normal(size=(5, spec.system.n_states))
+    inputs = rng.normal(size=(5, 2, spec.system.n_inputs))
+    following = model_forecast(spec.system, spec.model, parameters)(states, inputs)[0]
+    flow = np.stack(
+        [*spec.system.known(tuple(states.T), tuple(inputs[:, 0].T), spec.system.parameters)]
+    )
+    flow[list(spec.system.learned_rows)] += spec.model.predict(spec.system, parameters, states).T
+    assert following == pytest.approx(states + spec.system.dt * flow.T, rel=1e-12)
+
+
+def test_memory_counts_the_features_at_the_evaluation_points() -> None:
+    spec = features("pendulum", env={"grid_points": [64, 64]}, model={"n_features": 200})
+    points = points_of_trial(constants(spec.config)[3], KernelTrial(spec).constants[1], 9)
+    q = 200
+    assert spec.config.memory >= points.basis.nbytes + 8 * q**2
+    assert spec.config.largest_setting == "model.n_features"
