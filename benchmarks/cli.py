@@ -19,6 +19,7 @@ QUESTIONS = (
     "jax_scan",
     "reference",
     "linearisation_gap",
+    "adaptive_seeds",
     "evaluation",
     "trial",
     "width",

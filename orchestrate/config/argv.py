@@ -45,7 +45,16 @@ def normalize(arguments: Sequence[str], folder: Path) -> list[str]:
         if word.startswith("hydra/sweeper=") and word != "hydra/sweeper=grid":
             raise UsageError(OTHER_SWEEPER)
         _check_choice(word, folder)
-    return [*(word for word in arguments if word not in flags.overrides), *flags.overrides]
+    options = (word for word in arguments if word not in flags.overrides)
+    return [*options, *map(_quoted, flags.overrides)]
+
+
+def _quoted(word: str) -> str:
+    """Return ``launch.until=ci<5%`` with the quotes that Hydra requires around a ``<``."""
+    key, _, value = word.partition("=")
+    if key.lstrip("+") == "launch.until" and value.startswith("ci"):
+        return f"{key}='{value}'"
+    return word
 
 
 def _check_flags(flags: argparse.Namespace) -> None:

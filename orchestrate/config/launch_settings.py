@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from dopt.errors import unknown_name
+from orchestrate.config.stopping_rule import Until, until
 from orchestrate.config.value_checks import amount, count, flag, limit, section, text, wrong
 
 RETRY = ("failed", "diverged", "all")
@@ -26,6 +27,10 @@ class LaunchSettings:
         SQLAlchemy URL of the results database.
     retry
         Finished trials of the grid that are run again.
+    until
+        Rule by which a configuration gets no more of its seeds, or None to run all.
+    reference
+        Policy that the others are compared with where ``until`` decides comparisons.
     workers
         Processes, or None for one on each core.
     chunk_seconds
@@ -49,6 +54,8 @@ class LaunchSettings:
     dry_run: bool = False
     fail_fast: bool = False
     retry: Retry | None = None
+    until: Until | None = None
+    reference: str = "d_optimal"
     workers: int | None = None
     chunk_seconds: float = 1.0
     timeout: float | None = 3600.0
@@ -78,6 +85,8 @@ class LaunchSettings:
             dry_run=flag("launch.dry_run", launch["dry_run"]),
             fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
             retry=cast("Retry | None", retry),
+            until=until(launch["until"]),
+            reference=text("launch.reference", launch["reference"]),
             workers=count("launch.workers", launch["workers"]),
             chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
             timeout=limit("launch.timeout", launch["timeout"], "seconds"),

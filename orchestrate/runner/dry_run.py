@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dopt.control.task import GOAL_FIELDS
 from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
+from orchestrate.runner.text_table import aligned
 from orchestrate.store import FINISHED, RETRIED, NoDatabaseError, Reader
 
 SECTIONS = ("env", "policy", "model", "learner", "task")
@@ -44,7 +45,7 @@ def preview(grid: Grid, url: str, retry: str | None = None) -> str:
     total = sum(rows.values(), Counter[str]())
     plural = "" if total["trials"] == 1 else "s"
     end = f"{total['trials']:,} trial{plural}, {total['done']:,} done, {total['to run']:,} to run"
-    return "\n".join([*_aligned(lines), *left_out, end])
+    return "\n".join([*aligned(lines), *left_out, end])
 
 
 def _statuses(url: str) -> dict[str, str]:
@@ -107,11 +108,3 @@ def _heading_of(column: str) -> str:
 
 def _text(value: object) -> str:
     return "-" if value is None else str(value)
-
-
-def _aligned(lines: list[list[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return [
-        "  ".join(f"{cell:<{w}}" for cell, w in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    ]

@@ -24,6 +24,7 @@ from orchestrate.runner.memory_check import check_memory
 from orchestrate.runner.provenance import launch_record
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.runner.run_single import launch_trial
+from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.store import URL_VARIABLE, StoreError, StoreUnavailableError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -60,6 +61,12 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
     if path != "kernel":
         grid = grid.on_path(path)
     check_memory(grid, settings)
+    if settings.until and request.single:
+        raise LaunchError(
+            "launch.until chooses among the seeds of a grid, but a single trial is asked for: add "
+            "-m and a range such as 'seed=range(100)', or leave launch.until out."
+        )
+    SeedPlan(grid, settings)  # refuses a rule that does not apply to the grid
     return grid, settings
 
 
@@ -70,6 +77,8 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
             say(note)
         if settings.dry_run:
             say(preview(grid, settings.store_url, settings.retry))
+            if settings.until:
+                say("launch.until may need fewer of these seeds: they are run in batches")
             return ExitCode.DONE
         record = launch_record(sys.argv, request.overrides, ROOT)
         if not request.single:

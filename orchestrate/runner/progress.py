@@ -62,7 +62,7 @@ class Progress:
     def __init__(self, tally: Tally, stream: TextIO | None) -> None:
         self._tally = tally
         self._stream = stream
-        self._recent = deque([(time.monotonic(), 0)])
+        self._recent = deque([(time.monotonic(), tally.over)])
         self._shown = time.monotonic()
         self._live: Live | None = None
         if stream and stream.isatty():

@@ -60,6 +60,10 @@ class RetryingStore:
         """Register a grid and return the state of its trials."""
         return self._persist(lambda: self._store.register(self._launch, specs))
 
+    def final_losses(self, trial_keys: Sequence[str]) -> dict[str, float]:
+        """Return the final loss of those of the trials that are done and did not diverge."""
+        return self._persist(lambda: self._store.final_losses(trial_keys))
+
     def claim(self, trial_keys: Sequence[str]) -> list[Claim]:
         """Claim the pending ones of the trials, none of which the launch holds."""
 

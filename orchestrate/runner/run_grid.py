@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TextIO
@@ -22,6 +23,7 @@ from orchestrate.runner.heartbeat import Heartbeat
 from orchestrate.runner.progress import Progress, Tally
 from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.runner.scheduler import Scheduler
+from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.runner.signals import Interrupt
 from orchestrate.runner.summary import closing, opening
 from orchestrate.store import LaunchRecord, Registration, Store, StoreUnavailableError
@@ -140,30 +142,59 @@ def _run(
     store.recover()
     if settings.retry:
         store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
-    state = store.register(grid.trials)
-    tally = Tally(state.total)
-    _count(tally, state)
-    output.say(opening(grid, state, settings, store.safe_url))
-    if tally.left:
-        compiled = any(trial.config.path == "kernel" for trial in grid.trials)
-        prepare = work.prepare if compiled else None
-        if prepare:
-            with _announced_if_slow(COMPILING, output.warn):
-                prepare()
-        start = time.monotonic()
-        with make_executor(settings, work.run, prepare) as executor, Interrupt() as stop:
-            waiting = _waiting(grid, state)
-            chunks = Chunks(waiting, settings.chunk_seconds, executor.slots, executor.batch)
-            scheduler = Scheduler(store, executor, chunks, tally, stop, settings.fail_fast)
+    plan, tally = SeedPlan(grid, settings), Tally(0)
+    stages = _open_stages(store, plan, tally, settings, output.say)
+    first = next(stages, None)
+    if first is not None:
+        open_stages = itertools.chain([first], stages)
+        if _run_stages(open_stages, store, grid, tally, settings, work, output):
+            return ExitCode.INTERRUPTED
+    if plan.adaptive and not tally.left:
+        output.say(plan.report())
+    return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
+
+
+def _open_stages(
+    store: RetryingStore, plan: SeedPlan, tally: Tally, settings: LaunchSettings, say: Say
+) -> Iterator[tuple[Grid, Registration]]:
+    """Register the stages of a launch one after the other; yield those with trials to run."""
+    for heading, stage in plan.stages(store.final_losses):
+        state = store.register(stage.trials)
+        tally.total = state.total
+        _count(tally, state)
+        say(opening(stage, state, settings, store.safe_url, heading))
+        if tally.left:
+            yield stage, state
+
+
+def _run_stages(
+    stages: Iterable[tuple[Grid, Registration]],
+    store: RetryingStore,
+    grid: Grid,
+    tally: Tally,
+    settings: LaunchSettings,
+    work: Work,
+    output: Output,
+) -> bool:
+    """Run the stages with one executor; return whether an interrupt left trials of them."""
+    compiled = any(trial.config.path == "kernel" for trial in grid.trials)
+    prepare = work.prepare if compiled else None
+    if prepare:
+        with _announced_if_slow(COMPILING, output.warn):
+            prepare()
+    start = time.monotonic()
+    with make_executor(settings, work.run, prepare) as executor, Interrupt() as stop:
+        chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
+        scheduler = Scheduler(store, executor, chunks, tally, stop, settings.fail_fast)
+        for stage, state in stages:
+            chunks.add(_waiting(stage, state))
             scheduler.owned_by_others = state.running_elsewhere
             with Progress(tally, output.progress) as progress:
-                _drive(scheduler, grid, progress)
-        output.say(
-            closing(tally, scheduler.failures, stop.stop_requested, time.monotonic() - start)
-        )
-        if stop.stop_requested and tally.left:
-            return ExitCode.INTERRUPTED
-    return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
+                _drive(scheduler, stage, progress)
+            if tally.left:
+                break
+    output.say(closing(tally, scheduler.failures, stop.stop_requested, time.monotonic() - start))
+    return stop.stop_requested and tally.left > 0
 
 
 @contextmanager

@@ -13,8 +13,10 @@ MAX_LISTED_CAUSES = 3
 """Causes of failure that the summary lists."""
 
 
-def opening(grid: Grid, state: Registration, settings: LaunchSettings, url: str) -> str:
-    """Return the counts of trials to run, done, failed and left out."""
+def opening(
+    grid: Grid, state: Registration, settings: LaunchSettings, url: str, heading: str = ""
+) -> str:
+    """Return the counts of trials to run, done, failed and left out, after the stage's heading."""
     lines = [f"left out {count:,} trials: {reason}" for reason, count in grid.left_out.items()]
     if grid.repeats:
         lines.append(f"{grid.repeats:,} of {grid.n_jobs:,} jobs name a trial of the grid again")
@@ -24,7 +26,7 @@ def opening(grid: Grid, state: Registration, settings: LaunchSettings, url: str)
     if state.running_elsewhere:
         counted += f", {state.running_elsewhere:,} running in another launch"
     todo = f"{len(state.todo):,} to run with executor={settings.executor}"
-    lines.append(f"{counted}, {todo if state.todo else 'nothing to run'} · {url}")
+    lines.append(f"{heading}{counted}, {todo if state.todo else 'nothing to run'} · {url}")
     return "\n".join(lines)
 
 

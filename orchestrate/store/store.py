@@ -9,6 +9,7 @@ from orchestrate.records import Failure, RunRecord
 from orchestrate.store import database_url, schema_version
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, make_backend
+from orchestrate.store.read.final_losses import final_losses
 from orchestrate.store.records import (
     Claim,
     LaunchRecord,
@@ -85,6 +86,11 @@ class Store:
         grid = registration.GridRows(specs)
         with self._backend.transaction() as connection:
             return registration.register(connection, self._backend, launch, grid)
+
+    def final_losses(self, trial_keys: Sequence[str]) -> dict[str, float]:
+        """Return the final loss of those of the trials that are done and did not diverge."""
+        with self._backend.transaction() as connection:
+            return final_losses(connection, self._backend, trial_keys)
 
     def claim(self, launch: int, trial_keys: Sequence[str]) -> list[Claim]:
         """Claim those of the trials that are pending, in the given order."""

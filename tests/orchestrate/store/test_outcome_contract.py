@@ -37,6 +37,16 @@ class TestCommit:
         for name in ("states", "inputs", "parameters"):
             np.testing.assert_array_equal(getattr(arrays, name), getattr(sent, name), strict=True)
 
+    def test_gives_the_final_losses_of_trials_that_are_done(self, store: Store, take: Take) -> None:
+        specs = [Spec(seed) for seed in range(4)]
+        whole, lost, failed, _ = take(*specs)
+        store.commit(whole, result(), RUN)
+        store.commit(lost, diverged(at=3), RUN)
+        store.fail(failed, Failure("ZeroDivisionError", "no", "here"), RUN)
+        keys = [spec.trial_key for spec in specs]
+        assert store.final_losses(keys) == {whole.trial_key: result().loss[-1]}
+        assert store.final_losses(keys[1:]) == store.final_losses([]) == {}
+
     def test_gives_back_the_assessments(self, store: Store, take: Take, reader: Reader) -> None:
         for claim, seed in zip(take(Spec(0), Spec(1)), (0, 1), strict=True):
             assert store.commit(claim, assessed(seed), RUN)

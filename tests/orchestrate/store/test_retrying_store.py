@@ -98,6 +98,17 @@ def test_a_failure(
     assert len(reader.query("SELECT * FROM v_failures")) == 1
 
 
+@losses
+def test_final_losses(
+    patient: RetryingStore, monkeypatch: pytest.MonkeyPatch, lost: list[str]
+) -> None:
+    claims = patient.claim(patient.register(SPECS).todo)
+    patient.commit([(claim, result(claim.trial_id), RUN) for claim in claims[:2]])
+    lose(monkeypatch, lost)
+    found = patient.final_losses([spec.trial_key for spec in SPECS])
+    assert found == {one.trial_key: result(one.trial_id).loss[-1] for one in claims[:2]}
+
+
 def test_a_failure_that_comes_too_late(
     patient: RetryingStore, store: Store, launch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
