@@ -84,6 +84,11 @@ class Lab:
             lambda: f"{table} with {condition}:\n{launched.output}",
         )  # fmt: skip
 
+    def until_head_lost(self, name: str) -> None:
+        """Wait until the head of the cluster takes a worker for dead."""
+        given = (self.address, self.host("head").address, self.host(name).address)
+        self.host("head").run(sys.executable, "-c", servers.UNTIL_DEAD, *given, seconds=150.0)
+
     def done(self) -> int:
         """Return how many trials are done, -1 while the server does not say."""
         return self.count("trial", "status = 'done'")

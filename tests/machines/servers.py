@@ -16,6 +16,15 @@ WITNESS = ("-m", "tests.machines.witness")
 RAY_PORT = 6379
 OBJECT_STORE_BYTES = 100_000_000
 
+UNTIL_DEAD = """
+import sys, time, ray
+cluster, own, other = sys.argv[1:]
+ray.init(cluster, _node_ip_address=own, log_to_driver=False)
+while any(node["Alive"] and node["NodeManagerAddress"] == other for node in ray.nodes()):
+    time.sleep(0.2)
+"""
+"""Program for a host of a cluster that ends when the head takes another host for dead."""
+
 
 def ray_settings() -> dict[str, str]:
     """Return the settings that users give to every node of a cluster."""

@@ -1,7 +1,8 @@
 """``launch.py`` whose workers leave notes in HOME of what they begin and finish.
 
 So a test can see that a worker went on, whose outcome never arrived. Between computing and
-finishing a trial they wait for WITNESS_PAUSE seconds.
+finishing a trial they wait for WITNESS_PAUSE seconds, or, with WITNESS_HOLD, until the test lets
+the host go on.
 """
 
 from __future__ import annotations
@@ -19,11 +20,15 @@ from orchestrate.runner import launch
 from orchestrate.runner.run_grid import Work
 
 PAUSE = "WITNESS_PAUSE"
+HOLD = "WITNESS_HOLD"
+_GO = "go"
 
 
 def witnessed(spec: TrialSpec) -> TrialResult:
     _note("begun", spec.seed)
     result = run_trial(spec)
+    while HOLD in os.environ and not (Path.home() / _GO).exists():
+        time.sleep(0.05)
     time.sleep(float(os.environ.get(PAUSE, "0")))
     _note("finished", spec.seed)
     return result
@@ -32,6 +37,11 @@ def witnessed(spec: TrialSpec) -> TrialResult:
 def _note(kind: str, seed: int) -> None:
     with (Path.home() / kind).open("a") as notes:
         notes.write(f"{seed} {time.time()}\n")
+
+
+def let_go(home: Path) -> None:
+    """Let the trials of a host end that are started with WITNESS_HOLD."""
+    (home / _GO).touch()
 
 
 def read_notes(home: Path, kind: str) -> dict[int, float]:
