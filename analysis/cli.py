@@ -25,6 +25,7 @@ from analysis.plot_options import PlotOptions, Spread
 from analysis.report import command as report
 from analysis.serve import command as browser
 from analysis.stats.intervals import Statistic
+from analysis.stats.tolerance import BandKind
 from analysis.stats.trial_scores import Measure
 from analysis.tables.registry import TABLES, TableKind, comparison
 from analysis.tables.rendering import TextTable, gaps_table
@@ -73,6 +74,12 @@ def parser() -> Parser:
     figures.add_argument(
         "--style", choices=list(Spread), default=Spread.BAND, help="intervals of figure 1"
     )
+    figures.add_argument(
+        "--band",
+        choices=list(BandKind),
+        default=BandKind.CONFIDENCE,
+        help="intervals of figure 1: of the centre, or what holds 90 %% of the runs",
+    )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
     summary = _command(commands, "summary", _summary, "mean final losses ± 2 SE, n")
     compare = _command(commands, "compare", _compare, "every variant against the reference, paired")
@@ -80,23 +87,26 @@ def parser() -> Parser:
     compare.add_argument(
         "--measure", choices=list(Measure), default=Measure.FINAL, help="what a trial is judged by"
     )
+    aggregate = _command(
+        commands, "aggregate", _aggregate, "every variant against the reference, over all systems"
+    )
     floor = _command(commands, "floor", _floor, offline.HELP, diverged=False)
     offline.add_arguments(floor)
-    for table in (summary, compare, floor):
+    for table in (summary, compare, aggregate, floor):
         table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
     for command in (figures, compare):
         command.add_argument(
             "--epsilon", type=float, help="loss to reach (median final loss of random inputs)"
         )
     compared = _command(commands, "report", None, report.HELP)
-    for command in (figures, compare, compared):
+    for command in (figures, compare, aggregate, compared):
         command.add_argument(
             "--reference",
             default=REFERENCE,
             metavar="POLICY",
             help=f"what all others are compared with ({REFERENCE}); with --group-by a value",
         )
-    for command in (figures, summary, compare, floor):
+    for command in (figures, summary, compare, aggregate, floor):
         command.add_argument(
             "--group-by",
             nargs="+",
@@ -191,6 +201,7 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
         Spread(options.style),
         options.epsilon,
         options.color_by,
+        BandKind(options.band),
     )
     names = tuple(options.only or NAMES)
     empty = 0
@@ -203,6 +214,11 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
 def _summary(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
     plot_options = PlotOptions(DivergenceRule(options.diverged))
     return _print_table(TABLES["summary"], reader, selection, plot_options, options.format)
+
+
+def _aggregate(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    plot_options = PlotOptions(DivergenceRule(options.diverged))
+    return _print_table(TABLES["aggregate"], reader, selection, plot_options, options.format)
 
 
 def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:

@@ -64,6 +64,11 @@ def but_lost(text: str, lost: int) -> str:
     return f"{text}, {lost} lost" if lost else text
 
 
+def but_diverged(count: int, diverged: int) -> str:
+    """Return a number of trials or pairs, and how many trials diverged: ``98, 2 diverged``."""
+    return f"{count}, {diverged} diverged" if diverged else str(count)
+
+
 def count_text(counts: Mapping[str, str]) -> str:
     """Return the counts by policy as a text: the commonest one, then those that differ from it.
 

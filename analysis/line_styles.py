@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 from dopt.policies.titles import policy_title
 
@@ -82,3 +84,22 @@ def sequence_style(place: int, same: int, label: str, colour: str | None = None)
 def environment_title(env: str) -> str:
     """Return the name of an environment as a title."""
     return env.replace("_", " ")
+
+
+class OfEnvironment(Protocol):
+    """What belongs to an environment."""
+
+    @property
+    def env(self) -> str: ...
+
+
+Item = TypeVar("Item", bound=OfEnvironment)
+
+
+def text_by_environment(items: Sequence[Item], describe: Callable[[Sequence[Item]], str]) -> str:
+    """Return the words for the items of each environment in turn, behind its title."""
+    texts = [
+        f"{environment_title(env)}: {describe([one for one in items if one.env == env])}"
+        for env in dict.fromkeys(one.env for one in items)
+    ]
+    return "; ".join(texts)

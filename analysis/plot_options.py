@@ -8,6 +8,7 @@ from enum import StrEnum
 from analysis.data.divergence import DivergenceRule
 from analysis.figures.loss_curves.data import Axis
 from analysis.stats.intervals import Statistic
+from analysis.stats.tolerance import BandKind
 
 
 class Spread(StrEnum):
@@ -22,7 +23,7 @@ class PlotOptions:
     """What a user asks for; ``epsilon`` is the loss of the comparison of steps, None the default's.
 
     ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
-    each, are those of the loss curves.
+    each, and ``band``, what the intervals are of, are those of the loss curves.
     """
 
     rule: DivergenceRule = DivergenceRule.EXCLUDE
@@ -31,6 +32,12 @@ class PlotOptions:
     spread: Spread = Spread.BAND
     epsilon: float | None = None
     color_by: str | None = None
+    band: BandKind = BandKind.CONFIDENCE
+
+    @property
+    def interval(self) -> str:
+        """Return the name of the intervals of the loss curves."""
+        return self.band.label(self.statistic)
 
     def as_dict(self) -> dict[str, str]:
         return {key: str(value) for key, value in asdict(self).items()}

@@ -26,6 +26,9 @@ from orchestrate.store import CONFIG_COLUMNS, ConfigRow
 REFERENCE = "d_optimal"
 """The policy that all others are compared with, unless another one is asked for."""
 
+APART = "oracle"
+"""The policy that knows the form of the physics: on an axis of ratios others would have no room."""
+
 USUAL = {"model": "mlp", "learner": "adam_window"}
 """Names of what a launch takes by itself."""
 

@@ -13,7 +13,8 @@ from analysis.data.trial_selection import Selection
 from orchestrate.store import Reader
 
 LIBRARIES = ("dopt", "matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")
-PACKAGE = Path(__file__).parent
+PACKAGE = Path(__file__).parents[1]
+"""The folder of the analysis."""
 
 
 def versions() -> dict[str, str | None]:
@@ -45,7 +46,7 @@ def _git(*arguments: str) -> str | None:
 
 
 def code_hash() -> str:
-    """Return the SHA-256 of this package's files: a changed drawing is drawn again."""
+    """Return the SHA-256 of the files of the analysis: a changed drawing is drawn again."""
     digest = hashlib.sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(PACKAGE).as_posix().encode())

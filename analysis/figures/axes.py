@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import (
+    FixedLocator,
     FuncFormatter,
     LogLocator,
     MaxNLocator,
     MultipleLocator,
     NullFormatter,
+    NullLocator,
 )
 
 TAU_TICKS = {0: "0", 1: "π/2", 2: "π", 3: "3π/2", 4: "2π"}
@@ -51,6 +54,13 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     axis.set_minor_formatter(NullFormatter())
     if decades < 4:
         axis.set_major_formatter(FuncFormatter(lambda value, _: log_text(value)))
+
+
+def value_ticks(axis: Axis, values: Iterable[float]) -> None:
+    """Set ticks of a logarithmic axis at values, and nowhere else."""
+    axis.set_major_locator(FixedLocator(sorted(values)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: log_text(value)))
 
 
 def log_text(value: float) -> str:

@@ -12,8 +12,11 @@ from analysis.data.trial_selection import Selection
 from analysis.figures.control.plot import control_plot
 from analysis.figures.input_spectrum.plot import spectrum_plot
 from analysis.figures.loss_curves.plot import loss_plot
+from analysis.figures.pareto.plot import pareto_plot
 from analysis.figures.phase_portraits.plot import phase_plot
 from analysis.figures.plot import Plot
+from analysis.figures.profiles.plot import profiles_plot
+from analysis.figures.sensitivity.plot import sensitivity_plot
 from analysis.figures.style import styled
 from analysis.figures.width.plot import cost_plot, loss_against_width_plot
 from analysis.outputs import publish
@@ -34,6 +37,9 @@ PLOTS: dict[str, Plot[Any]] = {
         cost_plot("figure4_width"),
         loss_against_width_plot("figure4_width_loss"),
         control_plot("figure5_control"),
+        pareto_plot("figure6_pareto"),
+        profiles_plot("figure7_profiles"),
+        sensitivity_plot("figure8_sensitivity"),
     )
 }
 NAMES = (*PLOTS, *TABLES)

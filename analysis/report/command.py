@@ -87,10 +87,12 @@ def _origin(facts: dict[str, object], *, controlled: bool) -> str:
 
 
 def _gaps(group: VariantGroup) -> Iterable[Gap]:
-    """Yield what a variant lacks of the seeds that any other of the environment has."""
-    seeds = {trial.seed for one in group.variants for trial in one.trials}
+    """Yield what is registered of a variant and not finished.
+
+    Variants may have different numbers of seeds: a ratio is over the shared ones.
+    """
     for one in group.variants:
-        missing = seeds - {trial.seed for trial in one.finished}
+        missing = {trial.seed for trial in one.trials} - {trial.seed for trial in one.finished}
         if missing:
             yield Gap(group.env, one.label, tuple(sorted(missing)), f"{len(missing)} not finished")
 
@@ -98,7 +100,7 @@ def _gaps(group: VariantGroup) -> Iterable[Gap]:
 def _refusal(gaps: list[Gap]) -> str:
     missing = sum(len(gap.seeds) for gap in gaps)
     return (
-        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, the same seeds of "
-        f"every variant are expected: run the launch again, narrow the request by --env, --policy "
+        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, but all that are "
+        f"registered are expected: run the launch again, narrow the request by --env, --policy "
         f"and --where, or give --allow-partial to go on with what there is."
     )

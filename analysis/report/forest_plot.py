@@ -6,6 +6,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from analysis.data.config_matching import APART
 from analysis.figures.axes import log_ticks
 from analysis.figures.style import TEXT_WIDTH
 from analysis.line_styles import BLUE, GREY, VERMILLION
@@ -22,8 +23,6 @@ CAPTION = (
     f"{SIGNIFICANCE} or the interval holds 1. The oracle, which knows the form of the physics and "
     "is orders of magnitude below, is in the tables alone."
 )
-APART = "oracle"
-"""The policy that would leave no room for the others."""
 
 
 def draw(part: pd.DataFrame) -> Figure:

@@ -10,14 +10,14 @@ import pandas as pd
 from analysis.formatting import but_lost, number, p_text, plus_minus, share, steps_text, within
 from analysis.line_styles import environment_title
 from analysis.report.forest_plot import CAPTION
-from analysis.report.variant_table import SIGNIFICANCE, verdict
+from analysis.report.variant_table import SAME, SIGNIFICANCE, verdict
 from analysis.stats.paired_tests import FEWEST_BOOTSTRAP_PAIRS
 from analysis.tables.rendering import TextTable
 from dopt.policies import POLICIES
 
 LOSSES = (
-    "variant", "final loss", "ratio [95 %]", "adjusted p", "reachable set, ratio", "curve, ratio",
-    "n",
+    "variant", "final loss", "ratio [95 %]", "adjusted p", "same setting, ratio", "adjusted p",
+    "reachable set, ratio", "curve, ratio", "n",
 )  # fmt: skip
 EFFORT = (
     "variant", "steps to ε (share)", "adjusted p", "coverage", "control cost, ratio", "plan [µs]",
@@ -49,6 +49,8 @@ EXPLAINED = (
     "the information matrix with the plan; a plan is in time for real where both together are "
     "below dt. Runs on: the compiled kernel, or the torch reference, whose microseconds are those "
     "of an implementation that nobody made fast.",
+    "Same setting: the ratio to the reference policy with the variant's own model and learner, its "
+    "adjusted p beside it; – where that is the reference itself or was not run.",
     "n: trials that did not diverge; by default diverged ones are in no mean and in no ratio.",
 )
 
@@ -91,12 +93,9 @@ def _rows(part: pd.DataFrame) -> list[Row]:
 
 def _finding(env: str, rows: Sequence[Row]) -> str:
     """Return what is better, what worse, and what is not told apart, the best first."""
-    judged: dict[str, list[str]] = {"better": [], "worse": [], "open": []}
-    for row in sorted(rows[1:], key=lambda row: _number(row, "loss_ratio")):
-        words = f"{row['variant']} ({number(_number(row, 'loss_ratio'))})"
-        judged[verdict(row)].append(words)
-    names = {"better": "better", "worse": "worse", "open": "not told apart"}
-    said = [f"  - {names[kind]}: {'; '.join(found) or 'none'}" for kind, found in judged.items()]
+    said = [f"  - {line}" for line in _judged(rows[1:], "loss")]
+    for reference, same in _same_settings(rows).items():
+        said += [f"  - against {reference}, {line}" for line in _judged(same, f"{SAME}_loss")]
     turned = [
         f"{row['variant']} ({number(_number(row, 'reachable_loss_ratio'))})"
         for row in rows[1:]
@@ -105,6 +104,26 @@ def _finding(env: str, rows: Sequence[Row]) -> str:
     if turned:
         said.append(f"  - the other way round on the reachable set: {'; '.join(turned)}")
     return "\n".join([f"- **{environment_title(env)}** (ratio, p < {SIGNIFICANCE})", *said])
+
+
+def _judged(rows: Sequence[Row], measure: str) -> list[str]:
+    """Return which rows are better, worse and not told apart, the best first."""
+    judged: dict[str, list[str]] = {"better": [], "worse": [], "open": []}
+    for row in sorted(rows, key=lambda row: _number(row, f"{measure}_ratio")):
+        words = f"{row['variant']} ({number(_number(row, f'{measure}_ratio'))})"
+        judged[verdict(row, measure)].append(words)
+    names = {"better": "better", "worse": "worse", "open": "not told apart"}
+    return [f"{names[kind]}: {'; '.join(found) or 'none'}" for kind, found in judged.items()]
+
+
+def _same_settings(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Return the rows by the reference of their own setting, those of the first row left out."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows[1:]:
+        reference = str(row[f"{SAME}_reference"])
+        if reference not in ("", rows[0]["variant"]):
+            groups.setdefault(reference, []).append(row)
+    return groups
 
 
 def _described(table: pd.DataFrame) -> str:
@@ -143,6 +162,8 @@ def _losses(row: Row) -> list[object]:
         plus_minus(_number(row, "loss"), _number(row, "loss_2se")),
         _ratio(row, "loss"),
         p_text(_number(row, "loss_p_adjusted")),
+        _ratio(row, f"{SAME}_loss"),
+        p_text(_number(row, f"{SAME}_loss_p_adjusted")),
         _ratio(row, "reachable_loss"),
         _ratio(row, "auc"),
         f"{row['n']}{diverged}",

@@ -41,6 +41,12 @@ episode without a finite cost is in no mean and in no ratio (``control_lost`` pa
 in the test.
 """
 
+SAME = "same"
+"""Start of the columns that compare with the reference policy under the variant's own setting."""
+
+SAME_MEASURES = ("loss", "reachable_loss", "auc")
+"""Measures that are compared under the same setting too."""
+
 SIGNIFICANCE = 0.05
 """Adjusted p below which a report says that a variant is better or worse."""
 
@@ -58,6 +64,7 @@ def tabulate_group(
     return pd.DataFrame(
         [
             _row(reader, group, one, scores[one.label], scores)
+            | _under_same_setting(group, one, scores)
             | _samples(reader, group, one, math.nan if epsilon is None else epsilon, rule)
             for one in group.variants
         ]
@@ -67,7 +74,7 @@ def tabulate_group(
 def adjust(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     """Join the tables and adjust each measure's p-values over the whole report."""
     table = pd.concat(tables, ignore_index=True)
-    for measure in (*MEASURES, "steps"):
+    for measure in (*MEASURES, *(f"{SAME}_{one}" for one in SAME_MEASURES), "steps"):
         table[f"{measure}_p_adjusted"] = benjamini_hochberg(table[f"{measure}_p"].tolist())
     return table
 
@@ -145,6 +152,22 @@ def _row(
         row[f"{measure}_2se"] = 2 * float(standard_error(values)) if len(values) else math.nan
         row |= _against(own[measure], reference[measure], group.env, variant.label, measure)
     row["control_lost"] = without_ratio(*paired(own["control"], reference["control"]))
+    return row
+
+
+def _under_same_setting(
+    group: VariantGroup, variant: Entry, scores: Mapping[str, Mapping[str, BySeed]]
+) -> dict[str, object]:
+    """Compare with the reference policy under the same model and learner; NaN where it has none."""
+    reference = group.reference_with_setting_of(variant)
+    own = scores[variant.label]
+    with_setting = own if reference is None else scores[reference.label]
+    row: dict[str, object] = {
+        f"{SAME}_reference": "" if reference in (None, variant) else reference.label
+    }
+    for measure in SAME_MEASURES:
+        found = _against(own[measure], with_setting[measure], group.env, variant.label, measure)
+        row |= {f"{SAME}_{column}": value for column, value in found.items()}
     return row
 
 

@@ -7,12 +7,12 @@ settings too: a variant is a policy together with what sets it apart from the ot
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.data.config_matching import Filter, difference, nearness
 from analysis.data.trial_selection import Entry, environment_rank, labels_of, newest, policy_rank
+from analysis.data.variants import one_each, one_world, section_text
 from analysis.errors import AnalysisError
 from analysis.stats.control import common_task, task_of
 from orchestrate.store import Reader
@@ -43,6 +43,19 @@ class VariantGroup:
             return ()
         return tuple(one for one in self.variants if task_of(one) == self.task)
 
+    def reference_with_setting_of(self, variant: Entry) -> Entry | None:
+        """Return the reference policy under the model and the learner of a variant, if it is here.
+
+        Among several it is the one nearest to the defaults.
+        """
+        setting = _setting(variant)
+        same = [
+            one
+            for one in self.variants
+            if one.config.policy == self.reference.config.policy and _setting(one) == setting
+        ]
+        return max(same, key=lambda one: nearness(one.config), default=None)
+
 
 def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
     """Return the variants of every environment that has the reference policy and another.
@@ -70,7 +83,7 @@ def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
 
 
 def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | None:
-    world = _one_world(entries)
+    world = one_world(entries)
     task = common_task(world)
     kept = _one_each(world, task)
     references = [entry for entry in kept if entry.config.policy == policy]
@@ -104,35 +117,18 @@ def _of_other_tasks(variants: Sequence[Entry], task: str | None) -> Iterator[str
 
 def _company(entry: Entry, entries: Sequence[Entry]) -> int:
     """Return how many entries share the model and the learner of this one."""
-    own = [_section(entry, name) for name in _SETTING]
-    return sum([_section(one, name) for name in _SETTING] == own for one in entries)
+    own = _setting(entry)
+    return sum(_setting(one) == own for one in entries)
 
 
-def _one_world(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the entries of the env section with most trials."""
-    totals: Counter[str] = Counter()
-    for entry in entries:
-        totals[_section(entry, "env")] += len(entry.trials)
-    world = max(totals, key=lambda section: (totals[section], section))
-    return [entry for entry in entries if _section(entry, "env") == world]
+def _setting(entry: Entry) -> list[str]:
+    return [section_text(entry, name) for name in _SETTING]
 
 
 def _one_each(entries: Sequence[Entry], task: str | None) -> list[Entry]:
-    """Return one entry for each policy and setting: of the task if there is one, with most trials.
+    """Return one entry for each policy and setting: of the task, if any, and with most trials."""
 
-    The losses of a trial are the same with any task and without one.
-    """
-
-    def weight(entry: Entry) -> tuple[bool, int]:
+    def weight(entry: Entry) -> tuple[int, ...]:
         return task is not None and task_of(entry) == task, len(entry.trials)
 
-    best: dict[tuple[str, ...], Entry] = {}
-    for entry in entries:
-        key = tuple(_section(entry, name) for name in ("policy", *_SETTING, "path"))
-        if key not in best or weight(entry) > weight(best[key]):
-            best[key] = entry
-    return list(best.values())
-
-
-def _section(entry: Entry, name: str) -> str:
-    return json.dumps(entry.config.config.get(name), sort_keys=True)
+    return one_each(entries, weight)

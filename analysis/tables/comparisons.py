@@ -238,11 +238,16 @@ def _diverged(own: Scores, reference: Scores) -> dict[str, object]:
 
 def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFrame:
     if not rows:
-        raise AnalysisError(
-            f"A comparison needs trials of the reference {selection.reference} and of another "
-            f"variant in one environment, but only {', '.join(selection.labels)} is selected: run "
-            f"the others, ask wider, or choose another --reference."
-        )
+        raise nothing_to_compare(selection)
     table = pd.DataFrame(rows)
     table["p_adjusted"] = benjamini_hochberg(table["p_value"].tolist())
     return table
+
+
+def nothing_to_compare(selection: Selection) -> AnalysisError:
+    """Return the error for a selection without a pair of trials."""
+    return AnalysisError(
+        f"A comparison needs trials of the reference {selection.reference} and of another "
+        f"variant in one environment, but only {', '.join(selection.labels)} is selected: run "
+        f"the others, ask wider, or choose another --reference."
+    )

@@ -13,6 +13,7 @@ from analysis.data.trial_selection import Selection
 from analysis.plot_options import PlotOptions
 from analysis.stats.control import control_part
 from analysis.stats.trial_scores import Measure
+from analysis.tables.aggregate import aggregate
 from analysis.tables.comparisons import (
     EPSILON_POLICY,
     compare_control,
@@ -21,6 +22,7 @@ from analysis.tables.comparisons import (
 )
 from analysis.tables.rendering import (
     TextTable,
+    aggregate_table,
     comparison_table,
     control_table,
     hitting_times_table,
@@ -118,6 +120,12 @@ TABLES = {
         _whole,
         lambda reader, selection, options: summarise(reader, selection, options.rule),
         lambda table, options: summary_table(table, options.rule),
+    ),
+    "aggregate": TableKind(
+        "Final loss against the reference, all systems",
+        _compared,
+        lambda reader, selection, options: aggregate(reader, selection, options.rule),
+        lambda table, options: aggregate_table(table, options.rule),
     ),
     "comparison": comparison("loss", Measure.FINAL),
     "comparison_auc": comparison("loss", Measure.AUC),

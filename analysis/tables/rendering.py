@@ -11,7 +11,16 @@ import pandas as pd
 from tabulate import tabulate
 
 from analysis.data.missing_trials import Gap
-from analysis.formatting import but_lost, number, p_text, plus_minus, share, steps_text, within
+from analysis.formatting import (
+    but_diverged,
+    but_lost,
+    number,
+    p_text,
+    plus_minus,
+    share,
+    steps_text,
+    within,
+)
 from analysis.stats.paired_tests import FEWEST_BOOTSTRAP_PAIRS
 from analysis.stats.trial_scores import Measure
 
@@ -136,6 +145,28 @@ def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.
     return TextTable(headers, rows, note)
 
 
+def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
+    """Return the comparison over all systems."""
+    rows = [
+        [
+            row["variant"],
+            row["reference"],
+            within(row["ratio"], row["low"], row["high"]),
+            row["systems"],
+            but_diverged(row["n_pairs"], row["n_diverged"]),
+        ]
+        for row in table.to_dict("records")
+    ]
+    headers = ["variant", "reference", "loss ratio [95 %]", "systems", "pairs"]
+    note = (
+        f"Ratio: {_RATIO}; geometric mean over systems, each counted alike, of the geometric mean "
+        "over shared seeds of the final loss; interval: percentile bootstrap over pairs, "
+        "stratified by system. Compare only rows of the same systems. "
+        f"Diverged trials: {rule}."
+    )
+    return TextTable(headers, rows, note)
+
+
 def control_table(table: pd.DataFrame) -> TextTable:
     """Return the paired comparison of the costs of control, with the shares of successes."""
     rows = [
@@ -218,8 +249,7 @@ def _test_columns(row: Mapping[Hashable, Any]) -> list[str]:
 
     With the number of pairs comes how many trials of the two policies diverged, if any.
     """
-    diverged = f", {row['n_diverged']} diverged" if row["n_diverged"] else ""
-    pairs = f"{row['n_pairs']}{diverged}"
+    pairs = but_diverged(row["n_pairs"], row["n_diverged"])
     return [share(row["improvement"]), p_text(row["p_value"]), p_text(row["p_adjusted"]), pairs]
 
 

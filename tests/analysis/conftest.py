@@ -12,12 +12,18 @@ from tests.analysis.synthetic import fill, make_grid
 
 SHORT = {"env": {"horizon": 60}}
 WIDTHS = (4, 8, 32, 64)
+WINDOWS = (10, 20, 40, 60)
 
 
 def wide(width: int, seeds: Iterable[int], **sections: Mapping[str, object]) -> list[TrialSpec]:
     """Return D-optimal trials of a width in the cartpole."""
     model = {"model": {"width": width}}
     return make_grid(("cartpole",), ("d_optimal",), seeds, **{**SHORT, **model, **sections})
+
+
+def window(size: int, seeds: Iterable[int]) -> list[TrialSpec]:
+    """Return trials under random inputs whose learner has a window, in the pendulum."""
+    return make_grid(("pendulum",), ("random",), seeds, learner={"window": size}, **SHORT)
 
 
 def controlled(seeds: Iterable[int]) -> list[TrialSpec]:
@@ -31,12 +37,13 @@ def controlled(seeds: Iterable[int]) -> list[TrialSpec]:
 def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return a complete grid of three systems and five policies, one trial of which diverged.
 
-    Beside it there are other widths of the D-optimal policy in the cartpole, and trials with a task
-    in the pendulum and the quadrotor.
+    Beside it there are other widths of the D-optimal policy in the cartpole, other windows under
+    random inputs in the pendulum, and trials with a task in the pendulum and the quadrotor.
     """
     address = f"sqlite:///{tmp_path_factory.mktemp('complete')}/results.db"
     specs = make_grid(("pendulum", "cartpole", "quadrotor"), seeds=range(5), **SHORT)
     specs += [spec for width in WIDTHS for spec in wide(width, range(5))]
+    specs += [spec for size in WINDOWS for spec in window(size, range(5))]
     lost = [s for s in specs if (s.system.name, s.policy.name, s.seed) == ("cartpole", "random", 2)]
     specs += controlled(range(5))
     fill(address, specs, diverged={lost[0].trial_key: 20})

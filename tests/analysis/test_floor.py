@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 
 from analysis.cli import main
 from analysis.figures.error_budget import plot
-from analysis.figures.error_budget.data import PARTS, budgets, geometric_mean, tabulate
+from analysis.figures.error_budget.data import PARTS, budgets, tabulate
+from analysis.stats.geometric_means import geometric_mean
 from dopt.offline_fit import fit_offline
 from dopt.samples import recorded_samples, uniform_samples
 from dopt.spec.trial import TrialSpec

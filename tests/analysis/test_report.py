@@ -83,6 +83,33 @@ def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: Varia
     assert math.isnan(table.loc["D-optimal", "loss_ratio"])
 
 
+def test_every_policy_is_also_compared_under_its_own_learner(
+    reader: Reader, pendulum: VariantGroup
+) -> None:
+    table = adjust([tabulate_group(reader, pendulum)]).set_index("variant")
+    finals = {
+        name: np.log(
+            [
+                fake_result(make_spec("pendulum", name, s, **SHORT, **ONE_SAMPLE)).loss[-1]
+                for s in SEEDS
+            ]
+        )
+        for name in ("d_optimal", "random")
+    }
+    difference = finals["random"] - finals["d_optimal"]
+    row = table.loc["random, adam"]
+    assert row["same_reference"] == "D-optimal, adam"
+    assert row["same_loss_ratio"] == pytest.approx(np.exp(difference.mean()))
+    assert row["same_loss_p"] == pytest.approx(stats.wilcoxon(difference).pvalue)
+    assert table.loc["random", "same_loss_ratio"] == table.loc["random", "loss_ratio"]
+    assert table.loc[["D-optimal", "D-optimal, adam"], "same_loss_ratio"].isna().all()
+    tested = table["same_loss_p"].dropna()
+    expected = stats.false_discovery_control(tested)
+    assert table["same_loss_p_adjusted"].dropna().to_list() == pytest.approx(expected)
+    text = page.write(table.reset_index(), [], "origin", {})
+    assert "  - against D-optimal, adam, " in text
+
+
 def test_steps_until_the_loss_stays_at_that_of_random_inputs_are_counted(
     reader: Reader, pendulum: VariantGroup
 ) -> None:
@@ -143,13 +170,17 @@ def test_a_verdict_needs_the_adjusted_test_and_the_interval(
 
 def test_a_page_calls_what_is_worse_worse() -> None:
     unknown = dict.fromkeys(
-        [f"{m}_{c}" for m in MEASURES for c in ("ratio", "low", "high", "p", "p_adjusted")],
+        [
+            f"{measure}_{column}"
+            for measure in (*MEASURES, "same_loss")
+            for column in ("ratio", "low", "high", "p", "p_adjusted")
+        ],
         math.nan,
     )
     usual = {"env": "arm", "loss": 1.0, "loss_2se": 0.1, "coverage": 0.3, "coverage_2se": 0.1}
     usual |= {"epsilon": 2.5, "horizon": 500, "steps": math.inf, "reached": 0.25, "dt": 0.02}
     usual |= {"steps_p_adjusted": 0.5, "policy": "d_optimal", "policy_label": "D-optimal"}
-    usual |= {"path": "kernel"}
+    usual |= {"path": "kernel", "same_reference": ""}
     usual |= {"control_lost": 0, "plan_us": 2.0, "learn_us": 30.0, "n": 20, "n_diverged": 0}
     bad = {"loss_ratio": 1.5, "loss_low": 1.2, "loss_high": 1.9, "loss_p_adjusted": 1e-3}
     rows = [{"variant": "D-optimal"}, {"variant": "look-ahead", **bad}, {"variant": "max"}]
@@ -203,6 +234,24 @@ def test_missing_trials_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not (tmp_path / "out").exists()
     assert main([*words, "--allow-partial"]) == 0
     assert "PARTIAL: 1 trials are missing" in (tmp_path / "out/README.md").read_text()
+
+
+def test_variants_may_have_different_numbers_of_seeds(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/unequal.db"
+    specs = make_grid(("pendulum",), ("d_optimal",), range(6), **SHORT)
+    fill(url, specs + make_grid(("pendulum",), ("random",), range(2, 5), **SHORT))
+    assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
+    table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
+    assert table["n"].to_dict() == {"D-optimal": 6, "random": 3}
+    finals = [
+        [
+            np.log(fake_result(make_spec("pendulum", name, seed, **SHORT)).loss[-1])
+            for seed in (2, 3, 4)
+        ]
+        for name in ("random", "d_optimal")
+    ]
+    expected = np.exp(np.mean(np.subtract(*finals)))
+    assert table.loc["random", "loss_ratio"] == pytest.approx(expected)
 
 
 def test_a_report_of_one_variant_is_refused(tmp_path: Path) -> None:

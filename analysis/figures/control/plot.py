@@ -16,7 +16,7 @@ from analysis.figures.axes import log_limits, log_scale
 from analysis.figures.plot import Plot
 from analysis.figures.style import GUIDE, TEXT_WIDTH
 from analysis.formatting import count_text, share
-from analysis.line_styles import environment_title, policy_style
+from analysis.line_styles import environment_title, policy_style, text_by_environment
 from analysis.stats.control import ControlCurve, control_part, measure_control, tabulate_control
 
 ROW_HEIGHT = 1.9
@@ -108,11 +108,7 @@ def _counts(curves: Sequence[ControlCurve]) -> str:
 
 def caption_control(curves: Curves) -> str:
     """Return the caption, with what an episode is and n by environment."""
-    environments = dict.fromkeys(curve.env for curve in curves)
-    counts = "; ".join(
-        f"{environment_title(env)}: {_counts([curve for curve in curves if curve.env == env])}"
-        for env in environments
-    )
+    counts = text_by_environment(curves, _counts)
     return (
         "Control with the model learned after some explored steps, by model-predictive control "
         "(cross-entropy method) on the true system with its noise: swing-up of the pendulum and "

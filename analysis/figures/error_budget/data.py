@@ -14,25 +14,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
-from analysis.stats.paired_tests import interval_of_mean
-
-Array = npt.NDArray[np.float64]
+from analysis.stats.geometric_means import Estimate, geometric_mean
 
 PARTS = ("floor", "exploration_factor", "offline", "learner_factor", "online")
 """Columns of a budget, in the order in which they multiply: the third and last are products."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A geometric mean over trials with its 95 % interval, NaN for fewer than two."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -77,18 +64,6 @@ def _budget(rows: pd.DataFrame) -> Budget:
     unconverged = ~(rows["floor_converged"] & rows["offline_converged"])
     parts = {name: geometric_mean(rows[name].to_numpy(float)) for name in PARTS}
     return Budget(env, policy, label, len(rows), int(unconverged.sum()), **parts)
-
-
-def geometric_mean(values: Array) -> Estimate:
-    """Return the geometric mean of (n,); NaN where a value has no logarithm.
-
-    The interval is that of the mean logarithm: a BCa bootstrap, Student's for few trials.
-    """
-    if not np.all((values > 0) & np.isfinite(values)):
-        return Estimate(*[float("nan")] * 3)
-    logs = np.log(values)
-    low, high = interval_of_mean(logs, np.random.default_rng(0))
-    return Estimate(*(float(np.exp(end)) for end in (np.mean(logs), low, high)))
 
 
 def tabulate(found: tuple[Budget, ...]) -> pd.DataFrame:

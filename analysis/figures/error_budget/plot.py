@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from analysis.figures.axes import log_limits, log_ticks, rows_and_columns
-from analysis.figures.error_budget.data import Budget, Estimate
+from analysis.figures.error_budget.data import Budget
 from analysis.figures.loss_curves.plot import loss_label
 from analysis.figures.style import TEXT_WIDTH
 from analysis.formatting import count_text, number
-from analysis.line_styles import BLUE, VERMILLION, environment_title
+from analysis.line_styles import BLUE, VERMILLION, environment_title, text_by_environment
+from analysis.stats.geometric_means import Estimate
 
 TITLE = "Error budget"
 STATISTIC = "geometric mean over trials of the losses and of their quotients"
@@ -116,11 +117,7 @@ def counts(budgets: Sequence[Budget]) -> str:
 
 def caption(budgets: Sequence[Budget], ridge: float) -> str:
     """Return the caption, with what each number is, n and the fits that did not converge."""
-    environments = dict.fromkeys(budget.env for budget in budgets)
-    numbers = "; ".join(
-        f"{environment_title(env)}: {counts([one for one in budgets if one.env == env])}"
-        for env in environments
-    )
+    numbers = text_by_environment(budgets, counts)
     unconverged = sum(budget.n_unconverged for budget in budgets)
     fits = f" Trials of which a fit did not converge: {unconverged}." if unconverged else ""
     return (

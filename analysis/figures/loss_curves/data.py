@@ -16,6 +16,7 @@ from analysis.data.divergence import DivergenceRule, Sample
 from analysis.data.trial_selection import Entry, Selection
 from analysis.line_styles import LineStyle, policy_style, sequence_style
 from analysis.stats.intervals import Band, Statistic, band
+from analysis.stats.tolerance import BandKind, tolerance_band
 from analysis.units import loss_unit
 from dopt.systems import system_from_mapping
 from orchestrate.store import Reader
@@ -55,6 +56,7 @@ def measure_curves(
     axis: Axis = Axis.STEPS,
     statistic: Statistic = Statistic.MEAN,
     color_by: str | None = None,
+    band_kind: BandKind = BandKind.CONFIDENCE,
 ) -> tuple[LossCurve, ...]:
     """Return a curve for each entry of the selection, in its order.
 
@@ -63,7 +65,7 @@ def measure_curves(
     """
     styles = line_styles(selection, color_by)
     return tuple(
-        _measure(reader, entry, styles[entry.label], column, rule, axis, statistic)
+        _measure(reader, entry, styles[entry.label], column, rule, axis, statistic, band_kind)
         for entry in selection.entries
     )
 
@@ -99,6 +101,7 @@ def _measure(
     rule: DivergenceRule,
     axis: Axis,
     statistic: Statistic,
+    band_kind: BandKind,
 ) -> LossCurve:
     sample = read_sample(reader, entry, column, rule)
     t = np.arange(sample.values.shape[1])
@@ -106,7 +109,8 @@ def _measure(
     scale = system.dt if axis is Axis.SECONDS else 1.0
     names = entry.config.env, entry.config.policy, entry.label
     x = scale * t.astype(float)
-    shown = band(sample.values, statistic)
+    limits = tolerance_band if band_kind is BandKind.TOLERANCE else band
+    shown = limits(sample.values, statistic)
     return LossCurve(*names, style, t, x, loss_unit(system), shown, statistic, sample)
 
 

@@ -24,6 +24,7 @@ from analysis.figures.style import TEXT_WIDTH
 from analysis.formatting import count_text
 from analysis.line_styles import GREY, LineStyle, environment_title
 from analysis.plot_options import PlotOptions, Spread
+from analysis.stats.tolerance import FEWEST, BandKind
 from dopt.policies.titles import policy_title
 
 PANEL_HEIGHT = 2.3
@@ -52,7 +53,7 @@ def loss_plot(name: str, column: str) -> Plot[Numbers]:
             options,
             measure_curves(
                 *(reader, selection, column, options.rule),
-                *(options.axis, options.statistic, options.color_by),
+                *(options.axis, options.statistic, options.color_by, options.band),
             ),
         ),
         tabulate=lambda numbers: tabulate_curves(numbers[2]),
@@ -156,6 +157,15 @@ def _breaks(curves: Sequence[LossCurve]) -> str:
     return ""
 
 
+def _bandless(curves: Sequence[LossCurve], options: PlotOptions) -> str:
+    """Return which lines have no tolerance band, or nothing."""
+    if options.band is not BandKind.TOLERANCE:
+        return ""
+    few = [curve for curve in curves if curve.band.n < FEWEST]
+    lines = ", ".join(f"{environment_title(one.env)} {one.label} (n = {one.band.n})" for one in few)
+    return f"No band, as fewer than {FEWEST} trials have none: {lines}. " if few else ""
+
+
 def _title(env: str, counts: str) -> str:
     """Return the title of a panel in one line, or in more, none of which breaks a count."""
     if len(env) + len(counts) < 50:
@@ -176,7 +186,7 @@ def legend_handles(styles: Mapping[str, LineStyle], options: PlotOptions) -> lis
         Line2D([], [], color=style.colour, ls=style.line, lw=style.width, label=label)
         for label, style in styles.items()
     ]
-    name = options.statistic.band
+    name = options.interval
     if options.spread is Spread.BAND:
         return [*handles, Patch(color=GREY, alpha=0.35, lw=0, label=name)]
     return [*handles, Line2D([], [], ls="none", marker="|", ms=9, mew=1, color=GREY, label=name)]
@@ -202,7 +212,7 @@ def caption(numbers: Numbers) -> str:
         f"Root mean square error of the model over the {where} against time t, one panel per "
         f"environment. "
         f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
-        f"{options.statistic.band}; no smoothing. "
+        f"{options.interval}; no smoothing. {_bandless(curves, options)}"
         f"{_breaks(curves)}{rules[options.rule]} Policies of one environment share initial "
         f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )

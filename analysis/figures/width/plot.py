@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from analysis.figures.axes import log_limits, log_scale
+from analysis.figures.axes import log_limits, log_scale, value_ticks
 from analysis.figures.loss_curves.plot import loss_label
 from analysis.figures.plot import Plot
 from analysis.figures.style import COLUMN_WIDTH, GUIDE
@@ -87,9 +86,7 @@ def _axes(height: float, widths: np.ndarray[tuple[int], np.dtype[np.int64]]) -> 
     axes = figure.subplots()
     axes.set_xscale("log")
     axes.set_xlabel("width w [units in each hidden layer]")
-    axes.xaxis.set_major_locator(FixedLocator(widths.tolist()))
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    value_ticks(axes.xaxis, widths.tolist())
     return figure, axes
 
 

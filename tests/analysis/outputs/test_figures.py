@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.data import provenance
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Selection, select
 from analysis.figures.input_spectrum.plot import spectrum_plot
@@ -167,6 +169,20 @@ def test_what_is_unchanged_is_not_drawn_again(reader: Reader, tmp_path: Path) ->
     (tmp_path / "comparison.json").write_text("{ cut off")
     assert make(reader, selection, tmp_path) == ["written", "written"]
     assert make(reader, selection.only(["cartpole"]), tmp_path) == ["unchanged", "written"]
+
+
+def test_what_is_drawn_by_changed_code_is_drawn_again(
+    reader: Reader, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    selection = select(reader, Filter())
+    copied = tmp_path / "analysis"
+    shutil.copytree(provenance.PACKAGE, copied, ignore=shutil.ignore_patterns("*.pyc"))
+    monkeypatch.setattr(provenance, "PACKAGE", copied)
+    assert make(reader, selection, tmp_path / "out") == ["written", "written"]
+    assert make(reader, selection, tmp_path / "out") == ["unchanged", "unchanged"]
+    drawing = copied / "figures" / "input_spectrum" / "plot.py"
+    drawing.write_text(drawing.read_text() + "# changed\n")
+    assert make(reader, selection, tmp_path / "out") == ["written", "written"]
 
 
 def test_steps_to_a_given_loss_need_no_random_inputs(reader: Reader, tmp_path: Path) -> None:

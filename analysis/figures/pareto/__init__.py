@@ -1,0 +1,1 @@
+"""Final loss against the time of a step, with the Pareto front (Figure 6)."""

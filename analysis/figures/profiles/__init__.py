@@ -1,0 +1,1 @@
+"""Performance profiles over all systems (Figure 7)."""

@@ -1,0 +1,129 @@
+"""Figure 7 as numbers: share of the runs whose final loss is within a factor of the reference's.
+
+The factor is by the geometric mean of the final losses of the reference in the same environment.
+Its share of runs, as a function of the factor, is the performance profile (run-score distribution:
+Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", 2021).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from analysis.data.config_matching import APART
+from analysis.data.trial_selection import Entry, Selection
+from analysis.figures.loss_curves.data import line_styles
+from analysis.line_styles import LineStyle
+from analysis.stats.geometric_means import geometric_mean
+from analysis.stats.stratified import StratifiedMean, stratified_mean
+
+Array = npt.NDArray[np.float64]
+
+FACTORS = 301
+"""Points of a profile."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One variant over its environments.
+
+    Attributes
+    ----------
+    factors : (T,)
+        Factors τ, ascending.
+    share : StratifiedMean
+        Of the runs with a loss of at most τ times the reference's: mean over environments.
+    environments : tuple of str
+        Those in which both it and the reference have a final loss.
+    n, n_diverged : int
+        Trials that ended in all of them; a diverged one is within no factor.
+    """
+
+    label: str
+    style: LineStyle
+    reference: str
+    factors: Array
+    share: StratifiedMean
+    environments: tuple[str, ...]
+    n: int
+    n_diverged: int
+
+
+def profiles_part(selection: Selection) -> Selection:
+    """Return the environments in which the reference has a final loss, if there are others too.
+
+    The oracle is left out: the loss of the others is thousands of times its own.
+    """
+    policies = set(selection.policies) - ({APART} - {selection.reference})
+    compared = selection.only(selection.environments, policies).compared()
+    return compared if len(compared.labels) > 1 else Selection(())
+
+
+def measure_profiles(selection: Selection) -> tuple[Profile, ...]:
+    """Return the profile of every variant of the selection, in its order."""
+    ratios = {label: _ratios(selection, label) for label in selection.labels}
+    every = np.concatenate([part for own in ratios.values() for part in own.values()])
+    known = every[np.isfinite(every) & (every > 0)]
+    factors = np.geomspace(known.min() / 1.05, known.max() * 1.05, FACTORS)
+    styles = line_styles(selection)
+    first = selection.reference_of(selection.environments[0])
+    reference = first.label if first else selection.reference
+    return tuple(
+        Profile(
+            label=label,
+            style=styles[label],
+            reference=reference,
+            factors=factors,
+            share=stratified_mean([_within(part, factors) for part in own.values()]),
+            environments=tuple(own),
+            n=sum(map(len, own.values())),
+            n_diverged=sum(int(np.isinf(part).sum()) for part in own.values()),
+        )
+        for label, own in ratios.items()
+        if own
+    )
+
+
+def _within(ratios: Array, factors: Array) -> Array:
+    """Return 1 where a run (n,) is within a factor (T,), else 0: (n, T)."""
+    return (ratios[:, None] <= factors).astype(float)
+
+
+def _ratios(selection: Selection, label: str) -> dict[str, Array]:
+    """Return final loss / the reference's by environment, inf for a trial that diverged."""
+    found = {}
+    for entry in selection.entries:
+        reference = selection.reference_of(entry.config.env)
+        if entry.label == label and reference is not None and entry.finished:
+            scale = geometric_mean(np.array(list(reference.final_losses().values()))).value
+            found[entry.config.env] = _finals(entry) / scale
+    return found
+
+
+def _finals(entry: Entry) -> Array:
+    finals = entry.final_losses()
+    return np.array([finals.get(trial.seed, np.inf) for trial in entry.finished])
+
+
+def tabulate_profiles(profiles: tuple[Profile, ...]) -> pd.DataFrame:
+    """Return what is drawn, one row for each variant and factor."""
+    return pd.concat([_rows(profile) for profile in profiles], ignore_index=True)
+
+
+def _rows(profile: Profile) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "label": profile.label,
+            "reference": profile.reference,
+            "factor": profile.factors,
+            "share": profile.share.centre,
+            "low": profile.share.low,
+            "high": profile.share.high,
+            "n_environments": len(profile.environments),
+            "n": profile.n,
+            "n_diverged": profile.n_diverged,
+        }
+    )

@@ -1,0 +1,1 @@
+"""Final loss against single settings (Figure 8)."""
