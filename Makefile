@@ -7,6 +7,7 @@ BIN := $(VENV)/bin
 DB ?= sqlite:///results/results.db
 STUDY_DB ?= sqlite:///results/study.db
 CLAIMS_DB ?= sqlite:///results/claims.db
+CLAIMS_CONTROL_DB ?= sqlite:///results/claims_control.db
 SMOKE_DB := sqlite:///results/smoke.db
 # The policies of which figure 5 shows what their models are good for: all would hide each other.
 CONTROLLED := d_optimal lookahead uniform periodic random random_held
@@ -26,7 +27,7 @@ ALL := --numprocesses 2 --dist loadgroup --no-loadscope-reorder -m 'not soak and
 # Tests of pure functions, of the configuration and of the architecture: no trial, no database server,
 # no cluster and no browser. Two files compile, or compose many grids, and are left to `make test`.
 FAST := tests/test_architecture.py tests/test_release.py tests/dopt/declare tests/dopt/math \
-	tests/dopt/spec tests/dopt/control tests/dopt/systems tests/analysis/stats tests/orchestrate/config \
+	tests/dopt/spec tests/dopt/stopping tests/dopt/control tests/dopt/systems tests/analysis/stats tests/orchestrate/config \
 	--ignore=tests/dopt/systems/test_chain.py --ignore=tests/orchestrate/config/test_several_grids.py
 .PHONY: help setup run test test-fast test-lowest test-machines soak image coverage lint format docs \
 	grid figures study claims smoke bench clean
@@ -110,10 +111,11 @@ study: run  ## run everything beyond the paper and compare it on one page, repor
 	$(BIN)/python -m analysis report --db '$(STUDY_DB)' --out report
 	$(BIN)/python -m analysis figures --db '$(STUDY_DB)' --out report/figures --only figure5_control --env pendulum cartpole arm quadrotor --policy $(CONTROLLED)
 
-claims: run  ## run with 100 seeds what few leave open, and compare it on one page, report/claims/README.md
+claims: run  ## run with other seeds what few leave open, and compare it on two pages, report/claims/ and report/claims_control/
 	$(BIN)/python orchestrate/launch.py -m experiment=claims store.url='$(CLAIMS_DB)'
 	$(BIN)/python -m analysis report --db '$(CLAIMS_DB)' --out report/claims
-	$(BIN)/python -m analysis figures --db '$(CLAIMS_DB)' --out report/claims/figures --only figure5_control --env pendulum --policy $(CONTROLLED)
+	$(BIN)/python orchestrate/launch.py -m experiment=claims_control store.url='$(CLAIMS_CONTROL_DB)'
+	$(BIN)/python -m analysis report --db '$(CLAIMS_CONTROL_DB)' --out report/claims_control
 
 smoke: run  ## a small grid and its figures, in a database of their own
 	$(BIN)/python orchestrate/launch.py -m experiment=smoke store.url='$(SMOKE_DB)'

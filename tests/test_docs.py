@@ -202,7 +202,7 @@ def test_every_command_of_the_analysis_works(
     command: Command, typed: Callable[[Command], str]
 ) -> None:
     extra = {"animate": ("--frames", "2"), "floor": ("--where", "model.width=16")}
-    extra |= {"summary": (), "compare": (), "report": ()}
+    extra |= {"summary": (), "compare": (), "aggregate": (), "report": ()}
     if command.words[0] == "serve":  # which does not end; its own tests start it
         assert cli.parser().read(command.words)
     else:
