@@ -83,7 +83,7 @@ def write(
         *more,
     ]
     if notes:
-        sections.append("## Left out\n\n" + "\n".join(f"- {note}" for note in notes))
+        sections.append("## Notes\n\n" + "\n".join(f"- {note}" for note in notes))
     return "\n\n".join(sections) + "\n"
 
 

@@ -7,6 +7,7 @@ settings too: a variant is a policy together with what sets it apart from the ot
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -97,7 +98,19 @@ def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | No
     rest.sort(key=lambda one: (policy_rank(one.config.policy), one.label))
     left = len(entries) - len(kept)
     notes = [f"{left} configurations of another env section, task or fewer trials"] if left else []
-    return VariantGroup(env, (first, *rest), (*notes, *_of_other_tasks([first, *rest], task)), task)
+    notes += [*_of_unequal_seeds([first, *rest]), *_of_other_tasks([first, *rest], task)]
+    return VariantGroup(env, (first, *rest), tuple(notes), task)
+
+
+def _of_unequal_seeds(variants: Sequence[Entry]) -> Iterator[str]:
+    """Say how many seeds the variants have, where they differ."""
+    numbers = Counter(len({trial.seed for trial in one.trials}) for one in variants)
+    if len(numbers) > 1:
+        counts = ", ".join(
+            f"{n} seeds: {count} variant{'s' if count > 1 else ''}"
+            for n, count in sorted(numbers.items())
+        )
+        yield f"{counts}; a ratio is over the seeds that both variants of it have"
 
 
 def _of_other_tasks(variants: Sequence[Entry], task: str | None) -> Iterator[str]:

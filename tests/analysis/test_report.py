@@ -241,6 +241,8 @@ def test_variants_may_have_different_numbers_of_seeds(tmp_path: Path) -> None:
     specs = make_grid(("pendulum",), ("d_optimal",), range(6), **SHORT)
     fill(url, specs + make_grid(("pendulum",), ("random",), range(2, 5), **SHORT))
     assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
+    notes = (tmp_path / "out/README.md").read_text().split("## Notes")[1]
+    assert "pendulum: 3 seeds: 1 variant, 6 seeds: 1 variant; a ratio is over" in notes
     table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     assert table["n"].to_dict() == {"D-optimal": 6, "random": 3}
     finals = [

@@ -89,7 +89,7 @@ def test_costs_of_different_tasks_are_not_compared(tmp_path: Path) -> None:
     ]
     assert {row["variant"] for row in rows} >= {"D-optimal", "uniform"}
     assert not {row["variant"] for row in rows} & {"random", "periodic"}
-    notes = text.split("## Left out")[1]
+    notes = text.split("## Notes")[1]
     assert "control with random: assessed by another task" in notes
     assert "checkpoints = [10, 30] instead of [20]" in notes
     assert "control with periodic: assessed by another task" in notes
