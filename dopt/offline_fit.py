@@ -124,7 +124,7 @@ def can_be_fitted(model: Model) -> bool:
 
 def is_network(model: Model) -> bool:
     """Tell whether a model is the network that the kernel knows."""
-    return isinstance(model, MLP) and model.compiled
+    return isinstance(model, MLP) and model.compiled and model.n_members == 1
 
 
 def grid_loss(spec: TrialSpec, parameters: Array) -> float:
@@ -159,7 +159,7 @@ def _root_mean_square(errors: Array) -> float:
 def _fit_network(
     spec: TrialSpec, states: Array, accelerations: Array, initial: Array, ridge: float, most: int
 ) -> tuple[Array, int, bool]:
-    from dopt.kernel.from_spec import network_of
+    from dopt.kernel.model_from_spec import network_of
     from dopt.kernel.offline_fit import Problem, fit
     from dopt.kernel.pointers import compiled_for, kind_of
 

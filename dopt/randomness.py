@@ -107,7 +107,7 @@ def _plans(policy: Policy, system: System, seed: int) -> Array:
 
 def _parameters(spec: TrialSpec) -> Array:
     if isinstance(spec.policy, ICEM):
-        q = spec.model.n_parameters(spec.system)
+        q = spec.model.n_member_parameters(spec.system)
         return spec.policy.draw_parameters(q, stream(spec.seed, "sampled_parameters"))
     return np.zeros((0, 0))
 

@@ -9,7 +9,7 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.gaussian_process import kernel_value, mean_weights
-from dopt.kernel.network import features_at, forward
+from dopt.kernel.network import features_at, mean_forward
 from dopt.kernel.structs import Evaluation, Network, Plant
 from dopt.types import Matrix, Real, Singles, Vector
 
@@ -32,18 +32,22 @@ class Buffers(NamedTuple):
     outputs_single: Singles  # (r, BLOCK)
     hidden: Matrix  # (L, w BLOCK)
     outputs: Matrix  # (r, BLOCK)
-    theta_single: Singles  # (q,)
+    thetas_single: Singles  # (E, q)
+    one_single: Singles  # (r, BLOCK) of one member
+    one: Matrix  # (r, BLOCK)
 
 
 @compiled
 def model_error(
-    network: Network, theta: Vector, points: Evaluation, start: int, stop: int, buffers: Buffers
+    network: Network, thetas: Matrix, points: Evaluation, start: int, stop: int, buffers: Buffers
 ) -> float:
     """Return sqrt(mean ‖a_θ(x) - a(x)‖²) over the points from ``start`` to ``stop``.
 
+    Parameters ``thetas``, (E, q), of more than one network stand for the mean of what they give.
     But for the linear model points come in blocks, and both bounds lie between blocks or at the
     end.
     """
+    theta = thetas[0]
     if network.kind == ModelKind.LINEAR:
         return _linear_error(theta, points, start, stop)
     r = buffers.outputs.shape[0]
@@ -53,31 +57,43 @@ def model_error(
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
         alpha = mean_weights(network, theta, r)[: points.n_basis[0]]
         return _combination_error(alpha.T.copy(), points, start, stop, buffers.outputs)
-    hidden_single, outputs_single, hidden, outputs, theta_single = buffers
-    for i in range(theta.shape[0]):
-        theta_single[i] = np.float32(theta[i])
+    hidden_single, outputs_single, hidden, outputs, thetas_single, one_single, one = buffers
+    for k in range(thetas.shape[0]):
+        for i in range(thetas.shape[1]):
+            thetas_single[k, i] = np.float32(thetas[k, i])
     loss = _network_error(
-        network, theta_single, points.single, points, start, stop, hidden_single, outputs_single
+        network,
+        thetas_single,
+        points.single,
+        points,
+        start,
+        stop,
+        hidden_single,
+        outputs_single,
+        one_single,
     )
     if loss >= SINGLE_FLOOR * points.target_size:
         return loss
-    return _network_error(network, theta, points.features, points, start, stop, hidden, outputs)
+    return _network_error(
+        network, thetas, points.features, points, start, stop, hidden, outputs, one
+    )
 
 
 @compiled
 def _network_error(
     network: Network,
-    theta: Real,
+    thetas: Real,
     features: Real,
     points: Evaluation,
     start: int,
     stop: int,
     hidden: Real,
     outputs: Real,
+    one: Real,
 ) -> float:
     total, count = 0.0, 0
     for block in range(start, stop):
-        forward(network, theta, features[block], hidden, outputs)
+        mean_forward(network, thetas, features[block], hidden, outputs, one)
         used = points.block_sizes[block]
         total += _squared_errors(outputs, points.block_targets[block], used)
         count += used
@@ -123,7 +139,7 @@ def _linear_error(theta: Vector, points: Evaluation, start: int, stop: int) -> f
 
 
 @compiled
-def evaluation_buffers(network: Network, q: int, r: int) -> Buffers:
+def evaluation_buffers(network: Network, thetas: Matrix, r: int) -> Buffers:
     """Return the scratch memory of :func:`model_error`."""
     depth, room = network.offsets.shape[0] - 1, network.sizes[1] * BLOCK
     return Buffers(
@@ -131,7 +147,9 @@ def evaluation_buffers(network: Network, q: int, r: int) -> Buffers:
         np.empty((r, BLOCK), np.float32),
         np.empty((depth, room)),
         np.empty((r, BLOCK)),
-        np.empty(q, np.float32),
+        np.empty(thetas.shape, np.float32),
+        np.empty((r, BLOCK), np.float32),
+        np.empty((r, BLOCK)),
     )
 
 

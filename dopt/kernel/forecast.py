@@ -8,7 +8,8 @@ import numpy as np
 from numba import float64
 
 from dopt.control.prediction import Forecast
-from dopt.kernel.from_spec import network_of, plant_of
+from dopt.kernel.from_spec import plant_of
+from dopt.kernel.model_from_spec import network_of
 from dopt.kernel.pointers import compiled_for, kind_of
 from dopt.kernel.rollout import follow_equations, follow_network
 from dopt.models import MLP
@@ -25,7 +26,8 @@ def true_forecast(system: System) -> Forecast:
 def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
     """Return the forecast of a model of the kernel with parameters (q,)."""
     if isinstance(model, MLP):
-        given = (plant_of(system), network_of(system, model), np.array(parameters))
+        thetas = np.reshape(parameters, (model.n_members, -1)).copy()
+        given = (plant_of(system), network_of(system, model), thetas)
         return _forecast("follow-network", follow_network, given)
     # The accelerations are affine in θ, so that the linear model is the system with θ for its own.
     offset, *units = np.array(system.linear_form)

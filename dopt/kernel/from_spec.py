@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import functools
-import itertools
 
 import numpy as np
 
-from dopt.algorithm import FeatureKind, Form, ModelKind, Score, switch_step
-from dopt.errors import SpecificationError
+from dopt.algorithm import Form, Score, switch_step
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
+from dopt.kernel.model_from_spec import members_of, network_of
 from dopt.learning import GaussNewton, Learner
-from dopt.models import MLP, RFF, GaussianProcess, Linear
-from dopt.models.base import Model
+from dopt.models import MLP, GaussianProcess
 from dopt.policies import (
     ICEM,
     DOptimal,
@@ -38,7 +36,6 @@ from dopt.systems.base import System
 from dopt.types import Matrix, Vector
 
 MODULES = {Form.PRIMAL: primal_network, Form.DUAL: dual, Form.SKETCH: sketch}
-FEATURE_KINDS = {"identity": FeatureKind.IDENTITY, "cos": FeatureKind.COS, "sin": FeatureKind.SIN}
 
 
 @functools.lru_cache(maxsize=64)
@@ -64,50 +61,6 @@ def plant_of(system: System) -> args.Plant:
         system.gamma,
         system.state_limit,
     )
-
-
-def network_of(system: System, model: Model) -> args.Network:
-    """Return the architecture of a model on a system."""
-    if isinstance(model, MLP):
-        kind, sizes = ModelKind.MLP, model.layer_sizes(system)
-    elif isinstance(model, Linear):
-        kind, sizes = ModelKind.LINEAR, (len(system.features), 1, system.n_learned)
-    elif isinstance(model, RFF):
-        kind, sizes = ModelKind.RANDOM_FEATURES, (len(system.features), 1, system.n_learned)
-    elif isinstance(model, GaussianProcess):
-        kind, sizes = ModelKind.GAUSSIAN_PROCESS, (len(system.features), 1, system.n_learned)
-    else:
-        raise SpecificationError(
-            f"model '{model.name}' says that it is compiled, but the kernel knows 'mlp', 'linear', "
-            f"'rff' and 'gaussian_process': set compiled = False in its class."
-        )
-    lengths = [(n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes)]
-    return args.Network(
-        int(kind),
-        np.array(sizes),
-        np.cumsum([0, *lengths[:-1]]),
-        np.array([FEATURE_KINDS[feature.kind] for feature in system.features]),
-        np.array([feature.index for feature in system.features]),
-        np.array(system.feature_scales),
-        args.Waves(np.zeros((0, 0)), np.zeros(0), 1.0),
-        _process(system, model),
-    )
-
-
-def _process(system: System, model: Model) -> args.Process:
-    if isinstance(model, GaussianProcess):
-        return args.Process(model.lengthscale, model.amplitude, model.noise_variance(system))
-    return args.Process(1.0, 1.0, 1.0)
-
-
-def network_of_trial(spec: TrialSpec, network: args.Network, weights: Vector) -> args.Network:
-    """Return the architecture with the random features that a trial has drawn in its weights."""
-    if not isinstance(spec.model, RFF):
-        return network
-    D, p = spec.model.n_features, len(spec.system.features)
-    frequencies, phases = weights[-D * (p + 1) : -D].reshape(D, p), weights[-D:]
-    waves = args.Waves(frequencies.copy(), phases.copy(), spec.model.scale)
-    return network._replace(waves=waves)
 
 
 def algorithm_of(config: TrialConfig) -> args.Algorithm:
@@ -175,12 +128,12 @@ def _regularization(config: TrialConfig) -> float:
 def _n_learned(config: TrialConfig) -> int:
     """Return the number of parameters that are learned, the first ones."""
     model, system = config.model, config.system
-    return model.n_parameters(system) - model.n_fixed_parameters(system)
+    return model.n_member_parameters(system) - model.n_fixed_parameters(system)
 
 
 def _held(config: TrialConfig) -> Information | None:
     q, n_rows = (
-        config.model.n_parameters(config.system),
+        config.model.n_member_parameters(config.system),
         config.system.n_learned * config.system.horizon,
     )
     return held_information(config.policy, config.learner, q, n_rows)
@@ -196,6 +149,7 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
     return args.State(
         weights[:q].copy(),
         weights[:q].copy(),
+        members_of(spec.model, weights),
         np.zeros(q),
         np.zeros(q),
         *_information(spec, q),

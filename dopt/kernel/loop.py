@@ -8,6 +8,7 @@ from dopt.algorithm import ModelKind
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
 from dopt.kernel.evaluation import add_sample, evaluation_buffers, follow_truth, model_error
+from dopt.kernel.members import learn_members, members_or_one
 from dopt.kernel.structs import Evaluation, Learn, Plan, Plant, Trial
 from dopt.types import Vector
 
@@ -42,7 +43,8 @@ def advance(
     steps done from the start of the trial: ``last``, or the step at which the trial diverged.
     """
     plant, network, record, theta = trial.plant, trial.network, trial.record, trial.state.theta
-    buffers = evaluation_buffers(network, theta.shape[0], plant.learned_rows.shape[0])
+    thetas = members_or_one(trial.state)
+    buffers = evaluation_buffers(network, thetas, plant.learned_rows.shape[0])
     target = np.empty(plant.learned_rows.shape[0])
     for t in range(first, last):
         clock_0 = monotonic_microseconds()
@@ -56,7 +58,7 @@ def advance(
         if not within(following, plant.state_limit):
             return t
         clock_2 = monotonic_microseconds()
-        learn(trial, t, target)
+        learn_members(trial, learn, t, target)
         clock_3 = monotonic_microseconds()
         if not within(theta, np.inf):
             return t
@@ -66,10 +68,10 @@ def advance(
             add_sample(network, points, x)
         if plant.history.shape[0] > 1:
             follow_truth(plant, network, points, t)
-        loss = model_error(network, theta, points, 0, points.n_grid, buffers)
+        loss = model_error(network, thetas, points, 0, points.n_grid, buffers)
         record.loss[t] = loss
         record.reachable_loss[t] = model_error(
-            network, theta, points, points.n_grid, points.n_all, buffers
+            network, thetas, points, points.n_grid, points.n_all, buffers
         )
         clock_5 = monotonic_microseconds()
         record.plan_us[t] = (clock_1 - clock_0) + (clock_4 - clock_3)

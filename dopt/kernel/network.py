@@ -78,6 +78,27 @@ def forward(network: Network, theta: Real, inputs: Real, hidden: Real, outputs: 
             outputs[k, i] += b[k]
 
 
+@compiled
+def mean_forward(
+    network: Network, thetas: Real, inputs: Real, hidden: Real, outputs: Real, one: Real
+) -> None:
+    """Evaluate the mean of networks with parameters (E, q) as :func:`forward` does one.
+
+    ``one`` (r, n) is scratch memory.
+    """
+    forward(network, thetas[0], inputs, hidden, outputs)
+    if thetas.shape[0] == 1:
+        return
+    for k in range(1, thetas.shape[0]):
+        forward(network, thetas[k], inputs, hidden, one)
+        for i in range(outputs.shape[0]):
+            for n in range(outputs.shape[1]):
+                outputs[i, n] += one[i, n]
+    for i in range(outputs.shape[0]):
+        for n in range(outputs.shape[1]):
+            outputs[i, n] /= thetas.shape[0]
+
+
 @vectorized
 def _row_sums(values: Matrix, out: Vector) -> None:
     for i in range(out.shape[0]):

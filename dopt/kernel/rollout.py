@@ -11,7 +11,7 @@ from dopt.kernel import network as nn
 from dopt.kernel.compiler import called_from_python
 from dopt.kernel.model import euler_step, write_features
 from dopt.kernel.structs import Network, Plant
-from dopt.types import Stack, Vector
+from dopt.types import Matrix, Stack, Vector
 
 
 @called_from_python
@@ -26,17 +26,20 @@ def follow_equations(plant: Plant, parameters: Vector, inputs: Stack, states: St
 
 @called_from_python
 def follow_network(
-    plant: Plant, network: Network, theta: Vector, inputs: Stack, states: Stack
+    plant: Plant, network: Network, thetas: Matrix, inputs: Stack, states: Stack
 ) -> None:
-    """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m)."""
+    """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m).
+
+    They follow the mean of the networks with parameters ``thetas``, (E, q).
+    """
     n, r = inputs.shape[1], plant.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     flow, value = np.empty(states.shape[2]), np.empty(r)
-    features, outputs = np.empty((network.sizes[0], n)), np.empty((r, n))
+    features, outputs, one = np.empty((network.sizes[0], n)), np.empty((r, n)), np.empty((r, n))
     hidden = np.empty((depth, width * n))
     for t in range(inputs.shape[0]):
         write_features(network, states[t], features)
-        nn.forward(network, theta, features, hidden, outputs)
+        nn.mean_forward(network, thetas, features, hidden, outputs, one)
         for i in range(n):
             for k in range(r):
                 value[k] = outputs[k, i]

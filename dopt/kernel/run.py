@@ -16,9 +16,9 @@ from dopt.kernel.from_spec import (
     empty_scratch,
     information_of,
     initial_state,
-    network_of_trial,
     randomness_of,
 )
+from dopt.kernel.model_from_spec import network_of_trial
 from dopt.kernel.pointers import Compiled, compiled_trial
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import draw
@@ -68,13 +68,16 @@ class KernelTrial:
             empty_record(spec.system),
         )
         self.state, self.record = self.trial.state, self.trial.record
-        self._fixed = draws.weights[len(self.state.theta) :]
+        n_fixed = spec.model.n_fixed_parameters(spec.system)
+        self._fixed = draws.weights[len(draws.weights) - n_fixed :]
         self.done = 0
         self.diverged_at: int | None = None
 
     @property
     def parameters(self) -> Array:
-        """Parameters of the model, (q,), those that stay as they were drawn included."""
+        """Parameters of the model, (q,), of all members, and those that stay as they were drawn."""
+        if self.state.members.parameters.shape[0] > 0:
+            return self.state.members.parameters.flatten()
         return np.concatenate([self.state.theta, self._fixed])
 
     @property

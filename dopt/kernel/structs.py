@@ -190,11 +190,19 @@ class Linearization(NamedTuple):
     deltas_dots: Stack  # (m, L, w)
 
 
+class Members(NamedTuple):
+    """Networks of an ensemble (:mod:`dopt.kernel.members`); empty in other models."""
+
+    parameters: Matrix  # (E, q)
+    priors: Matrix  # (E, q) before the first step
+
+
 class State(NamedTuple):
     """Everything that changes from step to step; written in place."""
 
-    theta: Vector  # (q,) parameters
+    theta: Vector  # (q,) parameters, of an ensemble those of its first member
     prior: Vector  # (q,) parameters before the first step
+    members: Members
     moment_1: Vector  # (q,) of Adam
     moment_2: Vector  # (q,)
     covariance: Covariance

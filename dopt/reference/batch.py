@@ -19,7 +19,7 @@ from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
 from dopt.reference.dynamics import flow, known_flow, true_accelerations
 from dopt.reference.gaussian_process import Posterior
 from dopt.reference.learner_registry import batch_learner
-from dopt.reference.learning import KalmanLearner
+from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.planner_registry import plan_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
 from dopt.reference.search import searched_inputs
@@ -97,7 +97,21 @@ class Lockstep(BatchState):
         self.targets[:, t] = observed[:, list(self.system.learned_rows)]
 
     def learn(self, t: int) -> None:
-        """Update the parameters with the samples up to time t; diverged trials keep theirs."""
+        """Update the parameters with the samples up to time t; diverged trials keep theirs.
+
+        Of an ensemble that is the member whose turn it is, and then the first one, whose M stays.
+        """
+        if self.members is None:
+            self._learn(t)
+            return
+        assert isinstance(self.learner, GaussNewtonLearner)
+        for turn in (1 + t % (self.members.shape[1] - 1), 0):
+            self.theta.copy_(self.members[:, turn])
+            self.learner.prior.copy_(self.member_priors[:, turn])
+            self._learn(t)
+            self.members[:, turn] = self.theta
+
+    def _learn(self, t: int) -> None:
         before = self.theta.clone()
         seen = (self.states[:, : t + 1], self.targets[:, : t + 1])
         if isinstance(self.learner, KalmanLearner):
@@ -106,6 +120,11 @@ class Lockstep(BatchState):
         else:
             self.learner.learn(*seen)
         self.theta.copy_(torch.where(self.diverged, before, self.theta))
+
+    @property
+    def parameters_of_model(self) -> Tensor:
+        """Parameters of the model, (n, q), those of the members one after the other."""
+        return self.theta if self.members is None else self.members.flatten(1)
 
     def rows(self, t: int) -> Tensor:
         """Return J at x_t and the current parameters, (n, r, s), in the space of M."""
@@ -160,7 +179,11 @@ class Lockstep(BatchState):
         if isinstance(self.learner, Posterior):
             return self.learner.predict_points()
         over_points = vmap(self.model, in_dims=(None, 0))
-        predicted: Tensor = vmap(over_points, in_dims=(0, None))(self.theta, self.points)
+        over_trials = vmap(over_points, in_dims=(0, None))
+        if self.members is not None:
+            members = self.members.unbind(1)
+            return torch.stack([over_trials(theta, self.points) for theta in members]).mean(dim=0)
+        predicted: Tensor = over_trials(self.theta, self.points)
         return predicted
 
     def step(self, t: int) -> None:
@@ -206,7 +229,7 @@ def run_trials(
     checkpoints = {}
     for t in range(batch.system.horizon + 1):
         if t in specs[0].assessed_steps:
-            checkpoints[t] = batch.theta.cpu().numpy().copy()
+            checkpoints[t] = batch.parameters_of_model.cpu().numpy().copy()
         if t < batch.system.horizon:
             batch.step(t)
     n = len(specs)
@@ -231,7 +254,7 @@ def _result(
         **columns,
         states=states,
         inputs=inputs,
-        parameters=batch.theta[i].cpu().numpy().copy(),
+        parameters=batch.parameters_of_model[i].cpu().numpy().copy(),
         diverged_at=end,
         wall_seconds=wall,
         cpu_seconds=cpu,

@@ -142,7 +142,7 @@ class GaussNewtonLearner(KalmanLearner):
     ) -> None:
         between = ExtendedKalman(noise_variance=learner.noise_variance)
         super().__init__(between, model, theta, regularization)
-        self._fit, self._prior = learner, theta.clone()
+        self._fit, self.prior = learner, theta.clone()
         self._ridge = regularization * learner.noise_variance
         self._models = vmap(vmap(model, in_dims=(None, 0)))
         self._all_rows = vmap(vmap(jacrev(model), in_dims=(None, 0)))
@@ -161,7 +161,7 @@ class GaussNewtonLearner(KalmanLearner):
         """Take one damped step on (n, N, d) and (n, N, r); return ρM before it."""
         J = self._all_rows(self._theta, x).flatten(1, 2)
         e = (y - self._models(self._theta, x)).flatten(1).unsqueeze(-1)
-        distance = (self._prior - self._theta).unsqueeze(-1)
+        distance = (self.prior - self._theta).unsqueeze(-1)
         matrix: Tensor = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
         step = _solved(matrix, J.mT @ e + self._ridge * distance)
         before, share = self._theta.clone(), torch.ones_like(self._theta[:, :1])
@@ -177,7 +177,7 @@ class GaussNewtonLearner(KalmanLearner):
     def _objective(self, theta: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Return ‖e‖² + λρ ‖θ - θ₀‖², (n, 1)."""
         squares = (y - self._models(theta, x)).square().sum(dim=(1, 2))
-        whole = squares + self._ridge * (theta - self._prior).square().sum(dim=1)
+        whole = squares + self._ridge * (theta - self.prior).square().sum(dim=1)
         return whole.unsqueeze(1)
 
 

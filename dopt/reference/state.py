@@ -38,7 +38,10 @@ class BatchState:
     model : callable
         a_θ(x): parameters (q,) and state (d,) to accelerations (r,).
     theta : (n, q) tensor
-        Parameters; the first ``n_learned`` of each trial are learned.
+        Parameters, of an ensemble those of its first member; the first ``n_learned`` of
+        each trial are learned.
+    members : (n, E, q) tensor or None
+        Parameters of the networks of an ensemble.
     states, inputs, targets : (n, T + 1, d), (n, T, m), (n, T, r) tensors
         Visited states, applied inputs and observed accelerations; NaN where no trial has come yet.
     information : (n, s, s) tensor or None
@@ -72,6 +75,11 @@ class BatchState:
             self.model = network_function(self.system, module)
             flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
             self.theta = flat.to(device).repeat(len(specs), 1)
+        count = self.config.model.n_members
+        self.members = self.theta.view(len(specs), count, -1) if count > 1 else None
+        if self.members is not None:
+            self.theta = self.members[:, 0].clone()
+            self.member_priors = self.members.clone()
         self.n_learned = self.theta.shape[1] - self.config.model.n_fixed_parameters(self.system)
         self._allocate()
         self._hold_information()

@@ -54,7 +54,7 @@ class ReferenceTrial:
     @property
     def parameters(self) -> Array:
         """Parameters of the model, (q,)."""
-        parameters: Array = self._batch.theta[0].numpy()
+        parameters: Array = self._batch.parameters_of_model[0].numpy()
         return parameters
 
     @property

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dopt.errors import IncompatibleError
-from dopt.learning import LEARNERS, Adam, ExtendedKalman, InformationLearner, Learner
-from dopt.models import MODELS, GaussianProcess, Linear, LinearState, Model
+from dopt.learning import LEARNERS, Adam, ExtendedKalman, GaussNewton, InformationLearner, Learner
+from dopt.models import MODELS, Ensemble, GaussianProcess, Linear, LinearState, Model
 from dopt.policies import InformationPolicy, Oracle, Policy
 from dopt.policies.disagreement import Disagreement
 from dopt.policies.gaussian_process import GaussianProcessEntropy
@@ -32,12 +32,20 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
             "the two together",
             "were",
         )
+    if isinstance(model, Ensemble) and isinstance(learner, GaussNewton) and learner.refit_every > 1:
+        # a filter between two fits would keep the M of one network
+        every = f"learner.refit_every {learner.refit_every}"
+        raise mismatch(f"model '{model.name}'", "learner.refit_every 1", every)
 
 
 def _teaches(learner: type[Learner], model: type[Model]) -> bool:
-    """Tell whether a learner can learn a model's parameters; a filter also those of physics."""
+    """Tell whether a learner can learn a model's parameters.
+
+    A filter also learns those of physics, and a learner that fits anew the networks of an ensemble.
+    """
     filtered = issubclass(learner, ExtendedKalman) and issubclass(model, Linear)
-    return filtered or learner.structure == model.structure
+    fitted = issubclass(learner, GaussNewton) and issubclass(model, Ensemble)
+    return filtered or fitted or learner.structure == model.structure
 
 
 def _taught(learner: Learner) -> str:
@@ -101,7 +109,7 @@ def _check_information(
         raise mismatch(what, _models("gradient"), f"model '{model.name}'")
     if learner.updates_information:
         raise mismatch(what, "a learner that leaves M to the policy", f"learner '{learner.name}'")
-    q, n_rows = model.n_parameters(system), system.n_learned * system.horizon
+    q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
     form = policy.chosen_form(q, n_rows)
     if form != "primal":
         expected = "policy.form 'primal' or 'auto'" if hasattr(policy, "form") else "form 'primal'"

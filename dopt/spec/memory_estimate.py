@@ -11,7 +11,7 @@ import math
 from dopt.control import Control
 from dopt.control.free_run import STARTS
 from dopt.learning import Adam, AdamReplay, GaussNewton, Learner
-from dopt.models import MLP, RFF, GaussianProcess, Model
+from dopt.models import MLP, RFF, Ensemble, GaussianProcess, Model
 from dopt.policies import (
     ICEM,
     Disagreement,
@@ -51,7 +51,7 @@ def memory_by_setting(
     interpreter and its libraries, some 0.2 GiB, come on top.
     """
     T, d, m, r = system.horizon, system.n_states, system.n_inputs, system.n_learned
-    p, q = len(system.features), model.n_parameters(system)
+    p, q = len(system.features), model.n_member_parameters(system)
     N = math.prod(system.grid_points)
     w, L = (model.width, model.depth) if isinstance(model, MLP) else (1, 1)
     window = learner.window if isinstance(learner, Adam) else 0
@@ -62,7 +62,7 @@ def memory_by_setting(
         # states and their mesh, targets, and features in both precisions
         "env.grid_points": N * (2 * d + 2 * r + 2 * p),
         # parameters, two moments, gradient, and the copies for the evaluation
-        _size_of(model): 6 * q,
+        _size_of(model): (4 + 2 * model.n_members) * q,
         "learner.window": window * (p + r + (L + 3) * max(w, r)),
     }
     if isinstance(learner, AdamReplay):
@@ -103,7 +103,7 @@ def _samples_of_normal_matrix(policy: Policy, model: Model, learner: Learner, ho
 
 def _size_of(model: Model) -> str:
     """Return the setting that decides how many parameters a model has."""
-    names = {MLP: "model.width", RFF: "model.n_features"}
+    names = {MLP: "model.width", Ensemble: "model.width", RFF: "model.n_features"}
     return names.get(type(model), "model")
 
 
@@ -143,7 +143,7 @@ def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str
 
     The kernel holds one path at a time, the reference all of them.
     """
-    q, r = model.n_parameters(system), system.n_learned
+    q, r = model.n_member_parameters(system), system.n_learned
     if isinstance(policy, ICEM):
         return _sampling(policy, system, q)
     if not isinstance(policy, Search):
@@ -179,7 +179,7 @@ def _sampling(policy: ICEM, system: System, q: int) -> dict[str, int]:
 
 def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
     """Return the numbers of an ensemble, of a covariance and of a Gaussian process, by setting."""
-    T, r, q = system.horizon, system.n_learned, model.n_parameters(system)
+    T, r, q = system.horizon, system.n_learned, model.n_member_parameters(system)
     N = math.prod(system.grid_points)
     if isinstance(policy, Disagreement):
         per_network = 6 * q + T * (system.n_states + r)

@@ -1,0 +1,34 @@
+"""Members of an ensemble in compiled code (:class:`dopt.models.Ensemble`)."""
+
+from __future__ import annotations
+
+from dopt.kernel.compiler import compiled
+from dopt.kernel.structs import Learn, State, Trial
+from dopt.types import Matrix, Vector
+
+
+@compiled
+def members_or_one(state: State) -> Matrix:
+    """Return the parameters whose mean prediction is evaluated, (E, q), as a view."""
+    if state.members.parameters.shape[0] > 0:
+        return state.members.parameters
+    return state.theta.reshape(1, state.theta.shape[0])
+
+
+@compiled
+def learn_members(trial: Trial, learn: Learn, t: int, target: Vector) -> None:
+    """Let the member whose turn it is learn, and then the first one, whose M stays.
+
+    θ and θ₀ of the state are those of the first before and after.
+    """
+    state = trial.state
+    members, priors = state.members.parameters, state.members.priors
+    if members.shape[0] > 0:
+        turn = 1 + t % (members.shape[0] - 1)
+        state.theta[:], state.prior[:] = members[turn], priors[turn]
+        learn(trial, t, target)
+        members[turn] = state.theta
+        state.theta[:], state.prior[:] = members[0], priors[0]
+    learn(trial, t, target)
+    if members.shape[0] > 0:
+        members[0] = state.theta
