@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from orchestrate.config.grid import Grid
 
 BROKEN_SEED = 2
 
@@ -93,3 +95,15 @@ def diverged(spec: TrialSpec, at: int) -> TrialResult:
         if name in ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
     }
     return TrialResult(**{**vars(result), **arrays, "diverged_at": at})
+
+
+def trial_of(policy: str, seed: int, **env: object) -> TrialSpec:
+    """Return a short trial of a policy."""
+    content = specification(seed, **env).to_mapping()
+    return TrialSpec.from_mapping({**content, "policy": {"name": policy}})
+
+
+def grid_of(policies: Sequence[str], seeds: int, **env: object) -> Grid:
+    """Return a grid of short trials, seed by seed."""
+    trials = [trial_of(policy, seed, **env) for seed in range(seeds) for policy in policies]
+    return Grid(trials, n_jobs=len(trials), left_out={})

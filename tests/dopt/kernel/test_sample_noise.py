@@ -35,28 +35,43 @@ def noisy(
     return trial("arm", policy, 2, env={"horizon": horizon}, learner=learner, policy=fields)
 
 
-def following(fast: KernelTrial, M: Array, noise_variance: float) -> list[Array]:
-    """Return M + JᵀJ/ρ for each candidate of the next step, dense."""
+def candidate_rows(fast: KernelTrial) -> Array:
+    """Return the rows J of each candidate of the next step, by automatic differentiation."""
     policy, system = fast.spec.policy, fast.spec.system
     assert isinstance(policy, Search)
     model = model_function(system, fast.spec.model)
     theta, x = torch.tensor(fast.state.theta), torch.tensor(fast.record.states[fast.done])
     inputs = torch.tensor(policy.compared_inputs(system))
     states = paths(policy, system, model, theta, x, torch.stack([inputs, inputs], 1))[:, 0]
-    J = vmap(jacrev(model), (None, 0))(theta, states).numpy()
-    return [M + one.T @ one / noise_variance for one in J]
+    rows: Array = vmap(jacrev(model), (None, 0))(theta, states).numpy()
+    return rows
 
 
-def growth(fast: KernelTrial, M: Array, noise_variance: float) -> Array:
-    """Return log det(M + JᵀJ/ρ) - log det M for each candidate of the next step."""
-    after = following(fast, M, noise_variance)
-    return np.array([np.linalg.slogdet(one)[1] for one in after]) - np.linalg.slogdet(M)[1]
+def growth(J: Array, C: Array, noise_variance: float) -> Array:
+    """Return log det(M + JᵀJ/ρ) - log det M for the rows of each candidate, given C = M⁻¹."""
+    values: Array = np.linalg.slogdet(np.eye(J.shape[1]) + J @ C @ J.mT / noise_variance)[1]
+    return values
 
 
-def decrease(fast: KernelTrial, M: Array, noise_variance: float) -> Array:
-    """Return tr M⁻¹ - tr (M + JᵀJ/ρ)⁻¹ for each candidate of the next step."""
-    after = following(fast, M, noise_variance)
-    return np.trace(np.linalg.inv(M)) - np.array([np.trace(np.linalg.inv(one)) for one in after])
+def decrease(J: Array, C: Array, noise_variance: float) -> Array:
+    """Return tr M⁻¹ - tr (M + JᵀJ/ρ)⁻¹ for the rows of each candidate, given C = M⁻¹."""
+    CJ = C @ J.mT
+    removed = CJ @ np.linalg.solve(noise_variance * np.eye(J.shape[1]) + J @ CJ, CJ.mT)
+    traces: Array = np.trace(removed, axis1=1, axis2=2)
+    return traces
+
+
+def test_the_measures_are_those_of_the_whole_matrix() -> None:
+    rng = np.random.default_rng(0)
+    J, root = rng.normal(size=(3, 2, 7)), rng.normal(size=(7, 7))
+    M = np.eye(7) + root @ root.T
+    C = np.linalg.inv(M)
+    for noise_variance in (0.01, 30.0):
+        after = M + J.mT @ J / noise_variance
+        logs = np.linalg.slogdet(after)[1] - np.linalg.slogdet(M)[1]
+        traces = np.trace(C) - np.trace(np.linalg.inv(after), axis1=1, axis2=2)
+        assert growth(J, C, noise_variance) == pytest.approx(logs, rel=1e-9)
+        assert decrease(J, C, noise_variance) == pytest.approx(traces, rel=1e-9)
 
 
 MEASURES = {"exact": growth, "a_optimal": decrease}
@@ -70,9 +85,8 @@ def test_the_input_is_the_best_for_the_matrix_itself(policy: str, noise_variance
     candidates = fast.spec.policy.compared_inputs(fast.spec.system)
     for t in range(2, 40):
         fast.advance(t)
-        M = np.linalg.inv(dense(fast.state.covariance))
-        found = MEASURES[policy](fast, M, noise_variance)
-        unscaled = MEASURES[policy](fast, M, 1.0)
+        J, C = candidate_rows(fast), dense(fast.state.covariance)
+        found, unscaled = (MEASURES[policy](J, C, rho) for rho in (noise_variance, 1.0))
         fast.advance(t + 1)
         taken = int(np.flatnonzero((candidates == fast.record.inputs[t]).all(axis=1))[0])
         assert found[taken] >= found.max() - 1e-6 * abs(found.max())
@@ -90,7 +104,8 @@ def test_the_scores_of_the_reference_are_the_growth_of_the_determinant(
     batch, values = transplant_of(spec, spec), []
     monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
     batch.plan(12)
-    expected = growth(fast, batch.information[0].numpy(), 0.05)
+    C = np.linalg.inv(batch.information[0].numpy())
+    expected = growth(candidate_rows(fast), C, 0.05)
     assert values[0][0].numpy() == pytest.approx(expected, rel=1e-5, abs=1e-7)
 
 
@@ -109,7 +124,8 @@ def test_the_exact_gain_is_that_of_the_matrix() -> None:
     fast = KernelTrial(noisy("exact", 0.05))
     fast.advance(12)
     u = torch.tensor(fast.spec.policy.compared_inputs(spec.system))  # type: ignore[attr-defined]
-    expected = growth(fast, batch.information[0].numpy(), 0.05)
+    C = np.linalg.inv(batch.information[0].numpy())
+    expected = growth(candidate_rows(fast), C, 0.05)
     found = ExactGain(batch).values(u[None], now)[0].numpy()
     assert found == pytest.approx(expected, rel=1e-5, abs=1e-7)
 

@@ -32,8 +32,8 @@ SECTIONS = (
 
 OVERRIDES = {
     "env": ["env=first,second", "env=glob(*)", "env=glob([f*,s*],exclude=second)", "env=second"],
-    "policy": ["policy=plain,oracle", "policy=glob(*)", "policy=oracle"],
-    "model": ["model=mlp", "model=linear,mlp"],
+    "policy": ["policy=plain,oracle", "policy=glob(*)", "policy=oracle", "policy=cramped,free"],
+    "model": ["model=mlp", "model=linear,mlp", "model=shaped,linear"],
     "seed": ["seed=range(3)", "seed=7", "seed=choice(1,5)", "seed=sort(3,1,reverse=true)"],
     "width": ["width=8,16", "width=range(4,9,2)", "width=choice(4)", "width=float(4,5)"],
     "scale": ["scale=0.5,1e-3", "scale=range(0,0.3,0.1)", "scale=inf,-1.0"],
@@ -119,6 +119,20 @@ def test_each_override_is_read_as_hydra_reads_it(sample: Sample, override: str) 
 @given(arguments=command_lines())
 def test_any_mixture_expands_as_by_hydra(sample: Sample, arguments: list[str]) -> None:
     same(sample, arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["env=first,second", "policy=plain,free", "env.dt=1,2"],
+        ["env=first,second", "policy=cramped"],  # which writes to the section of env too
+        ["policy=plain,free", "model=shaped"],  # the defaults of which name the policy
+    ],
+)
+def test_options_are_exchanged_where_nothing_else_depends_on_them(
+    sample: Sample, arguments: list[str]
+) -> None:
+    assert by_us(sample, arguments) == by_hydra(sample, arguments)
 
 
 def test_each_choice_of_groups_is_composed_once(

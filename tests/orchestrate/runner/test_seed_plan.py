@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -16,13 +16,12 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.stopping_rule import Until, UntilDecided, UntilPrecise
-from orchestrate.errors import ExitCode, LaunchError
+from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
 from orchestrate.runner.run_grid import Work, launch_grid
-from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.store import Reader
 from tests.orchestrate.conftest import RECORD
-from tests.orchestrate.standins import diverged, quick, specification
+from tests.orchestrate.standins import diverged, grid_of, quick, trial_of
 
 SEEDS = 60
 FACTORS = {"d_optimal": 1.0, "uniform": 3.0, "periodic": 0.4, "random": 1.0}
@@ -31,14 +30,8 @@ FACTORS = {"d_optimal": 1.0, "uniform": 3.0, "periodic": 0.4, "random": 1.0}
 SPREADS = {"d_optimal": 0.5, "uniform": 0.5, "periodic": 0.5, "random": 0.5, "random_held": 0.02}
 
 
-def trial(policy: str, seed: int, **env: object) -> TrialSpec:
-    content = specification(seed, **env).to_mapping()
-    return TrialSpec.from_mapping({**content, "policy": {"name": policy}})
-
-
-def grid(policies: Sequence[str] = tuple(FACTORS), seeds: int = SEEDS, **env: object) -> Grid:
-    trials = [trial(policy, seed, **env) for seed in range(seeds) for policy in policies]
-    return Grid(trials, n_jobs=len(trials), left_out={})
+def grid(policies: Sequence[str] = tuple(FACTORS), seeds: int = SEEDS) -> Grid:
+    return grid_of(policies, seeds)
 
 
 def lossy(spec: TrialSpec) -> TrialResult:
@@ -238,107 +231,10 @@ def test_a_mean_that_is_known_needs_no_more_seeds(adaptive: Adaptive) -> None:
     assert adaptive.report.endswith("60 of 80 trials (75 %), 1 of 2 means known")
 
 
-def test_each_environment_and_width_has_its_reference() -> None:
-    """A wider network is compared with D-optimal inputs of the same width, where there are any."""
-    widths = [
-        TrialSpec.from_mapping({**trial(policy, seed).to_mapping(), "model": model})
-        for seed in range(20)
-        for policy, model in (
-            ("d_optimal", {"name": "mlp", "width": 2}),
-            ("d_optimal", {"name": "mlp", "width": 3}),
-            ("random", {"name": "mlp", "width": 3}),
-            ("uniform", {"name": "mlp", "width": 4}),
-        )
-    ]
-    heavier = [*grid(["random", "d_optimal"], 20, mass=2.0).trials]
-    both = Grid([*widths, *heavier], n_jobs=len(widths) + len(heavier), left_out={})
-    compared = _compared(both)
-    by_width = {"d_optimal": 3, "random": 3, "uniform": 4}
-    assert ("random", by_width["random"], "d_optimal", 3, False) in compared
-    assert ("uniform", by_width["uniform"], "d_optimal", 2, False) in compared
-    assert ("random", 2, "d_optimal", 2, True) in compared
-    assert len(compared) == 3
-
-
-def _compared(of: Grid) -> set[tuple[str, object, str, object, bool]]:
-    """Return policy and width of each variant and of its reference, and whether it is heavier."""
-    settings = LaunchSettings("inprocess", "sqlite://", until=UntilDecided())
-    rule = SeedPlan(of, settings)._rule
-    first = {one.config_key: one for one in reversed(of.trials)}
-    found = set()
-    for key, comparison in rule._comparisons.items():  # type: ignore[union-attr]
-        own, reference = first[key], first[comparison.reference]
-        assert own.system == reference.system
-        heavier = own.system != specification().system
-        names = [(one.policy.name, one.columns()["width"]) for one in (own, reference)]
-        found.add((*names[0], *names[1], heavier))
-    return found
-
-
-def test_a_comparison_without_a_pair_is_refused() -> None:
-    own = [trial("uniform", seed) for seed in range(10)]
-    other = [trial("d_optimal", seed) for seed in range(10, 20)]
-    apart = Grid([*own, *other], n_jobs=20, left_out={})
-    settings = LaunchSettings("inprocess", "sqlite://", until=UntilDecided())
-    with pytest.raises(LaunchError, match="uniform has no seed in common with its reference"):
-        SeedPlan(apart, settings)
-
-
 def test_only_shared_seeds_are_run(adaptive: Adaptive) -> None:
     """The reference has twenty seeds more, which no comparison needs."""
-    own = [trial("random", seed) for seed in range(20)]
-    other = [trial("d_optimal", seed) for seed in range(40)]
+    own = [trial_of("random", seed) for seed in range(20)]
+    other = [trial_of("d_optimal", seed) for seed in range(40)]
     assert adaptive(of=Grid([*own, *other], n_jobs=60, left_out={})) == ExitCode.DONE
     assert adaptive.result("random")[0] == 20
     assert adaptive.result("d_optimal") == (20, "reference")
-
-
-@pytest.mark.parametrize("policies", [["random", "uniform"], ["d_optimal"]])
-def test_a_grid_without_comparisons_is_refused(policies: list[str]) -> None:
-    settings = LaunchSettings("inprocess", "sqlite://", until=UntilDecided())
-    with pytest.raises(LaunchError, match=r"compares with launch\.reference=d_optimal"):
-        SeedPlan(grid(policies), settings)
-
-
-CommandLine = Callable[..., tuple[int, str, str]]
-GRID = ("-m", "policy=d_optimal,random", "env.horizon=5", "seed=range(20)", "executor=inprocess")
-
-
-@pytest.mark.parametrize("until", ["decided", "ci<5%", "ci < 12.5 %", "'ci<5%'"])
-def test_a_command_line_takes_a_rule(command_line: CommandLine, until: str) -> None:
-    code, output, errors = command_line(*GRID, f"launch.until={until}")
-    assert (code, "error:" in errors) == (0, False), errors
-    assert re.search(
-        r"40 of 40 trials \(100 %\), 0 of \d (comparisons decided|means known)", output
-    )
-
-
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["launch.until=soon"], "launch.until is 'soon', but null, decided"),
-        (["launch.until=ci<0%"], "launch.until is 'ci<0%', but null, decided"),
-        (["launch.until=ci<100%"], "launch.until is 'ci<100%', but null, decided"),
-        (["launch.until=ci<5"], "P percent), such as 'ci<5%', is expected: change launch.until."),
-        (["launch.until=5"], "launch.until is 5, but null, decided"),
-        (["launch.until=decided", "launch.reference=randon"], "did you mean 'random'?"),
-        (["launch.until=decided", "launch.reference=null"], "launch.reference is None, but a text"),
-    ],
-)
-def test_what_is_no_rule_is_refused(
-    command_line: CommandLine, words: list[str], sentence: str
-) -> None:
-    code, output, errors = command_line(*GRID, *words)
-    assert (code, output, errors.count("\n")) == (2, "", 1)
-    assert sentence in errors
-
-
-def test_a_single_trial_has_no_seeds_to_choose_from(command_line: CommandLine) -> None:
-    code, _, errors = command_line("env.horizon=5", "launch.until=ci<5%")
-    assert code == 2
-    assert "a single trial is asked for: add -m" in errors
-
-
-def test_a_dry_run_says_that_these_are_the_most(command_line: CommandLine) -> None:
-    output = command_line(*GRID, "launch.until=decided", "launch.dry_run=true")[1]
-    assert output.endswith("launch.until may need fewer of these seeds: they are run in batches\n")
