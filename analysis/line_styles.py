@@ -49,6 +49,7 @@ _POLICIES: dict[str, tuple[str, Dashes, float]] = {
     "periodic_square": (SEA, (0, (5, 1.2)), 1.2),
     "lookahead": (BLACK, (0, (9, 1)), 1.6),
     "icem": (TEAL, (0, (9, 1, 2, 1)), 1.6),
+    "episodic": (BLUE, (0, (9, 1, 1, 1, 1, 1)), 1.2),
     "exact": (BROWN, (0, (5, 1)), 1.2),
     "trace": (SEA, (0, (2, 1)), 1.2),
     "trace_linearized": (GOLD, (0, (3, 1, 1, 1)), 1.2),

@@ -8,6 +8,7 @@ J       ∂a_θ/∂θ at the newest state, before the learning step   r × q
 e       y - a_θ(x), observed less modelled accelerations        r
 M       information matrix, M₀ = λI                             q × q
 ρ       variance of the observations
+p       underweighting
 f       forgetting factor
 ======  ======================================================  =========
 
@@ -15,7 +16,9 @@ References: S. Singhal and L. Wu, "Training multilayer perceptrons with the exte
 algorithm" (1989); L. Ljung and T. Söderström, "Theory and practice of recursive identification"
 (1983), for forgetting; L. Ngia and J. Sjöberg, "Efficient training of neural nets for nonlinear
 adaptive filtering using a recursive Levenberg-Marquardt algorithm", IEEE Transactions on Signal
-Processing 48 (2000), for the renewal of the prior, some diagonal entries of M at a time.
+Processing 48 (2000), for the renewal of the prior, some diagonal entries of M at a time;
+R. Zanetti, K. DeMars and R. Bishop, "Underweighting nonlinear measurements", Journal of Guidance,
+Control, and Dynamics 33 (2010), for the underweighting, which is due to W. Lear.
 """
 
 from __future__ import annotations
@@ -57,10 +60,20 @@ class ExtendedKalman(InformationLearner):
     prior loses, so that M never falls below λ/2 I: directions that nothing excites do not wind up,
     and the variance of no parameter exceeds 2/λ.
 
+    With p > 0 a sample has the covariance R = ρI + p J M⁻¹ Jᵀ in place of ρI, M⁻¹ after what it
+    has forgotten: K = M⁻¹Jᵀ (ρI + (1 + p) J M⁻¹ Jᵀ)⁻¹, and M += Jᵀ R⁻¹ J. The additional part
+    stands for the error of the linearisation, which is large while the parameters are uncertain.
+    However small λ is, a step then removes at most the share 1/(1 + p) of an error, and a variance
+    along J falls by this share at most; once J M⁻¹ Jᵀ is far below ρ, it is the filter without p.
+    Plans count a sample as JᵀJ/ρ.
+
     Parameters
     ----------
     forgetting : float
         f, above 0 and at most 1: samples of 1/(1 - f) steps ago count 1/e. 1 forgets nothing.
+    underweighting : float
+        p, at least 0, which is the plain filter. With 2, and ρ = 0.1, the final loss hardly depends
+        on λ.
     """
 
     name: ClassVar[str] = "ekf"
@@ -68,6 +81,7 @@ class ExtendedKalman(InformationLearner):
     kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn"
 
     forgetting: float = parameter(1.0, bound="share")
+    underweighting: float = parameter(0.0, bound="nonnegative", added=True)
 
     def renewal(self, n_parameters: int, regularization: float) -> Renewal:
         """Return what is given back of λI for q parameters.
@@ -85,4 +99,4 @@ class ExtendedKalman(InformationLearner):
 
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:
         entries, weight = self.renewal(n_parameters, regularization)
-        return self.noise_variance, self.forgetting, float(entries), weight
+        return self.noise_variance, self.forgetting, float(entries), weight, self.underweighting

@@ -8,6 +8,7 @@ from dopt.policies.chirp import Chirp
 from dopt.policies.d_optimal import DOptimal
 from dopt.policies.disagreement import Disagreement
 from dopt.policies.e_optimal import EOptimal
+from dopt.policies.episodic import Episodic
 from dopt.policies.exact import Exact
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.gradient import GradientDOptimal
@@ -47,6 +48,7 @@ POLICIES: dict[str, type[Policy]] = {
         TaskOptimal,
         Lookahead,
         ICEM,
+        Episodic,
         Disagreement,
         GaussianProcessEntropy,
         GradientDOptimal,
@@ -63,6 +65,7 @@ __all__ = [
     "DOptimal",
     "Disagreement",
     "EOptimal",
+    "Episodic",
     "Exact",
     "GaussianProcessEntropy",
     "GradientDOptimal",

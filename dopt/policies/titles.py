@@ -20,6 +20,7 @@ TITLES: dict[str, str] = {
     "linear": "D-optimal, linear",
     "lookahead": "look-ahead",
     "icem": "iCEM",
+    "episodic": "episodic plans",
     "exact": "exact gain",
     "trace": "trace",
     "trace_linearized": "trace, linearised",

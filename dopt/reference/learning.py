@@ -105,7 +105,7 @@ class LeastSquaresLearner:
 class KalmanLearner:
     """The extended Kalman filter in information form: M is summed, and solved afresh.
 
-    M_{t+1} = f M_t + D_t + JᵀJ/ρ and θ += M_{t+1}⁻¹ Jᵀ e/ρ.
+    M_{t+1} = f M_t + D_t + JᵀJ/ρ and θ += M_{t+1}⁻¹ Jᵀ e/ρ. Underweighted, R takes the place of ρ.
     """
 
     def __init__(
@@ -118,12 +118,23 @@ class KalmanLearner:
     def filtered(self, states: Tensor, targets: Tensor, information: Tensor) -> Tensor:
         """Absorb the newest of the states (n, t + 1, d) and targets (n, t + 1, r); return M."""
         x, y = states[:, -1], targets[:, -1]
-        J, noise = self._rows(self._theta, x), self._learner.noise_variance
+        J, e = self._rows(self._theta, x), (y - self._model(self._theta, x)).unsqueeze(-1)
         given_back = torch.diag(self._given_back(states.shape[1] - 1))
-        information = self._learner.forgetting * information + given_back + J.mT @ J / noise
-        slope = J.mT @ (y - self._model(self._theta, x)).unsqueeze(-1) / noise
-        self._theta.add_(_solved(information, slope))
+        faded = self._learner.forgetting * information + given_back
+        noise = self._learner.noise_variance
+        if self._learner.underweighting > 0.0:
+            L, noise = self._noise_factor(faded, J), 1.0
+            J, e = (torch.linalg.solve_triangular(L, part, upper=False) for part in (J, e))
+        information = faded + J.mT @ J / noise
+        self._theta.add_(_solved(information, J.mT @ e / noise))
         return information
+
+    def _noise_factor(self, information: Tensor, J: Tensor) -> Tensor:
+        """Return the Cholesky factor of R = ρI + p J M⁻¹ Jᵀ, (n, r, r); NaN where there is none."""
+        predicted = J @ torch.cholesky_solve(J.mT, torch.linalg.cholesky_ex(information)[0])
+        noise = self._learner.noise_variance * torch.eye(J.shape[1]).to(J)
+        factor, failed = torch.linalg.cholesky_ex(noise + self._learner.underweighting * predicted)
+        return torch.where(failed[:, None, None] > 0, torch.nan, factor)
 
     def _given_back(self, t: int) -> Tensor:
         """Return the diagonal of D_t, (q,)."""

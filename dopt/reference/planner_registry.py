@@ -8,11 +8,13 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from dopt.policies.disagreement import Disagreement
+from dopt.policies.episodic import Episodic
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.gradient import GradientDOptimal
 from dopt.policies.greedy_linear import GreedyLinear
 from dopt.policies.icem import ICEM
 from dopt.reference.ensemble import EnsemblePlan
+from dopt.reference.episodes import EpisodePlan
 from dopt.reference.exact_gain import GradientPlan
 from dopt.reference.gaussian_process import EntropyPlan, Posterior
 from dopt.reference.greedy_linear import GreedyLinearPlan
@@ -35,6 +37,7 @@ PLANS: dict[type, Callable[[BatchState, Any], Plan]] = {
     GradientDOptimal: GradientPlan,
     GreedyLinear: GreedyLinearPlan,
     ICEM: SampledPlan,
+    Episodic: EpisodePlan,
 }
 
 

@@ -42,7 +42,7 @@ class SampledPlan:
         policy, gamma = self._policy, self._batch.system.gamma
         W, R = self._directions(t)
         if t % policy.hold == 0:
-            self._mean, self._elites = _shifted(self._mean), _shifted(self._elites)
+            self._mean, self._elites = shifted(self._mean), shifted(self._elites)
         spread = torch.full_like(self._mean, gamma)
         inputs = self._elites
         values = self._values(t, inputs, W, R)
@@ -131,7 +131,7 @@ def _rounded(values: Tensor) -> Tensor:
     return torch.where(values.isfinite(), (values / step).round(), values)
 
 
-def _shifted(inputs: Tensor) -> Tensor:
+def shifted(inputs: Tensor) -> Tensor:
     """Drop the first input of plans, (..., K, m), which was held to its end; repeat the last."""
     return torch.cat([inputs[..., 1:, :], inputs[..., -1:, :]], dim=-2)
 

@@ -20,6 +20,7 @@ SMALL_GRIDS = {
 }
 SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"count": 8}}
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}
+SMALL_SEARCHES |= {"episodic": SMALL_SEARCHES["icem"] | {"replan_every": 5}}
 SMALL_GRIDS |= {"mass_spring": (2, 2, 2, 2)}
 MODELS = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}
 LEARNERS = {"oracle": "recursive_least_squares", "linear": "recursive_least_squares"}

@@ -25,7 +25,7 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     seen, observed = state.window_features, state.window_targets
     store_sample(trial.network, seen, observed, t, trial.record.states[t], target)
     if t % refit_every != 0:
-        filter_sample(trial, t, target, noise_variance, 1.0, 0, 0.0)
+        filter_sample(trial, t, target, noise_variance, 1.0, 0, 0.0, 0.0)
         return
     n, q = min(t + 1, seen.shape[1]), state.theta.shape[0]
     features, targets = seen[:, :n].copy(), observed[:, :n].copy()

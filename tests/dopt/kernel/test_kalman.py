@@ -12,8 +12,11 @@ from hypothesis import strategies as st
 from torch.func import jacrev
 
 from dopt.errors import IncompatibleError
-from dopt.kernel.information.primal import dense
+from dopt.kernel.information.primal import PENDING_ROWS, dense
+from dopt.kernel.information.update import filter_step
+from dopt.kernel.learners.kalman import whiten
 from dopt.kernel.run import KernelTrial
+from dopt.kernel.structs import Covariance
 from dopt.learning import ExtendedKalman
 from dopt.reference.models import model_function
 from dopt.run import run_trial
@@ -24,6 +27,7 @@ from tests.dopt.kernel.twin import observed, relative_gap, transplant
 from tests.dopt.trials import trial
 
 EKF = {"name": "ekf"}
+WEIGHED = {"name": "ekf", "underweighting": 2.0, "noise_variance": 0.1}
 FADING = {"name": "ekf", "forgetting": 0.95, "noise_variance": 3.0, "regularization": 0.02}
 
 
@@ -68,7 +72,11 @@ def test_with_a_matrix_of_its_own_it_is_ridge_regression(regularization: float) 
     assert fast.state.theta == pytest.approx(expected, rel=1e-7)
 
 
-@pytest.mark.parametrize("learner", [EKF, FADING], ids=["whole", "fading"])
+@pytest.mark.parametrize(
+    "learner",
+    [EKF, FADING, WEIGHED, FADING | {"underweighting": 0.5}],
+    ids=["whole", "fading", "weighed", "both"],
+)
 @pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "quadrotor", "drifting_pendulum"])
 def test_both_paths_run_the_same_filter(env: str, policy: str, learner: dict[str, Any]) -> None:
@@ -88,6 +96,64 @@ def test_planner_and_filter_hold_one_matrix_of_the_rows_before_each_step() -> No
         step = np.linalg.solve(M, rows.T @ residual / 2.0)
         assert parameters[t + 1] - parameters[t] == pytest.approx(step, rel=1e-5, abs=1e-7)
     assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-8)
+
+
+def test_an_underweighted_sample_has_the_variance_of_its_prediction_as_well() -> None:
+    fast, parameters, J = filtered(WEIGHED | {"forgetting": 0.9})
+    k, weight = ExtendedKalman(forgetting=0.9).renewal(J.shape[2], 1e-3)
+    M = 1e-3 * np.eye(J.shape[2])
+    targets = observed(transplant(fast), len(J))[0].numpy()
+    for t, rows in enumerate(J):
+        M = 0.9 * M
+        for i in range(t * k, (t + 1) * k):
+            M[i % len(M), i % len(M)] += weight
+        predicted = rows @ np.linalg.solve(M, rows.T)
+        gain = np.linalg.solve(M, rows.T) @ np.linalg.inv(0.1 * np.eye(2) + 3.0 * predicted)
+        state = fast.record.states[t : t + 1]
+        residual = targets[t] - fast.spec.model.predict(fast.spec.system, parameters[t], state)[0]
+        step = gain @ residual
+        assert parameters[t + 1] - parameters[t] == pytest.approx(step, rel=1e-5, abs=1e-7)
+        M = M + rows.T @ np.linalg.solve(0.1 * np.eye(2) + 2.0 * predicted, rows)
+    assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-7)
+
+
+@given(
+    st.integers(0, 1000),
+    st.floats(0.01, 20.0),
+    st.floats(1e-3, 10.0),
+    st.floats(1e-6, 1e6),
+)
+def test_a_step_removes_at_most_a_share_of_an_error_and_of_its_variance(
+    seed: int, underweighting: float, noise_variance: float, regularization: float
+) -> None:
+    """Of a linear model, with any λ; and nearly all that the plain filter does where λ is large."""
+    rng = np.random.default_rng(seed)
+    J, e, theta = rng.standard_normal((1, 5)), rng.standard_normal(1), np.zeros(5)
+    covariance = Covariance(
+        np.eye(5) / regularization, np.zeros((PENDING_ROWS, 5)), np.zeros(1, np.int64)
+    )
+    before = float(J[0] @ J[0]) / regularization
+    rows, residuals = J.copy(), e.copy()
+    whiten(covariance, rows, residuals, noise_variance, underweighting)
+    filter_step(covariance, theta, rows, residuals)
+    share = underweighting / (1.0 + underweighting)
+    left = float((e - J @ theta)[0] / e[0])
+    assert left >= share * (1 - 1e-9)
+    assert float((J @ dense(covariance) @ J.T)[0, 0]) >= share * before * (1 - 1e-6)
+    plain = noise_variance / (noise_variance + before)
+    assert plain * (1 - 1e-9) <= left <= plain + underweighting * before / noise_variance + 1e-12
+
+
+def test_of_a_linear_model_it_ends_where_recursive_least_squares_ends() -> None:
+    """Samples count alike once their prediction is far more certain than they are."""
+    given = {"name": "linear"}
+    env = {"horizon": 400, "noise": 0.0}
+    plain, weighed = (
+        run_trial(trial("cartpole", "random", 3, env=env, model=given, learner=one)).parameters
+        for one in (EKF, EKF | {"underweighting": 2.0})
+    )
+    assert np.array_equal(plain, weighed) is False
+    assert weighed == pytest.approx(plain, rel=1e-2)
 
 
 def test_the_planner_plans_by_the_matrix_of_the_filter() -> None:
