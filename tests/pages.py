@@ -15,7 +15,11 @@ PAGES = {
     str(path.relative_to(ROOT)): path.read_text()
     for path in (ROOT / "README.md", *sorted(DOCS.rglob("*.md")))
 }
-GENERATED = ("docs/beyond/README.md", "docs/claims/README.md")
+GENERATED = (
+    "docs/beyond/README.md",
+    "docs/claims/README.md",
+    "docs/claims_control/README.md",
+)
 """Pages that ``python -m analysis report`` writes."""
 
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", flags=re.DOTALL | re.MULTILINE)

@@ -8,7 +8,7 @@ J       ∂a_θ/∂θ at the newest state, before the learning step   r × q
 e       y - a_θ(x), observed less modelled accelerations        r
 M       information matrix, M₀ = λI                             q × q
 ρ       variance of the observations
-p       underweighting
+ζ       underweighting
 f       forgetting factor
 ======  ======================================================  =========
 
@@ -60,11 +60,11 @@ class ExtendedKalman(InformationLearner):
     prior loses, so that M never falls below λ/2 I: directions that nothing excites do not wind up,
     and the variance of no parameter exceeds 2/λ.
 
-    With p > 0 a sample has the covariance R = ρI + p J M⁻¹ Jᵀ in place of ρI, M⁻¹ after what it
-    has forgotten: K = M⁻¹Jᵀ (ρI + (1 + p) J M⁻¹ Jᵀ)⁻¹, and M += Jᵀ R⁻¹ J. The additional part
+    With ζ > 0 a sample has the covariance R = ρI + ζ J M⁻¹ Jᵀ in place of ρI, M⁻¹ after what it
+    has forgotten: K = M⁻¹Jᵀ (ρI + (1 + ζ) J M⁻¹ Jᵀ)⁻¹, and M += Jᵀ R⁻¹ J. The additional part
     stands for the error of the linearisation, which is large while the parameters are uncertain.
-    However small λ is, a step then removes at most the share 1/(1 + p) of an error, and a variance
-    along J falls by this share at most; once J M⁻¹ Jᵀ is far below ρ, it is the filter without p.
+    However small λ is, a step then removes at most the share 1/(1 + ζ) of an error, and a variance
+    along J falls by this share at most; once J M⁻¹ Jᵀ is far below ρ, it is the filter with ζ = 0.
     Plans count a sample as JᵀJ/ρ.
 
     Parameters
@@ -72,7 +72,7 @@ class ExtendedKalman(InformationLearner):
     forgetting : float
         f, above 0 and at most 1: samples of 1/(1 - f) steps ago count 1/e. 1 forgets nothing.
     underweighting : float
-        p, at least 0, which is the plain filter. With 2, and ρ = 0.1, the final loss hardly depends
+        ζ, at least 0, which is the plain filter. With 2, and ρ = 0.1, the final loss hardly depends
         on λ.
     """
 

@@ -130,7 +130,7 @@ class KalmanLearner:
         return information
 
     def _noise_factor(self, information: Tensor, J: Tensor) -> Tensor:
-        """Return the Cholesky factor of R = ρI + p J M⁻¹ Jᵀ, (n, r, r); NaN where there is none."""
+        """Return the Cholesky factor of R = ρI + ζ J M⁻¹ Jᵀ, (n, r, r); NaN where there is none."""
         predicted = J @ torch.cholesky_solve(J.mT, torch.linalg.cholesky_ex(information)[0])
         noise = self._learner.noise_variance * torch.eye(J.shape[1]).to(J)
         factor, failed = torch.linalg.cholesky_ex(noise + self._learner.underweighting * predicted)

@@ -13,7 +13,7 @@ FINDINGS, METHOD = (
 
 CLAIMS = pd.read_csv(DOCS / "claims/report.csv").set_index(["env", "variant"])
 BEYOND = pd.read_csv(DOCS / "beyond/report.csv").set_index(["env", "variant"])
-CONTROL = pd.read_csv(DOCS / "claims_control/report_control.csv").set_index(["variant", "t"])
+CONTROL = pd.read_csv(DOCS / "claims_control/report_control.csv").set_index(["env", "variant", "t"])
 
 RATIO = ("loss_ratio",)
 INTERVAL = ("loss_ratio", "loss_low", "loss_high")

@@ -102,12 +102,41 @@ def test_ratios_by_horizon_are_those_of_the_claims(learner: str) -> None:
 def test_numbers_of_the_control_table_are_rounded_once(name: str, variant: str) -> None:
     cells = []
     for t in (100, 200, 500):
-        row = CONTROL.loc[(variant, t)]
+        row = CONTROL.loc[("pendulum", variant, t)]
         star = "*" if row.success_p_adjusted < 0.05 else ""
         success = f"{row.success:.2f}".removeprefix("0")
         loss = f"{row.loss:.{3 if row.loss < 1 else 2}f}"
         cells.append(f"{success}{star}, {loss}")
     assert f"| {name} | {' | '.join(cells)} |" in FINDINGS
+
+
+@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton"])
+@pytest.mark.parametrize(
+    ("name", "policy"),
+    [
+        ("D-optimal", "D-optimal"),
+        ("look-ahead", "look-ahead"),
+        ("uniform", "uniform"),
+        ("periodic", "periodic"),
+        ("held random", "held random"),
+        ("white random", "random"),
+    ],
+)
+def test_successes_of_every_learner_are_rounded_once(name: str, policy: str, learner: str) -> None:
+    cells = []
+    for env in ALL:
+        keys = [(env, under(policy, learner), t) for t in (100, 200, 500)]
+        known = keys[0] in CONTROL.index
+        successes = [f"{CONTROL.loc[key].success:.2f}" for key in keys if known]
+        cells.append(" / ".join(successes) or "–")
+    assert f"| {name}, `{learner}` | {' | '.join(cells)} |" in FINDINGS
+
+
+def test_the_seeds_of_the_control_are_as_many_as_the_page_says() -> None:
+    numbers_of_seeds = CONTROL["n"].unstack("t")[500].drop("true model", level="variant")
+    for (env, variant), n in numbers_of_seeds.items():
+        many = env == "pendulum" and "gauss_newton" not in variant
+        assert n == (100 if many else 20), (env, variant)
 
 
 @pytest.mark.parametrize(

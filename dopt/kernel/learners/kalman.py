@@ -1,7 +1,7 @@
 """The extended Kalman filter in compiled code (:mod:`dopt.learning.extended_kalman`).
 
 Its numbers are ρ, f, the count of diagonal entries of M renewed at a step, what each gets back,
-and p.
+and ζ.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def whiten(
     noise_variance: float,
     underweighting: float,
 ) -> None:
-    """Multiply J, (r, q), and the residuals, (r,), by L⁻¹, where L Lᵀ = ρI + p J M⁻¹ Jᵀ.
+    """Multiply J, (r, q), and the residuals, (r,), by L⁻¹, where L Lᵀ = ρI + ζ J M⁻¹ Jᵀ.
 
     The residuals are NaN, which ends the trial as diverged, where rounding has left no L.
     """
