@@ -1,9 +1,10 @@
 """Compilation of functions that only other compiled functions call, as far as to LLVM code.
 
-Numba optimizes every function that a compilation needs together with all functions below it, and
-makes machine code and a wrapper for Python of them, although the code of the outermost one holds
-them all. Here that is done for the outermost one alone. A function that Python calls after all is
-compiled again.
+Numba makes machine code and a wrapper for Python of every function that a compilation needs, with
+all functions below it, although the code of the outermost one holds them already. Here a function
+that is compiled on the way is optimized and handed to its caller. (To leave the optimization to the
+caller as well saves as much again, but changes the last bits of some sums.) A function that Python
+calls after all is compiled again.
 """
 
 from __future__ import annotations
@@ -26,10 +27,6 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]  # numba has no types
     """Code of a function; callers get it as it is before the making of machine code changes it."""
 
     only_linked = False
-
-    def _optimize_final_module(self) -> None:
-        if not self.only_linked:  # the outermost function is optimized with all that it calls
-            super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
         self._finalized = True
