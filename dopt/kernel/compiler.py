@@ -7,12 +7,12 @@ from collections.abc import Callable
 from types import FunctionType
 from typing import TypeVar, cast
 
+import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
-from dopt.kernel.linked_code import LinkedDispatcher
 from dopt.kernel.stored_code import stored
 from dopt.types import NumbaType
 
@@ -49,8 +49,8 @@ def _njit(function: F, *, fastmath: bool | set[str] = False, nogil: bool = False
     Numba compiles a function once, and hands it the liberties of the caller for which it does so
     unless ``fastmath`` is given, if only as False.
     """
-    options = {"nopython": True, "error_model": "numpy", "fastmath": fastmath, "nogil": nogil}
-    return cast(F, stored(LinkedDispatcher(function, targetoptions=options)))
+    options = {"error_model": "numpy", "fastmath": fastmath, "nogil": nogil}
+    return cast(F, stored(numba.njit(**options)(function)))
 
 
 def compilable(function: F) -> F:

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, Self
 
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.targetconfig import ConfigStack
 
 from dopt.kernel.cache import CACHE_FOLDER
-from dopt.kernel.linked_code import within_a_compilation
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -57,7 +57,7 @@ class StoredCode(FunctionCache):  # type: ignore[misc]
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store a function that Python calls; one compiled on the way is part of its caller."""
-        if not within_a_compilation():
+        if not len(ConfigStack()):
             super().save_overload(sig, data)
 
 
