@@ -94,8 +94,20 @@ def test_the_lowest_losses_of_the_readme_are_rounded_once() -> None:
     losses = pd.read_csv(DOCS / "best.csv").set_index("env")["final_loss"]
     envs = ("pendulum", "quadrotor", "cartpole", "arm")
     means = [float(np.exp(np.log(losses[env]).mean())) for env in envs]
-    phrase = "{:.4f} on the pendulum, {:.4f} on the quadrotor, {:.2f} on the cartpole and {:.2f} on"
+    phrase = (
+        "{:.4f} on the pendulum, {:.4f} on the quadrotor, {:.2f} on the cartpole and {:.2f} on the "
+        "arm"
+    )
     assert phrase.format(*means) in WORDS
+    assert phrase.format(*means) in " ".join(PAGES["docs/findings.md"].split())
+
+
+def test_the_swing_ups_of_the_readme_are_counted() -> None:
+    reached = pd.read_csv(DOCS / "best_control.csv").groupby("env").sum()
+    assert reached.loc["pendulum", "after_200"] == 100
+    assert "After 200 steps its models swing up all pendulums" in WORDS
+    phrase = f"after 500 steps {reached.loc['cartpole', 'after_500']} of 100 cartpoles."
+    assert phrase in WORDS
 
 
 @pytest.mark.parametrize("limit", ["0.2", "1", "10"])

@@ -14,6 +14,7 @@ SENSITIVITY = pd.read_csv(DOCS / "sensitivity/figure8_sensitivity.csv").set_inde
     ["env", "setting", "policy"]
 )
 PROFILES = pd.read_csv(DOCS / "profiles/figure7_profiles.csv")
+CLAIMS = pd.read_csv(DOCS / "claims/report.csv").set_index(["env", "variant"])
 AGGREGATE = pd.read_csv(DOCS / "profiles/aggregate.csv").set_index("variant")
 COMPARISONS = pd.read_csv(DOCS / "adaptive_seeds/comparisons.csv").set_index(["env", "variant"])
 
@@ -103,3 +104,16 @@ def test_the_joint_criterion_of_the_look_ahead_is_compared_at_the_same_horizon()
     ]
     intervals = [within(row.loss_ratio, row.loss_low, row.loss_high) for row in rows]
     assert "({} against {}, `adam_window`".format(*intervals) in FINDINGS
+
+
+def test_the_steps_of_the_filter_are_those_of_the_claims() -> None:
+    steps = [
+        f"{CLAIMS.loc[(env, variant)].steps:.0f}"
+        for variant in ("D-optimal, ekf", "D-optimal")
+        for env in ALL
+    ]
+    phrase = (
+        "it needs {}, {}, {} and {} steps on pendulum, cartpole, arm and quadrotor to stay below "
+        "the final loss of random inputs, against {}, {}, {} and {}."
+    )
+    assert phrase.format(*steps) in FINDINGS
