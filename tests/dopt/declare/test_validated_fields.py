@@ -35,6 +35,8 @@ POSITIVE = {
         "time_constant",
         "capacity",
         "refit_every",
+        "replan_every",
+        "members",
         "refresh_every",
         "batch",
         "steps",
@@ -44,7 +46,7 @@ POSITIVE = {
 }
 NONNEGATIVE = {
     *("noise", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
-    *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction"),
+    *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
 }
 FRACTIONS = {"beta_1", "beta_2"}
 SHARES = {"forgetting", "band"}
