@@ -19,6 +19,7 @@ GENERATED = (
     "docs/beyond/README.md",
     "docs/claims/README.md",
     "docs/claims_control/README.md",
+    "docs/rivals/README.md",
 )
 """Pages that ``python -m analysis report`` writes."""
 

@@ -6,6 +6,7 @@ import pandas as pd
 import pytest
 
 from analysis.formatting import number, within
+from analysis.report.variant_table import verdict
 from tests.pages import DOCS, PAGES
 
 FINDINGS = " ".join(PAGES["docs/findings.md"].split())
@@ -16,9 +17,11 @@ SENSITIVITY = pd.read_csv(DOCS / "sensitivity/figure8_sensitivity.csv").set_inde
 PROFILES = pd.read_csv(DOCS / "profiles/figure7_profiles.csv")
 CLAIMS = pd.read_csv(DOCS / "claims/report.csv").set_index(["env", "variant"])
 AGGREGATE = pd.read_csv(DOCS / "profiles/aggregate.csv").set_index("variant")
+RIVALS = pd.read_csv(DOCS / "rivals/report.csv").set_index(["env", "variant"])
 COMPARISONS = pd.read_csv(DOCS / "adaptive_seeds/comparisons.csv").set_index(["env", "variant"])
 
 LAMBDA, RATE, WINDOW = "policy.regularization", "learner.learning_rate", "learner.window"
+SUM = "iCEM, criterion=sum"
 ALL = ["pendulum", "cartpole", "arm", "quadrotor"]
 
 
@@ -117,3 +120,38 @@ def test_the_steps_of_the_filter_are_those_of_the_claims() -> None:
         "the final loss of random inputs, against {}, {}, {} and {}."
     )
     assert phrase.format(*steps) in FINDINGS
+
+
+@pytest.mark.parametrize(
+    ("agent", "variant"),
+    [
+        ("D-optimal", "D-optimal"),
+        ("look-ahead", "look-ahead"),
+        ("episodic agent of FLEX", "episodic plans"),
+        ("receding horizon curiosity", "episodic plans, replan_every=10"),
+        ("OPAX", SUM),
+    ],
+)
+def test_the_ratios_of_the_rivals_are_those_of_the_report(agent: str, variant: str) -> None:
+    rows = [RIVALS.loc[(env, variant)] for env in ALL]
+    assert {row.n for row in rows} == {20}
+    cells = [within(row.loss_ratio, row.loss_low, row.loss_high) for row in rows]
+    assert f"| {agent} | {' | '.join(cells)} |" in FINDINGS
+
+
+def test_what_the_page_says_of_the_rivals_is_told_apart() -> None:
+    apart = {
+        variant: {env: one for env in ALL if (one := verdict(RIVALS.loc[(env, variant)])) != "open"}
+        for variant in ("D-optimal", "episodic plans", "episodic plans, replan_every=10", SUM)
+    }
+    assert apart == {
+        "D-optimal": dict.fromkeys(ALL, "worse"),
+        "episodic plans": {"cartpole": "worse"},
+        "episodic plans, replan_every=10": {"quadrotor": "better"},
+        SUM: dict.fromkeys(("pendulum", "cartpole", "quadrotor"), "worse"),
+    }
+
+
+def test_the_losses_of_the_rivals_reference_are_those_of_the_report() -> None:
+    losses = [number(RIVALS.loc[(env, "iCEM"), "loss"]) for env in ALL]
+    assert "{} (pendulum), {} (cartpole), {} (arm) and {} (quadrotor)".format(*losses) in FINDINGS
