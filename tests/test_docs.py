@@ -116,11 +116,13 @@ def _run_one(spec: TrialSpec, made_up: TrialResult) -> TrialResult:
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return a small database with what the pages ask for: widths, learners and control."""
+    """Return a small database with what the pages ask for: policies, widths, learners, control."""
     url = f"sqlite:///{tmp_path_factory.mktemp('docs') / 'results.db'}"
     both, seeds = ("pendulum", "cartpole"), range(5)
     more = make_grid(both, ("lookahead", "random_held"), seeds, **SHORT, **TASK)
     fill(url, make_grid(both, seeds=seeds, **SHORT, **TASK) + more, edit=_run_one)
+    planned = {"policy": {"lookahead": 10}, **SHORT, **TASK}
+    fill(url, make_grid(both, ("icem",), seeds, **planned))
     ekf = {"learner": {"name": "ekf"}, **SHORT, **TASK}
     fill(url, make_grid(both, ("d_optimal", "lookahead"), seeds, **ekf))
     for width in (4, 8):
