@@ -15,6 +15,8 @@ shows the equations, units and defaults of one.
 
 ======================  ========================================================================
 ``run_trial``           run one trial, in compiled code where there is some for its parts
+``Explorer``            explore a plant that is measured: which input next, and what followed
+``Plant``               names, units, bounds and the known part of such a plant
 ``fit_offline``         fit the model of a trial to samples, all at once
 ``TrialSpec``           one trial: system, policy, model, learner and seed
 ``TrialResult``         losses, states, inputs and model parameters of one trial
@@ -33,6 +35,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from dopt.explorer import Explorer as Explorer
     from dopt.learning import LEARNERS as LEARNERS
     from dopt.models import MODELS as MODELS
     from dopt.offline_fit import fit_offline as fit_offline
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from dopt.run import run_trial as run_trial
     from dopt.spec.trial import TrialSpec as TrialSpec
     from dopt.systems import SYSTEMS as SYSTEMS
+    from dopt.systems.plant import Plant as Plant
 
     __version__: str
 
@@ -49,6 +53,8 @@ __all__ = [
     "MODELS",
     "POLICIES",
     "SYSTEMS",
+    "Explorer",
+    "Plant",
     "TrialResult",
     "TrialSpec",
     "__version__",
@@ -57,9 +63,11 @@ __all__ = [
 ]
 
 _MODULES = {
+    "Explorer": "dopt.explorer",
     "LEARNERS": "dopt.learning",
     "MODELS": "dopt.models",
     "POLICIES": "dopt.policies",
+    "Plant": "dopt.systems.plant",
     "SYSTEMS": "dopt.systems",
     "TrialResult": "dopt.result",
     "TrialSpec": "dopt.spec.trial",

@@ -21,6 +21,10 @@ class IncompatibleError(SpecificationError):
     """Two valid choices that make no sense together, such as a periodic input without a mode."""
 
 
+class ExplorationError(DoptError, RuntimeError):
+    """An exploration of a plant cannot go on, or was asked for out of order."""
+
+
 class ScaleWarning(UserWarning):
     """The quantities that a network is to learn are of another size than its outputs."""
 

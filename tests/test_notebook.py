@@ -1,7 +1,8 @@
-"""The notebook of ``docs/`` was executed, and runs again from wherever it is opened."""
+"""The notebooks of ``docs/`` were executed, and run again from wherever they are opened."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import nbformat
@@ -11,13 +12,26 @@ from nbclient import NotebookClient
 from tests.analysis.synthetic import fill, make_grid
 from tests.paths import ROOT
 
-NOTEBOOK = nbformat.read(ROOT / "docs" / "explore.ipynb", as_version=4)
+NOTEBOOK, PLANT = (
+    nbformat.read(ROOT / "docs" / name, as_version=4) for name in ("explore.ipynb", "plant.ipynb")
+)
 
 
-def test_it_is_executed() -> None:
-    cells = [cell for cell in NOTEBOOK.cells if cell.cell_type == "code"]
+@pytest.mark.parametrize(("notebook", "pictures"), [(NOTEBOOK, 3), (PLANT, 2)])
+def test_it_is_executed(notebook: nbformat.NotebookNode, pictures: int) -> None:
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
-    assert sum("image/png" in str(cell.outputs) for cell in cells) >= 3
+    assert sum("image/png" in str(cell.outputs) for cell in cells) >= pictures
+
+
+def test_the_notebook_of_a_plant_runs_in_ten_cells_without_a_database(tmp_path: Path) -> None:
+    assert len(PLANT.cells) == 10
+    text = " ".join(cell.source for cell in PLANT.cells)
+    assert not re.search(r"\b(hydra|ray|sql)", text, re.IGNORECASE)
+    place = {"metadata": {"path": str(tmp_path)}}
+    done = NotebookClient(nbformat.from_dict(PLANT), timeout=200, resources=place).execute()
+    [error] = [cell.outputs[0] for cell in done.cells if "free_run_error" in cell.source]
+    assert float(error["data"]["text/plain"]) < 0.05
 
 
 @pytest.mark.parametrize("opened_in", ["docs", "."])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.prediction import Forecast, forecast_by
+from dopt.control.prediction import Forecast, forecast_by_equations
 from dopt.evaluation import evaluation_set
 from dopt.policies.base import on_sphere
 from dopt.systems.base import System
@@ -52,7 +52,7 @@ def held_out(system: System, steps: int) -> HeldOut:
     rng = np.random.default_rng(_SEED)
     draws = rng.standard_normal((len(starts), -(-steps // HOLD_STEPS), system.n_inputs))
     inputs = np.repeat(on_sphere(draws, system.gamma), HOLD_STEPS, axis=1)[:, :steps]
-    return HeldOut(starts, inputs, forecast_by(system, system.learned)(starts, inputs))
+    return HeldOut(starts, inputs, forecast_by_equations(system)(starts, inputs))
 
 
 def free_run_error(system: System, forecast: Forecast, steps: int) -> float:
@@ -64,8 +64,16 @@ def free_run_error(system: System, forecast: Forecast, steps: int) -> float:
     prediction overflows.
     """
     truth = held_out(system, steps)
-    predicted = forecast(truth.starts, truth.inputs)
+    return relative_error(forecast(truth.starts, truth.inputs), truth.states, truth.starts)
+
+
+def relative_error(predicted: Array, states: Array, starts: Array) -> float:
+    """Return the error of predictions (H, N, d) of states (H, N, d), in units of their changes.
+
+    The changes are those from the starts, (N, d); a component that never changes does not count.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
-        errors = np.mean((predicted - truth.states) ** 2, axis=(0, 1))
-    changes = np.mean((truth.states - truth.starts) ** 2, axis=(0, 1))
-    return float(np.sqrt(np.mean(errors / changes)))
+        errors = np.mean((predicted - states) ** 2, axis=(0, 1))
+    changes = np.mean((states - starts) ** 2, axis=(0, 1))
+    moved = changes > 0.0
+    return float(np.sqrt(np.mean(errors[moved] / changes[moved])))

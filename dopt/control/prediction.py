@@ -11,8 +11,8 @@ from dopt.systems.base import System
 
 Array = npt.NDArray[np.float64]
 
-Accelerations = Callable[[Array], Array]
-"""Accelerations (N, r) of states (N, d)."""
+Accelerations = Callable[[Array, Array], Array]
+"""Accelerations (N, r) of states (N, d) under inputs (N, m)."""
 
 Forecast = Callable[[Array, Array], Array]
 """States (H, N, d) after each step, from states (N, d) under inputs (N, H, m)."""
@@ -21,6 +21,11 @@ Forecast = Callable[[Array, Array], Array]
 def forecast_by(system: System, accelerations: Accelerations) -> Forecast:
     """Return the forecast of a system by accelerations that any function gives."""
     return lambda states, inputs: predict(system, accelerations, states, inputs)
+
+
+def forecast_by_equations(system: System) -> Forecast:
+    """Return the forecast of the system itself as it is at the first step, without noise."""
+    return forecast_by(system, lambda states, inputs: system.learned(states, inputs=inputs))
 
 
 def predict(system: System, accelerations: Accelerations, states: Array, inputs: Array) -> Array:
@@ -36,7 +41,7 @@ def predict(system: System, accelerations: Accelerations, states: Array, inputs:
         for x, u, following in zip(visited, by_step, visited[1:], strict=False):
             for row, known in enumerate(system.known(tuple(x), tuple(u), system.parameters)):
                 following[row] = known
-            following[rows] += accelerations(x.T).T
+            following[rows] += accelerations(x.T, u.T).T
             following *= system.dt
             following += x
     return visited[1:].swapaxes(1, 2)

@@ -80,7 +80,9 @@ class Exploration(gymnasium.Env):
         """Return f(x_t, u), (d,), of the system as it is at step t."""
         system = self.system
         flow = np.array(system.known(tuple(self._state), tuple(u), system.parameters), dtype=float)
-        flow[list(system.learned_rows)] += system.learned(self._state[None], self._steps)[0]
+        flow[list(system.learned_rows)] += system.learned(self._state[None], self._steps, u[None])[
+            0
+        ]
         return flow
 
     def _gain(self, state: Array) -> float:

@@ -25,10 +25,12 @@ def warm_up(everything: bool = False) -> None:
 
     if is_complete(MARKS[everything]):
         return
-    from dopt.kernel.warming import compile_in_two_processes, kernel_parts
+    from dopt.kernel.compilation import compile_missing
+    from dopt.kernel.warming import kernel_parts
 
-    compile_in_two_processes(everything)
-    for part in kernel_parts(everything):  # also what no other process could compile
+    parts = kernel_parts(everything)
+    compile_missing([*parts])
+    for part in parts.values():  # also what no other process could compile
         part()
     for mark in {False, everything}:
         mark_complete(MARKS[mark])

@@ -13,7 +13,7 @@ import logging
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -53,7 +53,9 @@ def _cache_folder() -> Path:
             return folder
     except OSError:
         pass
-    return Path(tempfile.mkdtemp(prefix="dopt-kernel-"))
+    folder = Path(tempfile.mkdtemp(prefix="dopt-")) / folder.relative_to(root)
+    folder.mkdir(parents=True)
+    return folder
 
 
 CACHE_FOLDER = _cache_folder()
@@ -110,6 +112,7 @@ def mark_complete(what: str) -> None:
     (CACHE_FOLDER / f"{what}.complete").touch()
 
 
-def completed() -> int:
-    """Return how many parts are in the cache."""
-    return len(list(CACHE_FOLDER.glob("*.complete")))
+def n_complete(names: Iterable[str]) -> int:
+    """Return how many of the functions with these names are in the cache, for some signature."""
+    there = {path.stem for path in CACHE_FOLDER.glob("*.complete")}
+    return len({*names} & (there | {stem.rpartition("-")[0] for stem in there}))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 from collections.abc import Callable, Hashable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -17,9 +17,10 @@ from numba import float64, int64, types
 from numba.core.errors import NumbaError
 
 from dopt.errors import SpecificationError
+from dopt.kernel import held_trial, loop
 from dopt.kernel.cache import one_compiler_at_a_time
+from dopt.kernel.compilation import compile_missing
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
-from dopt.kernel.loop import advance
 from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Trial
 from dopt.kernel.user_code import compiled_own
 from dopt.learning.base import CompiledLearner, Learner
@@ -35,18 +36,48 @@ class Compiled(NamedTuple):
     learn: CompiledFunction
 
 
+class CompiledSteps(NamedTuple):
+    """Compiled code of an exploration whose steps are taken one by one."""
+
+    hold: Callable[..., Any]  # returns a HeldTrial
+    plan_input: Callable[..., int]
+    take_in: Callable[..., int]
+    plan: CompiledFunction
+    learn: CompiledFunction
+
+
 def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evaluation) -> Compiled:
     """Compile the loop for a trial, with the functions of its policy and its learner."""
     key = (layout_of(trial), layout_of(points), _source(policy), _source(learner))
     if key not in _trials:
-        plan, learn = signatures(trial)
-        compile_information(trial, trial.information)
-        loop = compiled_loop(trial, points)
-        _trials[key] = Compiled(loop, function_of(policy, plan), function_of(learner, learn))
+        parts = _compiled_parts(policy, learner, trial, [loop.advance])
+        _trials[key] = Compiled(compiled_loop(trial, points), *parts)
     return _trials[key]
 
 
 _trials: dict[Hashable, Compiled] = {}
+
+
+def compiled_steps(policy: Policy, learner: Learner, trial: Trial) -> CompiledSteps:
+    """Compile the steps of a trial, with the functions of its policy and its learner."""
+    parts = _compiled_parts(policy, learner, trial, list(STEPS))
+    hold, plan_input, take_in = (compiled_step(trial, step) for step in STEPS)
+    return CompiledSteps(hold, plan_input, take_in, *parts)
+
+
+STEPS = (held_trial.hold, held_trial.plan_input, held_trial.take_in)
+"""Functions of an exploration, which do not depend on its policy and its learner."""
+
+
+def _compiled_parts(
+    policy: Policy, learner: Learner, trial: Trial, callers: list[CompiledFunction]
+) -> tuple[CompiledFunction, CompiledFunction]:
+    """Compile what a trial needs but for the callers; return the plan and the learning step."""
+    compile_missing(_names(policy, learner, [*trial.information, *callers]))
+    plan, learn = signatures(trial)
+    for function in trial.information:
+        compile_form(trial, function)
+    return function_of(policy, plan), function_of(learner, learn)
 
 
 def layout_of(value: object) -> Hashable:
@@ -58,6 +89,13 @@ def layout_of(value: object) -> Hashable:
     return type(value) if isinstance(value, (int, float)) else value
 
 
+def _names(policy: Policy, learner: Learner, functions: list[CompiledFunction]) -> list[str]:
+    """Return the names in the cache of what a trial needs of the package."""
+    sources = (*map(path_of, functions), _source(policy), _source(learner))
+    package = f"{__package__}."
+    return [path for path in sources if isinstance(path, str) and path.startswith(package)]
+
+
 def _source(part: Policy | Learner) -> str | Callable[..., None]:
     """Return the path of the function of a policy or a learner, or a user's own function."""
     if isinstance(part, CompiledPolicy):
@@ -65,19 +103,23 @@ def _source(part: Policy | Learner) -> str | Callable[..., None]:
     return part.learn if isinstance(part, CompiledLearner) else part.kernel_function
 
 
-def compile_information(trial: Trial, information: Information) -> None:
-    """Compile the functions of a form in which a trial may hold M."""
+def compile_form(trial: Trial, function: CompiledFunction) -> None:
+    """Compile one of the functions of a form in which a trial may hold M."""
     kinds = _information_signatures(trial.plant, trial.network, trial.state)
-    for function, signature in zip(information, kinds, strict=True):
-        path = f"{function.__module__}.{function.__name__}"
-        compiled_for(path, function, signature.args)
+    compiled_for(path_of(function), function, kinds[function.__name__].args)
 
 
-def _information_signatures(
-    plant: Plant, network: Network, state: State
-) -> tuple[NumbaType, NumbaType]:
+def path_of(function: CompiledFunction) -> str:
+    """Return the dotted path of a function of the package."""
+    return f"{function.__module__}.{function.__name__}"
+
+
+def _information_signatures(plant: Plant, network: Network, state: State) -> dict[str, NumbaType]:
+    """Return the types of the functions of a form of M, by their names."""
     given = (*map(kind_of, (plant, network, state)), float64[::1])
-    return types.void(*given), float64[:, ::1](*given, float64[:, ::1], int64)
+    rows = types.void(*given)
+    forms = float64[:, ::1](*given, float64[:, ::1], int64)
+    return dict(zip(Information._fields, (rows, forms), strict=True))
 
 
 def signatures(trial: Trial) -> tuple[NumbaType, NumbaType]:
@@ -89,7 +131,20 @@ def signatures(trial: Trial) -> tuple[NumbaType, NumbaType]:
 def compiled_loop(trial: Trial, points: Evaluation) -> Callable[..., int]:
     """Compile the loop for a trial, with pointers to the functions of its policy and learner."""
     given = (kind_of(trial), kind_of(points), *map(pointer, signatures(trial)))
-    return compiled_for("loop", advance, (*given, int64, int64))
+    return compiled_for(path_of(loop.advance), loop.advance, (*given, int64, int64))
+
+
+def compiled_step(trial: Trial, step: CompiledFunction) -> Callable[..., Any]:
+    """Compile one of the functions of an exploration."""
+    whole = (kind_of(trial), *map(pointer, signatures(trial)))
+    fields = list(zip(("trial", "plan", "learn"), whole, strict=True))
+    held = held_trial.HeldTrialType(fields)
+    kinds = {
+        held_trial.hold: whole,
+        held_trial.plan_input: (held, int64),
+        held_trial.take_in: (held, int64, float64),
+    }
+    return compiled_for(path_of(step), step, kinds[step])
 
 
 def function_of(part: Policy | Learner, signature: NumbaType) -> CompiledFunction:
@@ -144,7 +199,7 @@ def kind_of(value: object) -> NumbaType:
         kinds = [*map(pointer, equations), *map(kind_of, value[len(equations) :])]
     elif isinstance(value, Trial):
         functions = _information_signatures(value.plant, value.network, value.state)
-        information = types.NamedTuple([*map(pointer, functions)], Information)
+        information = types.NamedTuple([*map(pointer, functions.values())], Information)
         kinds = [information if isinstance(part, Information) else kind_of(part) for part in value]
     else:
         kinds = [*map(kind_of, value)]

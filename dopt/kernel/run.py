@@ -8,17 +8,8 @@ import time
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.kernel import structs as args
 from dopt.kernel.evaluation_points import points_of_trial
-from dopt.kernel.from_spec import (
-    constants,
-    empty_record,
-    empty_scratch,
-    information_of,
-    initial_state,
-    randomness_of,
-)
-from dopt.kernel.model_from_spec import network_of_trial
+from dopt.kernel.from_spec import shared_points, trial_of
 from dopt.kernel.pointers import Compiled, compiled_trial
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import draw
@@ -33,45 +24,23 @@ PIECE_SECONDS = 1.0
 """Interval at which compiled code comes back to the interpreter, which can then heed a signal."""
 
 
-class KernelTrial:
-    """A trial in the compiled kernel, which can be advanced in pieces and looked at in between.
+class KernelState:
+    """What a trial in the compiled kernel has observed, and what its model has learned.
 
     Attributes
     ----------
+    trial : Trial
+        All that compiled functions work on.
     state, record : State, Record
-        Arrays that :meth:`advance` writes in place.
-    done : int
-        Number of steps done.
-    diverged_at : int or None
-        Step at which the trial diverged.
+        Its arrays that they write in place.
     """
 
     def __init__(self, spec: TrialSpec) -> None:
-        self.spec = spec
-        plant, network, algorithm, points = constants(spec.config)
         draws = draw(spec)
-        network = network_of_trial(spec, network, draws.weights)
-        self.constants = (
-            plant,
-            network,
-            algorithm,
-            points_of_trial(points, network, spec.system.horizon),
-        )
-        self.trial = args.Trial(
-            plant,
-            network,
-            algorithm,
-            information_of(spec.config),
-            randomness_of(spec, draws),
-            initial_state(spec, draws.weights),
-            empty_scratch(spec, network),
-            empty_record(spec.system),
-        )
+        self.spec, self.trial = spec, trial_of(spec, draws)
         self.state, self.record = self.trial.state, self.trial.record
         n_fixed = spec.model.n_fixed_parameters(spec.system)
         self._fixed = draws.weights[len(draws.weights) - n_fixed :]
-        self.done = 0
-        self.diverged_at: int | None = None
 
     @property
     def parameters(self) -> Array:
@@ -85,9 +54,30 @@ class KernelTrial:
         """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
         return self.record.states
 
+
+class KernelTrial(KernelState):
+    """A simulated trial, which can be advanced in pieces and looked at in between.
+
+    Attributes
+    ----------
+    points : Evaluation
+        Points at which the model is compared with the truth.
+    done : int
+        Number of steps done.
+    diverged_at : int or None
+        Step at which the trial diverged.
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        super().__init__(spec)
+        shared = shared_points(spec.config)
+        self.points = points_of_trial(shared, self.trial.network, spec.system.horizon)
+        self.done = 0
+        self.diverged_at: int | None = None
+
     @functools.cached_property
     def _code(self) -> Compiled:
-        return compiled_trial(self.spec.policy, self.spec.learner, self.trial, self.constants[3])
+        return compiled_trial(self.spec.policy, self.spec.learner, self.trial, self.points)
 
     def advance(self, last: int) -> None:
         """Run the steps up to ``last``, unless they are done or the trial has diverged.
@@ -105,9 +95,7 @@ class KernelTrial:
         if self.diverged_at is not None or last <= self.done:
             return
         before, code = self.done, self._code
-        self.done = code.advance(
-            self.trial, self.constants[3], code.plan, code.learn, self.done, last
-        )
+        self.done = code.advance(self.trial, self.points, code.plan, code.learn, self.done, last)
         _check_inputs(self.spec, self.record.inputs, before, self.done)
         if self.done < last:
             self.diverged_at = self.done

@@ -1,7 +1,9 @@
 """Structures that compiled functions receive: constants, mutable state and records, by name.
 
 Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
-w units in each hidden layer, L hidden layers, N evaluation points, D random features.
+w units in each hidden layer, L hidden layers, N evaluation points, D random features. A point is
+what a model depends on: a state, (d,), or a state and an input, (d + m,)
+(:mod:`dopt.kernel.points`).
 """
 
 from __future__ import annotations
@@ -25,13 +27,14 @@ class Plant(NamedTuple):
     """The system: its compiled equations, each writing into its last argument, and constants."""
 
     known: Known  # (x, u, p, out), known part of dx/dt
-    accelerations: Accelerations  # (x, p, out), learned accelerations
+    accelerations: Accelerations  # (x, p, out), learned accelerations; x, or (x, u) where read
     complex_accelerations: ComplexAccelerations  # (x, p, out), the same for complex arguments
     parameters: Vector  # physical parameters, at the start
     history: Matrix  # (T, number of them) at each step; one row where they stay
     linear_form: Matrix  # (1 + n_linear, number of physical parameters)
     learned_rows: Integers  # (r,)
     n_inputs: int  # m
+    n_inputs_read: int  # m where the learned accelerations depend on the inputs, 0 elsewhere
     dt: float
     gamma: float
     state_limit: float
@@ -58,7 +61,10 @@ class Network(NamedTuple):
 
     kind: int  # dopt.algorithm.ModelKind
     sizes: Integers  # (L + 2,) units of each layer, from p to r
+    layer_inputs: Integers  # (L + 1,) columns of each layer's weights
     offsets: Integers  # (L + 1,) where each layer's weights start in the parameter vector
+    n_inputs_read: int  # m where the model depends on the inputs, 0 elsewhere
+    n_factors: int  # m where they multiply the last hidden layer, 0 elsewhere
     feature_kinds: Integers  # (p,) dopt.algorithm.FeatureKind
     feature_indices: Integers  # (p,)
     feature_scales: Vector  # (p,)
@@ -117,7 +123,7 @@ class Evaluation(NamedTuple):
     block_sizes: Integers  # (blocks,) points that count
     regressors: Stack  # (N, r, q) of the linear model
     targets: Matrix  # (N, r) less the offset, of the linear model
-    states: Matrix  # (N, d) where the truth changes; otherwise empty
+    states: Matrix  # (N, d) where the truth changes, or (N, d + m); otherwise empty
     n_grid: int  # blocks of the grid, or its points for the linear model
     n_all: int  # all blocks or points
     target_size: float  # root mean square of the targets
@@ -238,12 +244,13 @@ class Record(NamedTuple):
 
 
 AddRows = Callable[[Plant, Network, State, Vector], None]
-"""Addition of JᵀJ to M at a state, (d,), and the current parameters."""
+"""Addition of JᵀJ to M at a point and the current parameters."""
 
 PlanningForms = Callable[[Plant, Network, State, Vector, Matrix, int], Matrix]
 """Products xᵀM⁻¹y for x and y among g and the columns of D B, (1 or 1 + m, 1 + m).
 
-Given a state, (d,), the columns of B as rows, (m, d), and the component of a_θ whose gradient g is.
+Given a point, the columns of B as rows, (m, d), with zeros behind them for inputs that the model
+reads, and the component of a_θ whose gradient g is.
 With one input the row of g is enough: the quadratic term of equation 7 is constant on the sphere.
 """
 

@@ -1,86 +1,33 @@
-"""Compilation of the kernel's parts in two processes at once: ``python -m dopt.kernel.warming``.
+"""The parts of the kernel, compiled into the cache: ``python -m dopt.kernel.warming END NAME...``.
 
-Each part is compiled by itself and called through a pointer, so that any process can put it into
-the cache. Reading it there is a matter of seconds.
+END says at which end of the list the process begins: first or last.
 """
 
 from __future__ import annotations
 
-import logging
-import os
-import subprocess
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import partial
-from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from dopt.kernel.cache import completed
-from dopt.kernel.equations import compiled_equations
+from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
-from dopt.kernel.pointers import compile_information, compiled_at, compiled_loop, signatures
+from dopt.kernel.loop import advance
+from dopt.kernel.pointers import (
+    STEPS,
+    compile_form,
+    compiled_at,
+    compiled_loop,
+    compiled_step,
+    path_of,
+    signatures,
+)
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.structs import Information
 from dopt.learning import LEARNERS, Adam
 from dopt.policies import POLICIES, DOptimal
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-
-ENDS = ("first", "last")
-"""Ends of the list of parts, at which the two processes begin."""
-
-SECONDS_BETWEEN_MESSAGES = 5.0
-
-_log = logging.getLogger("dopt.kernel")
-
-
-def compile_in_two_processes(everything: bool) -> None:
-    """Fill the cache; what a process could not compile is left to whoever needs it.
-
-    With ``everything``, all policies, learners and forms of M of the package are compiled.
-    """
-    if len(os.sched_getaffinity(0)) < len(ENDS):
-        return
-    start, total = time.perf_counter(), choices(everything).n_parts()
-    running = [_started(end, *(["everything"] if everything else [])) for end in ENDS]
-    said = -SECONDS_BETWEEN_MESSAGES
-    try:
-        while any(process.poll() is None for process in running):
-            seconds = time.perf_counter() - start
-            if seconds - said >= SECONDS_BETWEEN_MESSAGES:
-                said = seconds
-                _log.warning(
-                    "compiling the kernel, once per machine: %d of %d parts, %.0f s",
-                    *(min(completed(), total), total, seconds),
-                )
-            time.sleep(0.1)
-    finally:
-        for process in running:
-            process.kill()  # where the wait was broken off; one that has ended stays as it is
-            process.wait()
-
-
-def _started(*words: str) -> subprocess.Popen[bytes]:
-    place = str(Path(__file__).resolve().parents[2])
-    paths = os.pathsep.join(filter(None, (place, os.environ.get("PYTHONPATH"))))
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", __spec__.name, *words],  # no module of the working folder
-        env=os.environ | {"PYTHONPATH": paths},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-
-
-def compile_parts(end: str, everything: bool) -> None:
-    """Compile the parts of the kernel, beginning at one end of their list.
-
-    The two processes meet: what the other has compiled is only loaded.
-    """
-    parts = kernel_parts(everything)
-    for part in parts if end == "first" else reversed(parts):
-        part()
 
 
 class Choices(NamedTuple):
@@ -89,11 +36,6 @@ class Choices(NamedTuple):
     plans: list[str]
     learns: list[str]
     forms: list[ModuleType]
-
-    def n_parts(self) -> int:
-        """Return how many parts they are, with the loop and the equations of every system."""
-        functions = {one for form in self.forms for one in (form.add_rows, form.planning_forms)}
-        return 1 + len(SYSTEMS) + len(self.plans) + len(self.learns) + len(functions)
 
 
 def choices(everything: bool) -> Choices:
@@ -107,20 +49,35 @@ def choices(everything: bool) -> Choices:
     )
 
 
-def kernel_parts(everything: bool) -> list[Callable[[], object]]:
-    """Return what compiles each part."""
+def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
+    """Return what compiles each part, by its name in the cache."""
     spec = TrialSpec.from_names({"name": "pendulum", "grid_points": [2, 2]}, "d_optimal")
     trial, chosen = KernelTrial(spec), choices(everything)
     plan, learn = signatures(trial.trial)
-    forms = [Information(module.add_rows, module.planning_forms) for module in chosen.forms]
-    return [
-        partial(compiled_loop, trial.trial, trial.constants[3]),
-        *(partial(compiled_at, path, learn) for path in chosen.learns),
-        *(partial(compiled_equations, system()) for system in SYSTEMS.values()),
-        *(partial(compile_information, trial.trial, form) for form in forms),
-        *(partial(compiled_at, path, plan) for path in chosen.plans),
-    ]
+    systems = [system() for system in SYSTEMS.values()]
+    forms = [one for form in chosen.forms for one in (form.add_rows, form.planning_forms)]
+    return {
+        path_of(advance): partial(compiled_loop, trial.trial, trial.points),
+        **{
+            path_of(step): partial(compiled_step, trial.trial, step)
+            for step in (STEPS if everything else ())
+        },
+        **{path: partial(compiled_at, path, learn) for path in chosen.learns},
+        **{name_of_equations(system): partial(compiled_equations, system) for system in systems},
+        **{path_of(form): partial(compile_form, trial.trial, form) for form in forms},
+        **{path: partial(compiled_at, path, plan) for path in chosen.plans},
+    }
+
+
+def compile_parts(end: str, names: Container[str]) -> None:
+    """Compile the parts of the kernel with these names, beginning at one end of their list.
+
+    Two processes meet: what the other has compiled is only loaded.
+    """
+    parts = [part for name, part in kernel_parts(everything=True).items() if name in names]
+    for part in parts if end == "first" else reversed(parts):
+        part()
 
 
 if __name__ == "__main__":
-    compile_parts(sys.argv[1], everything="everything" in sys.argv)
+    compile_parts(sys.argv[1], sys.argv[2:])

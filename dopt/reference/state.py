@@ -13,6 +13,7 @@ from dopt.learning import InformationLearner
 from dopt.policies import DOptimal, InformationPolicy
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
+from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.models import model_function, network_function
 from dopt.spec.information_form import held_information
 from dopt.spec.trial import TrialSpec
@@ -36,7 +37,7 @@ class BatchState:
     Attributes
     ----------
     model : callable
-        a_θ(x): parameters (q,) and state (d,) to accelerations (r,).
+        a_θ: parameters (q,) and a point, (d,) or (d + m,), to accelerations (r,).
     theta : (n, q) tensor
         Parameters, of an ensemble those of its first member; the first ``n_learned`` of
         each trial are learned.
@@ -83,6 +84,16 @@ class BatchState:
         self.n_learned = self.theta.shape[1] - self.config.model.n_fixed_parameters(self.system)
         self._allocate()
         self._hold_information()
+
+    @property
+    def learned(self) -> LearnedDynamics:
+        """The system with the model in the place of what is learned."""
+        read = self.config.model.n_inputs_read(self.system)
+        return LearnedDynamics(self.system, self.model, read)
+
+    def points(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """Return what the model depends on at states (..., d) and inputs (..., m)."""
+        return self.learned.points(states, inputs)
 
     def tensor(self, values: Array) -> Tensor:
         """Return real numbers as a tensor where the trials are."""

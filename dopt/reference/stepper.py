@@ -1,4 +1,4 @@
-"""A trial of the reference that can be advanced in pieces and looked at in between."""
+"""A trial of the reference: advanced in pieces, or by steps between which a plant is measured."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 
 from dopt.errors import SpecificationError
 from dopt.reference.batch import Lockstep
+from dopt.reference.steps import BatchSteps
 from dopt.spec.trial import TrialSpec
 
 Array = npt.NDArray[np.float64]
@@ -62,3 +63,48 @@ class ReferenceTrial:
         """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
         states: Array = self._batch.states[0].numpy()
         return states
+
+
+class ReferenceSteps:
+    """The steps of a trial one by one: the caller says what state a plant has and what follows.
+
+    The states and the inputs are theirs to write.
+    """
+
+    @torch.no_grad()
+    def __init__(self, spec: TrialSpec) -> None:
+        self._batch = BatchSteps([spec])
+        self._batch.prepare(self._batch.tensor(np.zeros((1, spec.system.n_states))))
+        self.states: Array = self._batch.states[0].numpy()
+        self.inputs: Array = self._batch.inputs[0].numpy()
+        self.errors: Array = np.full(spec.system.horizon, np.nan)
+
+    @property
+    def parameters(self) -> Array:
+        """Parameters of the model, (q,)."""
+        parameters: Array = self._batch.parameters_of_model[0].numpy().copy()
+        return parameters
+
+    @torch.no_grad()
+    def plan_input(self, t: int) -> None:
+        """Write the input u_t that the policy chooses at x_t."""
+        self._batch.inputs[:, t] = self._batch.plan(t)
+
+    @torch.no_grad()
+    def take_in(self, t: int, dt: float) -> bool:
+        """Learn from x_t, u_t and x_{t+1}, which came dt seconds later.
+
+        Returns whether the parameters are finite.
+        """
+        self._batch.observe(t, dt)
+        self.errors[t] = self._prediction_error(t)
+        self._batch.learn(t)
+        self._batch.inform(t)
+        return bool(self._batch.theta.isfinite().all())
+
+    def _prediction_error(self, t: int) -> float:
+        """Return ‖y_t - a_θ(x_t, u_t)‖ before it is learned."""
+        batch = self._batch
+        members = batch.theta if batch.members is None else batch.members[0]
+        predicted = torch.stack([batch.model(theta, batch.sampled(t)[0]) for theta in members])
+        return float(torch.linalg.vector_norm(batch.targets[0, t] - predicted.mean(dim=0)))

@@ -47,8 +47,8 @@ class NewModel(Model):
     def initial_parameters(self, system: object, rng: object) -> np.ndarray:  # noqa: ARG002
         return np.zeros(1)
 
-    def predict(self, system: object, parameters: object, states: np.ndarray) -> np.ndarray:  # noqa: ARG002
-        return states
+    def predict_at(self, system: object, parameters: object, points: np.ndarray) -> np.ndarray:  # noqa: ARG002
+        return points
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,30 +4,26 @@ from __future__ import annotations
 
 import ast
 import os
-import re
 import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
 
 import llvmlite.binding
-import numpy as np
 import pytest
 
-from dopt.kernel import cache, warm_up
+from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import compiled, contracted, squared, vectorized
-from dopt.kernel.equations import compiled_equations
 from dopt.kernel.from_spec import MODULES
 from dopt.kernel.information import absent, fresh, primal_linear
-from dopt.kernel.warming import choices
+from dopt.kernel.run import KernelTrial
+from dopt.kernel.warming import choices, kernel_parts
 from dopt.learning import LEARNERS
 from dopt.policies import POLICIES
-from dopt.systems import SYSTEMS, Chain, Pendulum, System
+from dopt.spec.trial import TrialSpec
 from tests.paths import ROOT
 
 
@@ -80,82 +76,6 @@ def test_a_failed_compilation_is_not_taken_for_a_complete_one(folder: Path) -> N
     assert not (folder / "loop.complete").exists()
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_compiled_equations_are_those_of_the_system(name: str) -> None:
-    system, rng = SYSTEMS[name](), np.random.default_rng(0)
-    equations, p = compiled_equations(system), np.array(SYSTEMS[name]().parameters)
-    x, u = rng.standard_normal(system.n_states), rng.standard_normal(system.n_inputs)
-    known, learned = np.empty(system.n_states), np.empty(system.n_learned)
-    equations.known(x, u, p, known)
-    equations.accelerations(x, p, learned)
-    assert known == pytest.approx(np.array(system.known(tuple(x), tuple(u), system.parameters)))
-    assert learned == pytest.approx(system.learned(x[None])[0], rel=1e-12)
-    z, slopes = x + 1e-30j * rng.standard_normal(system.n_states), np.empty(len(learned), complex)
-    equations.complex_accelerations(z, p + 0j, slopes)
-    exact = np.array(system.accelerations(tuple(z), system.parameters))
-    assert slopes.imag == pytest.approx(exact.imag, rel=1e-10, abs=1e-42)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Springy(Pendulum):
-    """A system that no one has registered."""
-
-    name: ClassVar[str] = "springy"
-
-    @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
-        return (-parameters[2] * state[0] ** 3,)
-
-
-def test_equations_from_elsewhere_are_compiled_but_not_cached() -> None:
-    """Only the sources of the package are part of the name of the cache's folder."""
-    equations, out = compiled_equations(Springy()), np.empty(1)
-    equations.accelerations(np.array([2.0, 0.0]), np.array(Springy().parameters), out)
-    assert out[0] == -80.0
-    assert equations.accelerations.stats.cache_path is None
-    own = compiled_equations(Pendulum()).accelerations
-    assert str(cache.CACHE_FOLDER) in own.stats.cache_path
-
-
-def symbols(system: System) -> list[str]:
-    """Return the symbols of the compiled equations without Numba's number, which starts anew."""
-    names = [
-        code.fndesc.mangled_name
-        for function in compiled_equations(system)
-        for code in function.overloads.values()
-    ]
-    return [re.sub(r"B\d+v\d+B", "", name) for name in names]
-
-
-def test_no_two_systems_share_a_symbol() -> None:
-    """Two that do and come from different processes can be taken for each other: wrong physics."""
-    physics = {(cls.known, cls.accelerations): cls() for cls in SYSTEMS.values()}
-    different = [*physics.values(), Chain(n_links=2)]
-    shipped = [symbol for system in different for symbol in symbols(system)]
-    assert len(shipped) == 3 * len(different)
-    assert len(set(shipped)) == len(shipped)
-    assert not set(symbols(Springy())[1:]) & set(shipped)
-
-
-def test_systems_cached_by_different_processes_are_not_confused(tmp_path: Path) -> None:
-    program = (
-        "import sys, numpy as np\n"
-        "from dopt.kernel.equations import compiled_equations\n"
-        "from dopt.systems import SYSTEMS\n"
-        "systems = [SYSTEMS[name]() for name in sys.argv[1:]]\n"
-        "functions = [compiled_equations(system).known for system in systems]\n"
-        "for system, known in zip(systems, functions):\n"
-        "    x, u = np.arange(1.0, 1 + system.n_states), np.ones(system.n_inputs)\n"
-        "    out, p = np.empty(system.n_states), system.parameters\n"
-        "    known(x, u, np.array(p), out)\n"
-        "    assert np.allclose(out, system.known(tuple(x), tuple(u), p)), system.name\n"
-    )
-    environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
-    for names in (["pendulum"], ["cartpole"], ["cartpole", "pendulum"], ["pendulum", "cartpole"]):
-        command = [sys.executable, "-c", program, *names]
-        subprocess.run(command, check=True, env=environment, cwd=ROOT)
-
-
 def test_a_warm_cache_is_seen_without_the_compiler() -> None:
     warm_up()
     program = (
@@ -171,7 +91,46 @@ def test_everything_is_what_any_shipped_choice_calls() -> None:
     assert {*MODULES.values(), primal_linear, absent, fresh} == set(chosen.forms)
     few = choices(everything=False)
     assert set(few.plans) < set(chosen.plans)
-    assert few.n_parts() < chosen.n_parts()
+
+
+def test_a_trial_loads_what_other_processes_compile(tmp_path: Path) -> None:
+    """Where a trial compiles a part itself, its numbers can differ from those of later trials."""
+    program = (
+        "from dopt.kernel.compilation import compile_missing\n"
+        "from dopt.kernel.information import absent\n"
+        "from dopt.kernel.pointers import compile_form\n"
+        "from dopt.kernel.run import KernelTrial\n"
+        "from dopt.spec.trial import TrialSpec\n"
+        "compile_missing(['dopt.kernel.information.absent.add_rows'])\n"
+        "trial = KernelTrial(TrialSpec.from_names('pendulum', 'random')).trial\n"
+        "compile_form(trial, absent.add_rows)\n"
+        "stats = absent.add_rows.stats\n"
+        "print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"DOPT_CACHE": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == ["1", "0"]
+    assert "0 of 1 parts" in done.stderr
+
+
+def test_a_trial_asks_for_each_part_that_it_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(pointers, "compile_missing", asked.extend)
+    monkeypatch.setattr(pointers, "_trials", {})
+    KernelTrial(TrialSpec.from_names("pendulum", "d_optimal")).advance(1)
+    assert set(asked) == {
+        "dopt.kernel.loop.advance",
+        "dopt.kernel.policies.d_optimal.plan",
+        "dopt.kernel.learners.adam.learn",
+        "dopt.kernel.information.primal_network.add_rows",
+        "dopt.kernel.information.primal_network.planning_forms",
+    }
+    assert set(asked) <= {*kernel_parts(everything=True)}
 
 
 def test_code_for_another_processor_is_not_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,10 +18,12 @@ from torch.func import grad, hessian, jacfwd, jacrev, jvp
 from dopt.systems import (
     Arm,
     Cartpole,
+    CartpoleUnknownGain,
     Chain,
     DriftingPendulum,
     MassSpring,
     Pendulum,
+    PendulumUnknownGain,
     Quadrotor,
     System,
 )
@@ -224,6 +226,16 @@ class MassSpringMechanics(Mechanics):
         return -grad(dissipation)(rates)
 
 
+class PendulumUnknownGainMechanics(PendulumMechanics):
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
+        return super().driving(q, rates, self.system.gain * u)
+
+
+class CartpoleUnknownGainMechanics(CartpoleMechanics):
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
+        return super().driving(q, rates, self.system.gain * u)
+
+
 MECHANICS: dict[type[System], type[Mechanics]] = {
     Pendulum: PendulumMechanics,
     Cartpole: CartpoleMechanics,
@@ -232,6 +244,8 @@ MECHANICS: dict[type[System], type[Mechanics]] = {
     MassSpring: MassSpringMechanics,
     DriftingPendulum: PendulumMechanics,
     Chain: ChainMechanics,
+    PendulumUnknownGain: PendulumUnknownGainMechanics,
+    CartpoleUnknownGain: CartpoleUnknownGainMechanics,
 }
 
 FRICTION = {
@@ -242,4 +256,6 @@ FRICTION = {
     "mass_spring": ("damping",),
     "drifting_pendulum": ("friction", "final_friction"),
     "chain": ("friction",),
+    "pendulum_unknown_gain": ("friction",),
+    "cartpole_unknown_gain": ("pivot_friction", "cart_friction"),
 }

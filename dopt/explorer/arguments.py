@@ -1,0 +1,73 @@
+"""Checks of what an explorer is given."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.errors import SpecificationError
+from dopt.policies.base import ROUNDING
+from dopt.spec.trial import TrialSpec
+from dopt.types import Array
+
+
+def numbers(what: str, given: npt.ArrayLike, size: int) -> Array:
+    """Return so many real numbers, or raise SpecificationError."""
+    try:
+        values = np.asarray(given)
+    except ValueError:  # rows of different lengths
+        values = np.asarray(given, dtype=object)
+    if values.shape != (size,) or values.dtype.kind not in "fiu":
+        raise SpecificationError(
+            f"{what} has the shape {values.shape} and the type {values.dtype}, but {size} real "
+            f"{'number is' if size == 1 else 'numbers are'} expected: correct it."
+        )
+    return values.astype(np.float64)
+
+
+def finite(what: str, given: npt.ArrayLike, size: int) -> Array:
+    """Return so many finite numbers, or raise SpecificationError."""
+    values = numbers(what, given, size)
+    if not np.isfinite(values).all():
+        raise SpecificationError(
+            f"{what} is {values.tolist()}, but finite numbers are expected: correct it."
+        )
+    return values
+
+
+def safe_input(spec: TrialSpec, fallback: npt.ArrayLike | None) -> Array:
+    """Return the fallback, (m,), 0 unless it is given, or raise SpecificationError."""
+    m, gamma = spec.system.n_inputs, spec.system.gamma
+    u = np.zeros(m) if fallback is None else finite("fallback", fallback, m)
+    if np.linalg.norm(u) > gamma * (1 + ROUNDING):
+        raise SpecificationError(
+            f"fallback is {u.tolist()}, but its norm has to be at most {gamma:g}: lower it."
+        )
+    return u
+
+
+def within(what: str, given: float, upper: float) -> float:
+    """Return a real number above 0 and below a bound."""
+    if not _is_real(given) or not 0.0 < given < upper:
+        raise SpecificationError(
+            f"{what} is {given!r}, but a number above 0"
+            f"{f' and below {upper:g}' if upper < math.inf else ''} is expected: correct it."
+        )
+    return float(given)
+
+
+def seconds(given: float | None) -> float | None:
+    """Return a time in seconds, or raise SpecificationError."""
+    if given is not None and not (_is_real(given) and math.isfinite(given)):
+        raise SpecificationError(
+            f"time is {given!r}, but a finite number of seconds is expected: correct it, or leave "
+            f"it out."
+        )
+    return None if given is None else float(given)
+
+
+def _is_real(given: object) -> bool:
+    value = np.asarray(given)
+    return value.shape == () and value.dtype.kind in "fiu"

@@ -1,0 +1,351 @@
+"""Exploration of a plant by questions and answers: which input next, and what followed it."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from dopt.errors import ExplorationError, SpecificationError
+from dopt.explorer.arguments import finite, numbers, safe_input, seconds, within
+from dopt.explorer.interrupts import uninterrupted
+from dopt.explorer.journal import FORMAT, Event, Journal
+from dopt.explorer.measured import measured
+from dopt.explorer.planner import PunctualPlanner
+from dopt.explorer.saving import SavedExplored
+from dopt.explorer.state import difference
+from dopt.spec.trial import TrialSpec
+from dopt.systems.base import System
+from dopt.systems.plant import Plant
+from dopt.types import Array
+
+IN_VAIN = 20
+"""States in a row without a learned step after which that is said."""
+
+_log = logging.getLogger("dopt.explorer")
+
+STEPS = 20_000
+"""Steps of an exploration unless it is told otherwise."""
+
+
+class Explorer(SavedExplored):
+    """Explores a plant: chooses its inputs, and learns from the states that follow.
+
+    >>> explorer = Explorer(plant, policy="d_optimal", journal="run.jsonl")
+    >>> u = explorer.ask(x)  # x measured now
+    >>> explorer.tell(x_next)  # x measured after u was applied for dt seconds
+
+    Steps are counted by what was learned. A measurement that cannot be learned from changes no
+    parameter; :attr:`counts` says how many there were of each kind:
+
+    ``learned``
+        transitions from one state to the next
+    ``repeated``
+        states with the time of the last one, which are left out
+    ``out_of_order``
+        states with an earlier time, which are left out
+    ``gaps``
+        states that came too early or too late after the last one for the input to have been held
+        for about dt. The exploration goes on from them
+    ``unusable``
+        states with a number that is not finite or beyond the limit of the plant. The exploration
+        goes on from the next state
+    ``jumps``
+        states for which an input was asked that are not those told last
+    ``resets``
+        calls of :meth:`reset`
+    ``missed``
+        questions that were answered with the fallback, because the plan was not ready in time
+
+    Parameters
+    ----------
+    plant : Plant or System
+        The plant; a system, such as one of ``dopt.SYSTEMS`` or an environment of Gymnasium, says by
+        its horizon how many steps there are.
+    policy, model, learner : str or mapping
+        As those of :meth:`dopt.TrialSpec.from_names`.
+    seed : int
+        Seed of the initial parameters and of the policy's own draws.
+    steps : int
+        Most steps of the exploration, for which memory is set aside.
+    journal : str or Path, optional
+        File that each event is written to before a call returns (:mod:`dopt.explorer.journal`).
+        If it holds an exploration, that one goes on: the arguments have to describe the same.
+    fsync : bool
+        Whether events are on the disk, and not only in the file, before a call returns.
+    deadline : float, optional
+        Seconds that :meth:`ask` waits for a plan. Then it returns the fallback.
+    fallback : (m,), optional
+        A safe input, 0 unless it is given.
+    tolerance : float
+        Share of dt by which the time between two states may differ from it.
+    path : {"kernel", "reference"}, optional
+        Where the steps are computed; the kernel, unless a part is not written for it.
+
+    Raises
+    ------
+    SpecificationError, IncompatibleError
+        As :meth:`dopt.TrialSpec.from_names`; also if the journal is that of another exploration.
+    """
+
+    def __init__(
+        self,
+        plant: Plant | System,
+        *,
+        policy: str | Mapping[str, object] = "d_optimal",
+        model: str | Mapping[str, object] = "mlp",
+        learner: str | Mapping[str, object] = "adam_window",
+        seed: int = 0,
+        steps: int = STEPS,
+        journal: str | Path | None = None,
+        fsync: bool = True,
+        deadline: float | None = None,
+        fallback: npt.ArrayLike | None = None,
+        tolerance: float = 0.5,
+        path: str | None = None,
+    ) -> None:
+        system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
+        given = {"model": model, "learner": learner}
+        spec = TrialSpec.of_system(system, policy, **given, seed=seed, path=path)
+        self._tolerance = within("tolerance", tolerance, 1.0)
+        deadline = None if deadline is None else within("deadline", deadline, math.inf)
+        self._fallback = safe_input(spec, fallback)
+        self._limits = np.full(system.n_states, system.state_limit)
+        self._limits[list(system.angle_indices)] = np.finfo(float).max
+        super().__init__(spec)
+        self._in_vain = 0  # states in a row that were not learned from
+        self._journal = None if journal is None else Journal(Path(journal), fsync)
+        self._planner = PunctualPlanner(self._state.plan, deadline)
+        if self._journal is not None:
+            try:
+                self._resume(self._journal)
+            except BaseException:
+                self._journal.close()
+                raise
+
+    def ask(self, state: npt.ArrayLike, time: float | None = None) -> Array:
+        """Return the input u_t, (m,), for a state x_t, (d,).
+
+        Asked again for the same state, it gives the same input.
+
+        Parameters
+        ----------
+        state : (d,)
+            State as it was measured last. If it is not the one that was told last, the exploration
+            goes on from it; if it is an older one, the input is that for the one told last.
+        time : float, optional
+            When it was measured [s], by the clock that :meth:`tell` is given the times of.
+
+        Raises
+        ------
+        SpecificationError
+            If the state has another shape.
+        ExplorationError
+            If all steps are done.
+        """
+        x, now = self._measured(state), seconds(time)
+        with uninterrupted(), self._lock:
+            self._require_step()
+            if not self._is_usable(x):
+                self._wait()
+                self._note({"lost": "unusable"})
+                return self._fallback.copy()
+            return self._answer(x, now).copy()
+
+    def _answer(self, x: Array, now: float | None) -> Array:
+        """Return the input for a usable state."""
+        state = self._state
+        elapsed = self._elapsed(now)
+        same = state.present is not None and np.array_equal(x, state.present)
+        older = state.present is not None and now is not None and elapsed <= 0.0
+        if older and not same:
+            self._note({"counted": "out_of_order" if elapsed < 0.0 else "repeated"}, durable=False)
+        elif not same or (now is not None and elapsed > 0.0):
+            self._wait()
+            self._note({"begin": x.tolist(), "time": now})
+        if state.answer is None:
+            self._wait()
+            self._plan()
+        assert state.answer is not None
+        return state.answer
+
+    def reset(self) -> None:
+        """Forget the present state: the plant, or its clock, starts anew with the next one."""
+        with uninterrupted(), self._lock:
+            self._require_open()
+            self._wait()
+            self._note({"lost": "resets"})
+
+    def tell(
+        self, state: npt.ArrayLike, applied: npt.ArrayLike | None = None, time: float | None = None
+    ) -> bool:
+        """Learn from the state x_{t+1}, (d,), that followed, and return whether that was possible.
+
+        Parameters
+        ----------
+        state : (d,)
+            State that was measured after an input was held for about dt seconds.
+        applied : (m,), optional
+            That input, if it is another one than :meth:`ask` has returned.
+        time : float, optional
+            When the state was measured [s]. Without it, it counts as measured dt after the last.
+
+        Raises
+        ------
+        SpecificationError
+            If a shape is wrong, or the input is not finite.
+        ExplorationError
+            If all steps are done, if no input is known, or if the parameters are not finite any
+            more.
+        """
+        x, now = self._measured(state), seconds(time)
+        u = None if applied is None else finite("applied", applied, self.spec.system.n_inputs)
+        with uninterrupted(), self._lock:
+            self._require_step()
+            self._wait()
+            learned = self._take_in(x, u, now)
+        self._warn_in_vain(learned)
+        return learned
+
+    def _take_in(self, x: Array, applied: Array | None, now: float | None) -> bool:
+        state, dt = self._state, self.spec.system.dt
+        elapsed = self._elapsed(now)
+        u = state.answer if applied is None else applied
+        if elapsed <= 0.0:
+            kind = "repeated" if elapsed == 0.0 else "out_of_order"
+            self._note({"counted": kind}, durable=False)
+        elif not self._is_usable(x):
+            self._note({"lost": "unusable"})
+        elif state.present is None:
+            self._note({"begin": x.tolist(), "time": now})
+        elif abs(elapsed - dt) > self._tolerance * dt:
+            self._note({"gap": x.tolist(), "time": now})
+        elif u is None:
+            raise ExplorationError(
+                "a state was told before an input was asked for: call ask() first, or say which "
+                "input was applied."
+            )
+        elif not np.isfinite(state.accelerations(x, u, elapsed)).all():
+            self._note({"lost": "unusable"})
+        else:
+            if now is None and state.time is not None:
+                now = state.time + dt
+            event = {"learn": x.tolist(), "applied": u.tolist(), "dt": elapsed, "time": now}
+            self._note(event)
+            return True
+        return False
+
+    def _elapsed(self, now: float | None) -> float:
+        """Return the seconds since the last state."""
+        if now is None or self._state.time is None:
+            return self.spec.system.dt
+        return now - self._state.time
+
+    def _measured(self, given: npt.ArrayLike) -> Array:
+        """Return a state, (d,), with its angles within half a turn of the present ones."""
+        x, present = numbers("state", given, self.spec.system.n_states), self._state.present
+        if present is not None:
+            for i in self.spec.system.angle_indices:
+                turns = (present[i] - x[i]) / (2 * math.pi)
+                if abs(turns) > 0.5 and math.isfinite(turns):
+                    x[i] += 2 * math.pi * np.round(turns)
+        return x
+
+    def _is_usable(self, x: Array) -> bool:
+        """Tell whether a state can be a measurement; angles may turn as often as they like."""
+        return bool(np.all(np.abs(x) <= self._limits))  # also false for NaN
+
+    def _warn_in_vain(self, learned: bool) -> None:
+        """Say so once when nothing was learned from many states in a row."""
+        self._in_vain = 0 if learned else self._in_vain + 1
+        if self._in_vain == IN_VAIN:
+            _log.warning(
+                "nothing was learned from the last %d states (%s), but states are expected every "
+                "%g s: give times in seconds, a limit that no state is beyond, and a policy and a "
+                "learner that are faster than that",
+                *(IN_VAIN, self.counts, self.spec.system.dt),
+            )
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise ExplorationError(
+                "the exploration is closed: open it again, with its journal if it goes on."
+            )
+
+    def _require_step(self) -> None:
+        self._require_open()
+        if self.n_steps == self.spec.system.horizon:
+            raise ExplorationError(
+                f"all {self.n_steps} steps of the exploration are done: begin another one with "
+                f"more steps."
+            )
+
+    def _note(self, event: Event, *, durable: bool = True) -> None:
+        """Write an event, and change by it."""
+        if self._journal is not None:
+            self._journal.write(event, durable=durable)
+        self._state.do(event)
+
+    def _plan(self) -> None:
+        """Plan for the present state; the fallback is the answer if that is not ready in time."""
+        if self._planner.plan():
+            self._note_plan()
+        if self._state.answer is None:
+            self._note({"missed": self._fallback.tolist()}, durable=False)
+
+    def _note_plan(self) -> None:
+        planned = self._state.planned
+        if np.isfinite(planned).all():
+            self._note({"plan": planned.tolist()}, durable=False)
+
+    def _wait(self) -> None:
+        """Wait for a plan that was not ready in time, which the policy may remember."""
+        if self._planner.wait():
+            self._note_plan()
+
+    def _resume(self, journal: Journal) -> None:
+        """Replay what the journal holds, or write what it is about."""
+        about = {"format": FORMAT, "trial": self.spec.to_mapping()}
+        if not journal.events:
+            journal.write(about, durable=True)
+            return
+        stored = journal.events[0]["trial"]
+        if stored != about["trial"]:
+            raise SpecificationError(
+                f"the journal {journal.path} is that of another exploration "
+                f"({difference(stored, about['trial'])}): give the same arguments as then, or "
+                f"another file."
+            )
+        for event in journal.events[1:]:
+            self._state.replay(event)
+
+    def close(self) -> None:
+        """Close the journal and end the thread of the planner."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            with uninterrupted(), self._lock:
+                self._wait()
+        finally:
+            self._planner.close()
+            if self._journal is not None:
+                self._journal.close()
+            self._close_savers()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,143 @@
+"""Append-only file of an exploration: its specification, and everything that changed its state.
+
+Each line is one event as JSON. It is in the file before the exploration goes on, and a durable one
+is on the disk where ``fsync`` is set; a line that a power cut has torn is dropped when the file is
+opened again. Real numbers are written so that they are read back bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dopt.errors import ExplorationError, SpecificationError
+
+FORMAT = 1
+"""Version of the lines."""
+
+Event = Mapping[str, Any]
+
+
+class Journal:
+    """A journal that one process writes, through one object.
+
+    Parameters
+    ----------
+    path : Path
+        File, which is made if it is not there.
+    fsync : bool
+        Whether a durable event is on the disk before :meth:`write` returns.
+
+    Attributes
+    ----------
+    path : Path
+    events : list of mappings
+        What the file held when it was opened, the first with the specification.
+
+    Raises
+    ------
+    SpecificationError
+        If the file cannot be opened, is being written, or is none of this kind.
+    """
+
+    def __init__(self, path: Path, fsync: bool) -> None:
+        self.path, self._fsync = path.expanduser(), fsync
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self.path.open("ab", buffering=0)
+        except OSError as error:
+            raise SpecificationError(
+                f"the journal {path} cannot be written ({error}): give a file in a folder that can "
+                f"be written."
+            ) from error
+        self._process, self._broken = os.getpid(), False
+        try:
+            _lock(self._file.fileno(), self.path)
+            self._size, self.events = _read(self.path)
+        except SpecificationError:
+            self._file.close()
+            raise
+        self._file.truncate(self._size)
+
+    def write(self, event: Event, *, durable: bool) -> None:
+        """Append an event; one that is not durable may wait for the next one that is.
+
+        Raises
+        ------
+        ExplorationError
+            If the disk is full or broken, now or before; if the journal is closed, or another
+            process has opened it.
+        """
+        if self._file.closed or self._broken or os.getpid() != self._process:
+            raise ExplorationError(
+                f"the journal {self.path} is closed, or belongs to another process: open the "
+                f"exploration again."
+            )
+        line = f"{json.dumps(event, allow_nan=False)}\n".encode()
+        try:
+            if self._file.write(line) != len(line):
+                raise OSError("the disk is full")
+            if durable and self._fsync:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            self._broken = True
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size)  # half a line would hide what follows it
+            raise ExplorationError(
+                f"the journal {self.path} could not be written ({error}), so that the exploration "
+                f"cannot go on: free space on its disk, and open the exploration again."
+            ) from error
+        self._size += len(line)
+
+    def close(self) -> None:
+        """Close the file, on the disk."""
+        if not self._file.closed:
+            with contextlib.suppress(OSError):
+                os.fsync(self._file.fileno())
+            self._file.close()
+
+
+def _lock(file: int, path: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise SpecificationError(
+            f"the journal {path} is written by another explorer, here or in another process, but "
+            f"one at a time may do so: close() it, or give another file."
+        ) from error
+
+
+def _read(path: Path) -> tuple[int, list[dict[str, Any]]]:
+    """Return the number of bytes that are whole lines, and their events."""
+    content = path.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    torn = content[whole:]
+    if whole == 0 and not torn.startswith(_BEGINNING[: len(torn)]):
+        raise _foreign(path, f"it begins with {torn[:20]!r}")
+    events: list[dict[str, Any]] = []
+    for number, line in enumerate(content[:whole].splitlines(), start=1):
+        try:
+            event = json.loads(line)
+        except ValueError as error:
+            raise _foreign(path, f"line {number}: {error}") from error
+        if not isinstance(event, dict):
+            raise _foreign(path, f"line {number} is no JSON object")
+        events.append(event)
+    if events and (events[0].get("format") != FORMAT or "trial" not in events[0]):
+        raise _foreign(path, "its first line is that of no exploration")
+    return whole, events
+
+
+_BEGINNING = f'{{"format": {FORMAT}, "trial": '.encode()
+
+
+def _foreign(path: Path, reason: str) -> SpecificationError:
+    return SpecificationError(
+        f"{path} is no journal of format {FORMAT} ({reason}), but one was expected there: give the "
+        f"path of a journal, or of a file that does not exist."
+    )

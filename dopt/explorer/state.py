@@ -1,0 +1,187 @@
+"""State of an exploration, which changes by events alone: live, or as a journal replays them.
+
+======================  =====================================================================
+event                   meaning
+======================  =====================================================================
+``begin``, ``time``     the state from which the next step is taken
+``plan``                the input that the policy chose at it, which is the answer unless there
+                        is one
+``missed``              the fallback that was the answer, as no plan was ready
+``learn``, ``applied``, the state that followed, the input that was applied, and the seconds
+``dt``, ``time``        between the two states
+``gap``, ``time``       a state that followed after another time than about dt
+``lost``                a state that could not be used, after which the present one is unknown
+``counted``             something that changes nothing, by the name of its count
+======================  =====================================================================
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from typing import Any, Protocol
+
+import numpy as np
+
+from dopt.errors import ExplorationError
+from dopt.explorer.journal import Event
+from dopt.models import MLP
+from dopt.spec.scale_check import warn_of_sizes
+from dopt.spec.trial import TrialSpec
+from dopt.types import Array
+
+SIZED_STEPS = 50
+"""First steps over which the size of the accelerations is taken."""
+
+_log = logging.getLogger("dopt.explorer")
+
+
+class Steps(Protocol):
+    """The steps of a trial, in the kernel or in the reference."""
+
+    @property
+    def states(self) -> Array: ...
+    @property
+    def inputs(self) -> Array: ...
+    @property
+    def parameters(self) -> Array: ...
+    @property
+    def errors(self) -> Array: ...
+    def plan_input(self, t: int) -> None: ...
+    def take_in(self, t: int, dt: float) -> bool: ...
+
+
+class ExplorerState:
+    """What was measured, and what was learned from it.
+
+    Attributes
+    ----------
+    spec : TrialSpec
+        Plant, policy, model, learner and seed.
+    steps : Steps
+        The arrays and the steps of the trial.
+    done : int
+        Steps t that were learned from.
+    present : (d,) or None
+        State x_t; None where it is unknown.
+    answer : (m,) or None
+        Input that was given for it.
+    time : float or None
+        When it was measured [s].
+    counts : Counter of str
+        How often what happened (:class:`dopt.Explorer`).
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        self.spec, self.steps = spec, _steps_of(spec)
+        self.done, self.counts = 0, Counter[str]()
+        self.present: Array | None = None
+        self.answer: Array | None = None
+        self.time: float | None = None
+        self._rows = list(spec.system.learned_rows)
+        self._squares = np.zeros(spec.system.n_learned)
+        self._told_of_plans = False
+
+    def do(self, event: Event) -> None:
+        """Change by one event."""
+        if "learn" in event:
+            self._learn(event)
+        elif "plan" in event:
+            self.answer = np.array(event["plan"]) if self.answer is None else self.answer
+        elif "missed" in event:
+            self.counts["missed"] += 1
+            self.answer = np.array(event["missed"])
+        elif "begin" in event:
+            x = np.array(event["begin"])
+            self.counts["jumps"] += self.present is not None and not np.array_equal(x, self.present)
+            self._move(x, event["time"])
+        elif "gap" in event:
+            self.counts["gaps"] += 1
+            self._move(np.array(event["gap"]), event["time"])
+        elif "lost" in event:
+            self.counts[event["lost"]] += 1
+            self.present = self.answer = self.time = None
+        else:
+            self.counts[event["counted"]] += 1
+
+    def replay(self, event: Event) -> None:
+        """Do an event of a journal; a plan is made again, as the policy may remember it."""
+        if "plan" in event:
+            self.plan()
+            self._compare(np.array(event["plan"]))
+        self.do(event)
+
+    def plan(self) -> None:
+        """Let the policy choose an input at the present state."""
+        self.steps.plan_input(self.done)
+
+    @property
+    def planned(self) -> Array:
+        """The input that it chose, (m,)."""
+        chosen: Array = self.steps.inputs[self.done].copy()
+        return chosen
+
+    def _move(self, x: Array, time: float | None) -> None:
+        self.present, self.time, self.answer = x, time, None
+        self.steps.states[self.done] = x
+
+    def _learn(self, event: Event) -> None:
+        t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
+        self.steps.inputs[t], self.steps.states[t + 1] = u, x
+        self._watch_size(t, x, u, event["dt"])
+        finite = self.steps.take_in(t, event["dt"])
+        self.done += 1
+        self.counts["learned"] += 1
+        self.present, self.time = self.steps.states[t + 1].copy(), event["time"]
+        self.answer = None
+        if not finite:
+            raise ExplorationError(
+                f"the parameters are not finite after {self.done} steps: lower the learning rate, "
+                f"or raise the regularization, and begin another journal."
+            )
+
+    def accelerations(self, following: Array, u: Array, dt: float) -> Array:
+        """Return the accelerations that are observed from x_t to the next state, (r,)."""
+        system, x, rows = self.spec.system, self.steps.states[self.done], self._rows
+        with np.errstate(all="ignore"):
+            known = np.array(system.known(tuple(x), tuple(u), system.parameters), dtype=float)
+            seen: Array = (following - x)[rows] / dt - known[rows]
+        return seen
+
+    def _watch_size(self, t: int, following: Array, u: Array, dt: float) -> None:
+        """Warn once where the first accelerations are of another size than a network learns."""
+        if t < SIZED_STEPS and isinstance(self.spec.model, MLP):
+            self._squares += self.accelerations(following, u, dt) ** 2
+            if t == SIZED_STEPS - 1:
+                sizes = np.sqrt(self._squares / SIZED_STEPS)
+                warn_of_sizes(self.spec.system, sizes, f"over the first {SIZED_STEPS} steps")
+
+    def _compare(self, planned: Array) -> None:
+        """Say so once if a plan that is replayed is another one than when it was made."""
+        if not np.array_equal(self.planned, planned) and not self._told_of_plans:
+            self._told_of_plans = True
+            _log.warning(
+                "step %d of the journal is planned as %s here, but was planned as %s: another "
+                "version or processor wrote it, or the policy plans for a limited time. The answer "
+                "was the latter, and what was learned agrees to rounding",
+                *(self.done, self.planned, planned),
+            )
+
+
+def _steps_of(spec: TrialSpec) -> Steps:
+    if spec.config.path == "reference":
+        from dopt.reference.stepper import ReferenceSteps
+
+        return ReferenceSteps(spec)
+    from dopt.kernel.steps import KernelSteps
+
+    return KernelSteps(spec)
+
+
+def difference(stored: Any, given: Any, path: str = "") -> str:
+    """Say where two specifications differ first."""
+    if isinstance(stored, dict) and isinstance(given, dict):
+        for key in sorted({*stored, *given}):
+            if stored.get(key) != given.get(key):
+                return difference(stored.get(key), given.get(key), f"{path}.{key}".lstrip("."))
+    return f"{path} was {stored!r} and is {given!r}"

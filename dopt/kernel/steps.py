@@ -1,0 +1,41 @@
+"""Steps of Algorithm 1 one by one, on a plant that is not simulated."""
+
+from __future__ import annotations
+
+from dopt.kernel.pointers import compiled_steps
+from dopt.kernel.run import KernelState
+from dopt.spec.trial import TrialSpec
+from dopt.types import Array
+
+
+class KernelSteps(KernelState):
+    """The compiled steps of a trial: the caller says what state a plant has and what follows.
+
+    The states and the inputs of the record are theirs to write.
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        super().__init__(spec)
+        self._code = compiled_steps(spec.policy, spec.learner, self.trial)
+        self._held = self._code.hold(self.trial, self._code.plan, self._code.learn)
+
+    @property
+    def inputs(self) -> Array:
+        """Inputs u_0 ... u_{T-1}, (T, m)."""
+        return self.record.inputs
+
+    @property
+    def errors(self) -> Array:
+        """Errors of the accelerations before they were learned, (T,)."""
+        return self.record.loss
+
+    def plan_input(self, t: int) -> None:
+        """Write the input u_t that the policy chooses at x_t."""
+        self._code.plan_input(self._held, t)
+
+    def take_in(self, t: int, dt: float) -> bool:
+        """Learn from x_t, u_t and x_{t+1}, which came dt seconds later.
+
+        Returns whether the parameters are finite.
+        """
+        return bool(self._code.take_in(self._held, t, dt))

@@ -1,0 +1,287 @@
+"""A plant that is measured and not simulated, declared by names, units and its known part."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NoReturn
+
+import numpy as np
+
+from dopt.errors import SpecificationError, unknown_name
+from dopt.systems.black_box import BlackBox
+from dopt.systems.expressions import check_names, compiled_text
+from dopt.systems.features import Feature
+from dopt.systems.input_effect import input_effect
+from dopt.types import Equation, Scalar
+
+NAME = "plant"
+"""Name of every plant in configurations and in the results database."""
+
+_MAPPINGS = ("states", "inputs", "known", "box", "constants")
+
+_LISTS = ("learned", "angles")
+
+_ORDERED = ("states", "inputs")
+"""Mappings whose order counts, which sections hold as lists of pairs."""
+
+GRID_POINTS = 8
+"""Points to an axis of the evaluation box."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plant:
+    """Declaration of a plant for :class:`dopt.Explorer`.
+
+    Its derivative is known(x, u) + E a(x): what is known of it, and the accelerations of the rows
+    ``learned``, which the exploration learns. Inputs whose effect is not known are left out of the
+    known part; then the model has to read them, such as 'affine'.
+
+    >>> motor = Plant(
+    ...     states={"angle": "rad", "rate": "rad/s"},
+    ...     inputs={"voltage": "V"},
+    ...     dt=0.005,
+    ...     gamma=6.0,
+    ...     known={"angle": "rate", "rate": "gain * voltage"},
+    ...     constants={"gain": 40.0},
+    ...     learned=["rate"],
+    ...     angles=["angle"],
+    ...     box={"rate": 20.0},
+    ... )
+
+    Parameters
+    ----------
+    states, inputs : mapping of str to str
+        Names of the d states and the m inputs, each with its unit.
+    dt : float
+        Time between two measurements [s].
+    gamma : float
+        Largest norm of an input.
+    known : mapping of str to str
+        Known part of the derivative of each state, as an expression in the names of states, inputs
+        and constants (:mod:`dopt.systems.expressions`); 0 for a state that is left out. It is
+        affine in the inputs.
+    learned : sequence of str
+        States whose derivatives have a part that is learned.
+    box : mapping of str to float
+        Half-width of the region of interest along each state that a(x) depends on. An angle that
+        is left out has π.
+    angles : sequence of str
+        States in radians of which a(x) is a function of period 2π. They may be measured over one
+        turn or over many: each is followed from one state to the next.
+    constants : mapping of str to float
+        Known numbers that the expressions name.
+    limit : float
+        Largest magnitude of a state that can be a measurement, but for angles; what is beyond is
+        left out.
+
+    Raises
+    ------
+    SpecificationError
+        If a name, a number or an expression is not as described.
+    """
+
+    states: Mapping[str, str]
+    inputs: Mapping[str, str]
+    dt: float
+    gamma: float
+    known: Mapping[str, str]
+    learned: Sequence[str]
+    box: Mapping[str, float]
+    angles: Sequence[str] = ()
+    constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    limit: float = 1e4
+
+    def __post_init__(self) -> None:
+        self._check_types()
+        for what in _MAPPINGS:  # copies: what a caller changes later changes no plant
+            object.__setattr__(self, what, dict(getattr(self, what)))
+        for what in _LISTS:
+            object.__setattr__(self, what, tuple(getattr(self, what)))
+        check_names("a plant", [*self.states, *self.inputs, *self.constants])
+        for what in ("known", "learned", "box", "angles"):
+            for name in getattr(self, what):
+                if name not in self.states:
+                    raise unknown_name(f"state in '{what}' of a plant", name, self.states)
+        self._check_numbers()
+        _check_effect(self.system(1))
+
+    def _check_types(self) -> None:
+        for what in _MAPPINGS:
+            if not isinstance(getattr(self, what), Mapping):
+                raise _unlike(what, getattr(self, what), "a mapping of names")
+        for what in _LISTS:
+            given = getattr(self, what)
+            if isinstance(given, str) or not isinstance(given, Sequence):
+                raise _unlike(what, given, "a list of states")
+            if len(set(given)) < len(given):
+                raise _unlike(what, given, "a list that names no state twice")
+        for what in ("states", "inputs", "learned"):
+            if not getattr(self, what):
+                raise SpecificationError(
+                    f"a plant has no {what}, but at least one is expected: name it."
+                )
+        if not (self.box or self.angles):
+            raise SpecificationError(
+                "a plant has neither a box nor angles, but what is learned has to depend on some "
+                "states: give the half-width of the box for each of them."
+            )
+
+    def _check_numbers(self) -> None:
+        positive = {"dt": self.dt, "gamma": self.gamma, "limit": self.limit}
+        positive |= {f"box['{name}']": width for name, width in self.box.items()}
+        for what, value in positive.items():
+            if not _is_number(value) or value <= 0:
+                raise _unlike(what, value, "a positive number")
+        for name, value in self.constants.items():
+            if not _is_number(value):
+                raise _unlike(f"constants['{name}']", value, "a finite number")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the declaration, and not the class that was made of it."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return functools.partial(Plant, **fields), ()
+
+    def to_section(self) -> dict[str, object]:
+        """Return the section of a configuration that :meth:`from_section` turns into the plant."""
+        ordered = {key: [list(pair) for pair in getattr(self, key).items()] for key in _ORDERED}
+        lists = {key: list(getattr(self, key)) for key in _LISTS}
+        numbers = {key: float(getattr(self, key)) for key in ("dt", "gamma", "limit")}
+        named = {
+            key: {name: float(value) for name, value in getattr(self, key).items()}
+            for key in ("box", "constants")
+        }
+        return {"name": NAME, **ordered, "known": self.known, **named, **lists, **numbers}
+
+    @classmethod
+    def from_section(cls, section: Mapping[str, Any]) -> ExploredPlant:
+        """Return the system that a section describes, which also says how many steps it has."""
+        given = {key: value for key, value in section.items() if key not in ("name", "horizon")}
+        fields = [field.name for field in dataclasses.fields(cls)]
+        for key in given:
+            if key not in fields:
+                raise unknown_name("field of a plant", key, fields)
+        ordered = {key: dict(given[key]) for key in _ORDERED}
+        return cls(**(given | ordered)).system(section["horizon"])
+
+    def system(self, horizon: int) -> ExploredPlant:
+        """Return the plant as the system of an exploration of so many steps."""
+        half_widths = dict.fromkeys(self.angles, math.pi) | dict(self.box)
+        axes = [name for name in self.states if name in half_widths]
+        return self._class(
+            gamma=self.gamma,
+            dt=self.dt,
+            horizon=horizon,
+            state_limit=self.limit,
+            grid_half_widths=tuple(half_widths[name] for name in axes),
+            grid_points=(GRID_POINTS,) * len(axes),
+        )
+
+    @functools.cached_property
+    def _class(self) -> type[ExploredPlant]:
+        """A class of systems with what this plant declares."""
+        names = list(self.states)
+        groups = {"states": names, "inputs": [*self.inputs], "constants": [*self.constants]}
+        known = {f"known['{name}'] of a plant": self.known.get(name, "0.0") for name in names}
+        features = [
+            feature
+            for i, name in enumerate(names)
+            if name in self.angles or name in self.box
+            for feature in _features(i, name in self.angles)
+        ]
+        axes = [i for i, name in enumerate(names) if name in self.angles or name in self.box]
+        declared: dict[str, Any] = {
+            "plant": self,
+            "_constants": tuple(float(value) for value in self.constants.values()),
+            "physical": tuple(self.constants),
+            "state_labels": tuple(f"{name} [{unit}]" for name, unit in self.states.items()),
+            "input_labels": tuple(f"{name} [{unit}]" for name, unit in self.inputs.items()),
+            "learned_rows": tuple(names.index(name) for name in self.learned),
+            "angle_indices": tuple(names.index(name) for name in self.angles),
+            "features": tuple(features),
+            "grid_indices": tuple(axes),
+            "phase_plane": _phase_plane(axes, names),
+            "known": staticmethod(compiled_text(known, groups)),
+            "accelerations": staticmethod(unknown_accelerations(len(self.learned))),
+        }
+        return dataclasses.dataclass(frozen=True, kw_only=True)(
+            type(ExploredPlant.__name__, (ExploredPlant,), declared)
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExploredPlant(BlackBox):
+    """A plant as the system of an exploration; :class:`Plant` makes a class of its own for each.
+
+    Its accelerations are NaN: they are known from measurements alone.
+    """
+
+    name: ClassVar[str] = NAME
+    compiled: ClassVar[bool] = True
+    plant: ClassVar[Plant]
+    _constants: ClassVar[tuple[float, ...]] = ()
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        return self._constants
+
+    def to_section(self) -> dict[str, object]:
+        """Return what identifies the plant and its exploration."""
+        return {**self.plant.to_section(), "horizon": self.horizon}
+
+    def episode(self, seed: int) -> NoReturn:  # noqa: ARG002
+        raise SpecificationError(
+            "a plant is measured and not simulated, so that no trial of it can be run: drive it "
+            "with dopt.Explorer."
+        )
+
+
+def _features(index: int, is_angle: bool) -> list[Feature]:
+    if is_angle:
+        return [Feature("cos", index), Feature("sin", index)]
+    return [Feature("identity", index)]
+
+
+def _phase_plane(axes: Sequence[int], names: Sequence[str]) -> tuple[int, int]:
+    """Return the two states of a phase portrait: the first two that the accelerations depend on."""
+    chosen = [*axes, *(i for i in range(len(names)) if i not in axes), 0]
+    return chosen[0], chosen[1]
+
+
+def unknown_accelerations(n: int) -> Equation:
+    """Return the equation of n accelerations that are known from measurements alone: NaN."""
+    nothing = (math.nan,) * n
+
+    def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:  # noqa: ARG001
+        return nothing
+
+    accelerations.__module__ = NAME
+    return accelerations
+
+
+def _check_effect(system: ExploredPlant) -> None:
+    """Refuse a known part that fails, or is not affine in the inputs."""
+    try:
+        effect = input_effect(system)
+    except (ArithmeticError, ValueError) as error:
+        raise SpecificationError(
+            f"the known part of a plant fails ({error}), but numbers are expected of it over the "
+            f"box: correct its expressions."
+        ) from error
+    if not effect.is_affine:
+        raise SpecificationError(
+            "the known part of a plant is not affine in its inputs, but a derivative of the form "
+            "f(x) + B(x) u is expected: make the inputs other quantities, in which it is."
+        )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and math.isfinite(value)
+
+
+def _unlike(what: str, given: object, expected: str) -> SpecificationError:
+    return SpecificationError(
+        f"'{what}' of a plant is {given!r}, but {expected} is expected: correct it."
+    )

@@ -1,0 +1,168 @@
+"""Plants are declared by names, units and expressions, and refused in a sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt import Plant
+from dopt.errors import SpecificationError
+from dopt.kernel.equations import compiled_equations
+from dopt.systems import system_from_mapping
+from dopt.systems.expressions import compiled_text
+from tests.dopt.explorer.plants import MOTOR
+
+CRANE = Plant(
+    states={"place": "m", "speed": "m/s", "tilt": "rad", "spin": "rad/s"},
+    inputs={"left": "N", "right": "N"},
+    dt=0.01,
+    gamma=3.0,
+    known={
+        "place": "speed",
+        "speed": "(left + right) / mass",
+        "tilt": "spin",
+        "spin": "where(spin > 0, 2, 1) * (left - right) * cos(tilt) - sign(spin)",
+    },
+    constants={"mass": 2.0},
+    learned=["spin", "speed"],
+    angles=["tilt"],
+    box={"spin": 4.0, "speed": 2.0},
+)
+
+
+def test_a_declaration_is_a_system() -> None:
+    system = CRANE.system(7)
+    assert (system.n_states, system.n_inputs, system.n_learned, system.horizon) == (4, 2, 2, 7)
+    assert system.state_labels == ("place [m]", "speed [m/s]", "tilt [rad]", "spin [rad/s]")
+    assert system.learned_rows == (3, 1)
+    assert [(f.kind, f.index) for f in system.features] == [
+        ("identity", 1),
+        ("cos", 2),
+        ("sin", 2),
+        ("identity", 3),
+    ]
+    assert system.feature_scales == (2.0, 1.0, 1.0, 4.0)
+    assert system.grid_box() == {1: (-2.0, 2.0), 2: (-np.pi, np.pi), 3: (-4.0, 4.0)}
+
+
+def test_the_known_part_is_that_of_the_expressions_in_python_and_compiled() -> None:
+    system, x, u = CRANE.system(7), (0.3, -0.5, 0.7, -1.1), (0.4, -0.9)
+    expected = [-0.5, -0.25, -1.1, 1.3 * np.cos(0.7) + 1.0]
+    assert np.allclose(system.known(x, u, system.parameters), expected, rtol=1e-15)
+    out = np.empty(4)
+    equations = compiled_equations(system)
+    equations.known(np.array(x), np.array(u), np.array(system.parameters), out)
+    assert np.allclose(out, expected, rtol=1e-15)
+    states = np.array([x, x])
+    flow = system.known(tuple(states.T), u, system.parameters)
+    assert np.allclose(np.broadcast_arrays(*flow)[3], expected[3])
+
+
+def test_the_accelerations_are_unknown() -> None:
+    system = MOTOR.system(3)
+    assert np.isnan(system.learned(np.zeros((4, 2)))).all()
+
+
+@pytest.mark.parametrize("plant", [MOTOR, CRANE])
+def test_a_plant_is_read_back_from_its_section(plant: Plant) -> None:
+    system = plant.system(9)
+    again = system_from_mapping(system.to_section())
+    assert again.to_section() == system.to_section()  # type: ignore[attr-defined]
+    assert (again.state_labels, again.learned_rows) == (system.state_labels, system.learned_rows)
+    assert again.horizon == 9
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"states": {}}, "a plant has no states"),
+        ({"states": {"angle": "rad", "2": "V"}}, "has the name '2'"),
+        ({"states": {"angle": "rad", "lambda": "V"}}, "has the name 'lambda'"),
+        ({"states": {"sin": "rad", "rate": "rad/s"}}, "a function of expressions"),
+        ({"inputs": {"rate": "V"}}, "'rate' more than once"),
+        ({"learned": ["speed"]}, "'learned' of a plant 'speed' is unknown"),
+        ({"box": {"rat": 1.0}}, "did you mean 'rate'"),
+        ({"box": {"rate": -1.0}}, "'box['rate']' of a plant is -1.0"),
+        ({"box": ["rate"]}, "'box' of a plant is ['rate'], but a mapping"),
+        ({"states": ["angle", "rate"]}, "a mapping of names is expected"),
+        ({"learned": "rate"}, "'learned' of a plant is 'rate', but a list"),
+        ({"learned": ["rate", "rate"]}, "names no state twice"),
+        ({"dt": 0.0}, "'dt' of a plant is 0.0, but a positive number"),
+        ({"gamma": "6"}, "'gamma' of a plant is '6'"),
+        ({"limit": float("inf")}, "'limit' of a plant is inf"),
+        ({"constants": {"gain": float("nan")}}, "'constants['gain']' of a plant is nan"),
+        ({"constants": {"_gain": 1.0}}, "has the name '_gain'"),
+        ({"constants": {"\u00b5": 1.0}}, "has the name '\u00b5'"),
+        ({"known": {"angle": "rate", "rate": "voltage**2"}}, "not affine in its inputs"),
+        ({"known": {"rate": "gain * magnitude(voltage)"}}, "not affine in its inputs"),
+        ({"known": {"rate": "where(voltage > 0, gain, 1) * voltage"}}, "not affine"),
+        ({"known": {"rate": "sign(voltage)"}}, "not affine in its inputs"),
+        ({"known": {"rate": "voltage * 9**9**9"}}, "the known part of a plant fails"),
+        ({"known": {"rate": "voltage | 1"}}, "holds voltage | 1"),
+        ({"known": {"rate": "~voltage"}}, "holds ~voltage"),
+        ({"known": {"rate": "(angle > 0) * voltage"}}, "holds angle > 0"),
+        (
+            {"known": {"rate": "where(0 < angle < 1, 1, 2) * voltage"}},
+            "not one comparison by < or >",
+        ),
+        ({"known": {"rate": "sin(1, 2) * voltage"}}, "gives sin 2 arguments, not 1"),
+        ({"known": {"rate": "gain * volt"}}, "did you mean 'voltage'"),
+        ({"known": {"rate": "exp(voltage)"}}, "function of known"),
+        ({"known": {"rate": "__import__('os').system('true')"}}, "holds"),
+        ({"known": {"rate": "voltage.real"}}, "holds voltage.real"),
+        ({"known": {"rate": "'text'"}}, "holds 'text'"),
+        ({"known": {"rate": "voltage +"}}, "cannot be read"),
+        ({"angles": [], "box": {}}, "neither a box nor angles"),
+    ],
+)
+def test_wrong_declarations_are_refused(changed: dict[str, Any], said: str) -> None:
+    given = {f.name: getattr(MOTOR, f.name) for f in dataclasses.fields(MOTOR)}
+    with pytest.raises(SpecificationError, match=re.escape(said)):
+        Plant(**(given | changed))
+
+
+@pytest.mark.parametrize(
+    "known", ["where(angle > 2, gain, 0) * voltage", "gain * voltage - magnitude(angle) / angle"]
+)
+def test_effects_that_depend_on_the_state_are_accepted(known: str) -> None:
+    given = {f.name: getattr(MOTOR, f.name) for f in dataclasses.fields(MOTOR)}
+    Plant(**(given | {"known": {"angle": "rate", "rate": known}}))
+
+
+def test_a_product_of_inputs_is_refused() -> None:
+    given = {f.name: getattr(CRANE, f.name) for f in dataclasses.fields(CRANE)}
+    with pytest.raises(SpecificationError, match="not affine"):
+        Plant(**(given | {"known": {"speed": "left + right + 0.1 * left * right"}}))
+
+
+def test_a_plant_is_a_copy_and_can_be_pickled() -> None:
+    constants = {"gain": 5.0}
+    plant = dataclasses.replace(MOTOR, constants=constants)
+    constants["gain"] = 50.0
+    again = pickle.loads(pickle.dumps(plant))
+    assert again == plant
+    assert plant.to_section()["constants"] == again.system(3).plant.constants == {"gain": 5.0}
+
+
+def test_names_of_arguments_may_be_quantities() -> None:
+    plant = Plant(
+        states={"states": "m"},
+        inputs={"inputs": "N"},
+        dt=0.1,
+        gamma=1.0,
+        known={"states": "inputs * constants"},
+        constants={"constants": 2.0},
+        learned=["states"],
+        box={"states": 1.0},
+    )
+    assert plant.system(1).known((0.5,), (0.25,), (2.0,)) == (0.5,)
+
+
+def test_expressions_keep_their_order() -> None:
+    function = compiled_text({"first": "a - b", "second": "2**b"}, {"x": ["a", "b"], "p": []})
+    assert function((5, 3), ()) == (2, 8)
