@@ -20,6 +20,7 @@ from typing import Any
 from analysis.errors import AnalysisError
 from dopt.errors import SpecificationError
 from dopt.spec.label import flatten
+from dopt.spec.prequential import is_prequential
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow
 
@@ -222,7 +223,7 @@ def defaults(config: ConfigRow) -> dict[str, object]:
     names.pop("task", None)
     try:
         return flatten(TrialSpec.from_mapping(names).to_mapping())
-    except SpecificationError:
+    except (SpecificationError, KeyError):  # a plant is more than its name
         return {}
 
 
@@ -261,3 +262,26 @@ def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]
         if any(value != values[0] for value in values):
             return path, values
     return "config_key", [None for _ in configs]
+
+
+def check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
+    """Raise AnalysisError for a name that is not stored."""
+    for name in given:
+        if name not in stored:
+            raise AnalysisError(
+                f"The database has no trial of {kind} '{name}', "
+                f"choose one of {', '.join(sorted(stored)) or 'none: it is empty'}."
+            )
+
+
+def omissions(accepted: list[ConfigRow], chosen: list[ConfigRow]) -> Iterable[str]:
+    """Yield sentences on configurations that were left out, and on explorations."""
+    kept = {config.config_key for config in chosen}
+    left = Counter(config.env for config in accepted if config.config_key not in kept)
+    for env, count in sorted(left.items()):
+        yield f"{env}: {count} other stored configurations are not part of this (see --where)"
+    for env in sorted({config.env for config in chosen if is_prequential(config.config)}):
+        yield (
+            f"{env}: the loss is prequential, the error of each predicted acceleration before it "
+            f"is learned; explorations take paths of their own, so that it is not compared"
+        )

@@ -25,6 +25,7 @@ from analysis.data.learned_model import LearnedModel, learned_model
 from analysis.data.trial_selection import environment_rank, newest, policy_rank
 from analysis.errors import AnalysisError
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
+from orchestrate.store.serialization import stacked
 
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
@@ -41,7 +42,7 @@ class Trajectories:
     t : (T + 1,)
         Time of each state [s].
     states : (n, T + 1, d)
-        NaN from a divergence on.
+        NaN from a divergence on, and after the end of a shorter exploration.
     inputs : (n, T, m)
     """
 
@@ -194,9 +195,9 @@ class Results:
         paths = [self.reader.trajectory(config.config_key, seed) for seed in seeds]
         return Trajectories(
             seeds=np.array(seeds, dtype=np.int64),
-            t=config.dt * np.arange(config.horizon + 1, dtype=np.float64),
-            states=np.stack([path.states for path in paths]),
-            inputs=np.stack([path.inputs for path in paths]),
+            t=config.dt * np.arange(max(len(path.states) for path in paths), dtype=np.float64),
+            states=stacked([path.states for path in paths]),
+            inputs=stacked([path.inputs for path in paths]),
         )
 
     def model(self, trial: str | Mapping[str, object] | pd.Series[Any]) -> LearnedModel:

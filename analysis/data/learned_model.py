@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from analysis.errors import AnalysisError
 from dopt.spec.config import without_versions
+from dopt.spec.prequential import is_prequential, without_mark
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import ConfigRow, Reader
 
@@ -53,9 +54,9 @@ class LearnedModel:
         """
         x = _rows(states, self.spec.system.n_states, "states")
         single = np.ndim(states) == 1
-        values = self.spec.model.predict(self.spec.system, self.parameters, x)
-        if inputs is not None:
-            u = _rows(inputs, self.spec.system.n_inputs, "inputs")
+        u = None if inputs is None else _rows(inputs, self.spec.system.n_inputs, "inputs")
+        values = self.spec.model.predict(self.spec.system, self.parameters, x, u)
+        if u is not None:
             values = self._derivative(x, u, values)
         return values[0] if single else values
 
@@ -79,6 +80,24 @@ def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
 
 def learned_model(reader: Reader, configuration: ConfigRow, seed: int) -> LearnedModel:
     """Read the final parameters of a trial; raise ``QueryError`` where it is not finished."""
-    spec = TrialSpec.from_mapping({**without_versions(configuration.config), "seed": seed})
+    spec = TrialSpec.from_mapping(
+        {**without_versions(without_mark(configuration.config)), "seed": seed}
+    )
     parameters = reader.trajectory(configuration.config_key, seed).parameters
     return LearnedModel(spec, parameters)
+
+
+def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
+    """Return the specification of a trial, to run it or its system again.
+
+    Raises
+    ------
+    AnalysisError
+        If it is an exploration, which nothing can simulate.
+    """
+    if is_prequential(configuration.config):
+        raise AnalysisError(
+            f"{configuration.env} × {configuration.policy} is an exploration that was measured, "
+            f"but a trial that can be simulated again is needed here: choose another one."
+        )
+    return TrialSpec.from_mapping({**without_versions(configuration.config), "seed": seed})

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES
+from dopt.spec.prequential import is_prequential
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from orchestrate.store import ConfigRow
@@ -68,10 +69,14 @@ _SECTIONS = ("env", "policy", "model", "learner")
 def absent_pairs(
     configs: Sequence[ConfigRow], compatible: Compatible = is_possible
 ) -> list[tuple[str, str]]:
-    """Return the (environment, policy) pairs of which nothing is stored though they make sense."""
+    """Return the (environment, policy) pairs of which nothing is stored though they make sense.
+
+    Nothing is expected of explorations.
+    """
     stored = {(config.env, config.policy) for config in configs}
-    environments = {config.env: config for config in configs}
-    policies = {config.policy: config for config in configs}
+    simulated = [config for config in configs if not is_prequential(config.config)]
+    environments = {config.env: config for config in simulated}
+    policies = {config.policy: config for config in simulated}
     return [
         (env, policy)
         for env in environments

@@ -13,15 +13,18 @@ from analysis.data.config_matching import (
     Candidate,
     Filter,
     check_keys,
+    check_names,
     choose,
     choose_by,
     nearness,
+    omissions,
     setting_value,
 )
 from analysis.data.missing_trials import Compatible, Gap, absent_pairs, is_possible
 from analysis.errors import AnalysisError
 from dopt.policies.titles import TITLES
 from dopt.spec.label import labels, value_label
+from dopt.spec.prequential import is_prequential
 from orchestrate.store import ConfigRow, Reader, TrialRow
 
 FINISHED = ("done", "diverged")
@@ -29,6 +32,7 @@ FINISHED = ("done", "diverged")
 ENVIRONMENTS = (
     *("pendulum", "cartpole", "arm", "quadrotor"),
     *("drifting_pendulum", "chain", "mass_spring"),
+    *("pendulum_unknown_gain", "cartpole_unknown_gain"),
 )
 """The paper's order; other environments follow by name."""
 
@@ -125,12 +129,20 @@ class Selection:
         references = [self.reference_of(env) for env in self.environments]
         return self.only(one.config.env for one in references if one and one.final_losses())
 
+    def simulated(self) -> Selection:
+        """Return the part without explorations, whose losses are errors on paths of their own."""
+        entries, stored = (
+            tuple(one for one in part if not is_prequential(one.config.config))
+            for part in (self.entries, self.stored)
+        )
+        return replace(self, entries=entries, stored=stored)
+
     def fingerprint(self) -> str:
         """Return the SHA-256 of the selected trials, their outcome and what is missing."""
         content = [
             [
                 entry.config.config_key,
-                *([t.trial_key, t.status, t.final_loss] for t in entry.trials),
+                *([t.trial_key, t.status, t.n_steps, t.final_loss] for t in entry.trials),
             ]
             for entry in self.entries
         ]
@@ -158,8 +170,8 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
         When nothing fits, a name is unknown, or several configurations fit equally well.
     """
     configs = list(reader.configs())
-    _check_names("environment", wanted.environments, {config.env for config in configs})
-    _check_names("policy", wanted.policies, {config.policy for config in configs})
+    check_names("environment", wanted.environments, {config.env for config in configs})
+    check_names("policy", wanted.policies, {config.policy for config in configs})
     wanted.check_where(configs)
     accepted = newest([config for config in configs if wanted.accepts(config)])
     if not accepted:
@@ -182,7 +194,7 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     return Selection(
         entries,
         tuple(_gaps(entries, compatible if by_policy else None)),
-        tuple(_notes(accepted, chosen)),
+        tuple(omissions(accepted, chosen)),
         tuple(labelled(Entry(config, trials[config.config_key]) for config in accepted)),
         wanted.reference,
         wanted.group_by,
@@ -262,21 +274,14 @@ def _assessment_version(config: ConfigRow) -> int | None:
     return int(config.config.get("assessment_version", 1)) if config.config.get("task") else None
 
 
-def _check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
-    for name in given:
-        if name not in stored:
-            raise AnalysisError(
-                f"The database has no trial of {kind} '{name}', "
-                f"choose one of {', '.join(sorted(stored)) or 'none: it is empty'}."
-            )
-
-
 def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable[Gap]:
     """Yield what entries lack; policies without any trial where it is known which are possible."""
     seeds: dict[str, set[int]] = {}
     for entry in entries:
         seeds.setdefault(entry.config.env, set()).update(trial.seed for trial in entry.trials)
     for entry in entries:
+        if is_prequential(entry.config.config):
+            continue
         expected = seeds[entry.config.env]
         missing = expected - {trial.seed for trial in entry.finished}
         if missing:
@@ -289,10 +294,3 @@ def _gaps(entries: tuple[Entry, ...], compatible: Compatible | None) -> Iterable
     for env, policy in absent_pairs([entry.config for entry in entries], compatible):
         expected = seeds[env]
         yield Gap(env, policy, tuple(sorted(expected)), f"{len(expected)} not registered")
-
-
-def _notes(accepted: list[ConfigRow], chosen: list[ConfigRow]) -> Iterable[str]:
-    kept = {config.config_key for config in chosen}
-    left = Counter(config.env for config in accepted if config.config_key not in kept)
-    for env, count in sorted(left.items()):
-        yield f"{env}: {count} other stored configurations are not part of this (see --where)"

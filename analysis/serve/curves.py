@@ -56,6 +56,7 @@ def curves(state: ServerState, params: QueryParams) -> dict[str, Any]:
     longest = max(found, key=lambda curve: len(curve.x))
     return {
         "env": found[0].env,
+        "is_prequential": found[0].is_prequential,
         "statistic": found[0].statistic.label,
         "band": found[0].statistic.band,
         "t": longest.t,

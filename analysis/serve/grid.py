@@ -16,6 +16,7 @@ from analysis.serve.query_params import QueryParams
 from analysis.serve.state import ServerState
 from analysis.stats.intervals import mean, standard_error
 from dopt.spec.label import labels
+from dopt.spec.prequential import is_prequential
 from orchestrate.store import ConfigRow, Reader
 
 _FINAL = """
@@ -63,7 +64,8 @@ def _slots(configs: Sequence[ConfigRow], finals: dict[str, dict[str, Any]]) -> S
         widths = {config.width for config in own if config.width is not None}
         only = next(iter(widths)) if len(widths) == 1 else None
         found = [_configuration(config, finals.get(config.config_key, nothing)) for config in own]
-        _shade(found)
+        for prequential in (False, True):  # losses of two kinds have two scales
+            _shade([one for one in found if is_prequential(one["config"]) is prequential])
         for config, one in zip(own, found, strict=True):
             slots.setdefault((env, config.width or only, config.policy), []).append(one)
     for group in slots.values():
@@ -120,7 +122,8 @@ def _shade(found: Sequence[dict[str, Any]]) -> None:
 def _label(group: Sequence[dict[str, Any]]) -> None:
     """Replace the configuration by a label that says how it differs from the others of its cell."""
     configs = [one.pop("config") for one in group]
-    found = labels(configs) if len(configs) > 1 else [""]
+    plain = len(configs) == 1 and not is_prequential(configs[0])
+    found = [""] if plain else labels(configs)
     for one, label in zip(group, found, strict=True):
         one["label"] = label
 

@@ -9,7 +9,8 @@ from typing import Any
 from orchestrate.store import Reader
 
 _TRIALS = """
-SELECT status, count(*) AS n, sum(attempt) AS attempts FROM trial GROUP BY status ORDER BY status
+SELECT status, count(*) AS n, sum(attempt) AS attempts, sum(coalesce(n_steps, 0)) AS steps
+FROM trial GROUP BY status ORDER BY status
 """
 _LAUNCHES = """
 SELECT count(*) AS n, max(launch_id) AS newest, count(*) FILTER (WHERE state = 'running') AS running
@@ -22,10 +23,10 @@ def read_progress(reader: Reader) -> dict[str, Any]:
 
     The query reads the table of trials once and no steps.
     """
-    trials = [(row.status, int(row.n), int(row.attempts)) for row in reader.rows(_TRIALS)]
+    trials = [[row.status, *map(int, row[1:])] for row in reader.rows(_TRIALS)]
     (launches,) = reader.rows(_LAUNCHES)
     content = [trials, list(launches)]
-    counts = {status: n for status, n, _ in trials}
+    counts = {status: n for status, n, *_ in trials}
     return {
         "token": hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16],
         "counts": counts,

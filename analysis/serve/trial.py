@@ -18,9 +18,10 @@ from analysis.stats.spectrum import periodogram
 from dopt.errors import SpecificationError
 from dopt.spec.added_fields import completed
 from dopt.spec.label import flatten
-from dopt.systems import System, system_from_mapping
+from dopt.spec.prequential import is_prequential, system_of
+from dopt.systems import System
 from dopt.systems.equilibrium import eigenmode
-from orchestrate.store import Reader, Trajectory
+from orchestrate.store import Reader, Trajectory, explorations
 from orchestrate.store.errors import QueryError
 
 _TRIAL = """
@@ -42,6 +43,9 @@ SELECT launch_id, state, started, ended, host, pid, argv, overrides, git_commit,
 FROM launch
 WHERE launch_id IN (SELECT launch_id FROM attempt WHERE trial_id = :trial_id) ORDER BY launch_id
 """
+_ASSESSED = """
+SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure
+"""
 _STEPS = "SELECT t, loss, reachable_loss FROM step WHERE trial_id = :trial_id ORDER BY t"
 _TEXTS = ("argv", "overrides", "versions")
 
@@ -60,7 +64,9 @@ def trial(state: ServerState, params: QueryParams) -> dict[str, Any]:
             one | {name: json.loads(one[name]) for name in _TEXTS}
             for one in _table(reader, _LAUNCHES, row["trial_id"])
         ],
+        "assessments": _table(reader, _ASSESSED, row["trial_id"]),
         "has_arrays": row["status"] in ("done", "diverged"),
+        "exploration": _exploration(reader, row["trial_key"]),
         "system_is_known": _system(config) is not None,
         "legend_entry": legend_entry(row["policy"]),
     }
@@ -77,13 +83,15 @@ def arrays(state: ServerState, params: QueryParams) -> dict[str, Any]:
         raise NotFoundError(
             f"Trial {row['trial_key'][:12]} is {row['status']} and has no curve: wait for it."
         ) from error
-    system = _system(json.loads(row["config_json"]))
+    config = json.loads(row["config_json"])
+    system = _system(config)
     labels = system.input_labels if system else _numbered(trajectory)
     return {
         "t": [step["t"] for step in steps],
         "loss": [step["loss"] for step in steps],
         "reachable_loss": [step["reachable_loss"] for step in steps],
         "diverged_at": row["diverged_at"],
+        "is_prequential": is_prequential(config),
         "dt": row["dt"],
         "gamma": row["gamma"],
         "legend_entry": legend_entry(row["policy"]),
@@ -94,6 +102,12 @@ def arrays(state: ServerState, params: QueryParams) -> dict[str, Any]:
         "spectrum": _spectrum(trajectory, row["dt"], system),
         "phase": _phase(trajectory, system) if system else None,
     }
+
+
+def _exploration(reader: Reader, trial_key: str) -> dict[str, Any] | None:
+    """Return whether an exploration goes on, and its steps; None for another trial."""
+    found = (one for one in explorations(reader) if one.trial_key == trial_key)
+    return next(({"is_running": one.is_running, "state": one.state} for one in found), None)
 
 
 def _row(reader: Reader, params: QueryParams) -> dict[str, Any]:
@@ -115,7 +129,7 @@ def _table(reader: Reader, sql: str, trial_id: int) -> list[dict[str, Any]]:
 def _system(config: dict[str, Any]) -> System | None:
     """Return the system of a configuration, None for a custom system that is not registered."""
     try:
-        return system_from_mapping(config["env"])
+        return system_of(config)
     except (SpecificationError, KeyError):
         return None
 

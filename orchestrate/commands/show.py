@@ -47,9 +47,10 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 
 
 def _parts(found: TrialReport) -> Iterator[RenderableType]:
-    yield _outcome(found.trial)
+    yield _outcome(found)
     if line := sparkline(found.loss):
-        yield Text(f"loss, log scale, {len(found.loss)} steps  {line}")
+        kind = "prequential loss" if found.exploration else "loss"
+        yield Text(f"{kind}, log scale, {len(found.loss)} steps  {line}")
     yield Text("\nConfiguration", style="bold")
     yield from _configuration(found.config)
     for launch in found.launches:
@@ -63,8 +64,9 @@ def _parts(found: TrialReport) -> Iterator[RenderableType]:
         yield plain(errors[-1]["traceback"].rstrip())
 
 
-def _outcome(trial: Mapping[str, Any]) -> Text:
-    words = [trial["status"]]
+def _outcome(found: TrialReport) -> Text:
+    trial = found.trial
+    words = [found.exploration.state if found.exploration else trial["status"]]
     if trial["diverged_at"] is not None:
         words.append(f"at step {trial['diverged_at']:,}")
     words += [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
@@ -14,13 +15,14 @@ from orchestrate.commands.display import plain
 from orchestrate.queries.status import STATES, FailureKind, Status, seconds_since
 from orchestrate.redaction import without_password
 from orchestrate.runner.progress import duration
-from orchestrate.store import LaunchRow
+from orchestrate.store import ExplorationRow, LaunchRow
 
 _NAMES = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
 _CONFIG = ("config_key", *_NAMES, "n", *(f"n_{state}" for state in STATES))
 _LAUNCH = ("launch_id", "alive", "host", "pid", "started", "argv")
 _FAILURE = ("cause", "type", "message", "trials", "attempts", "last_line", "place")
 _MAX_KINDS = 10
+_MAX_EXPLORATIONS = 20  # the newest
 _MAX_PLACES = 4
 _MAX_LINE = 200  # characters of a line of a traceback
 
@@ -41,6 +43,9 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
     """Yield the grid in at most ``max_rows`` rows, the failures and the launches."""
     yield grid_table(status.configs, max_rows)
     yield Text(f"\n{summary(status)}", style="bold")
+    if status.explorations:
+        yield Text("\nExplorations", style="bold")
+        yield from map(_exploration, status.explorations[-_MAX_EXPLORATIONS:])
     if status.failures:
         yield Text("\nFailures", style="bold red")
         yield from map(_failure, status.failures[:_MAX_KINDS])
@@ -51,6 +56,10 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
         yield from map(_launch, status.launches)
     elif status.left:
         yield Text("\nNo launch is running: run the same launch command again to continue.")
+
+
+def _exploration(one: ExplorationRow) -> Text:
+    return plain(f"  {one.trial_key[:12]}  {one.env}, {one.label}, seed {one.seed}: {one.state}")
 
 
 def _failure(kind: FailureKind) -> Text:
@@ -96,6 +105,7 @@ def document(status: Status, database: str) -> dict[str, Any]:
             for kind in status.failures
         ],
         "launches": launches,
+        "explorations": [asdict(one) for one in status.explorations],
     }
 
 

@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Literal
 
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob, Override, OverrideType, QuotedString
@@ -91,13 +92,19 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         _check_count(override)
         texts = tuple(override.sweep_string_iterator())
         values = tuple(_unquoted(value) for value in override.sweep_iterator())
-    options = loader.get_group_options(override.key_or_group, results_filter=None)
+    options = _options(loader, override.key_or_group)
     if options and not any(isinstance(value, dict) for value in values):
         if None in values:
             raise unknown_name(override.key_or_group, "null", options)
         return Axis(key, texts, values, "choice")
     scalar = override.type == OverrideType.CHANGE and override.package is None
     return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
+
+
+def _options(loader: ConfigLoader, group: str) -> list[str]:
+    """Return the options of a group; the loader itself copies all of its sources to find them."""
+    source = loader.repository if isinstance(loader, ConfigLoaderImpl) else loader
+    return source.get_group_options(group, results_filter=None)
 
 
 def _check_key(override: Override) -> None:

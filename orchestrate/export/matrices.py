@@ -15,6 +15,7 @@ import numpy.typing as npt
 from orchestrate.export import streams
 from orchestrate.export.columns import STEP_COLUMNS, TRIALS
 from orchestrate.store import ConfigRow, Reader
+from orchestrate.store.serialization import stacked
 
 Named = tuple[str, npt.NDArray[Any], tuple[str, ...]]
 """Name, array and the names of its axes."""
@@ -33,7 +34,7 @@ def names(configs: Sequence[ConfigRow]) -> list[str]:
 
 
 def curves(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
-    """Yield the curves of the finished trials, (seed, t), NaN from a divergence on."""
+    """Yield the curves of the finished trials, (seed, t), NaN from a divergence or an end on."""
     for name, config in zip(names(configs), configs, strict=True):
         seeds, diverged, steps = _steps(reader, config)
         for column, values in zip(STEP_COLUMNS, steps, strict=True):
@@ -47,13 +48,17 @@ def _steps(
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
     """Return seeds (n,), flags of divergence (n,) and the columns of the steps (5, n, T)."""
     trials: dict[int, bool] = {}
+    lengths: Counter[int] = Counter()
     blocks = [np.empty((0, len(STEP_COLUMNS)))]
     with closing(streams.steps(reader, config)) as batches:
         for rows in batches:
             seeds, statuses, _t, *values = zip(*rows, strict=True)
             trials.update(zip(seeds, (status == "diverged" for status in statuses), strict=True))
+            lengths.update(seeds)
             blocks.append(np.array(values, dtype=np.float64).T)
-    steps = np.concatenate(blocks).reshape(len(trials), config.horizon, len(STEP_COLUMNS))
+    ends = np.cumsum([lengths[seed] for seed in trials])[:-1]
+    curves = np.split(np.concatenate(blocks), ends)
+    steps = stacked(curves) if trials else np.empty((0, config.horizon, len(STEP_COLUMNS)))
     return (
         np.array([*trials], np.int64),
         np.array([*trials.values()], np.bool_),
@@ -66,9 +71,9 @@ def trajectories(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Name
     for name, config in zip(names(configs), configs, strict=True):
         found = list(streams.of_config(reader, config, _AT_A_TIME))
         if found:
-            yield f"{name}/states", _stack([one.states for *_, one in found]), _axes("state")
-            yield f"{name}/inputs", _stack([one.inputs for *_, one in found]), _axes("input")
-            parameters = _stack([one.parameters for *_, one in found])
+            yield f"{name}/states", stacked([one.states for *_, one in found]), _axes("state")
+            yield f"{name}/inputs", stacked([one.inputs for *_, one in found]), _axes("input")
+            parameters = np.stack([one.parameters for *_, one in found])
             yield f"{name}/parameters", parameters, ("seed", "parameter")
         yield f"{name}/seed", np.array([seed for seed, *_ in found], dtype=np.int64), ("seed",)
         diverged = [status == "diverged" for _, status, _ in found]
@@ -109,10 +114,6 @@ def write(path: Path, arrays: Iterator[Named]) -> dict[str, dict[str, Any]]:
                 np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
             written[name] = {"axes": axes, "shape": array.shape, "dtype": str(array.dtype)}
     return written
-
-
-def _stack(arrays: Sequence[npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
-    return np.stack(arrays)
 
 
 def _axes(last: str) -> tuple[str, str, str]:

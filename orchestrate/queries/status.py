@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
-from orchestrate.store import ConfigRow, LaunchRow, Reader
+from orchestrate.store import ConfigRow, ExplorationRow, LaunchRow, Reader, explorations
 from orchestrate.store.serialization import utc_text
 
 RATE_WINDOW_SECONDS = 300.0
@@ -87,12 +87,15 @@ class Status:
         Launches recorded as running, including dead ones.
     rate
         Trials per second of the living launches over the last minutes.
+    explorations
+        Explorations that were saved; they count as done or diverged.
     """
 
     configs: Sequence[ConfigRow]
     failures: Sequence[FailureKind]
     launches: Sequence[LaunchRow]
     rate: float
+    explorations: Sequence[ExplorationRow] = ()
 
     @property
     def counts(self) -> Counter[str]:
@@ -132,7 +135,8 @@ def gather(reader: Reader, configs: Sequence[ConfigRow], kinds: int = 10) -> Sta
     for kind in failures[:kinds]:
         if kind.error_id is not None:
             kind.traceback = str(reader.rows(_TRACEBACK, error_id=kind.error_id)[0][0])
-    return Status(configs, failures, running, _rate(reader, by_key, running))
+    explored = [one for one in explorations(reader) if one.config_key in by_key]
+    return Status(configs, failures, running, _rate(reader, by_key, running), explored)
 
 
 def _failures(reader: Reader, by_key: dict[str, ConfigRow]) -> list[FailureKind]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from dopt.spec.added_fields import completed
 from orchestrate.redaction import without_password
-from orchestrate.store import Reader
+from orchestrate.store import ExplorationRow, Reader, explorations
 
 _TRIAL = "SELECT * FROM v_trial WHERE trial_id = :trial_id"
 _CONFIG = "SELECT config_json FROM config WHERE config_key = :config_key"
@@ -40,6 +40,8 @@ class TrialReport:
         One for each claim, with its error if there was one.
     loss
         The loss curve, with None for values that are not finite; empty if there is none.
+    exploration
+        Steps of an exploration, and whether it goes on; None for another trial.
     """
 
     trial: Mapping[str, Any]
@@ -47,6 +49,7 @@ class TrialReport:
     launches: Sequence[Mapping[str, Any]]
     attempts: Sequence[Mapping[str, Any]]
     loss: Sequence[float | None]
+    exploration: ExplorationRow | None = None
 
 
 def report(reader: Reader, trial_id: int) -> TrialReport:
@@ -64,6 +67,9 @@ def report(reader: Reader, trial_id: int) -> TrialReport:
         ],
         attempts=attempts,
         loss=[row[0] for row in reader.rows(_LOSS, trial_id=trial_id)],
+        exploration=next(
+            (one for one in explorations(reader) if one.trial_key == trial["trial_key"]), None
+        ),
     )
 
 

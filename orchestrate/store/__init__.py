@@ -22,6 +22,7 @@ from orchestrate.store.errors import (
 )
 from orchestrate.store.merging.merge import Merged, TrialName, merge
 from orchestrate.store.migrations.upgrade import Upgrade, upgrade
+from orchestrate.store.read.explorations import ExplorationRow, explorations
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.read.rows import (
     Assessments,
@@ -41,6 +42,7 @@ from orchestrate.store.records import (
 )
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
 from orchestrate.store.store import Store
+from orchestrate.store.write.explorations import Saved
 
 __all__ = [
     "CONFIG_COLUMNS",
@@ -53,6 +55,7 @@ __all__ = [
     "Claim",
     "ConfigRow",
     "Curves",
+    "ExplorationRow",
     "Failure",
     "Finding",
     "InvalidResultError",
@@ -67,6 +70,7 @@ __all__ = [
     "Registration",
     "Result",
     "RunRecord",
+    "Saved",
     "SchemaVersionError",
     "Store",
     "StoreError",
@@ -78,6 +82,7 @@ __all__ = [
     "Upgrade",
     "default_url",
     "examine",
+    "explorations",
     "merge",
     "upgrade",
 ]

@@ -66,6 +66,15 @@ RETRIED = {
 }
 """Statuses that each argument of ``retry`` selects."""
 
+PREQUENTIAL = '%"loss":"prequential"%'
+"""Pattern of the JSON of an exploration's configuration (:mod:`dopt.spec.prequential`)."""
+
+N_ROWS = (
+    f"CASE WHEN c.config_json LIKE '{PREQUENTIAL}' AND r.status = 'done' "
+    "THEN coalesce(r.n_steps, 0) ELSE c.horizon END"
+)
+"""SQL of the number of steps that are stored of a finished trial r of a configuration c."""
+
 STEP_VALUES = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 metadata = MetaData()

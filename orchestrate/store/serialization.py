@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -55,6 +56,15 @@ def now() -> str:
 def pack(array: Array) -> tuple[str, bytes]:
     """Return the shape as JSON and the numbers as bytes of type ``DTYPE``."""
     return json.dumps(array.shape), np.ascontiguousarray(array, dtype=DTYPE).tobytes()
+
+
+def stacked(arrays: Sequence[Array]) -> Array:
+    """Return arrays (T_i, k) as one, (n, T, k), with NaN after the end of the shorter ones."""
+    longest = max(len(one) for one in arrays)
+    result = np.full((len(arrays), longest, *arrays[0].shape[1:]), np.nan)
+    for row, one in zip(result, arrays, strict=True):
+        row[: len(one)] = one
+    return result
 
 
 def unpack(dtype: str, shape: str, data: bytes) -> Array:

@@ -17,7 +17,8 @@ from orchestrate.store.records import (
     Registration,
     Result,
 )
-from orchestrate.store.write import claims, launches, registration, results
+from orchestrate.store.write import claims, explorations, launches, registration, results
+from orchestrate.store.write.explorations import Saved
 
 
 class Store:
@@ -118,6 +119,28 @@ class Store:
             for i in order:
                 written[i] = results.write(connection, self._backend, prepared[i])
         return written
+
+    def holds_more(self, spec: Registrable, result: Result) -> bool:
+        """Return whether more steps of an exploration are stored; raises as :meth:`save`."""
+        with self._backend.transaction() as connection:
+            return explorations.is_longer(connection, self._backend, spec, result)
+
+    def save(
+        self,
+        launch: int,
+        spec: Registrable,
+        result: Result,
+        run: RunRecord,
+        last: Saved | None = None,
+    ) -> Saved | None:
+        """Write an exploration as it is now, in place of what was stored of it.
+
+        ``last`` is what the last save of this launch has returned; with it the new steps are
+        appended. Returns None, and writes nothing, if more steps of it are stored. Raises
+        ``StoreError`` for another exploration of the same key, and ``InvalidResultError``.
+        """
+        with self._backend.transaction() as connection:
+            return explorations.save(connection, self._backend, launch, spec, result, run, last)
 
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
         """Write a failed trial with its error; return False if the claim is lost."""

@@ -1,4 +1,4 @@
-"""What runs on the hosts of a lab: Ray nodes, a PostgreSQL server, launches."""
+"""Programs on the hosts of a lab: Ray nodes, a PostgreSQL server, launches."""
 
 from __future__ import annotations
 

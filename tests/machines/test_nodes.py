@@ -19,8 +19,12 @@ RELEASED = "outcome = 'released'"
 
 
 def test_all_hosts_work(lab: Lab, undisturbed: Outcome) -> None:
-    lab.start_cluster("w1", "w2")
-    launched = lab.launch()
+    lab.start_cluster("w1", "w2", **{HOLD: "1"})
+    launched = lab.launch(witness=True)
+    for worker in ("w1", "w2"):
+        begun(lab, launched, worker)
+    for worker in ("w1", "w2"):
+        let_go(home_of(lab, worker))
     assert launched.wait() == 0, launched.output
     outcome = lab.outcome()
     outcome.check_complete(undisturbed)
@@ -50,8 +54,11 @@ def test_a_host_that_joins_in_mid_run_is_used(
 def test_a_host_that_is_lost_costs_nothing(
     lab: Lab, undisturbed: Outcome, measured: Measured, fault: str
 ) -> None:
-    lab.start_cluster("w1", "w2")
+    """The lost host holds a trial all the while, so that there is one to release."""
+    lab.start_cluster("w1", "w2", **{HOLD: "1"})
+    let_go(home_of(lab, "w2"))
     launched = lab.launch(witness=True)
+    begun(lab, launched, "w1")
     lab.until_done(launched, 4)
     if fault == "power off":
         lab.network.power_off(lab.host("w1"))
@@ -84,7 +91,7 @@ def test_a_host_that_lost_head_and_launch_ends_its_trial_in_vain(
     """It reaches all others, the database too, and goes on: its trial ends twice, counts once."""
     lab.start_cluster("w1", "w2", **{PAUSE: "20"})
     launched = lab.launch(seeds=4, on="head", witness=True)
-    seed = begun(lab, launched)
+    seed = begun(lab, launched, "w1")
     with lab.network.cut_between(lab.host("head"), lab.host("w1")):
         seconds = lab.until_rows(launched, "attempt", RELEASED)
         requeued = time.time()
@@ -110,7 +117,7 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     lab.start_cluster("w1", "w2", **{HOLD: "1"})
     let_go(home_of(lab, "w2"))
     launched = lab.launch(seeds=4, witness=True)
-    seed = begun(lab, launched)
+    seed = begun(lab, launched, "w1")
     with lab.network.cut_between(lab.host("head"), lab.host("w1")):
         lab.until_head_lost("w1")
         let_go(home_of(lab, "w1"))
@@ -121,10 +128,12 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     assert len(outcome.attempts) == 4
 
 
-def begun(lab: Lab, launched: Process) -> int:
-    """Return the first trial of w1, once it has begun."""
-    until(lambda: notes(lab, "w1", "begun"), 90.0, lambda: f"trial on w1:\n{launched.output}")
-    return next(iter(notes(lab, "w1", "begun")))
+def begun(lab: Lab, launched: Process, host: str) -> int:
+    """Return the first trial of the host, once it has begun."""
+    until(
+        lambda: notes(lab, host, "begun"), 90.0, lambda: f"trial on {host}:\n{launched.output}"
+    )  # fmt: skip
+    return next(iter(notes(lab, host, "begun")))
 
 
 def notes(lab: Lab, host: str, kind: str) -> dict[int, float]:

@@ -1,4 +1,4 @@
-"""What happens to a launch in the soak; each says how it must go on, or end."""
+"""Disturbances of a launch in the soak; each says how it must go on, or end."""
 
 from __future__ import annotations
 

@@ -68,8 +68,13 @@ class Backend(ABC):
         """Return the keys as a one-column query, for ``IN``; any number of them."""
 
     @abstractmethod
-    def insert_steps(self, connection: Connection, trial_id: int, values: Array) -> None:
-        """Write the steps of a trial, (T, number of STEP_VALUES); NaN becomes NULL."""
+    def insert_steps(
+        self, connection: Connection, trial_id: int, values: Array, first: int = 0
+    ) -> None:
+        """Write steps of a trial from t = ``first`` on, (T, number of STEP_VALUES).
+
+        NaN becomes NULL.
+        """
 
     @abstractmethod
     def hold(self, connection: Connection, launch_id: int, token: str) -> None:

@@ -6,7 +6,7 @@ import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import repeat
+from itertools import count, repeat
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -109,12 +109,14 @@ class PostgreSQLBackend(Backend):
         listed = bindparam("keys", list(keys), type_=ARRAY(Text), unique=True)
         return select(func.unnest(listed).column_valued("key"))
 
-    def insert_steps(self, connection: Connection, trial_id: int, values: Array) -> None:
+    def insert_steps(
+        self, connection: Connection, trial_id: int, values: Array, first: int = 0
+    ) -> None:
         driver = cast("psycopg.Connection", connection.connection.driver_connection)
         columns = [finite_list(column) for column in values.T]
         with driver.cursor() as cursor, cursor.copy(_COPY_STEP) as copy:
             copy.set_types(_COPY_TYPES)
-            for row in zip(repeat(trial_id), range(len(values)), *columns, strict=False):
+            for row in zip(repeat(trial_id), count(first), *columns, strict=False):
                 copy.write_row(row)
 
     def hold(self, connection: Connection, launch_id: int, token: str) -> None:  # noqa: ARG002

@@ -107,11 +107,13 @@ class SQLiteBackend(Backend):
     def members(self, keys: Sequence[str]) -> Select[Any]:
         return select(func.json_each(json.dumps(list(keys))).table_valued("value").c.value)
 
-    def insert_steps(self, connection: Connection, trial_id: int, values: Array) -> None:
+    def insert_steps(
+        self, connection: Connection, trial_id: int, values: Array, first: int = 0
+    ) -> None:
         whole = len(values) - len(values) % _BLOCK
         for start, part, size in ((0, values[:whole], _BLOCK), (whole, values[whole:], None)):
             if len(part):
-                _insert_blocks(connection, trial_id, start, part, size or len(part))
+                _insert_blocks(connection, trial_id, first + start, part, size or len(part))
 
     def hold(self, connection: Connection, launch_id: int, token: str) -> None:  # noqa: ARG002
         with translated_file(self.safe_url):

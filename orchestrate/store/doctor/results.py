@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from orchestrate.store.doctor.findings import REBUILD, Finding, found
 from orchestrate.store.read.reader import Reader
-from orchestrate.store.schema import STEP_VALUES
+from orchestrate.store.schema import N_ROWS, PREQUENTIAL, STEP_VALUES
 
 _NAME = (
     "c.env || ' ' || c.policy || ' seed ' || r.seed || ' (' || substr(r.trial_key, 1, 12) || ')'"
 )
 _FINISHED = "r.status IN ('done', 'diverged')"
-_END = "coalesce(r.diverged_at, c.horizon)"  # the first step without a loss
+_END = f"coalesce(r.diverged_at, {N_ROWS})"  # the first step without a loss
 _LARGEST = "1.7976931348623157e308"  # NaN is larger in PostgreSQL, and NULL in SQLite
 
 
@@ -19,8 +19,9 @@ def _not_finite(table: str, *columns: str) -> str:
 
 
 _CONDITIONS = {
-    "finished trials without one step for each t below their horizon": f"{_FINISHED} AND "
-    "(s.n IS NULL OR s.n <> c.horizon OR s.low <> 0 OR s.high <> c.horizon - 1)",
+    "finished trials without one step for each t below their horizon": (
+        f"{_FINISHED} AND (s.n IS NULL OR s.n <> {N_ROWS} OR s.low <> 0 OR s.high <> {N_ROWS} - 1)"
+    ),
     "finished trials that lack a loss before they diverged or ended, or have one after that": (
         f"{_FINISHED} AND (s.n_loss <> {_END} OR s.last >= {_END})"
     ),
@@ -29,7 +30,8 @@ _CONDITIONS = {
     ),
     "finished trials without a trajectory": f"{_FINISHED} AND p.trial_id IS NULL",
     "done trials that lack assessments": (
-        "r.status = 'done' AND (coalesce(a.n, 0) <> coalesce(m.most, 0) "
+        f"r.status = 'done' AND c.config_json NOT LIKE '{PREQUENTIAL}' "
+        "AND (coalesce(a.n, 0) <> coalesce(m.most, 0) "
         """OR (c.config_json LIKE '%"task":{%' AND a.n IS NULL))"""
     ),
     "unfinished trials with steps, a trajectory or assessments": (
@@ -66,7 +68,7 @@ SELECT * FROM (
     FROM trial r
     JOIN config c ON c.config_id = r.config_id
     LEFT JOIN ({_STEPS}) s ON s.trial_id = r.trial_id
-    LEFT JOIN step e ON e.trial_id = r.trial_id AND e.t = c.horizon - 1
+    LEFT JOIN step e ON e.trial_id = r.trial_id AND e.t = {N_ROWS} - 1
     LEFT JOIN trajectory p ON p.trial_id = r.trial_id
     LEFT JOIN ({_ASSESSMENTS}) a ON a.trial_id = r.trial_id
     LEFT JOIN ({_EXPECTED_ASSESSMENTS}) m ON m.config_id = r.config_id) AS flagged

@@ -44,7 +44,8 @@ class Merged:
     identical
         Trials finished in both databases with equal numbers.
     kept
-        Trials that failed or were cancelled there and have an outcome here.
+        Trials that failed or were cancelled there and have an outcome here, and explorations that
+        have more steps here.
     running
         Trials that a launch is running here, which were not copied.
     conflicts
@@ -110,7 +111,14 @@ def _merge_trial(target: Target, source: Source, row: dict[str, Any], here: Row[
     if finished and curve is None:
         return "incomplete"
     if curve is not None and here is not None and here.status in FINISHED:
-        return "identical" if target.is_same(here, row, curve) else "conflict"
+        if target.is_same(here, row, curve):
+            return "identical"
+        ahead = target.steps_ahead(here, curve) if row["grows"] else None
+        if ahead is None or ahead == 0:
+            return "conflict"
+        if ahead > 0:
+            return "kept"
+        target.clear(here)
     attempts = target.new_attempts(row, here)
     if here is not None and not finished and not attempts:
         return "kept"  # it was merged before, and a new run was requested here since

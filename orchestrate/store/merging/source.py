@@ -10,13 +10,14 @@ import numpy as np
 
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.records import Array
-from orchestrate.store.schema import STEP_VALUES
+from orchestrate.store.schema import N_ROWS, PREQUENTIAL, STEP_VALUES
 
 PAGE = 50
 """Trials in one transaction, so that a concurrent launch waits for less than a second."""
 
 _TRIALS = (
-    "SELECT r.*, c.config_key, c.horizon, c.env, c.policy, e.hash AS error_hash FROM trial r "
+    f"SELECT r.*, c.config_key, {N_ROWS} AS n_rows, c.env, c.policy, e.hash AS error_hash, "
+    f"CASE WHEN c.config_json LIKE '{PREQUENTIAL}' THEN 1 ELSE 0 END AS grows FROM trial r "
     "JOIN config c ON c.config_id = r.config_id LEFT JOIN error e ON e.error_id = r.error_id "
     "WHERE r.trial_id > :last AND r.status IN ('done', 'diverged', 'failed', 'cancelled') "
     "ORDER BY r.trial_id LIMIT :size"
@@ -32,11 +33,13 @@ _STEPS = f"SELECT t, {', '.join(STEP_VALUES)} FROM step WHERE trial_id = :trial_
 _ASSESSMENTS = (
     "SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure"
 )
-# All trials of a configuration have the same number of assessments.
+# All trials of a configuration have the same number of assessments, but for explorations.
 _EXPECTED = (
     "SELECT max(n) FROM (SELECT count(*) AS n FROM assessment a "
     "JOIN trial r ON r.trial_id = a.trial_id JOIN trial o ON o.config_id = r.config_id "
+    "JOIN config c ON c.config_id = o.config_id "
     "WHERE o.trial_id = :trial_id AND o.status = 'done' AND r.status = 'done' "
+    f"AND c.config_json NOT LIKE '{PREQUENTIAL}' "
     "GROUP BY a.trial_id) AS counts"
 )
 
@@ -89,21 +92,21 @@ class Source:
 
     def curve(self, row: dict[str, Any]) -> Curve | None:
         """Return the rows of a trial, or None if some are missing."""
-        return curve(self._moment, row["trial_id"], row["horizon"])
+        return curve(self._moment, row["trial_id"], row["n_rows"])
 
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
         table = self._moment.rows(sql, **values)
         return [dict(zip(table.columns, row, strict=True)) for row in table]
 
 
-def curve(moment: Reader, trial_id: int, horizon: int) -> Curve | None:
+def curve(moment: Reader, trial_id: int, n_rows: int) -> Curve | None:
     """Return the rows of a finished trial, or None if some are missing."""
     steps = np.array(list(moment.rows(_STEPS, trial_id=trial_id)), dtype=np.float64)
     arrays = moment.rows("SELECT * FROM trajectory WHERE trial_id = :id", id=trial_id)
     if (
         len(arrays) != 1
-        or len(steps) != horizon
-        or not np.array_equal(steps[:, 0], np.arange(horizon))
+        or len(steps) != n_rows
+        or not np.array_equal(steps[:, 0], np.arange(n_rows))
     ):
         return None
     assessments = [tuple(row) for row in moment.rows(_ASSESSMENTS, trial_id=trial_id)]

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from orchestrate.store.backends.base import Backend
+from orchestrate.store.growth import steps_ahead, unpacked
 from orchestrate.store.merging.source import Curve, Source
 from orchestrate.store.schema import (
     OUTCOME_COLUMNS,
@@ -99,6 +100,19 @@ class Target:
             and arrays is not None
             and all(getattr(arrays, name) == value for name, value in there.trajectory.items())
         )
+
+    def steps_ahead(self, here: Row[Any], there: Curve) -> int | None:
+        """Return by how many steps an exploration is longer here; None if it is another one."""
+        statement = select(trajectory_table).where(trajectory_table.c.trial_id == here.trial_id)
+        mine = self._connection.execute(statement).mappings().one_or_none()
+        if mine is None:
+            return None
+        return steps_ahead(unpacked(dict(mine)), unpacked(there.trajectory))
+
+    def clear(self, here: Row[Any]) -> None:
+        """Delete the rows of an exploration that has more steps in the source."""
+        for table in (step_table, trajectory_table, assessment):
+            self._connection.execute(delete(table).where(table.c.trial_id == here.trial_id))
 
     def _write_assessments(self, trial_id: int, curve: Curve) -> None:
         names = ("t", "measure", "value")

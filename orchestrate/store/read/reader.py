@@ -33,6 +33,7 @@ from orchestrate.store.read.user_query import run_select
 from orchestrate.store.records import Array
 from orchestrate.store.schema import (
     FINISHED,
+    N_ROWS,
     STEP_VALUES,
     assessment,
     config,
@@ -52,6 +53,11 @@ _TRIALS = text(
     "SELECT seed, trial_key, status, attempt, n_steps, diverged_at, final_loss, best_loss, "
     "wall_seconds, cpu_seconds, peak_memory_bytes, node, launch_id, error_type, error_message "
     "FROM v_trial WHERE config_key = :config_key ORDER BY seed"
+)
+_LENGTHS = text(
+    f"SELECT r.seed, r.status, {N_ROWS} AS n FROM trial r "
+    "JOIN config c ON c.config_id = r.config_id "
+    "WHERE c.config_key = :config_key AND r.status IN ('done', 'diverged') ORDER BY r.seed"
 )
 
 _MEASURES = (
@@ -132,9 +138,7 @@ class Reader:
         with self._snapshot() as connection:
             config_id, horizon = _config(connection, config_key)
             finished = (trial.c.config_id == config_id) & trial.c.status.in_(FINISHED)
-            trials = connection.execute(
-                select(trial.c.seed, trial.c.status).where(finished).order_by(trial.c.seed)
-            ).all()
+            trials = connection.execute(_LENGTHS, {"config_key": config_key}).all()
             rows = connection.execute(
                 select(step.c[column])
                 .join(trial, trial.c.trial_id == step.c.trial_id)
@@ -142,17 +146,21 @@ class Reader:
                 .order_by(trial.c.seed, step.c.t)
             )
             numbers = _numbers(rows)
-        if numbers.size != len(trials) * horizon:
+        lengths = np.array([n for _, _, n in trials], dtype=np.int64)
+        if numbers.size != lengths.sum():
             raise StoreUnavailableError(
                 f"The curves of configuration {config_key[:12]} in {self.safe_url} are incomplete "
-                f"({numbers.size:,} steps instead of {len(trials) * horizon:,}): the database is "
+                f"({numbers.size:,} steps instead of {lengths.sum():,}): the database is "
                 "damaged; run python -m orchestrate doctor."
             )
+        t = np.arange(lengths.max(initial=0) if trials else horizon, dtype=np.int64)
+        values = np.full((len(trials), len(t)), np.nan)
+        values[t < lengths[:, None]] = numbers
         return Curves(
-            seeds=np.array([seed for seed, _ in trials], dtype=np.int64),
-            t=np.arange(horizon, dtype=np.int64),
-            values=numbers.reshape(len(trials), horizon),
-            diverged=np.array([status == "diverged" for _, status in trials], dtype=np.bool_),
+            seeds=np.array([seed for seed, _, _ in trials], dtype=np.int64),
+            t=t,
+            values=values,
+            diverged=np.array([status == "diverged" for _, status, _ in trials], dtype=np.bool_),
         )
 
     def assessments(self, config_key: str, measure: str) -> Assessments:

@@ -67,7 +67,9 @@ class Curves:
     ----------
     seeds : (n,) int64, ascending
     t : (T,) int64
-    values : (n, T) float64, NaN from a divergence on
+        To the horizon, or to the end of the longest exploration.
+    values : (n, T) float64
+        NaN from a divergence on, and after the end of an exploration.
     diverged : (n,) bool
     """
 

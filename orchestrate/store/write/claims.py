@@ -11,9 +11,11 @@ from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Claim
 from orchestrate.store.schema import (
     OUTCOME_COLUMNS,
+    PREQUENTIAL,
     RETRIED,
     assessment,
     attempt,
+    config,
     step,
     trajectory,
     trial,
@@ -38,11 +40,12 @@ def claim(
     )
     rows = connection.execute(statement).all()
     claims = {key: Claim(key, trial_id, number, launch_id) for key, trial_id, number in rows}
-    _begin_attempts(connection, list(claims.values()))
+    begin_attempts(connection, list(claims.values()))
     return [claims[key] for key in dict.fromkeys(trial_keys) if key in claims]
 
 
-def _begin_attempts(connection: Connection, claims: Sequence[Claim]) -> None:
+def begin_attempts(connection: Connection, claims: Sequence[Claim]) -> None:
+    """Insert the attempts of new claims."""
     moment = now()
     rows = [
         {
@@ -91,13 +94,18 @@ def free_claims(
 def retry(
     connection: Connection, backend: Backend, status: str, trial_keys: Sequence[str] | None
 ) -> int:
-    """Put finished but unsuccessful trials back to pending, without what they had written."""
+    """Put finished but unsuccessful trials back to pending, without what they had written.
+
+    Explorations stay, as no launch can run them again.
+    """
     if status not in RETRIED:
         raise ValueError(
             f"Trials cannot be retried by the status '{status}': give {', '.join(RETRIED)}."
         )
     backend.exclusive(connection)
+    explored = select(config.c.config_id).where(config.c.config_json.like(PREQUENTIAL))
     which: ColumnElement[bool] = trial.c.status.in_(RETRIED[status])
+    which = which & trial.c.config_id.not_in(explored)
     if trial_keys is not None:
         which = which & trial.c.trial_key.in_(backend.members(trial_keys))
     chosen = select(trial.c.trial_id).where(which)

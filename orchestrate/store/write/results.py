@@ -164,7 +164,7 @@ def write(connection: Connection, backend: Backend, rows: PreparedRows) -> bool:
     connection.execute(_INSERT_TRAJECTORY, rows.trajectory)
     if rows.assessments:
         connection.execute(_INSERT_ASSESSMENT, rows.assessments)
-    _end_attempt(connection, rows.claim, rows.summary)
+    end_attempt(connection, rows.claim, rows.summary)
     return True
 
 
@@ -183,7 +183,7 @@ def write_failure(connection: Connection, claim: Claim, failure: Failure, run: R
         return False
     values["error_id"] = _error_id(connection, failure)
     connection.execute(_SET_ERROR, {"fence_trial": claim.trial_id, **values})
-    _end_attempt(connection, claim, values)
+    end_attempt(connection, claim, values)
     return True
 
 
@@ -201,7 +201,8 @@ def _pass_fence(connection: Connection, claim: Claim, values: Mapping[str, Any])
     return connection.execute(_FENCED, {**fence, **values}).scalar_one_or_none()
 
 
-def _end_attempt(connection: Connection, claim: Claim, values: Mapping[str, Any]) -> None:
+def end_attempt(connection: Connection, claim: Claim, values: Mapping[str, Any]) -> None:
+    """Write the outcome of the attempt of a claim."""
     connection.execute(_END_ATTEMPT, {**_attempt_key(claim), **values})
 
 

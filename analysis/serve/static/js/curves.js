@@ -127,14 +127,15 @@ function options(style, unit, column) {
     );
     bands.push({ series: [first + 2, first + 1], fill: () => veil(curve.colour, 0.17) });
   });
-  const what = column === "loss" ? "evaluation grid" : "reachable set";
+  const what = column === "loss" ? "L² error, evaluation grid" : "L² error, reachable set";
+  const name = column === "loss" && answer.is_prequential ? "prequential loss" : what;
   return {
     series,
     bands: style === "band" ? bands : [],
     scales: { x: { time: false }, y: { distr: 3, log: 10, range: limits } },
     axes: [
       axis(`time t [${unit}]`, false, { size: 38, space: 70 }),
-      axis(`L² error, ${what}`, true, { size: 54 }),
+      axis(name, true, { size: 54 }),
     ],
     cursor: { y: false, points: { size: 7, one: false, fill: (u, i) => pointFill(i), stroke: "transparent", width: 0 }, drag: { x: true, y: false } },
     hooks: {

@@ -11,6 +11,16 @@ const PAINTS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
 const SILENT = { y: false, drag: { x: true, y: false } };
 const charts = document.getElementById("charts");
 
+/** Charts on the page. */
+const shown = new Map();
+
+/** Draw a chart in the place of the one that was there. */
+function drawn(place, ...rest) {
+  shown.get(place)?.destroy();
+  shown.set(place, plot(place, ...rest));
+  return shown.get(place);
+}
+
 /** @param {string} id */
 const part = (id) => document.getElementById(id);
 
@@ -26,13 +36,14 @@ function sample(colour, dash = []) {
 
 function drawLoss(found) {
   const series = [{}, line(found.legend_entry.colour), line(found.legend_entry.colour, { dash: [5, 4], width: 1.2 })];
+  const names = found.is_prequential ? ["prequential loss"] : ["evaluation grid", "reachable set"];
   const range = () => logRange([...found.loss, ...found.reachable_loss].filter((one) => one !== null));
-  const chart = plot(
+  const chart = drawn(
     part("loss"),
     {
       series,
       scales: { x: { time: false }, y: { distr: 3, log: 10, range } },
-      axes: [axis("time t [steps]", false, { size: 38 }), axis("L² error", true, { size: 54 })],
+      axes: [axis("time t [steps]", false, { size: 38 }), axis(found.is_prequential ? "prequential loss" : "L² error", true, { size: 54 })],
       cursor: SILENT,
     },
     [found.t, found.loss, found.reachable_loss],
@@ -41,16 +52,16 @@ function drawLoss(found) {
   hoverBox(part("loss"), chart, (index) => ({
     title: `t = ${found.t[index]}`,
     rows: [
-      { line: sample(found.legend_entry.colour), label: "evaluation grid", value: numeral(found.loss[index]) },
-      { line: sample(found.legend_entry.colour, [5, 4]), label: "reachable set", value: numeral(found.reachable_loss[index]) },
-    ],
+      { line: sample(found.legend_entry.colour), label: names[0], value: numeral(found.loss[index]) },
+      { line: sample(found.legend_entry.colour, [5, 4]), label: names[1], value: numeral(found.reachable_loss[index]) },
+    ].slice(0, names.length),
   }));
 }
 
 function drawInputs(found) {
   const times = found.t.map((t) => t * found.dt);
   const series = [{}, ...found.inputs.map((_, index) => line(paint(found, index), { width: 1.2 }))];
-  const chart = plot(
+  const chart = drawn(
     part("inputs"),
     {
       series,
@@ -94,7 +105,7 @@ function drawSpectrum(found) {
   const top = Math.max(...density);
   const range = () => logRange(density.filter((value) => value > top * 1e-5));
   const clipped = density.map((value) => Math.max(value, top * 1e-7) || null);
-  const chart = plot(
+  const chart = drawn(
     part("spectrum"),
     {
       series: [{}, line(found.legend_entry.colour, { width: 1.3 })],
@@ -157,4 +168,7 @@ async function load() {
   }
 }
 
-if (charts) load();
+if (charts) {
+  load();
+  if (document.getElementById("exploration")) document.addEventListener("dopt:change", load); // it grows
+}

@@ -1,0 +1,44 @@
+"""The page of an exploration draws what is added to it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from playwright.sync_api import Browser
+
+from dopt import Explorer
+from orchestrate.store import Reader
+from tests.analysis.browser import chromium
+from tests.dopt.explorer.plants import MOTOR, following
+
+
+def explore(explorer: Explorer, steps: int) -> None:
+    x = explorer.states[-1] if explorer.n_steps else np.zeros(2)
+    for _ in range(steps):
+        x = following(x, explorer.ask(x))
+        explorer.tell(x)
+
+
+def test_its_page_follows_it(browser: Browser, sqlite_url: str, figures: Path) -> None:
+    with Explorer(MOTOR, policy="random", steps=500) as explorer:
+        explore(explorer, 60)
+        explorer.save(sqlite_url)
+        with Reader.open(sqlite_url) as reader:
+            [(key,)] = reader.query("SELECT trial_key FROM trial")
+        with (
+            chromium.served(sqlite_url, figures) as address,
+            chromium.strict_page(browser, address) as page,
+        ):
+            page.goto(f"{address}/trials/{key}")
+            page.wait_for_selector("#charts[data-drawn]")
+            assert "running, 60 of 500 steps" in page.inner_text("#trial-state")
+            path = page.get_attribute("#phase path", "d")
+            explore(explorer, 60)
+            explorer.save(sqlite_url)
+            page.wait_for_selector("text=running, 120 of 500 steps")
+            page.wait_for_function(
+                "old => document.querySelector('#phase path').getAttribute('d') !== old", arg=path
+            )
+            assert page.locator("#loss canvas").count() == 1, "the chart before is gone"
+            assert "prequential loss" in page.inner_text("#outcome")
