@@ -20,7 +20,7 @@ from analysis.data.trial_selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.figures.loss_curves.data import Axis
 from analysis.floor import command as offline
-from analysis.outputs.registry import NAMES, build, partial_warning
+from analysis.outputs.names import NAMES, partial_warning
 from analysis.plot_options import PlotOptions, Spread
 from analysis.report import command as report
 from analysis.serve import command as browser
@@ -194,6 +194,8 @@ def _check_complete(selection: Selection, allow_partial: bool) -> None:
 
 
 def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    from analysis.outputs.registry import build  # Matplotlib: other commands do without it
+
     plot_options = PlotOptions(
         DivergenceRule(options.diverged),
         Axis(options.x),

@@ -30,12 +30,16 @@ class EvaluationSet:
     Attributes
     ----------
     states : (N, d)
+    inputs : (N, m)
+        At the points of the grid they are uniform in the ball ‖u‖ ≤ γ, elsewhere those under which
+        the states were visited. They count where the system or the model reads inputs.
     accelerations : (N, r)
     n_grid : int
         Number of grid points; the other points are the reachable set.
     """
 
     states: Array
+    inputs: Array
     accelerations: Array
     n_grid: int
 
@@ -50,8 +54,18 @@ def evaluation_set(system: System) -> EvaluationSet:
     if isinstance(system, BlackBox):
         return _held_out(system)
     grid = system.grid()
-    states = np.concatenate([grid, reachable_states(system)])
-    return EvaluationSet(states, system.learned(states), len(grid))
+    reached, applied = reachable_points(system)
+    states = np.concatenate([grid, reached])
+    inputs = np.concatenate([_in_ball(system, len(grid)), applied])
+    return EvaluationSet(states, inputs, system.learned(states, inputs=inputs), len(grid))
+
+
+def _in_ball(system: System, n: int) -> Array:
+    """Return inputs, (n, m), uniform in the ball ‖u‖ ≤ γ; always the same."""
+    rng, m = np.random.default_rng(_SEED), system.n_inputs
+    directions = on_sphere(rng.standard_normal((n, m)), system.gamma)
+    inputs: Array = directions * rng.uniform(size=(n, 1)) ** (1.0 / m)
+    return inputs
 
 
 def _held_out(system: BlackBox) -> EvaluationSet:
@@ -59,14 +73,16 @@ def _held_out(system: BlackBox) -> EvaluationSet:
     rng = np.random.default_rng(_SEED)
     grid = random_transitions(system, math.prod(system.grid_points), rng)
     waves = _sampled(system, _waves(system), REACHABLE_POINTS, rng)
-    states, accelerations = (np.concatenate(parts) for parts in zip(grid, waves, strict=True))
-    return EvaluationSet(states, accelerations, len(grid[0]))
+    states, inputs, accelerations = (
+        np.concatenate(parts) for parts in zip(grid, waves, strict=True)
+    )
+    return EvaluationSet(states, inputs, accelerations, len(grid[0]))
 
 
 def random_transitions(
     system: BlackBox, wanted: int, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return states (N, d) and accelerations (N, r) of at most the wanted transitions.
+) -> tuple[Array, Array, Array]:
+    """Return states (N, d), inputs (N, m) and accelerations (N, r) of at most so many transitions.
 
     They are drawn without replacement from runs under random inputs of the strength of a trial's.
     """
@@ -77,19 +93,27 @@ def random_transitions(
 
 def _sampled(
     system: BlackBox, sequences: list[Array], wanted: int, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return states (N, d) and accelerations (N, r) of at most the wanted transitions."""
+) -> tuple[Array, Array, Array]:
+    """Return states (N, d), inputs (N, m) and accelerations (N, r) of at most so many."""
     runs = [transitions(system, inputs, seed) for seed, inputs in enumerate(sequences)]
-    states, accelerations, there = (np.concatenate(parts) for parts in zip(*runs, strict=True))
+    states, inputs, accelerations, there = (
+        np.concatenate(parts) for parts in zip(*runs, strict=True)
+    )
     found = np.flatnonzero(there)
     chosen = np.sort(rng.choice(found, min(wanted, len(found)), replace=False))
-    return states[chosen], accelerations[chosen]
+    return states[chosen], inputs[chosen], accelerations[chosen]
 
 
 def reachable_states(system: System) -> Array:
+    """Return the states of :func:`reachable_points`, (512, d)."""
+    return reachable_points(system)[0]
+
+
+def reachable_points(system: System) -> tuple[Array, Array]:
     """Return states, (512, d), that the true system visits under strong inputs of full energy.
 
-    The inputs are random ones held for 5, 10, 20 and 40 steps, square waves at and around the
+    With them come the inputs that are applied there, (512, m), 0 after the last step of a run. The
+    inputs are random ones held for 5, 10, 20 and 40 steps, square waves at and around the
     eigenfrequency and one of rising frequency, each over the whole horizon without process noise.
     They are of the kind of two baselines, ``random_held`` and ``periodic_square``, which visit
     states like those of the set.
@@ -98,9 +122,11 @@ def reachable_states(system: System) -> Array:
     rng = np.random.default_rng(_SEED)
     inputs = np.stack(_held(system, rng) + _waves(system), axis=1)
     visited = simulate(system, inputs).reshape(-1, system.n_states)
-    visited = visited[np.all(np.abs(visited) <= system.state_limit, axis=1)]
-    chosen = rng.choice(len(visited), min(REACHABLE_POINTS, len(visited)), replace=False)
-    return np.ascontiguousarray(visited[np.sort(chosen)])
+    applied = np.concatenate([inputs, np.zeros_like(inputs[:1])]).reshape(-1, system.n_inputs)
+    inside = np.flatnonzero(np.all(np.abs(visited) <= system.state_limit, axis=1))
+    found = rng.choice(len(inside), min(REACHABLE_POINTS, len(inside)), replace=False)
+    chosen = inside[np.sort(found)]
+    return visited[chosen], applied[chosen]
 
 
 def simulate(system: System, inputs: Array) -> Array:
@@ -121,7 +147,7 @@ def _flows(system: System, states: Array, inputs: Array, step: int) -> Array:
     """Return f(x, u) at a step, (n, d), for states (n, d) and inputs (n, m)."""
     known = system.known(tuple(states.T), tuple(inputs.T), system.parameters)
     flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-    flow[:, list(system.learned_rows)] += system.learned(states, step)
+    flow[:, list(system.learned_rows)] += system.learned(states, step, inputs)
     return flow
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +60,7 @@ def fit_offline(
     states: npt.ArrayLike,
     accelerations: npt.ArrayLike,
     *,
+    inputs: npt.ArrayLike | None = None,
     ridge: float = RIDGE,
     max_steps: int = MAX_STEPS,
 ) -> OfflineFit:
@@ -77,6 +79,8 @@ def fit_offline(
         States x.
     accelerations : (N, r)
         Observed accelerations y, such as those of :func:`dopt.samples.recorded_samples`.
+    inputs : (N, m), optional
+        Inputs u, for a model that reads them.
     ridge : float
         ρ, which keeps what the samples do not decide near its initial value.
     max_steps : int
@@ -103,17 +107,31 @@ def fit_offline(
             f"there are {len(x)} states and {len(y)} accelerations, but as many of both, and at "
             f"least one, are expected: give one row of each for every sample."
         )
+    u = None
+    if spec.model.n_inputs_read(spec.system):
+        if inputs is None:
+            raise SpecificationError(
+                f"model '{spec.model.name}' reads inputs, but none were given: give the input of "
+                f"each sample."
+            )
+        u = _rows(inputs, spec.system.n_inputs, "inputs")
+        if len(u) != len(x):
+            raise SpecificationError(
+                f"there are {len(x)} states and {len(u)} inputs, but as many of both are expected "
+                f"for model '{spec.model.name}', which reads inputs: give the input of each sample."
+            )
     initial = initial_weights(spec)
     if is_network(spec.model):
-        parameters, steps, converged = _fit_network(spec, x, y, initial, ridge, max_steps)
+        points = spec.model.points(spec.system, x, u)
+        parameters, steps, converged = _fit_network(spec, points, y, initial, ridge, max_steps)
     elif spec.model.structure == "least_squares":
-        parameters, steps, converged = _solve(spec, x, y, initial, ridge), 1, True
+        parameters, steps, converged = _solve(spec, x, u, y, initial, ridge), 1, True
     else:
         raise SpecificationError(
             f"model '{spec.model.name}' has no offline fit, but 'mlp', or a model that is linear "
             f"in its parameters, is expected: choose one of these."
         )
-    residual = _root_mean_square(spec.model.predict(spec.system, parameters, x) - y)
+    residual = _root_mean_square(spec.model.predict(spec.system, parameters, x, u) - y)
     return OfflineFit(parameters, grid_loss(spec, parameters), residual, steps, converged)
 
 
@@ -130,10 +148,12 @@ def is_network(model: Model) -> bool:
 def grid_loss(spec: TrialSpec, parameters: Array) -> float:
     """Return the loss of parameters, (q,), on the evaluation grid at the last step."""
     system, points = spec.system, evaluation_set(spec.system)
-    states, truth = points.states[: points.n_grid], points.accelerations[: points.n_grid]
+    states, inputs, truth = (
+        rows[: points.n_grid] for rows in (points.states, points.inputs, points.accelerations)
+    )
     if len(system.history) > 1:
-        truth = system.learned(states, system.horizon - 1)
-    return _root_mean_square(spec.model.predict(system, parameters, states) - truth)
+        truth = system.learned(states, system.horizon - 1, inputs)
+    return _root_mean_square(spec.model.predict(system, parameters, states, inputs) - truth)
 
 
 def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
@@ -157,29 +177,40 @@ def _root_mean_square(errors: Array) -> float:
 
 
 def _fit_network(
-    spec: TrialSpec, states: Array, accelerations: Array, initial: Array, ridge: float, most: int
+    spec: TrialSpec, points: Array, accelerations: Array, initial: Array, ridge: float, most: int
 ) -> tuple[Array, int, bool]:
     from dopt.kernel.model_from_spec import network_of
     from dopt.kernel.offline_fit import Problem, fit
     from dopt.kernel.pointers import compiled_for, kind_of
 
-    network, features = network_of(spec.system, spec.model), spec.system.featurize(states)
+    network, features = (
+        network_of(spec.system, spec.model),
+        spec.model.featurize(spec.system, points),
+    )
     columns = (np.array(rows.T, order="C") for rows in (features, accelerations))
     problem, theta = Problem(network, initial, float(ridge), *columns), initial.copy()
-    compiled_for("offline_fit", fit, tuple(map(kind_of, (problem, theta, most))))
-    steps, converged = fit(problem, theta, most)
+    kinds = tuple(map(kind_of, (problem, theta, most)))
+    # The machine code itself: called by its name, Numba would compile it anew for its own type of
+    # a tuple of equal numbers.
+    code: Any = compiled_for("offline_fit", fit, kinds)
+    steps, converged = code(problem, theta, most)
     return theta, steps, bool(converged)
 
 
 def _solve(
-    spec: TrialSpec, states: Array, accelerations: Array, initial: Array, ridge: float
+    spec: TrialSpec,
+    states: Array,
+    inputs: Array | None,
+    accelerations: Array,
+    initial: Array,
+    ridge: float,
 ) -> Array:
     """Return the minimum for a model linear in its parameters but the fixed ones, the last."""
     system, model = spec.system, spec.model
     n_free = len(initial) - model.n_fixed_parameters(system)
-    start = model.predict(system, initial, states)
+    start = model.predict(system, initial, states, inputs)
     units = initial + np.eye(n_free, len(initial))
-    columns = [(model.predict(system, unit, states) - start).ravel() for unit in units]
+    columns = [(model.predict(system, unit, states, inputs) - start).ravel() for unit in units]
     rows = np.concatenate([np.stack(columns, axis=-1), np.sqrt(ridge) * np.eye(n_free)])
     right = np.concatenate([(accelerations - start).ravel(), np.zeros(n_free)])
     theta = initial.copy()

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.evaluation import random_transitions
+from dopt.policies.base import on_sphere
 from dopt.randomness import process_noise, stream
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
@@ -18,16 +19,19 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """States and the accelerations that were observed there.
+    """States, inputs, and the accelerations that were observed there.
 
     Attributes
     ----------
     states : (N, d)
+    inputs : (N, m)
+        They count where the model reads inputs.
     accelerations : (N, r)
         Per second what the learned rows of the state are measured in, noise included.
     """
 
     states: Array
+    inputs: Array
     accelerations: Array
 
 
@@ -36,6 +40,7 @@ def uniform_samples(spec: TrialSpec) -> Samples:
 
     The noise is that of the trial, w_t of equation 2. One step from a state x under any input is
     observed as y = a(x) + w/dt in the learned rows: the known part, and with it the input, cancels.
+    Where the effect of the inputs is learned, they are drawn uniformly from the sphere ‖u‖ = γ.
     State components without an axis in the grid are zero, as they are there. Of a system that
     changes, the accelerations are those of the last step, by which the final loss is judged.
 
@@ -49,7 +54,10 @@ def uniform_samples(spec: TrialSpec) -> Samples:
     for index, (low, high) in system.grid_box().items():
         states[:, index] = rng.uniform(low, high, system.horizon)
     noise = process_noise(system, spec.seed)[:, list(system.learned_rows)] / system.dt
-    return Samples(states, system.learned(states, system.horizon - 1) + noise)
+    draws = rng.standard_normal((system.horizon, system.n_inputs))
+    inputs = on_sphere(draws, system.gamma)
+    accelerations = system.learned(states, system.horizon - 1, inputs)
+    return Samples(states, inputs, accelerations + noise)
 
 
 def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
@@ -62,4 +70,4 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
     known = system.known(tuple(before.T), tuple(inputs.T), system.parameters)
     flow = np.stack(np.broadcast_arrays(*known, before[:, 0])[:-1], axis=-1)
     observed = (after - before) / system.dt - flow
-    return Samples(before, observed[:, list(system.learned_rows)])
+    return Samples(before, inputs, observed[:, list(system.learned_rows)])

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 from analysis.animation.replay_data import tell
-from analysis.animation.writers import shoot
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Entry, select
 from analysis.errors import AnalysisError
@@ -29,6 +28,8 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the film and say where it is."""
+    from analysis.animation.writers import shoot  # Matplotlib: other commands do without it
+
     for name in ("frames", "fps"):
         if getattr(options, name) < 1:
             raise AnalysisError(

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from analysis.data.learned_model import simulated_trial
 from analysis.data.trial_selection import Entry
 from analysis.errors import AnalysisError
 from analysis.figures.phase_portraits.data import DrawnPlane
 from dopt.geometry import Body, body
 from dopt.rerun import rerun
-from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System
 from orchestrate.store import Reader
@@ -104,7 +104,7 @@ def _specification(entry: Entry, seed: int) -> TrialSpec:
             f"{entry.config.env} × {entry.config.policy} has no finished trial of seed {seed}, "
             f"finished are {listed}: choose one of these with --seed."
         )
-    return TrialSpec.from_mapping({**without_versions(entry.config.config), "seed": seed})
+    return simulated_trial(entry.config, seed)
 
 
 def _check_same(replayed: Array, stored: Array, entry: Entry, seed: int) -> None:

@@ -14,17 +14,15 @@ import pandas as pd
 from analysis.data import provenance
 from analysis.data.trial_selection import Selection
 from analysis.errors import AnalysisError
-from analysis.figures.error_budget import plot
 from analysis.figures.error_budget.data import Budget, budgets, tabulate
-from analysis.figures.style import styled
 from analysis.floor.trial_fits import fit_trials, with_offline_fit
 from analysis.outputs import publish
-from analysis.outputs.registry import partial_warning
+from analysis.outputs.names import partial_warning
 from analysis.tables.error_budget import budget_table
 from analysis.tables.rendering import TextTable
 from analysis.units import loss_unit
 from dopt.offline_fit import RIDGE
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
 
 HELP = "fit the models of stored trials offline: how much exploration and learner lose"
@@ -87,6 +85,9 @@ def _draw(
     facts: Mapping[str, Any],
 ) -> dict[str, str]:
     """Write the picture and its caption; return what the provenance says of them."""
+    from analysis.figures.error_budget import plot  # Matplotlib: other commands do without it
+    from analysis.figures.style import styled
+
     mark = publish.fingerprint({key: facts[key] for key in ("selection", "request", "versions")})
     warning = partial_warning(selection) if selection.gaps else ""
     with styled():
@@ -103,8 +104,7 @@ def _draw(
 def _units(selection: Selection) -> dict[str, str]:
     """Return the unit of the loss by environment."""
     return {
-        entry.config.env: loss_unit(system_from_mapping(entry.config.config["env"]))
-        for entry in selection.entries
+        entry.config.env: loss_unit(system_of(entry.config.config)) for entry in selection.entries
     }
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import pandas as pd
 
+from analysis.data.learned_model import simulated_trial
 from analysis.data.trial_selection import Entry, Selection
 from analysis.errors import AnalysisError
 from dopt.offline_fit import OfflineFit, can_be_fitted, fit_offline
 from dopt.samples import Samples, recorded_samples, uniform_samples
-from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 
@@ -110,7 +110,7 @@ class _Fits:
 
     def fit(self, spec: TrialSpec, samples: Samples) -> Future[OfflineFit]:
         given = (spec, samples.states, samples.accelerations)
-        return self._pool.submit(fit_offline, *given, ridge=self._ridge)
+        return self._pool.submit(fit_offline, *given, inputs=samples.inputs, ridge=self._ridge)
 
 
 def _submit(reader: Reader, entry: Entry, fits: _Fits) -> Iterator[Callable[[], TrialLosses]]:
@@ -137,4 +137,4 @@ def _awaited(
 
 
 def _specification(entry: Entry, seed: int) -> TrialSpec:
-    return TrialSpec.from_mapping({**without_versions(entry.config.config), "seed": seed})
+    return simulated_trial(entry.config, seed)

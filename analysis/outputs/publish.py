@@ -7,10 +7,12 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
-from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PICTURES = ("pdf", "svg", "png")
 
@@ -34,10 +36,10 @@ def is_current(folder: Path, name: str, endings: tuple[str, ...], mark: str) -> 
 def write_pictures(figure: Figure, folder: Path, name: str, title: str, mark: str) -> None:
     """Write a figure in every format, with its title and fingerprint, in the context of the style.
 
-    The layout is computed once, so that all formats show the same picture.
+    The layout is computed once, so that all formats show the same picture and none is drawn twice.
     """
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    figure.set_layout_engine(None)
     for ending in PICTURES:
         target = folder / f"{name}.{ending}"
         part = folder / f".{name}.part.{ending}"

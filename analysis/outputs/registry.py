@@ -20,6 +20,7 @@ from analysis.figures.sensitivity.plot import sensitivity_plot
 from analysis.figures.style import styled
 from analysis.figures.width.plot import cost_plot, loss_against_width_plot
 from analysis.outputs import publish
+from analysis.outputs.names import NAMES, partial_warning
 from analysis.outputs.page import NAME as PAGE
 from analysis.outputs.page import write_page
 from analysis.plot_options import PlotOptions
@@ -42,7 +43,9 @@ PLOTS: dict[str, Plot[Any]] = {
         sensitivity_plot("figure8_sensitivity"),
     )
 }
-NAMES = (*PLOTS, *TABLES)
+WITH_EXPLORATIONS = ("figure1", *(name for name in PLOTS if name.startswith("figure2")), "summary")
+"""Outputs that compare no losses, and so show explorations too."""
+
 TABLE_FILES = ("md", "tex", "csv")
 
 
@@ -87,6 +90,8 @@ def build(
 
 
 def _part(name: str, selection: Selection, options: PlotOptions) -> Selection:
+    if name not in WITH_EXPLORATIONS:
+        selection = selection.simulated()
     if name in PLOTS:
         return PLOTS[name].part(selection)
     return TABLES[name].part(selection, options)
@@ -139,8 +144,3 @@ def _tabulate(
 
 def _commented(warning: str) -> str:
     return f"% {warning.rstrip()}\n" if warning else ""
-
-
-def partial_warning(selection: Selection) -> str:
-    """Return the mark of an output that lacks trials."""
-    return f"PARTIAL: {sum(len(gap.seeds) for gap in selection.gaps)} trials missing."

@@ -12,9 +12,8 @@ from analysis.data.config_matching import Filter
 from analysis.data.missing_trials import Gap
 from analysis.data.trial_selection import Selection
 from analysis.errors import IncompleteError
-from analysis.figures.style import styled
 from analysis.outputs import publish
-from analysis.report import control, forest_plot, page, variant_table
+from analysis.report import control, page, variant_table
 from analysis.report.variants import VariantGroup, variant_groups
 from analysis.tables.rendering import gaps_table
 from orchestrate.store import Reader
@@ -32,6 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, wanted: Filter) -> int:
     """Write the page, the pictures, the CSV and the provenance; 0."""
+    from analysis.figures.style import styled  # Matplotlib: other commands do without it
+    from analysis.report import forest_plot
+
     with Reader.open(options.db) as reader, reader.moment() as moment:
         found = variant_groups(moment, wanted)
         gaps = [gap for group in found for gap in _gaps(group)]

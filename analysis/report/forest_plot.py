@@ -10,19 +10,11 @@ from analysis.data.config_matching import APART
 from analysis.figures.axes import log_ticks
 from analysis.figures.style import TEXT_WIDTH
 from analysis.line_styles import BLUE, GREY, VERMILLION
-from analysis.report.variant_table import SIGNIFICANCE, verdict
+from analysis.report.variant_table import verdict
 
 _LOOK = {"better": (BLUE, "o"), "worse": (VERMILLION, "s"), "open": (GREY, "D")}
 _INCHES_PER_ROW = 0.16
 _INCHES_AROUND = 0.62
-
-CAPTION = (
-    "Ratio of final losses, variant / reference: left of the line, below 1, the variant is "
-    "better. Geometric mean over shared seeds with its 95 % interval, the best at the top. "
-    "Circles: better, squares: worse, diamonds: not told apart, as the adjusted p is not below "
-    f"{SIGNIFICANCE} or the interval holds 1. The oracle, which knows the form of the physics and "
-    "is orders of magnitude below, is in the tables alone."
-)
 
 
 def draw(part: pd.DataFrame) -> Figure:

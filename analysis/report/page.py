@@ -9,7 +9,6 @@ import pandas as pd
 
 from analysis.formatting import but_lost, number, p_text, plus_minus, share, steps_text, within
 from analysis.line_styles import environment_title
-from analysis.report.forest_plot import CAPTION
 from analysis.report.variant_table import SAME, SIGNIFICANCE, verdict
 from analysis.stats.paired_tests import FEWEST_BOOTSTRAP_PAIRS
 from analysis.tables.rendering import TextTable
@@ -23,6 +22,15 @@ EFFORT = (
     "variant", "steps to ε (share)", "adjusted p", "coverage", "control cost, ratio", "plan [µs]",
     "learn [µs]", "runs on",
 )  # fmt: skip
+
+CAPTION = (
+    "Ratio of final losses, variant / reference: left of the line, below 1, the variant is "
+    "better. Geometric mean over shared seeds with its 95 % interval, the best at the top. "
+    "Circles: better, squares: worse, diamonds: not told apart, as the adjusted p is not below "
+    f"{SIGNIFICANCE} or the interval holds 1. The oracle, which knows the form of the physics and "
+    "is orders of magnitude below, is in the tables alone."
+)
+"""Caption of the picture of a system."""
 
 EXPLAINED = (
     "Final loss: root mean square error of the learned accelerations over the evaluation grid "

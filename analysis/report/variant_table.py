@@ -29,7 +29,7 @@ from analysis.tables.comparisons import (
 )
 from dopt.coverage import Plane
 from dopt.policies.titles import policy_title
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
 
 MEASURES = ("loss", "reachable_loss", "auc", "coverage", "control")
@@ -55,7 +55,7 @@ def tabulate_group(
     reader: Reader, group: VariantGroup, rule: DivergenceRule = DivergenceRule.EXCLUDE
 ) -> pd.DataFrame:
     """Return one row for each variant of an environment, the reference first."""
-    plane = Plane.of(system_from_mapping(group.reference.config.config["env"]))
+    plane = Plane.of(system_of(group.reference.config.config))
     epsilon = loss_of_random_inputs(reader, group.variants, "loss", rule)
     scores = {one.label: _scores(reader, one, plane, rule) for one in group.variants}
     costs = _control_costs(reader, group)

@@ -16,6 +16,7 @@ from analysis.data.trial_selection import Entry, environment_rank, labels_of, ne
 from analysis.data.variants import one_each, one_world, section_text
 from analysis.errors import AnalysisError
 from analysis.stats.control import common_task, task_of
+from dopt.spec.prequential import is_prequential
 from orchestrate.store import Reader
 
 _SETTING = ("model", "learner")
@@ -61,12 +62,18 @@ class VariantGroup:
 def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
     """Return the variants of every environment that has the reference policy and another.
 
+    Explorations are left out: their losses are errors on paths of their own.
+
     Raises
     ------
     AnalysisError
         If no environment has both.
     """
-    configs = [config for config in newest(list(reader.configs())) if wanted.accepts(config)]
+    configs = [
+        config
+        for config in newest(list(reader.configs()))
+        if wanted.accepts(config) and not is_prequential(config.config)
+    ]
     entries = [Entry(config, tuple(reader.trials(config.config_key))) for config in configs]
     names = sorted({config.env for config in configs}, key=environment_rank)
     found = [

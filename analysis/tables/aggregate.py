@@ -32,6 +32,7 @@ def aggregate(
         If the reference shares no seed with another variant.
     """
     found: dict[str, list[Pair]] = {}
+    selection = selection.simulated()
     for env in selection.environments:
         for own, reference, _ in references(selection, env):
             ours, theirs = (final_losses(reader, one, "loss", rule) for one in (own, reference))

@@ -76,6 +76,7 @@ def compare_policies(
     """
     name = "auc" if measure is Measure.AUC else column
     rows = []
+    selection = selection.simulated()
     for env in selection.environments:
         scores = [_SCORES[measure](reader, entry, column, rule) for entry in selection.of(env)]
         for own, reference, row in _pairs(scores, selection, env):
@@ -107,6 +108,7 @@ def compare_steps(
             f"choose one between the losses of figure 1."
         )
     rows = []
+    selection = selection.simulated()
     for env in selection.environments:
         entries = selection.of(env)
         threshold = (
@@ -245,9 +247,10 @@ def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFra
 
 
 def nothing_to_compare(selection: Selection) -> AnalysisError:
-    """Return the error for a selection without a pair of trials."""
+    """Return the error for a selection without a pair of simulated trials."""
+    selected = ", ".join(selection.labels) or "no simulated trial"
     return AnalysisError(
         f"A comparison needs trials of the reference {selection.reference} and of another "
-        f"variant in one environment, but only {', '.join(selection.labels)} is selected: run "
-        f"the others, ask wider, or choose another --reference."
+        f"variant in one environment, but only {selected} is selected: run the others, ask wider, "
+        f"or choose another --reference."
     )

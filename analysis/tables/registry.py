@@ -72,7 +72,7 @@ def _whole(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
 
 
 def _compared(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
-    compared = selection.compared()
+    compared = selection.simulated().compared()
     return compared if len(compared.labels) > 1 else Selection(())
 
 

@@ -105,8 +105,18 @@ class Equations(NamedTuple):
 
 def compiled_equations(system: System) -> Equations:
     """Compile the equations of a system's class, or load them from the disk cache."""
-    sizes = (system.n_states, system.n_inputs, len(system.physical))
+    read = system.n_inputs if system.reads_inputs else 0
+    sizes = (system.n_states, system.n_inputs, len(system.physical), read)
     return _compiled_functions(system.known, system.accelerations, *sizes)
+
+
+def name_of_equations(system: System) -> str:
+    """Return the name in the cache of the compiled equations of a system's class."""
+    return _name(system.known, system.n_states)
+
+
+def _name(known: Equation, n_states: int) -> str:
+    return f"equations of {known.__module__}.{known.__qualname__}.{n_states}"
 
 
 @functools.cache
@@ -116,14 +126,15 @@ def _compiled_functions(
     n_states: int,
     n_inputs: int,
     n_parameters: int,
+    n_inputs_read: int,
 ) -> Equations:
-    name = f"equations of {known.__module__}.{known.__qualname__}.{n_states}"
+    name, n_read = _name(known, n_states), n_states + n_inputs_read
     known, accelerations = compilable(known), compilable(accelerations)
     with one_compiler_at_a_time(name) if _shipped(known) else contextlib.nullcontext():
         return Equations(
             _known_into(known, n_states, n_inputs, n_parameters),
-            _accelerations_into(accelerations, n_states, n_parameters, ACCELERATIONS),
-            _accelerations_into(accelerations, n_states, n_parameters, COMPLEX_ACCELERATIONS),
+            _accelerations_into(accelerations, n_read, n_parameters, ACCELERATIONS),
+            _accelerations_into(accelerations, n_read, n_parameters, COMPLEX_ACCELERATIONS),
         )
 
 
@@ -163,14 +174,14 @@ def _known_into(
 
 
 def _accelerations_into(
-    function: Equation, n_states: int, n_parameters: int, signature: NumbaType
+    function: Equation, n_read: int, n_parameters: int, signature: NumbaType
 ) -> CompiledFunction:
     def into(x: Array, p: Array, out: Array) -> None:
-        values = function(to_fixed_tuple(x, n_states), to_fixed_tuple(p, n_parameters))
+        values = function(to_fixed_tuple(x, n_read), to_fixed_tuple(p, n_parameters))
         for i in range(len(values)):
             out[i] = values[i]
 
-    return _compiled_for(function, into, signature, (n_states, n_parameters))
+    return _compiled_for(function, into, signature, (n_read, n_parameters))
 
 
 def _compiled_for(

@@ -8,21 +8,23 @@ from dopt.algorithm import ModelKind
 from dopt.evaluation import EvaluationSet, evaluation_set
 from dopt.kernel import structs as args
 from dopt.kernel.evaluation import BLOCK
+from dopt.models.base import Model
 from dopt.systems.base import System
 from dopt.types import Array, Integers, Stack
 
 
-def evaluation_points(system: System, network: args.Network) -> args.Evaluation:
+def evaluation_points(system: System, model: Model, network: args.Network) -> args.Evaluation:
     """Return the points of a system in the form that its model takes."""
     points = evaluation_set(system)
     if network.kind == ModelKind.LINEAR:
         return _linear_evaluation(system, points)
-    columns = [system.featurize(points.states).T, points.accelerations.T]
+    features = model.featurize(system, model.points(system, points.states, points.inputs))
+    columns = [features.T, points.accelerations.T]
     parts = [slice(0, points.n_grid), slice(points.n_grid, None)]
-    features, targets, sizes = zip(
+    blocks_of_features, targets, sizes = zip(
         *(_blocks(columns[0][:, part], columns[1][:, part]) for part in parts), strict=True
     )
-    blocks = np.concatenate(features)
+    blocks = np.concatenate(blocks_of_features)
     return args.Evaluation(
         blocks.astype(np.float32),
         blocks,
@@ -41,7 +43,8 @@ def evaluation_points(system: System, network: args.Network) -> args.Evaluation:
 
 def _followed(system: System, points: EvaluationSet) -> Array:
     """Return the states at which the truth is evaluated anew at each step."""
-    return points.states if len(system.history) > 1 else points.states[:0]
+    followed = system.points(points.states, points.inputs)
+    return followed if len(system.history) > 1 else followed[:0]
 
 
 def points_of_trial(
@@ -82,8 +85,9 @@ def _blocks(features: Array, targets: Array) -> tuple[Stack, Stack, Integers]:
 
 
 def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation:
+    at = system.points(points.states, points.inputs)
     offset, *units = (
-        np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.states.T), form)), axis=-1)
+        np.stack(np.broadcast_arrays(*system.accelerations(tuple(at.T), form)), axis=-1)
         for form in system.linear_form
     )
     regressors = np.stack([unit - offset for unit in units], axis=-1)
@@ -105,5 +109,5 @@ def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation
 
 def _size(system: System, points: EvaluationSet) -> float:
     """Return the root mean square norm of the targets, at the first or the last step."""
-    ends = (points.accelerations, system.learned(points.states, system.horizon - 1))
+    ends = (points.accelerations, system.learned(points.states, system.horizon - 1, points.inputs))
     return max(float(np.sqrt(np.mean(np.sum(targets**2, axis=1)))) for targets in ends)

@@ -12,7 +12,7 @@ from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
-from dopt.kernel.model_from_spec import members_of, network_of
+from dopt.kernel.model_from_spec import members_of, network_of, network_of_trial
 from dopt.learning import GaussNewton, Learner
 from dopt.models import MLP, GaussianProcess
 from dopt.policies import (
@@ -33,19 +33,39 @@ from dopt.spec.config import TrialConfig
 from dopt.spec.information_form import Information, held_information, is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
 from dopt.types import Matrix, Vector
 
 MODULES = {Form.PRIMAL: primal_network, Form.DUAL: dual, Form.SKETCH: sketch}
 
 
 @functools.lru_cache(maxsize=64)
-def constants(
-    config: TrialConfig,
-) -> tuple[args.Plant, args.Network, args.Algorithm, args.Evaluation]:
-    """Return everything that the trials of a configuration share."""
-    system, network = config.system, network_of(config.system, config.model)
-    points = evaluation_points(system, network)
-    return plant_of(system), network, algorithm_of(config), points
+def constants(config: TrialConfig) -> tuple[args.Plant, args.Network, args.Algorithm]:
+    """Return what the trials of a configuration share, but for their evaluation points."""
+    network = network_of(config.system, config.model)
+    return plant_of(config.system), network, algorithm_of(config)
+
+
+@functools.lru_cache(maxsize=64)
+def shared_points(config: TrialConfig) -> args.Evaluation:
+    """Return the evaluation points of a configuration."""
+    return evaluation_points(config.system, config.model, constants(config)[1])
+
+
+def trial_of(spec: TrialSpec, draws: Draws) -> args.Trial:
+    """Return all that a trial works on, before its first step."""
+    plant, network, algorithm = constants(spec.config)
+    network = network_of_trial(spec, network, draws.weights)
+    return args.Trial(
+        plant,
+        network,
+        algorithm,
+        information_of(spec.config),
+        randomness_of(spec, draws),
+        initial_state(spec, draws.weights),
+        empty_scratch(spec, network),
+        empty_record(spec.system),
+    )
 
 
 def plant_of(system: System) -> args.Plant:
@@ -57,6 +77,7 @@ def plant_of(system: System) -> args.Plant:
         np.array(system.linear_form),
         np.array(system.learned_rows),
         system.n_inputs,
+        system.n_inputs if system.reads_inputs else 0,
         system.dt,
         system.gamma,
         system.state_limit,
@@ -155,7 +176,7 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
         *_information(spec, q),
         _visited(spec),
         _posterior(spec),
-        np.zeros((len(system.features), window)),
+        np.zeros((len(spec.model.features(system)), window)),
         np.zeros((system.n_learned, window)),
         *(np.zeros(part.memory_size(system, q)) for part in (spec.policy, spec.learner)),
     )
@@ -208,7 +229,7 @@ def _visited(spec: TrialSpec) -> args.Visited:
     if is_fresh(spec.policy):
         places, refresh_every = spec.system.horizon, spec.policy.refresh_every
     return args.Visited(
-        np.empty((len(spec.system.features), places)),
+        np.empty((len(spec.model.features(spec.system)), places)),
         np.zeros(1, dtype=np.int64),
         refresh_every,
         _regularization(spec.config),
@@ -227,7 +248,7 @@ def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
     if isinstance(spec.model, MLP):
         depth, width = spec.model.depth, spec.model.width
     return args.Dual(
-        np.empty((states, len(spec.system.features))),
+        np.empty((states, len(spec.model.features(spec.system)))),
         np.empty((depth, states, width)),
         np.empty((r, depth, states, width)),
         np.empty((r * states, r * states)),
@@ -252,6 +273,7 @@ def empty_record(system: System) -> args.Record:
     """Return the record of a trial before its first step."""
     steps = system.horizon
     states = np.full((steps + 1, system.n_states), np.nan)
-    states[0] = system.initial_state
+    if not isinstance(system, BlackBox):  # which starts where it is measured
+        states[0] = system.initial_state
     rows = (np.full(steps, np.nan) for _ in range(5))
     return args.Record(states, np.zeros((steps, system.n_inputs)), *rows)

@@ -1,4 +1,4 @@
-"""Accelerations of every model, rows of their Jacobian, and the change of these rows.
+"""Accelerations of every model at points, rows of their Jacobian, and the change of these rows.
 
 Where a model is linear in its parameters the rows of J are the regressors Ψ(x). For the linear form
 of physics their change along a direction is taken by a complex step through the system's own
@@ -14,6 +14,7 @@ from dopt.kernel import gaussian_process, random_features
 from dopt.kernel import network as nn
 from dopt.kernel import network_tangents as tangents
 from dopt.kernel.compiler import compiled
+from dopt.kernel.points import model_point
 from dopt.kernel.structs import Linearization, Network, Plant
 from dopt.types import Matrix, Stack, Vector
 
@@ -79,7 +80,7 @@ def add_linear(rows: Matrix, theta: Vector, out: Vector) -> None:
 def model_accelerations(
     plant: Plant, network: Network, theta: Vector, x: Vector, out: Vector
 ) -> None:
-    """Write a_θ(x), (r,)."""
+    """Write a_θ, (r,), at a point x."""
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
         gaussian_process.write_mean(network, theta, x, out)
         return
@@ -88,15 +89,26 @@ def model_accelerations(
         regressors(plant, network, x, rows, out)
         add_linear(rows, theta, out)
         return
-    phi = np.empty(network.sizes[0])
+    phi = np.empty(network.feature_kinds.shape[0])
     hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1]))
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
 
 
 @compiled
+def write_point_features(
+    network: Network, x: Vector, u: Vector, features: Matrix, column: int
+) -> None:
+    """Write the features of a state and an input into a column of a matrix, (p, N)."""
+    phi = np.empty(features.shape[0])
+    nn.features_at(network, model_point(network, x, u), phi)
+    for j in range(phi.shape[0]):
+        features[j, column] = phi[j]
+
+
+@compiled
 def write_features(network: Network, states: Matrix, features: Matrix) -> None:
-    """Write the features of states, (N, d), one state to a column, (p, N)."""
+    """Write the features of points, (N, ·), one point to a column, (p, N)."""
     phi = np.empty(features.shape[0])
     for n in range(states.shape[0]):
         nn.features_at(network, states[n], phi)
@@ -108,7 +120,7 @@ def write_features(network: Network, states: Matrix, features: Matrix) -> None:
 def accelerations_at(
     plant: Plant, network: Network, theta: Vector, states: Matrix, outputs: Matrix
 ) -> None:
-    """Write a_θ, (r, N), at states, (N, d)."""
+    """Write a_θ, (r, N), at points, (N, ·)."""
     N, r = states.shape[0], outputs.shape[0]
     if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)
@@ -117,7 +129,7 @@ def accelerations_at(
             add_linear(rows, theta, value)
             outputs[:, n] = value
         return
-    features = np.empty((network.sizes[0], N))
+    features = np.empty((network.feature_kinds.shape[0], N))
     hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * N))
     write_features(network, states, features)
     nn.forward(network, theta, features, hidden, outputs)
@@ -143,7 +155,7 @@ def linearization_at(
 
     ``out`` (r,) receives a_θ(x).
     """
-    m, p = directions.shape[0], network.sizes[0]
+    m, p = directions.shape[0], network.feature_kinds.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     point = Linearization(
         np.empty(p),
@@ -155,12 +167,13 @@ def linearization_at(
     )
     nn.features_at(network, x, point.phi)
     nn.activations_at(network, theta, point.phi, point.hidden, out)
-    nn.back_signals(network, theta, point.hidden, component, point.deltas)
+    nn.back_signals(network, theta, point.phi, point.hidden, component, point.deltas)
     for j in range(m):
         tangents.features_along(network, x, directions[j], point.phi_dots[j])
         tangents.tangents_at(
             network,
             theta,
+            point.phi,
             point.phi_dots[j],
             point.hidden,
             component,
@@ -180,12 +193,12 @@ def all_components(
     ``out`` (r,) receives a_θ(x).
     """
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    phi, hidden = np.empty(network.sizes[0]), np.empty((depth, width))
+    phi, hidden = np.empty(network.feature_kinds.shape[0]), np.empty((depth, width))
     deltas = np.empty((out.shape[0], depth, width))
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
     for k in range(out.shape[0]):
-        nn.back_signals(network, theta, hidden, k, deltas[k])
+        nn.back_signals(network, theta, phi, hidden, k, deltas[k])
     return phi, hidden, deltas
 
 
@@ -228,7 +241,7 @@ def network_jacobian(network: Network, theta: Vector, x: Vector, value: Vector) 
 
 @compiled
 def rows_at(plant: Plant, network: Network, theta: Vector, states: Matrix) -> Matrix:
-    """Return the rows of J at states, (n, d), as a matrix, (n r, q)."""
+    """Return the rows of J at points, (n, ·), as a matrix, (n r, q)."""
     n, r = states.shape[0], plant.learned_rows.shape[0]
     rows, value = np.empty((n * r, theta.shape[0])), np.empty(r)
     for i in range(n):

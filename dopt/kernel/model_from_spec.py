@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from dopt.algorithm import FeatureKind, ModelKind
 from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
-from dopt.models import MLP, RFF, GaussianProcess, Linear
+from dopt.models import MLP, MODELS, RFF, AffineMLP, GaussianProcess, Linear
 from dopt.models.base import Model
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
@@ -31,17 +29,23 @@ def network_of(system: System, model: Model) -> args.Network:
     else:
         raise SpecificationError(
             f"model '{model.name}' says that it is compiled, but the kernel knows "
-            f"'mlp', 'ensemble', 'linear', 'rff' and 'gaussian_process': set compiled = False in "
-            f"its class."
+            f"{', '.join(name for name, one in MODELS.items() if one.compiled)} alone: set "
+            f"compiled = False in its class."
         )
-    lengths = [(n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes)]
+    inputs = model.layer_inputs(system) if isinstance(model, MLP) else sizes[:-1]
+    lengths = [(n_in + 1) * n_out for n_in, n_out in zip(inputs, sizes[1:], strict=True)]
+    n_read = model.n_inputs_read(system)
+    features = model.features(system)
     return args.Network(
         int(kind),
         np.array(sizes),
+        np.array(inputs),
         np.cumsum([0, *lengths[:-1]]),
-        np.array([FEATURE_KINDS[feature.kind] for feature in system.features]),
-        np.array([feature.index for feature in system.features]),
-        np.array(system.feature_scales),
+        n_read,
+        n_read if isinstance(model, AffineMLP) else 0,
+        np.array([FEATURE_KINDS[feature.kind] for feature in features]),
+        np.array([feature.index for feature in features]),
+        np.array(model.feature_scales(system)),
         args.Waves(np.zeros((0, 0)), np.zeros(0), 1.0),
         _process(system, model),
     )

@@ -1,7 +1,9 @@
 """The model in compiled code: values and gradients, for batches and single states.
 
 Twin of the ``torch.nn.Module`` of the reference. In the backward passes δ is the derivative of an
-output with respect to the pre-activations of a layer, and h the activations.
+output with respect to the pre-activations of a layer, and h the activations. The output layer has
+the last hidden layer for its inputs, and with it the inputs of the system where they multiply it
+(:mod:`dopt.kernel.output_layer`).
 """
 
 from __future__ import annotations
@@ -12,6 +14,12 @@ import numpy as np
 
 from dopt.algorithm import FeatureKind
 from dopt.kernel.compiler import compiled, contracted, squared, vectorized
+from dopt.kernel.output_layer import (
+    output_inputs,
+    output_inputs_at,
+    output_slope,
+    sum_over_factors,
+)
 from dopt.kernel.structs import Network
 from dopt.kernel.tanh import tanh
 from dopt.types import Matrix, Real, Stack, Vector
@@ -19,7 +27,7 @@ from dopt.types import Matrix, Real, Stack, Vector
 
 @compiled
 def features_at(network: Network, x: Vector, out: Vector) -> None:
-    """Write the features of a state."""
+    """Write the features of a point."""
     for i in range(out.shape[0]):
         value = x[network.feature_indices[i]]
         kind = network.feature_kinds[i]
@@ -33,7 +41,7 @@ def features_at(network: Network, x: Vector, out: Vector) -> None:
 @compiled
 def layer(network: Network, theta: Real, index: int) -> tuple[Real, Real]:
     """Return views of the weights, (outputs, inputs), and biases of a layer."""
-    n_in, n_out = network.sizes[index], network.sizes[index + 1]
+    n_in, n_out = network.layer_inputs[index], network.sizes[index + 1]
     start = network.offsets[index]
     middle = start + n_in * n_out
     return theta[start:middle].reshape(n_out, n_in), theta[middle : middle + n_out]
@@ -63,7 +71,7 @@ def forward(network: Network, theta: Real, inputs: Real, hidden: Real, outputs: 
     n, depth, width = inputs.shape[1], network.offsets.shape[0] - 1, network.sizes[1]
     W, b = layer(network, theta, 0)
     values = units_by_points(hidden[0], width, n)
-    np.dot(W, inputs, values)
+    np.dot(W, inputs[: W.shape[1]], values)
     _activate(values, b)
     for index in range(1, depth):
         W, b = layer(network, theta, index)
@@ -72,7 +80,7 @@ def forward(network: Network, theta: Real, inputs: Real, hidden: Real, outputs: 
         _activate(above, b)
         values = above
     W, b = layer(network, theta, depth)
-    np.dot(W, values, outputs)
+    np.dot(W, output_inputs(network, values, inputs), outputs)
     for k in range(b.shape[0]):
         for i in range(n):
             outputs[k, i] += b[k]
@@ -143,13 +151,17 @@ def loss_gradient(
         dW, db = layer(network, gradient, index)
         _row_sums(delta, db)
         if index == 0:
-            np.dot(delta, inputs.T, dW)
+            np.dot(delta, inputs[: dW.shape[1]].T, dW)
         else:
             W, _ = layer(network, theta, index)
             values = units_by_points(hidden[index - 1], width, n)
-            np.dot(delta, values.T, dW)
             below = units_by_points(deltas[index % 2], width, n)
-            np.dot(W.T, delta, below)
+            if index == depth and network.n_factors > 0:
+                np.dot(delta, output_inputs(network, values, inputs).T, dW)
+                sum_over_factors(network.n_factors, np.dot(W.T, delta), inputs, below)
+            else:
+                np.dot(delta, values.T, dW)
+                np.dot(W.T, delta, below)
             through_tanh(below, values)
             delta = below
 
@@ -169,14 +181,14 @@ def activations_at(
             values[i] = tanh(values[i])
         below = values
     W, b = layer(network, theta, depth)
-    _affine(W, b, below, output)
+    _affine(W, b, output_inputs_at(network, below, phi), output)
 
 
 @contracted
 def _affine(W: Matrix, b: Vector, x: Vector, out: Vector) -> None:
     for i in range(out.shape[0]):
         total = b[i]
-        for j in range(x.shape[0]):
+        for j in range(W.shape[1]):
             total += W[i, j] * x[j]
         out[i] = total
 
@@ -192,13 +204,14 @@ def transposed_product(W: Matrix, delta: Vector, out: Vector) -> None:
 
 @contracted
 def back_signals(
-    network: Network, theta: Vector, hidden: Matrix, component: int, deltas: Matrix
+    network: Network, theta: Vector, phi: Vector, hidden: Matrix, component: int, deltas: Matrix
 ) -> None:
     """Write δ, (L, w): the derivative of output k with respect to every pre-activation."""
     depth = network.offsets.shape[0] - 1
     W, _ = layer(network, theta, depth)
     for i in range(deltas.shape[1]):
-        deltas[depth - 1, i] = W[component, i] * (1.0 - squared(hidden[depth - 1, i]))
+        slope = output_slope(network, W, phi, component, i)
+        deltas[depth - 1, i] = slope * (1.0 - squared(hidden[depth - 1, i]))
     for index in range(depth - 1, 0, -1):
         W, _ = layer(network, theta, index)
         transposed_product(W, deltas[index], deltas[index - 1])
@@ -207,8 +220,14 @@ def back_signals(
 
 
 @compiled
-def batch_back_signals(network: Network, theta: Vector, hidden: Matrix, r: int, n: int) -> Stack:
-    """Return δ of every output and hidden layer, (r L, w, N), layer by layer of an output."""
+def batch_back_signals(
+    network: Network, theta: Vector, inputs: Matrix, hidden: Matrix, r: int
+) -> Stack:
+    """Return δ of every output and hidden layer, (r L, w, N), layer by layer of an output.
+
+    ``inputs`` (p, N) are features, ``hidden`` (L, w N) the activations there.
+    """
+    n, m, p = inputs.shape[1], network.n_factors, inputs.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     out = np.empty((r * depth, width, n))
     last, _ = layer(network, theta, depth)
@@ -219,6 +238,8 @@ def batch_back_signals(network: Network, theta: Vector, hidden: Matrix, r: int, 
             if index == depth - 1:
                 for i in range(width):
                     signal[i] = last[k, i]
+                    for j in range(m):
+                        signal[i] += inputs[p - m + j] * last[k, (1 + j) * width + i]
             else:
                 W, _ = layer(network, theta, index + 1)
                 np.dot(W.T, out[k * depth + index + 1], signal)
@@ -238,11 +259,12 @@ def parameter_gradient(
         for i in range(db.shape[0]):
             delta = deltas[index, i]
             db[i] = delta
-            for j in range(below.shape[0]):
+            for j in range(dW.shape[1]):
                 dW[i, j] = delta * below[j]
     dW, db = layer(network, out, depth)
+    top = output_inputs_at(network, hidden[depth - 1], phi)
     for k in range(db.shape[0]):
         chosen = 1.0 if k == component else 0.0
         db[k] = chosen
         for j in range(dW.shape[1]):
-            dW[k, j] = chosen * hidden[depth - 1, j]
+            dW[k, j] = chosen * top[j]

@@ -9,7 +9,8 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import called_from_python
-from dopt.kernel.model import euler_step, write_features
+from dopt.kernel.model import euler_step, write_point_features
+from dopt.kernel.points import plant_point
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
 
@@ -20,7 +21,8 @@ def follow_equations(plant: Plant, parameters: Vector, inputs: Stack, states: St
     flow, value = np.empty(states.shape[2]), np.empty(plant.learned_rows.shape[0])
     for t in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
-            plant.accelerations(states[t, i], parameters, value)
+            point = plant_point(plant, states[t, i], inputs[t, i])
+            plant.accelerations(point, parameters, value)
             euler_step(plant, states[t, i], inputs[t, i], value, flow, states[t + 1, i])
 
 
@@ -35,10 +37,12 @@ def follow_network(
     n, r = inputs.shape[1], plant.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     flow, value = np.empty(states.shape[2]), np.empty(r)
-    features, outputs, one = np.empty((network.sizes[0], n)), np.empty((r, n)), np.empty((r, n))
+    features, outputs = np.empty((network.feature_kinds.shape[0], n)), np.empty((r, n))
+    one = np.empty((r, n))
     hidden = np.empty((depth, width * n))
     for t in range(inputs.shape[0]):
-        write_features(network, states[t], features)
+        for i in range(n):
+            write_point_features(network, states[t, i], inputs[t, i], features, i)
         nn.mean_forward(network, thetas, features, hidden, outputs, one)
         for i in range(n):
             for k in range(r):

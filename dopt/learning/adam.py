@@ -47,6 +47,7 @@ class Adam(AdamRule):
     name: ClassVar[str] = "adam"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.adam.learn"
+    reads_inputs: ClassVar[bool] = True
 
     window: int = parameter(1, "samples", "positive")
 

@@ -35,6 +35,7 @@ class AdamReplay(AdamRule):
     name: ClassVar[str] = "adam_replay"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.replay.learn"
+    reads_inputs: ClassVar[bool] = True
 
     learning_rate: float = parameter(3e-3, bound="positive")
     capacity: int = parameter(10_000, "samples", "positive")

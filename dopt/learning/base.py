@@ -22,12 +22,14 @@ class Learner(KernelPart):
 
     ``structure`` is that of the models which it teaches (:class:`dopt.models.Model`), and
     ``updates_information`` says whether its step also adds the sample to the information matrix.
+    ``reads_inputs`` says whether it teaches models that depend on the inputs.
     """
 
     section: ClassVar[str] = "learner"
     name: ClassVar[str]
     structure: ClassVar[str] = "gradient"
     updates_information: ClassVar[bool] = False
+    reads_inputs: ClassVar[bool] = False
 
     def samples_kept(self, horizon: int) -> int:  # noqa: ARG002  # of most learners, none
         """Return how many of the newest samples the kernel keeps in a trial of so many steps."""

@@ -79,6 +79,7 @@ class ExtendedKalman(InformationLearner):
     name: ClassVar[str] = "ekf"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn"
+    reads_inputs: ClassVar[bool] = True
 
     forgetting: float = parameter(1.0, bound="share")
     underweighting: float = parameter(0.0, bound="nonnegative", added=True)

@@ -48,6 +48,7 @@ class GaussNewton(InformationLearner):
     name: ClassVar[str] = "gauss_newton"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.gauss_newton.learn"
+    reads_inputs: ClassVar[bool] = True
 
     capacity: int = parameter(10_000, "samples", "positive")
     refit_every: int = parameter(1, "steps", "positive")

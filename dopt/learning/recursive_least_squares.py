@@ -25,6 +25,7 @@ class RecursiveLeastSquares(Learner):
     name: ClassVar[str] = "recursive_least_squares"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.learners.least_squares.learn"
+    reads_inputs: ClassVar[bool] = True
     updates_information: ClassVar[bool] = True
     structure: ClassVar[str] = "least_squares"
 

@@ -5,13 +5,35 @@ from __future__ import annotations
 from dopt.models.base import Model
 from dopt.models.ensemble import Ensemble
 from dopt.models.gaussian_process import GaussianProcess
+from dopt.models.input_networks import AffineMLP, BlackBoxMLP
 from dopt.models.linear import Linear
 from dopt.models.linear_state import LinearState
 from dopt.models.mlp import MLP
 from dopt.models.rff import RFF
 
 MODELS: dict[str, type[Model]] = {
-    model.name: model for model in (MLP, Ensemble, Linear, LinearState, RFF, GaussianProcess)
+    model.name: model
+    for model in (
+        MLP,
+        Ensemble,
+        AffineMLP,
+        BlackBoxMLP,
+        Linear,
+        LinearState,
+        RFF,
+        GaussianProcess,
+    )
 }
 
-__all__ = ["MLP", "MODELS", "RFF", "Ensemble", "GaussianProcess", "Linear", "LinearState", "Model"]
+__all__ = [
+    "MLP",
+    "MODELS",
+    "RFF",
+    "AffineMLP",
+    "BlackBoxMLP",
+    "Ensemble",
+    "GaussianProcess",
+    "Linear",
+    "LinearState",
+    "Model",
+]

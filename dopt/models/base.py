@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.declare.kernel_support import KernelSupport
-from dopt.systems.base import System
+from dopt.systems.base import System, with_inputs
+from dopt.systems.features import Feature, feature_values
 
 Array = npt.NDArray[np.float64]
 
@@ -49,6 +50,38 @@ class Model(KernelSupport):
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
         """Draw the initial parameters, (q,)."""
 
+    def predict(
+        self, system: System, parameters: Array, states: Array, inputs: Array | None = None
+    ) -> Array:
+        """Return the modelled accelerations, (N, r), of states, (N, d), with parameters (q,).
+
+        The inputs, (N, m), count in a model that reads them; without any they are 0.
+        """
+        return self.predict_at(system, parameters, self.points(system, states, inputs))
+
     @abstractmethod
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
-        """Return the modelled accelerations, (N, r), of states, (N, d), with parameters (q,)."""
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
+        """Return the modelled accelerations, (N, r), at :meth:`points`, with parameters (q,)."""
+
+    def n_inputs_read(self, system: System) -> int:  # noqa: ARG002  # of most models, none
+        """Return how many inputs the model depends on: all m, or none."""
+        return 0
+
+    def points(self, system: System, states: Array, inputs: Array | None = None) -> Array:
+        """Return what the model depends on: states (N, d), or states and inputs, (N, d + m)."""
+        return with_inputs(states, inputs, self.n_inputs_read(system))
+
+    def features(self, system: System) -> tuple[Feature, ...]:
+        """Return the p features of a point: those of the state, then the inputs, if they count."""
+        first, m = system.n_states, self.n_inputs_read(system)
+        return (*system.features, *(Feature("identity", first + j) for j in range(m)))
+
+    def feature_scales(self, system: System) -> tuple[float, ...]:
+        """Return the divisor of each feature: that of the system, and γ for an input."""
+        return (*system.feature_scales, *[system.gamma] * self.n_inputs_read(system))
+
+    def featurize(self, system: System, points: Array) -> Array:
+        """Return the features, (N, p), of points."""
+        scales = self.feature_scales(system)
+        values = feature_values(self.features(system), scales, np.moveaxis(points, -1, 0))
+        return np.stack(values, axis=-1)

@@ -49,9 +49,9 @@ class Ensemble(MLP):
         drawn = [super(Ensemble, self).initial_parameters(system, rng) for _ in range(self.members)]
         return np.concatenate(drawn)
 
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         """Return the mean of the members' accelerations, (N, r)."""
         members = parameters.reshape(self.members, -1)
-        values = [super(Ensemble, self).predict(system, theta, states) for theta in members]
+        values = [super(Ensemble, self).predict_at(system, theta, points) for theta in members]
         mean: Array = np.mean(values, axis=0)
         return mean

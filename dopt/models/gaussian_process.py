@@ -50,11 +50,11 @@ class GaussianProcess(Model):
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
         return np.zeros(self.n_parameters(system))
 
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         first = system.horizon * len(system.features)
         centers = parameters[:first].reshape(system.horizon, -1)
         alpha = parameters[first:].reshape(system.horizon, -1)
-        predicted: Array = self.kernel(system.featurize(states), centers) @ alpha
+        predicted: Array = self.kernel(system.featurize(points), centers) @ alpha
         return predicted
 
     def kernel(self, phi: Array, other: Array) -> Array:

@@ -29,9 +29,12 @@ class Linear(Model):
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
         return np.zeros(self.n_parameters(system))
 
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+    def n_inputs_read(self, system: System) -> int:
+        return system.n_inputs if system.reads_inputs else 0
+
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         offset, *units = (
-            np.stack(np.broadcast_arrays(*system.accelerations(tuple(states.T), form)), axis=-1)
+            np.stack(np.broadcast_arrays(*system.accelerations(tuple(points.T), form)), axis=-1)
             for form in system.linear_form
         )
         regressors = np.stack([unit - offset for unit in units], axis=-1)

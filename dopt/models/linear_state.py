@@ -29,7 +29,7 @@ class LinearState(Model):
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
         return np.zeros(self.n_parameters(system))
 
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         matrix = parameters.reshape(system.n_learned, len(system.features))
-        predicted: Array = system.featurize(states) @ matrix.T
+        predicted: Array = system.featurize(points) @ matrix.T
         return predicted

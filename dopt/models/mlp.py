@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -36,26 +35,49 @@ class MLP(Model):
 
     def layer_sizes(self, system: System) -> tuple[int, ...]:
         """Return the number of units of every layer, from the features to the outputs."""
-        return (len(system.features), *[self.width] * self.depth, system.n_learned)
+        return (self.n_first_inputs(system), *[self.width] * self.depth, system.n_learned)
+
+    def layer_inputs(self, system: System) -> tuple[int, ...]:
+        """Return the number of inputs of every layer, as many as its matrix has columns."""
+        return (*self.layer_sizes(system)[:-2], self.n_output_inputs(system))
+
+    def n_first_inputs(self, system: System) -> int:
+        """Return how many features the first layer has for inputs."""
+        return len(self.features(system))
+
+    def n_output_inputs(self, system: System) -> int:  # noqa: ARG002  # the units of a hidden layer
+        """Return how many inputs the output layer has."""
+        return self.width
+
+    def output_inputs(self, system: System, hidden: Array, features: Array) -> Array:  # noqa: ARG002  # the hidden layer alone
+        """Return the inputs of the output layer for the last hidden layer, (N, w)."""
+        return hidden
 
     def n_parameters(self, system: System) -> int:
-        n_in, n_out, width = len(system.features), system.n_learned, self.width
-        return (n_in + 1) * width + (self.depth - 1) * (width + 1) * width + (width + 1) * n_out
+        n_in, n_out, width = self.n_first_inputs(system), system.n_learned, self.width
+        hidden = (n_in + 1) * width + (self.depth - 1) * (width + 1) * width
+        return hidden + (self.n_output_inputs(system) + 1) * n_out
 
     def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
-        """Draw every weight and bias of a layer uniformly in ±1/√(number of its inputs)."""
-        sizes = self.layer_sizes(system)
+        """Draw every weight and bias of a layer uniformly in ±1/√(units below it)."""
         return np.concatenate(
             [
-                rng.uniform(-1.0, 1.0, (n_in + 1) * n_out) / np.sqrt(n_in)
-                for n_in, n_out in itertools.pairwise(sizes)
+                rng.uniform(-1.0, 1.0, (n_in + 1) * n_out) / np.sqrt(below)
+                for n_in, below, n_out in self._layers(system)
             ]
         )
 
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
-        values = system.featurize(states)
-        sizes, first = self.layer_sizes(system), 0
-        for layer, (n_in, n_out) in enumerate(itertools.pairwise(sizes)):
+    def _layers(self, system: System) -> list[tuple[int, int, int]]:
+        """Return for each layer the number of its inputs, of the units below it and of its own."""
+        sizes = self.layer_sizes(system)
+        return list(zip(self.layer_inputs(system), sizes[:-1], sizes[1:], strict=True))
+
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
+        features = self.featurize(system, points)
+        values, first = features[:, : self.layer_sizes(system)[0]], 0
+        for layer, (n_in, _, n_out) in enumerate(self._layers(system)):
+            if layer == self.depth:
+                values = self.output_inputs(system, values, features)
             weights = parameters[first : first + n_in * n_out].reshape(n_out, n_in)
             first += n_in * n_out
             values = values @ weights.T + parameters[first : first + n_out]

@@ -55,12 +55,12 @@ class RFF(Model):
         phases = rng.uniform(0.0, 2.0 * math.pi, self.n_features)
         return np.concatenate([weights, frequencies / self.lengthscale, phases])
 
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         first = self.n_features * system.n_learned
         last = len(parameters) - self.n_features
         weights = parameters[:first].reshape(system.n_learned, self.n_features)
         frequencies = parameters[first:last].reshape(self.n_features, len(system.features))
-        waves = np.cos(system.featurize(states) @ frequencies.T + parameters[last:])
+        waves = np.cos(system.featurize(points) @ frequencies.T + parameters[last:])
         predicted: Array = self.scale * waves @ weights.T
         return predicted
 

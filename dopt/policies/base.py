@@ -40,12 +40,13 @@ class Policy(KernelPart):
     """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.
 
     ``uses_full_amplitude`` says whether every input has the norm γ; without it inputs may have
-    other norms.
+    other norms. ``reads_inputs`` says whether it goes with models that depend on the inputs.
     """
 
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
     uses_full_amplitude: ClassVar[bool] = True
+    reads_inputs: ClassVar[bool] = False
 
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
@@ -64,6 +65,7 @@ class OpenLoop(Policy):
 
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.policies.open_loop.plan"
+    reads_inputs: ClassVar[bool] = True
     exceeds: ClassVar[bool] = False
 
     @abstractmethod

@@ -41,6 +41,7 @@ class DOptimal(InformationPolicy):
     name: ClassVar[str] = "d_optimal"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.policies.d_optimal.plan"
+    reads_inputs: ClassVar[bool] = True
 
     form: str = parameter("auto", choices=("auto", "primal", "dual", "sketch"))
     sketch_size: int = parameter(256, "dimensions", "positive")

@@ -69,6 +69,7 @@ class ICEM(InformationPolicy):
     name: ClassVar[str] = "icem"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.search.sampling.plan"
+    reads_inputs: ClassVar[bool] = True
 
     lookahead: int = parameter(60, "steps", "positive")
     hold: int = parameter(10, "steps", "positive")

@@ -42,6 +42,7 @@ class Search(CandidatePolicy, InformationPolicy):
     """
 
     kernel_function: ClassVar[str] = "dopt.kernel.search.plans.plan"
+    reads_inputs: ClassVar[bool] = True
 
     budget_us: float = parameter(0.0, "µs", "nonnegative")
 

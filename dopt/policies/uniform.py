@@ -27,5 +27,6 @@ class Uniform(ClosedLoop):
     name: ClassVar[str] = "uniform"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "dopt.kernel.policies.uniform.plan"
+    reads_inputs: ClassVar[bool] = True
 
     iterations: int = parameter(8, "steps", "positive")

@@ -8,31 +8,21 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.func import jacrev, vmap
+from torch.func import vmap
 
-from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
-from dopt.policies.base import OpenLoop
 from dopt.reference.black_box import episodes_for, initial_states, stepped
-from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
-from dopt.reference.dynamics import flow, known_flow, true_accelerations
+from dopt.reference.dynamics import flow, true_accelerations
 from dopt.reference.gaussian_process import Posterior
-from dopt.reference.learner_registry import batch_learner
-from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
-from dopt.reference.planner_registry import plan_for
-from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
-from dopt.reference.search import searched_inputs
-from dopt.reference.state import BatchState
+from dopt.reference.steps import BatchSteps
 from dopt.result import TrialResult
-from dopt.spec.information_form import is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 
-class Lockstep(BatchState):
+class Lockstep(BatchSteps):
     """A batch of n trials of one configuration that take each step together.
 
     Parameters and errors are those of :class:`dopt.reference.state.BatchState`.
@@ -49,39 +39,10 @@ class Lockstep(BatchState):
             name: np.full((len(specs), self.system.horizon), np.nan) for name in COLUMNS
         }
         points = evaluation_set(self.system)
-        self.points, self.truth = self.tensor(points.states), self.tensor(points.accelerations)
-        self.n_grid = points.n_grid
-        self.planners = planners_for(self.specs)
-        self.learner = batch_learner(self, self.points)
-        self.own_plan = plan_for(self, self.learner)
-        self._rows = vmap(jacrev(self.model))
-
-    def plan(self, t: int) -> Tensor:
-        """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
-        policy, x = self.config.policy, self.states[:, t]
-        if isinstance(policy, OpenLoop) or t == 0:
-            return self.open_loop[:, t]
-        if self.planners:
-            return planned_inputs(self, self.planners, t)
-        if self.own_plan is not None:
-            return self.own_plan.plan(t)
-        if isinstance(policy, Uniform):
-            seen = self.states[:, : t + 1]
-            return uniform_inputs(self.system, self.model, self.theta, seen, policy.iterations)
-        if self.information is None or not isinstance(policy, (Search, DOptimal)):
-            raise SpecificationError(
-                f"the reference has no plan for policy '{policy.name}': derive its class from "
-                f"CustomPolicy, or enter a plan in dopt.reference.planner_registry."
-            )
-        given = (self.system, self.model, self.theta, self.information, x)
-        if isinstance(policy, Search):
-            assert self.held is not None
-            return searched_inputs(policy, *given, self.ties[:, t], self.held.noise_variance)
-        components = self.components[:, t : t + 1]
-        if isinstance(policy, TraceLinearized):
-            components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)
-        problems = [quadratic_problem(*given, k, self.project) for k in components.unbind(1)]
-        return d_optimal_inputs(summed(problems), self.system.gamma, self.ties[:, t])
+        self.visited, self.applied = self.tensor(points.states), self.tensor(points.inputs)
+        self.truth, self.n_grid = self.tensor(points.accelerations), points.n_grid
+        self.evaluated = self.points(self.visited, self.applied)
+        self.prepare(self.evaluated)
 
     def act(self, t: int, u: Tensor) -> None:
         """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""
@@ -89,87 +50,16 @@ class Lockstep(BatchState):
         if self.episodes:
             u, following = stepped(self.episodes, u)
         else:
-            step = flow(self.system, x, u, true_accelerations(self.system, x, t))
+            step = flow(self.system, x, u, true_accelerations(self.system, x, u, t))
             following = x + self.system.dt * step + self.noise[:, t]
-        observed = (following - x) / self.system.dt - known_flow(self.system, x, u)
         self.inputs[:, t] = u
         self.states[:, t + 1] = following
-        self.targets[:, t] = observed[:, list(self.system.learned_rows)]
-
-    def learn(self, t: int) -> None:
-        """Update the parameters with the samples up to time t; diverged trials keep theirs.
-
-        Of an ensemble that is the member whose turn it is, and then the first one, whose M stays.
-        """
-        if self.members is None:
-            self._learn(t)
-            return
-        assert isinstance(self.learner, GaussNewtonLearner)
-        for turn in (1 + t % (self.members.shape[1] - 1), 0):
-            self.theta.copy_(self.members[:, turn])
-            self.learner.prior.copy_(self.member_priors[:, turn])
-            self._learn(t)
-            self.members[:, turn] = self.theta
-
-    def _learn(self, t: int) -> None:
-        before = self.theta.clone()
-        seen = (self.states[:, : t + 1], self.targets[:, : t + 1])
-        if isinstance(self.learner, KalmanLearner):
-            assert self.information is not None
-            self.information = self.learner.filtered(*seen, self.information)
-        else:
-            self.learner.learn(*seen)
-        self.theta.copy_(torch.where(self.diverged, before, self.theta))
-
-    @property
-    def parameters_of_model(self) -> Tensor:
-        """Parameters of the model, (n, q), those of the members one after the other."""
-        return self.theta if self.members is None else self.members.flatten(1)
-
-    def rows(self, t: int) -> Tensor:
-        """Return J at x_t and the current parameters, (n, r, s), in the space of M."""
-        return self.project(self._rows(self.theta, self.states[:, t]))
-
-    def inform(self, t: int) -> None:
-        """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t.
-
-        A learner that shares M has done so in its learning step. Fresh information has the rows of
-        all states at these parameters instead.
-        """
-        observe(self, self.planners, t)
-        if self.information is not None and not isinstance(self.learner, KalmanLearner):
-            self.information = self._informed(self.information, t)
-        if self.own_plan is not None:
-            self.own_plan.inform(t)
-
-    def _informed(self, information: Tensor, t: int) -> Tensor:
-        """Return M after step t: with the rows at x_t, or fresh, with those of all states."""
-        policy = self.config.policy
-        if is_fresh(policy) and (t + 1) % policy.refresh_every == 0:
-            return self._summed_anew(t)
-        J = self.rows(t)
-        return information + J.mT @ J
-
-    def _summed_anew(self, t: int) -> Tensor:
-        """Return λI + Σ JᵀJ over x_0 ... x_t at the current parameters.
-
-        θ is NaN afterwards, which ends the trial as diverged, where rounding has left the sum
-        indefinite or its inverse is not finite.
-        """
-        assert self.held is not None
-        over_states = vmap(self._rows, in_dims=(None, 1), out_dims=1)
-        J = self.project(over_states(self.theta, self.states[:, : t + 1])).flatten(1, 2)
-        total: Tensor = self.held.regularization * torch.eye(J.shape[-1]).to(J) + J.mT @ J
-        factor, failed = torch.linalg.cholesky_ex(total)
-        root = torch.linalg.solve_triangular(factor, torch.eye(J.shape[-1]).to(J), upper=False)
-        lost = (failed > 0) | ~root.square().sum(dim=1).isfinite().all(dim=1)
-        self.theta.masked_fill_(lost.unsqueeze(1) & ~self.diverged, torch.nan)
-        return total
+        self.observe(t, self.system.dt)
 
     def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
         """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""
         if len(self.system.history) > 1:
-            self.truth = true_accelerations(self.system, self.points, t)
+            self.truth = true_accelerations(self.system, self.visited, self.applied, t)
         squares = (self._predicted() - self.truth).square().sum(dim=-1)
         grid, reachable = squares[:, : self.n_grid], squares[:, self.n_grid :]
         return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
@@ -182,8 +72,9 @@ class Lockstep(BatchState):
         over_trials = vmap(over_points, in_dims=(0, None))
         if self.members is not None:
             members = self.members.unbind(1)
-            return torch.stack([over_trials(theta, self.points) for theta in members]).mean(dim=0)
-        predicted: Tensor = over_trials(self.theta, self.points)
+            each = [over_trials(theta, self.evaluated) for theta in members]
+            return torch.stack(each).mean(dim=0)
+        predicted: Tensor = over_trials(self.theta, self.evaluated)
         return predicted
 
     def step(self, t: int) -> None:

@@ -1,11 +1,14 @@
-"""True and predicted dynamics over tensors: the equations of :mod:`dopt.systems` themselves."""
+"""True and learned dynamics over tensors: the equations of :mod:`dopt.systems` themselves."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+from torch.func import jacrev, vmap
 
-from dopt.reference.models import stack
+from dopt.reference.models import Accelerations, stack
 from dopt.systems.base import System
 
 
@@ -14,10 +17,11 @@ def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:
     return stack(system.known(x.unbind(-1), u.unbind(-1), system.parameters))
 
 
-def true_accelerations(system: System, x: Tensor, step: int) -> Tensor:
-    """Return a(x) at a step, (..., r), for states (..., d)."""
+def true_accelerations(system: System, x: Tensor, u: Tensor, step: int) -> Tensor:
+    """Return a at a step, (..., r), for states (..., d) and inputs (..., m)."""
     parameters = system.history[min(step, len(system.history) - 1)].tolist()
-    return stack(system.accelerations(x.unbind(-1), parameters))
+    point = torch.cat([x, u], dim=-1) if system.reads_inputs else x
+    return stack(system.accelerations(point.unbind(-1), parameters))
 
 
 def flow(system: System, x: Tensor, u: Tensor, accelerations: Tensor) -> Tensor:
@@ -27,7 +31,7 @@ def flow(system: System, x: Tensor, u: Tensor, accelerations: Tensor) -> Tensor:
 
 
 def input_matrix(system: System, x: Tensor) -> Tensor:
-    """Return B = dt ∂f/∂u, (d, m), at one state (d,)."""
+    """Return B = dt ∂known/∂u, (d, m), at one state (d,)."""
 
     def by_input(u: Tensor) -> Tensor:
         return known_flow(system, x, u)
@@ -35,3 +39,68 @@ def input_matrix(system: System, x: Tensor) -> Tensor:
     zero = torch.zeros(system.n_inputs, dtype=x.dtype, device=x.device)
     columns: Tensor = torch.func.jacfwd(by_input)(zero)
     return system.dt * columns
+
+
+@dataclass(frozen=True)
+class LearnedDynamics:
+    """A system with a model in the place of the accelerations that are learned.
+
+    Attributes
+    ----------
+    system : System
+        Known part, γ and dt.
+    model : callable
+        a_θ: parameters (q,) and a point to accelerations (r,).
+    n_inputs_read : int
+        m where a point is a state and an input, (d + m,); 0 where it is a state, (d,).
+    """
+
+    system: System
+    model: Accelerations
+    n_inputs_read: int = 0
+
+    def points(self, x: Tensor, u: Tensor) -> Tensor:
+        """Return what the model depends on at states (..., d) and inputs (..., m)."""
+        return torch.cat([x, u], dim=-1) if self.n_inputs_read else x
+
+    def next_points(self, x: Tensor) -> Tensor:
+        """Return points, (..., n, ·), that stand for states (..., d) without an input yet.
+
+        These are the states themselves, or for a model that reads inputs each state under ±γ along
+        each axis. The mean of JᵀJ over them is that over the sphere where J is affine in u.
+        """
+        if not self.n_inputs_read:
+            return x.unsqueeze(-2)
+        axes = self.system.gamma * torch.eye(self.n_inputs_read).to(x)
+        both = torch.stack([axes, -axes], dim=1).flatten(0, 1)
+        states = x.unsqueeze(-2).expand(*x.shape[:-1], len(both), -1)
+        return torch.cat([states, both.expand(*x.shape[:-1], -1, -1)], dim=-1)
+
+    def rows_at(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return rows, (N, n r, q), whose JᵀJ is the mean over :meth:`next_points` of (N, d)."""
+        points = self.next_points(x)
+        J = vmap(vmap(jacrev(self.model), (None, 0)), (None, 0))(theta, points)
+        rows: Tensor = J.flatten(1, 2) * points.shape[-2] ** -0.5
+        return rows
+
+    def following(self, theta: Tensor, x: Tensor, u: Tensor) -> Tensor:
+        """Return x + dt f_θ(x, u), (n, d), for parameters (q,), states (n, d), inputs (n, m)."""
+        accelerations = vmap(self.model, (None, 0))(theta, self.points(x, u))
+        return x + self.system.dt * flow(self.system, x, u, accelerations)
+
+    def input_matrix(self, theta: Tensor, x: Tensor) -> Tensor:
+        """Return B = dt ∂f_θ/∂u, (d, m), at one state (d,).
+
+        What a model has learned of the inputs is taken as its secant between -γ and γ along each
+        axis, exact for one that is affine in them.
+        """
+        columns = input_matrix(self.system, x)
+        if not self.n_inputs_read:
+            return columns
+        gamma = self.system.gamma
+        axes = gamma * torch.eye(self.n_inputs_read).to(x)
+        both = torch.cat([axes, -axes])
+        values = vmap(self.model, (None, 0))(theta, self.points(x.expand(len(both), -1), both))
+        slopes = (values[: len(axes)] - values[len(axes) :]).mT / (2.0 * gamma)
+        rows = torch.tensor(self.system.learned_rows, device=x.device)
+        return columns.index_add(0, rows, self.system.dt * slopes)

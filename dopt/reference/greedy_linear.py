@@ -25,7 +25,7 @@ class GreedyLinearPlan:
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m)."""
         batch = self._batch
-        bar = predicted_states(batch.system, batch.model, batch.theta, batch.states[:, t])
+        bar = predicted_states(batch.learned, batch.theta, batch.states[:, t])
         center = features(batch.system, bar).unsqueeze(-1)
         solved = torch.linalg.solve(self._gram, self._B)
         v = -(solved.mT @ center).squeeze(-1)

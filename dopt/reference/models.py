@@ -10,13 +10,16 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from dopt.models import MLP, RFF, GaussianProcess, Linear, LinearState, Model
+from dopt.models import MLP, RFF, AffineMLP, GaussianProcess, Linear, LinearState, Model
 from dopt.systems.base import System
 from dopt.systems.features import feature_values
 from dopt.types import Scalar
 
 Accelerations = Callable[[Tensor, Tensor], Tensor]
-"""a_θ(x): parameters (q,) and state (d,) to accelerations (r,)."""
+"""a_θ: parameters (q,) and a point, (d,) or (d + m,), to accelerations (r,).
+
+A point is what the model depends on: a state, or a state and an input.
+"""
 
 
 @runtime_checkable
@@ -28,8 +31,10 @@ class Networked(Protocol):
 
 def model_function(system: System, model: Model) -> Accelerations:
     """Return a_θ of a registered model."""
+    if isinstance(model, AffineMLP):
+        return network_function(system, AffineNetwork(model, system), model)
     if isinstance(model, MLP):
-        return network_function(system, tanh_network(model.layer_sizes(system)))
+        return network_function(system, tanh_network(model.layer_sizes(system)), model)
     if isinstance(model, Linear):
         return linear_function(system)
     if isinstance(model, LinearState):
@@ -43,13 +48,15 @@ def model_function(system: System, model: Model) -> Accelerations:
     raise TypeError(f"model {model!r} is no Module and none of this package: give its module.")
 
 
-def features(system: System, x: Tensor) -> Tensor:
-    """Return the features, (..., p), of states (..., d)."""
-    values = feature_values(system.features, system.feature_scales, x.unbind(-1))
-    return torch.stack(values, dim=-1)
+def features(system: System, x: Tensor, model: Model | None = None) -> Tensor:
+    """Return the features, (..., p), of states (..., d), or of points of a model."""
+    kinds, scales = system.features, system.feature_scales
+    if model is not None:
+        kinds, scales = model.features(system), model.feature_scales(system)
+    return torch.stack(feature_values(kinds, scales, x.unbind(-1)), dim=-1)
 
 
-def tanh_network(sizes: tuple[int, ...]) -> nn.Module:
+def tanh_network(sizes: tuple[int, ...]) -> nn.Sequential:
     """Return a stack of linear layers with tanh between them."""
     layers: list[nn.Module] = []
     for n_in, n_out in itertools.pairwise(sizes):
@@ -57,9 +64,32 @@ def tanh_network(sizes: tuple[int, ...]) -> nn.Module:
     return nn.Sequential(*layers[:-1])
 
 
-def network_function(system: System, module: nn.Module) -> Accelerations:
+class AffineNetwork(nn.Module):
+    """a(x) + B(x) u from the features of x and u/γ (:class:`dopt.models.AffineMLP`)."""
+
+    def __init__(self, model: AffineMLP, system: System) -> None:
+        super().__init__()
+        *below, r = model.layer_sizes(system)
+        self.n_inputs = system.n_inputs
+        self.hidden = nn.Sequential(*tanh_network((*below,)), nn.Tanh())
+        last = model.layer_inputs(system)[-1]
+        self.output = nn.Linear(last, r, dtype=torch.float64)
+
+    def forward(self, phi: Tensor) -> Tensor:
+        """Return accelerations, (..., r), of features (..., p)."""
+        u = phi[..., -self.n_inputs :]
+        h = self.hidden(phi[..., : -self.n_inputs])
+        products = [h * u[..., j : j + 1] for j in range(self.n_inputs)]
+        out: Tensor = self.output(torch.cat([h, *products, u], dim=-1))
+        return out
+
+
+def network_function(
+    system: System, module: nn.Module, model: Model | None = None
+) -> Accelerations:
     """Return a_θ for any module that maps the features, (p,), to accelerations, (r,).
 
+    The features are those of a state, or those of the points of a model.
     The flat vector holds the module's parameters in the order of ``module.named_parameters()``.
     """
     shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
@@ -73,7 +103,7 @@ def network_function(system: System, module: nn.Module) -> Accelerations:
             for (name, shape), part in zip(shapes.items(), parts, strict=True)
         }
         weights |= {name: buffer.to(x.device) for name, buffer in buffers.items()}
-        out: Tensor = functional_call(module, weights, (features(system, x),))
+        out: Tensor = functional_call(module, weights, (features(system, x, model),))
         return out
 
     return accelerations

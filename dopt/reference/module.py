@@ -101,10 +101,10 @@ class Module(Model):
         drawn = _built(self, len(system.features), system.n_learned, seed)
         return _array(parameters_to_vector(drawn.parameters()))
 
-    def predict(self, system: System, parameters: Array, states: Array) -> Array:
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         function = network_function(system, self.module(system))
         over_states = vmap(function, in_dims=(None, 0))
-        return _array(over_states(torch.as_tensor(parameters), torch.as_tensor(states)))
+        return _array(over_states(torch.as_tensor(parameters), torch.as_tensor(points)))
 
 
 def _canonical(given: Mapping[str, object]) -> str:

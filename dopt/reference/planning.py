@@ -4,7 +4,7 @@
 symbol  meaning (Proposition 1)                             shape
 ======  ==================================================  =========
 x̄       predicted state x_t + dt f_θ(x_t, 0)                d
-B       dt ∂f/∂u at x̄                                       d × m
+B       dt ∂f_θ/∂u at x̄                                     d × m
 g       ∂a_θ^k/∂θ at x̄                                      q
 D B     derivative of g along the columns of B              q × m
 M       information matrix                                  q × q
@@ -21,10 +21,8 @@ from torch import Tensor
 from torch.func import grad, jvp, vmap
 
 from dopt.algorithm import TIE_MARGIN
-from dopt.reference.dynamics import flow, input_matrix
-from dopt.reference.models import Accelerations
+from dopt.reference.dynamics import LearnedDynamics, flow
 from dopt.reference.sphere import maximize_on_spheres
-from dopt.systems.base import System
 
 
 class QuadraticProblem(NamedTuple):
@@ -34,28 +32,31 @@ class QuadraticProblem(NamedTuple):
     v: Tensor  # (n, m)
 
 
-def predicted_states(system: System, model: Accelerations, theta: Tensor, x: Tensor) -> Tensor:
+def predicted_states(learned: LearnedDynamics, theta: Tensor, x: Tensor) -> Tensor:
     """Return x̄ of every trial, (n, d), for parameters (n, q) and states (n, d)."""
+    system = learned.system
     zero = torch.zeros(len(x), system.n_inputs, dtype=x.dtype, device=x.device)
-    return x + system.dt * flow(system, x, zero, vmap(model)(theta, x))
+    accelerations = vmap(learned.model)(theta, learned.points(x, zero))
+    return x + system.dt * flow(system, x, zero, accelerations)
 
 
 def quadratic_problem(
-    system: System,
-    model: Accelerations,
+    learned: LearnedDynamics,
     theta: Tensor,
     information: Tensor,
     x: Tensor,
     components: Tensor,
+    next_inputs: Tensor,
     project: Callable[[Tensor], Tensor],
 ) -> QuadraticProblem:
     """Return Q and v for parameters (n, q), M (n, s, s), states (n, d), components k (n,).
 
+    ``next_inputs`` (n, m) are those of the next sample, for a model that reads inputs.
     ``project`` maps gradients, (..., q), to the space of M, (..., s): the identity, or a sketch.
     """
-    bar = predicted_states(system, model, theta, x)
-    g, DB = vmap(lambda p, z, k: _gradient_and_changes(system, model, p, z, k))(
-        theta, bar, components
+    bar = predicted_states(learned, theta, x)
+    g, DB = vmap(lambda p, z, v, k: _gradient_and_changes(learned, p, z, v, k))(
+        theta, bar, next_inputs, components
     )
     columns = project(torch.cat([g.unsqueeze(-1), DB], dim=-1).mT).mT
     solved = torch.cholesky_solve(columns, _factor(information))
@@ -79,20 +80,26 @@ def _factor(information: Tensor) -> Tensor:
 
 
 def _gradient_and_changes(
-    system: System, model: Accelerations, theta: Tensor, bar: Tensor, component: Tensor
+    learned: LearnedDynamics, theta: Tensor, bar: Tensor, next_input: Tensor, component: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return g, (q,), and D B, (q, m), by forward over reverse differentiation."""
+    """Return g, (q,), and D B, (q, m), by forward over reverse differentiation.
+
+    They are those at the predicted state; a model that reads inputs is given the next one, which
+    does not change with the input that is planned.
+    """
 
     def chosen(parameters: Tensor, z: Tensor) -> Tensor:
-        return model(parameters, z).gather(-1, component.view(1)).squeeze(-1)
+        return learned.model(parameters, z).gather(-1, component.view(1)).squeeze(-1)
 
     def gradient(z: Tensor) -> Tensor:
         g: Tensor = grad(chosen)(theta, z)
         return g
 
-    columns = input_matrix(system, bar)
-    change = vmap(lambda column: jvp(gradient, (bar,), (column,))[1], in_dims=1, out_dims=1)
-    return gradient(bar), change(columns)
+    columns = learned.input_matrix(theta, bar)
+    point = learned.points(bar, next_input)
+    columns = learned.points(columns.mT, columns.new_zeros(columns.shape[1], columns.shape[1])).mT
+    change = vmap(lambda column: jvp(gradient, (point,), (column,))[1], in_dims=1, out_dims=1)
+    return gradient(point), change(columns)
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:
@@ -111,20 +118,14 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
     return torch.where(finite, chosen, torch.nan)
 
 
-def uniform_inputs(
-    system: System,
-    model: Accelerations,
-    theta: Tensor,
-    states: Tensor,
-    steps: int,
-) -> Tensor:
+def uniform_inputs(learned: LearnedDynamics, theta: Tensor, states: Tensor, steps: int) -> Tensor:
     """Return the inputs, (n, m), that lead farthest from all states seen, (n, t + 1, d).
 
     Gradient ascent on the sphere from ±γ along every input axis, by automatic differentiation.
     """
-    x = states[:, -1]
-    center = predicted_states(system, model, theta, x)
-    B = vmap(lambda z: input_matrix(system, z))(x)
+    system, x = learned.system, states[:, -1]
+    center = predicted_states(learned, theta, x)
+    B = vmap(learned.input_matrix)(theta, x)
     axes = torch.eye(system.n_inputs, dtype=x.dtype, device=x.device)
     starts = system.gamma * torch.stack([axes, -axes], dim=1).flatten(0, 1)
 

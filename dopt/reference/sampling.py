@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
+from torch.func import vmap
 
 from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, Score
 from dopt.policies import ICEM
@@ -35,7 +35,7 @@ class SampledPlan:
         self._normals = batch.plans.view(n, -1, policy.iterations, policy.plans, K, m)
         self._mean = torch.zeros(n, K, m).to(batch.theta)
         self._elites = torch.zeros(n, policy.elites, K, m).to(batch.theta)
-        self._rows = vmap(vmap(jacrev(batch.model), (None, 0)))
+        self._rows = vmap(batch.learned.rows_at)
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m)."""
@@ -117,7 +117,8 @@ class SampledPlan:
         kept = []
         for i in range(policy.lookahead // policy.stride * policy.stride):
             u = inputs[:, :, (t + i) // policy.hold - t // policy.hold]
-            x = x + batch.system.dt * flow(batch.system, x, u, predict(batch.theta, x))
+            accelerations = predict(batch.theta, batch.points(x, u))
+            x = x + batch.system.dt * flow(batch.system, x, u, accelerations)
             inside = inside & (x.abs() <= batch.system.state_limit).all(dim=-1)
             if (i + 1) % policy.stride == 0:
                 kept.append(x)

@@ -16,21 +16,19 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
+from torch.func import vmap
 
 from dopt.algorithm import INVARIANT, TIE_MARGIN, Score, switch_step
 from dopt.policies import EOptimal, Lookahead, Search, TaskOptimal
 from dopt.policies.search import score_code
 from dopt.policies.task_states import task_states
-from dopt.reference.dynamics import flow
-from dopt.reference.models import Accelerations
+from dopt.reference.dynamics import LearnedDynamics
 from dopt.systems.base import System
 
 
 def searched_inputs(
     policy: Search,
-    system: System,
-    model: Accelerations,
+    learned: LearnedDynamics,
     theta: Tensor,
     information: Tensor,
     x: Tensor,
@@ -42,17 +40,18 @@ def searched_inputs(
     Given are parameters (n, q), M (n, q, q), states (n, d) and tie-breaking directions (n, m). A
     sample adds JᵀJ/ρ to M, with ρ the ``noise_variance``.
     """
+    system = learned.system
     candidates = torch.tensor(policy.compared_inputs(system)).to(x)
     pairs = plans(policy, system, len(candidates))
     inputs = candidates[torch.tensor(pairs)]
-    states = vmap(lambda p, z: paths(policy, system, model, p, z, inputs))(theta, x)
+    states = vmap(lambda p, z: paths(policy, learned, p, z, inputs))(theta, x)
     stride = policy.stride_of(system) if isinstance(policy, Lookahead) else 1
     seen = states[:, :, stride - 1 :: stride]
-    rows = vmap(vmap(vmap(jacrev(model), (None, 0)), (None, 0)))(theta, seen)
+    rows = vmap(vmap(learned.rows_at, (None, 0)))(theta, seen)
     rows = rows[..., : information.shape[1]] * noise_variance**-0.5
     if score_code(policy) == Score.JOINT:
         rows = rows * stride**0.5
-    score = score_function(policy, system, model)
+    score = score_function(policy, learned)
     values = vmap(vmap(score, (0, None, None)))(rows, theta, torch.linalg.inv_ex(information)[0])
     inside = (states.abs() <= system.state_limit).flatten(2).all(dim=2)
     values = torch.where(inside & values.isfinite(), values, -torch.inf)
@@ -67,23 +66,23 @@ def plans(policy: Search, system: System, count: int) -> list[tuple[int, int]]:
 
 
 def paths(
-    policy: Search, system: System, model: Accelerations, theta: Tensor, x: Tensor, inputs: Tensor
+    policy: Search, learned: LearnedDynamics, theta: Tensor, x: Tensor, inputs: Tensor
 ) -> Tensor:
     """Return the states predicted from one state (d,) under inputs (plans, 2, m): (plans, H, d)."""
-    steps = policy.steps(system)
+    steps = policy.steps(learned.system)
     states = [x.expand(len(inputs), -1)]
     for i in range(steps):
         u = inputs[:, 0 if i < switch_step(steps) else 1]
-        accelerations = vmap(model, (None, 0))(theta, states[-1])
-        states.append(states[-1] + system.dt * flow(system, states[-1], u, accelerations))
+        states.append(learned.following(theta, states[-1], u))
     return torch.stack(states[1:], dim=1)
 
 
 PathScore = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-def score_function(policy: Search, system: System, model: Accelerations) -> PathScore:
+def score_function(policy: Search, learned: LearnedDynamics) -> PathScore:
     """Return the score of one path from its rows, (B, r, q), the parameters (q,) and M⁻¹ (q, q)."""
+    system = learned.system
 
     def joint(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
         return _log_determinant(rows.flatten(0, 1), inverse)
@@ -111,7 +110,7 @@ def score_function(policy: Search, system: System, model: Accelerations) -> Path
     def task(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
         assert isinstance(policy, TaskOptimal)
         states = torch.tensor(task_states(system, policy)).to(theta)
-        G = vmap(jacrev(model), (None, 0))(theta, states).flatten(0, 1)[:, : len(inverse)]
+        G = learned.rows_at(theta, states).flatten(0, 1)[:, : len(inverse)]
         total: Tensor = ((G @ decrease(rows, inverse)) * G).sum()
         return total
 

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import functools
+
 from dopt.errors import IncompatibleError
 from dopt.learning import LEARNERS, Adam, ExtendedKalman, GaussNewton, InformationLearner, Learner
-from dopt.models import MODELS, Ensemble, GaussianProcess, Linear, LinearState, Model
+from dopt.models import (
+    MODELS,
+    AffineMLP,
+    BlackBoxMLP,
+    Ensemble,
+    GaussianProcess,
+    Linear,
+    LinearState,
+    Model,
+)
 from dopt.policies import InformationPolicy, Oracle, Policy
 from dopt.policies.disagreement import Disagreement
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.greedy_linear import GreedyLinear
-from dopt.spec.information_form import is_fresh
+from dopt.spec.information_form import held_information, is_fresh
 from dopt.systems import System
+from dopt.systems.input_effect import input_effect
+from dopt.systems.plant import ExploredPlant
 
 
 def check_together(system: System, policy: Policy, model: Model, learner: Learner) -> None:
@@ -25,6 +38,7 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
         expected = "learner 'adam' or 'adam_window', which can learn for many networks"
         raise mismatch(f"policy '{policy.name}'", expected, f"learner '{learner.name}'")
     _check_model(system, policy, model, learner)
+    _check_inputs(system, policy, model, learner)
     if not _teaches(type(learner), type(model)):
         raise mismatch(
             f"learner '{learner.name}'",
@@ -90,6 +104,34 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
     if model.structure == "conditioning" and hasattr(policy, "regularization"):
         expected = "a policy that needs no information matrix of parameters"
         raise mismatch(f"model '{model.name}'", expected, given)
+
+
+def _check_inputs(system: System, policy: Policy, model: Model, learner: Learner) -> None:
+    """Check a model that reads the inputs, and a system of which it has to learn their effect."""
+    readers = [name for name, one in MODELS.items() if issubclass(one, BlackBoxMLP)]
+    if not model.n_inputs_read(system):
+        if system.reads_inputs or without_known_effect(system):
+            expected = f"a model that learns the effect of the inputs, {_choice('', readers)[1:]}"
+            raise mismatch(f"env '{system.name}'", expected, f"model '{model.name}'")
+        return
+    for part in (policy, learner):
+        if not part.reads_inputs:
+            expected = "a model of the state alone, such as 'mlp'"
+            raise mismatch(f"{part.section} '{part.name}'", expected, f"model '{model.name}'")
+    form = getattr(policy, "form", "auto")
+    q, n_rows = model.n_member_parameters(system), system.n_learned * system.horizon
+    if isinstance(model, AffineMLP) and isinstance(policy, InformationPolicy):
+        held = held_information(policy, learner, q, n_rows)
+        if held and held.form == "dual":
+            expected = "policy.form 'primal' or 'sketch'"
+            chosen = "policy.form 'auto', which takes 'dual' here," if form == "auto" else None
+            raise mismatch("model 'affine'", expected, chosen or f"policy.form '{form}'")
+
+
+@functools.lru_cache(maxsize=64)
+def without_known_effect(system: System) -> bool:
+    """Tell whether the known part of a measured plant leaves out an input."""
+    return isinstance(system, ExploredPlant) and bool(input_effect(system).without)
 
 
 def _check_information(

@@ -40,10 +40,13 @@ _COLUMNS = {
 }
 """Columns of the results database that stand for a setting."""
 
+_LOSS = "env.loss"
+
 _FORMATS = {
     "env.gamma": "γ={}",
     "env.noise": "σ={}",
     "env.horizon": "horizon {}",
+    _LOSS: "{} loss",
     "model.width": "width {}",
     "model.depth": "depth {}",
     "policy.regularization": "λ={}",
@@ -93,6 +96,8 @@ def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[
         words = _words(flat, [path for path in paths if _is_unusual(path, flat, own)])
         brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
         whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
+        if _LOSS in flat and _LOSS not in paths:  # never to be taken for another loss
+            brief, whole = ([*one, *_words(flat, [_LOSS])] for one in (brief, whole))
         rows.append((", ".join(brief), ", ".join(whole)))
     counts = Counter(brief for brief, _ in rows)
     return [brief if counts[brief] == 1 else whole for brief, whole in rows]
@@ -137,7 +142,7 @@ def usual_values(config: Mapping[str, object]) -> dict[str, object]:
             usual |= {f"{key}.{name}": value for name, value in own.items()}
     model = _MODEL_OF.get(section_name(config, "policy"), "mlp")
     learner = _LEARNER_OF.get(section_name(config, "model"), "recursive_least_squares")
-    usual |= {"model.name": model, "learner.name": learner, "task.name": None}
+    usual |= {"model.name": model, "learner.name": learner, "task.name": None, _LOSS: None}
     parts = [classes[key] for key in SECTIONS]
     if None not in parts:
         compiled = all(getattr(cls, "compiled", False) for cls in parts)

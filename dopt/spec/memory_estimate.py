@@ -11,7 +11,7 @@ import math
 from dopt.control import Control
 from dopt.control.free_run import STARTS
 from dopt.learning import Adam, AdamReplay, GaussNewton, Learner
-from dopt.models import MLP, RFF, Ensemble, GaussianProcess, Model
+from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
     ICEM,
     Disagreement,
@@ -51,7 +51,7 @@ def memory_by_setting(
     interpreter and its libraries, some 0.2 GiB, come on top.
     """
     T, d, m, r = system.horizon, system.n_states, system.n_inputs, system.n_learned
-    p, q = len(system.features), model.n_member_parameters(system)
+    p, q = len(model.features(system)), model.n_member_parameters(system)
     N = math.prod(system.grid_points)
     w, L = (model.width, model.depth) if isinstance(model, MLP) else (1, 1)
     window = learner.window if isinstance(learner, Adam) else 0
@@ -103,8 +103,9 @@ def _samples_of_normal_matrix(policy: Policy, model: Model, learner: Learner, ho
 
 def _size_of(model: Model) -> str:
     """Return the setting that decides how many parameters a model has."""
-    names = {MLP: "model.width", Ensemble: "model.width", RFF: "model.n_features"}
-    return names.get(type(model), "model")
+    if isinstance(model, MLP):
+        return "model.width"
+    return "model.n_features" if isinstance(model, RFF) else "model"
 
 
 def _information(
@@ -143,9 +144,9 @@ def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str
 
     The kernel holds one path at a time, the reference all of them.
     """
-    q, r = model.n_member_parameters(system), system.n_learned
+    q, r = model.n_member_parameters(system), system.n_learned * _points_of_state(system, model)
     if isinstance(policy, ICEM):
-        return _sampling(policy, system, q)
+        return _sampling(policy, system, q, r)
     if not isinstance(policy, Search):
         return {}
     steps = policy.steps(system)
@@ -161,12 +162,18 @@ def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str
     }
 
 
-def _sampling(policy: ICEM, system: System, q: int) -> dict[str, int]:
+def _points_of_state(system: System, model: Model) -> int:
+    """Return how many points stand for a state of a path (:mod:`dopt.kernel.points`)."""
+    return max(1, 2 * model.n_inputs_read(system))
+
+
+def _sampling(policy: ICEM, system: System, q: int, r: int) -> dict[str, int]:
     """Return the numbers of the sampling planner: its plans, their paths and the rows along them.
 
-    The factor of M⁻¹ and the draws of the parameters belong to the model.
+    There are r rows for each state. The factor of M⁻¹ and the draws of the parameters belong to the
+    model.
     """
-    d, m, r, count = system.n_states, system.n_inputs, system.n_learned, policy.task_count
+    d, m, count = system.n_states, system.n_inputs, policy.task_count
     plans, states = policy.plans + policy.elites, policy.lookahead // policy.stride
     drawn, directions = BLOCKS * policy.iterations * policy.plans, policy.samples + r * count
     return {

@@ -11,6 +11,7 @@ from dopt.errors import ScaleWarning
 from dopt.models import MLP, Model
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
+from dopt.types import Array
 
 LARGEST = 100.0
 """Root mean square of the accelerations over the grid up to which a network learns them well.
@@ -31,14 +32,18 @@ def warn_of_scale(system: System, model: Model) -> None:
     if isinstance(system, BlackBox) or not isinstance(model, MLP):
         return
     values = system.learned(system.grid())
-    sizes = np.sqrt(np.mean(values**2, axis=0))
+    warn_of_sizes(system, np.sqrt(np.mean(values**2, axis=0)), "over the evaluation grid")
+
+
+def warn_of_sizes(system: System, sizes: Array, where: str) -> None:
+    """Warn of each learned acceleration whose size, (r,), a network does not learn well."""
     for row, size in zip(system.learned_rows, sizes, strict=True):
         if size > LARGEST or 0 < size < SMALLEST:
             warnings.warn(
                 f"The learned acceleration of {system.state_labels[row]} in env '{system.name}' "
-                f"has a root mean square of {size:.3g} over the evaluation grid, but a network "
-                f"learns one of {SMALLEST:g} to {LARGEST:g} well: measure that state in a unit "
-                f"about {size:.1g} times as large.",
+                f"has a root mean square of {size:.3g} {where}, but a network learns one of "
+                f"{SMALLEST:g} to {LARGEST:g} well: measure that state in a unit about "
+                f"{size:.1g} times as large.",
                 ScaleWarning,
                 stacklevel=2,
             )

@@ -19,7 +19,7 @@ from dopt.models.mlp import MLP
 from dopt.policies import POLICIES, Policy
 from dopt.spec.config import SECTIONS, TrialConfig, without_versions
 from dopt.spec.label import config_label
-from dopt.systems import SYSTEMS, System
+from dopt.systems import System, system_from_mapping
 
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
@@ -71,7 +71,15 @@ class TrialSpec(Validated):
             if key not in _KEYS:
                 raise unknown_name("configuration key", key, _KEYS)
         sections = {key: _section(given, key) for key in SECTIONS}
-        system = build("env", SYSTEMS, sections["env"])
+        return cls._of_parts(system_from_mapping(sections["env"]), sections, given)
+
+    @classmethod
+    def _of_parts(
+        cls,
+        system: System,
+        sections: Mapping[str, Mapping[str, object]],
+        given: Mapping[str, object],
+    ) -> TrialSpec:
         policy = build("policy", POLICIES, sections["policy"])
         model = _model(sections["model"])
         learner = build("learner", LEARNERS, sections["learner"])
@@ -106,10 +114,26 @@ class TrialSpec(Validated):
             As :meth:`from_mapping`.
         """
         parts = {"env": env, "policy": policy, "model": model, "learner": learner}
-        sections = {
-            key: {"name": part} if isinstance(part, str) else part for key, part in parts.items()
-        }
-        return cls.from_mapping({**sections, "seed": seed})
+        return cls.from_mapping({**_sections(parts), "seed": seed})
+
+    @classmethod
+    def of_system(
+        cls,
+        system: System,
+        policy: str | Mapping[str, object],
+        *,
+        model: str | Mapping[str, object] = "mlp",
+        learner: str | Mapping[str, object] = "adam_window",
+        seed: int = 0,
+        path: str | None = None,
+    ) -> TrialSpec:
+        """Return the trial of a system, with the other parts as in :meth:`from_names`.
+
+        ``path`` is the execution path; without one it is chosen as in :meth:`from_mapping`.
+        """
+        parts = {"policy": policy, "model": model, "learner": learner}
+        rest: dict[str, object] = {"seed": seed} | ({"path": path} if path else {})
+        return cls._of_parts(system, _sections(parts), rest)
 
     def with_seed(self, seed: int) -> TrialSpec:
         """Return the same configuration with another seed."""
@@ -178,6 +202,12 @@ class TrialSpec(Validated):
             "gamma": self.system.gamma,
             "label": config_label(json.loads(self.config_json)),
         }
+
+
+def _sections(
+    parts: Mapping[str, str | Mapping[str, object]],
+) -> dict[str, Mapping[str, object]]:
+    return {key: {"name": part} if isinstance(part, str) else part for key, part in parts.items()}
 
 
 def _model(section: Mapping[str, object]) -> Model:

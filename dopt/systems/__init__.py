@@ -4,25 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dopt.declare.registry import build
+from dopt.declare.registry import TARGET, build
+from dopt.systems import plant
 from dopt.systems.arm import Arm
 from dopt.systems.base import System
-from dopt.systems.cartpole import Cartpole
+from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
 from dopt.systems.chain import Chain
 from dopt.systems.drifting_pendulum import DriftingPendulum
 from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
-from dopt.systems.pendulum import Pendulum
+from dopt.systems.pendulum import Pendulum, PendulumUnknownGain
 from dopt.systems.quadrotor import Quadrotor
 
 SYSTEMS: dict[str, type[System]] = {
     system.name: system
-    for system in (Pendulum, Cartpole, Arm, Quadrotor, MassSpring, DriftingPendulum, Chain)
+    for system in (
+        Pendulum,
+        Cartpole,
+        Arm,
+        Quadrotor,
+        MassSpring,
+        DriftingPendulum,
+        Chain,
+        PendulumUnknownGain,
+        CartpoleUnknownGain,
+    )
 }
 
 
 def system_from_mapping(section: Mapping[str, object]) -> System:
     """Return the system that a configuration section describes: ``name`` plus its fields."""
+    if section.get("name") == plant.NAME and TARGET not in section:
+        return plant.Plant.from_section(section)
     return build("env", SYSTEMS, section)
 
 
@@ -30,11 +43,13 @@ __all__ = [
     "SYSTEMS",
     "Arm",
     "Cartpole",
+    "CartpoleUnknownGain",
     "Chain",
     "DriftingPendulum",
     "Feature",
     "MassSpring",
     "Pendulum",
+    "PendulumUnknownGain",
     "Quadrotor",
     "System",
     "system_from_mapping",

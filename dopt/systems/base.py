@@ -5,7 +5,8 @@ All systems are control-affine with known kinematics and a known input term,
     dx/dt = known(x, u) + E a(x),
 
 where a(x), r accelerations at u = 0, is what the exploration learns and E puts them into the r
-``learned_rows`` of the state derivative (design note to equation 1 of the paper).
+``learned_rows`` of the state derivative (design note to equation 1 of the paper). Where the effect
+of the inputs is learned as well (``reads_inputs``), it is a(x, u).
 
 =========  ==========================================  ============
 symbol     meaning                                     shape
@@ -44,12 +45,14 @@ class System(Validated):
 
     The two equations are static methods over sequences of scalars, arrays or tensors, so that one
     definition serves the simulator, the evaluation, automatic differentiation and the compiled
-    kernel. ``compiled`` says whether the kernel runs it.
+    kernel. ``compiled`` says whether the kernel runs it, and ``reads_inputs`` whether the learned
+    accelerations depend on the inputs.
     """
 
     section: ClassVar[str] = "env"
     name: ClassVar[str]
     compiled: ClassVar[bool] = True
+    reads_inputs: ClassVar[bool] = False
     physical: ClassVar[tuple[str, ...]]
     linear_parameters: ClassVar[tuple[str, ...]] = ()
     state_labels: ClassVar[tuple[str, ...]]
@@ -96,7 +99,10 @@ class System(Validated):
     @staticmethod
     @abstractmethod
     def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:
-        """Return the learned accelerations at zero input: r scalars."""
+        """Return the learned accelerations: r scalars.
+
+        ``state`` holds the d scalars of x, and those of u after them if the system reads inputs.
+        """
 
     @property
     def n_states(self) -> int:
@@ -169,13 +175,21 @@ class System(Validated):
         values = feature_values(self.features, self.feature_scales, np.moveaxis(states, -1, 0))
         return np.stack(values, axis=-1)
 
-    def learned(self, states: Array, steps: npt.ArrayLike = 0) -> Array:
+    def learned(
+        self, states: Array, steps: npt.ArrayLike = 0, inputs: Array | None = None
+    ) -> Array:
         """Return the true accelerations, (N, r), of states, (N, d), at a step or at (N,) steps.
 
-        A system that has changed stays as it is at the horizon.
+        The inputs, (N, m), count where the system reads them; without any they are 0. A system that
+        has changed stays as it is at the horizon.
         """
-        values = self.accelerations(tuple(states.T), self._parameters_at(steps))
+        points = self.points(states, inputs)
+        values = self.accelerations(tuple(points.T), self._parameters_at(steps))
         return np.stack(np.broadcast_arrays(*values), axis=-1)
+
+    def points(self, states: Array, inputs: Array | None = None) -> Array:
+        """Return what the learned accelerations depend on: the states, (N, d), or (N, d + m)."""
+        return with_inputs(states, inputs, self.n_inputs if self.reads_inputs else 0)
 
     def _parameters_at(self, steps: npt.ArrayLike) -> Sequence[Scalar]:
         """Return the physical parameters at a step, or arrays of them at (N,) steps."""
@@ -187,7 +201,8 @@ class System(Validated):
         """Return dx/dt = f(x, u), equation 1, of one state (d,) and input (m,) at a step."""
         x, u = tuple(np.asarray(state)), tuple(np.asarray(inputs))
         flow = np.array(self.known(x, u, self.parameters))
-        rows = np.array(self.accelerations(x, self._parameters_at(step)))
+        point = (*x, *u) if self.reads_inputs else x
+        rows = np.array(self.accelerations(point, self._parameters_at(step)))
         kind = np.result_type(flow, rows)
         flow = flow.astype(kind)
         flow[list(self.learned_rows)] += rows
@@ -205,3 +220,12 @@ class System(Validated):
         zero = values | dict.fromkeys(self.linear_parameters, 0.0)
         points = [zero] + [zero | {name: 1.0} for name in self.linear_parameters]
         return tuple(tuple(point[name] for name in self.physical) for point in points)
+
+
+def with_inputs(states: Array, inputs: Array | None, n_inputs: int) -> Array:
+    """Return states, (N, d), with inputs, (N, m), beside them if ``n_inputs`` are read; else 0."""
+    if not n_inputs:
+        return states
+    if inputs is None:
+        inputs = np.zeros((len(states), n_inputs))
+    return np.concatenate([states, inputs], axis=-1)

@@ -34,8 +34,8 @@ class BlackBox(System):
     """A system whose next state comes from somewhere else, such as a simulator.
 
     Declared are what it is called, which rows of the state derivative are learned, the features and
-    the known part: the kinematics and the effect of the inputs, which the model of the package, one
-    of accelerations at zero input, does not learn. All of its numbers are observed by differences:
+    the known part: the kinematics and the effect of the inputs, unless the model learns that. All
+    of its numbers are observed by differences:
     y_t = (x_{t+1} - x_t)/dt less the known part. There is no process noise but its own, and it
     starts where its reset leaves it, the same for all policies of a seed. A run that ends early is
     one that diverged.
@@ -93,8 +93,11 @@ class BlackBox(System):
 
 def transitions(
     system: BlackBox, inputs: Array, seed: int
-) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """Run an episode; return states (T, d), accelerations (T, r) and which of them there are."""
+) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
+    """Run an episode under inputs (T, m).
+
+    Returned are states (T, d), applied inputs (T, m), accelerations (T, r) and which there are.
+    """
     episode = system.episode(seed)
     states = np.empty((len(inputs) + 1, system.n_states))
     applied = np.empty_like(inputs)
@@ -104,4 +107,4 @@ def transitions(
         states[t + 1] = episode.state
     seen = system.observed(states[:-1], states[1:], applied)
     inside = np.all(np.abs(states) <= system.state_limit, axis=1)
-    return states[:-1], seen, inside[:-1] & inside[1:]
+    return states[:-1], applied, seen, inside[:-1] & inside[1:]

@@ -13,6 +13,18 @@ from dopt.systems.features import Feature
 from dopt.types import Scalar
 
 
+def _free_accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
+    """Return the accelerations without input, for numbers, arrays and tensors."""
+    cart_mass, pole_mass, length, gravity, alpha, beta = parameters
+    _, speed, angle, rate = state
+    sine, cosine = sin(angle), cos(angle)
+    hinge = alpha * rate / length
+    force = pole_mass * sine * (length * rate**2 - gravity * cosine) + hinge * cosine - beta * speed
+    cart = force / (cart_mass + pole_mass - pole_mass * cosine**2)
+    pole = (gravity * sine - cart * cosine - hinge / pole_mass) / length
+    return cart, pole
+
+
 @dataclass(frozen=True, kw_only=True)
 class Cartpole(System):
     """Cart on a track with a point mass on a rod, pushed by a force on the cart.
@@ -80,15 +92,40 @@ class Cartpole(System):
         push = inputs[0] / (cart_mass + pole_mass - pole_mass * cosine**2)
         return state[1], push, state[3], -push * cosine / length
 
+    accelerations = staticmethod(_free_accelerations)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CartpoleUnknownGain(Cartpole):
+    """The cartpole, pushed by a motor of which nobody knows what force it gives.
+
+    The force on the cart is k u. Both accelerations with all effects of u are learned. With k = 1
+    it moves as the cartpole does.
+
+    Parameters
+    ----------
+    gain : float
+        k, force by input.
+    """
+
+    name: ClassVar[str] = "cartpole_unknown_gain"
+    reads_inputs: ClassVar[bool] = True
+    physical: ClassVar[tuple[str, ...]] = (*Cartpole.physical, "gain")
+    linear_parameters: ClassVar[tuple[str, ...]] = (*Cartpole.linear_parameters, "gain")
+
+    gain: float = parameter(1.0, bound="nonnegative")
+
+    @staticmethod
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:  # noqa: ARG004
+        return state[1], 0.0 * state[1], state[3], 0.0 * state[3]
+
     @staticmethod
     def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
-        cart_mass, pole_mass, length, gravity, alpha, beta = parameters
-        _, speed, angle, rate = state
-        sine, cosine = sin(angle), cos(angle)
-        hinge = alpha * rate / length
-        force = (
-            pole_mass * sine * (length * rate**2 - gravity * cosine) + hinge * cosine - beta * speed
+        place, speed, angle, rate, u = state
+        cart_mass, pole_mass, length, gravity, alpha, beta, gain = parameters
+        cart, pole = _free_accelerations(
+            (place, speed, angle, rate), (cart_mass, pole_mass, length, gravity, alpha, beta)
         )
-        cart = force / (cart_mass + pole_mass - pole_mass * cosine**2)
-        pole = (gravity * sine - cart * cosine - hinge / pole_mass) / length
-        return cart, pole
+        cosine = cos(angle)
+        push = gain * u / (cart_mass + pole_mass - pole_mass * cosine**2)
+        return cart + push, pole - push * cosine / length

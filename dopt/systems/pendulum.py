@@ -13,6 +13,14 @@ from dopt.systems.features import Feature
 from dopt.types import Scalar
 
 
+def _free_accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
+    """Return the accelerations without input, for numbers, arrays and tensors."""
+    mass, length, gravity, friction = parameters
+    inertia = mass * length**2 / 3.0
+    torque = mass * gravity * length / 2.0 * sin(state[0]) + friction * state[1]
+    return (-torque / inertia,)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Pendulum(System):
     """Uniform rod of mass m and length l on a pivot with viscous friction, driven by a torque.
@@ -64,9 +72,36 @@ class Pendulum(System):
         mass, length, _, _ = parameters
         return state[1], 3.0 * inputs[0] / (mass * length**2)
 
+    accelerations = staticmethod(_free_accelerations)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PendulumUnknownGain(Pendulum):
+    """The pendulum, driven by a motor of which nobody knows what torque it gives.
+
+    I φ̈ = -(m g l / 2) sin φ - b φ̇ + k u, all of which is learned. With k = 1 it moves as the
+    pendulum does.
+
+    Parameters
+    ----------
+    gain : float
+        k, torque by input.
+    """
+
+    name: ClassVar[str] = "pendulum_unknown_gain"
+    reads_inputs: ClassVar[bool] = True
+    physical: ClassVar[tuple[str, ...]] = (*Pendulum.physical, "gain")
+    linear_parameters: ClassVar[tuple[str, ...]] = (*Pendulum.linear_parameters, "gain")
+
+    gain: float = parameter(1.0, bound="nonnegative")
+
+    @staticmethod
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:  # noqa: ARG004
+        return state[1], 0.0 * state[1]
+
     @staticmethod
     def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
-        mass, length, gravity, friction = parameters
-        inertia = mass * length**2 / 3.0
-        torque = mass * gravity * length / 2.0 * sin(state[0]) + friction * state[1]
-        return (-torque / inertia,)
+        angle, rate, u = state
+        mass, length, gravity, friction, gain = parameters
+        (free,) = _free_accelerations((angle, rate), (mass, length, gravity, friction))
+        return (free + 3.0 * gain * u / (mass * length**2),)

@@ -33,7 +33,13 @@ pytestmark = pytest.mark.xdist_group("films")  # the trials are run once for all
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Return real trials, one of each system, and one of the oracle."""
-    specs = [make_spec(env, "d_optimal", 1, env={"horizon": HORIZON}) for env in SYSTEMS]
+    specs = [
+        make_spec(
+            env, "d_optimal", 1, env={"horizon": HORIZON},
+            model={"name": "affine" if system.reads_inputs else "mlp"},
+        )
+        for env, system in SYSTEMS.items()
+    ]  # fmt: skip
     specs.append(make_spec("pendulum", "oracle", 1, env={"horizon": HORIZON}))
     return stored(tmp_path_factory.mktemp("films"), specs)
 

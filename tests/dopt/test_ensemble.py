@@ -94,7 +94,9 @@ def test_forecasts_follow_the_mean() -> None:
     spec = make(ENSEMBLE)
     parameters = run_trial(spec).parameters
     states, inputs = rng.standard_normal((3, 4)), rng.standard_normal((3, 6, 2))
-    by_mean = forecast_by(spec.system, lambda x: spec.model.predict(spec.system, parameters, x))
+    by_mean = forecast_by(
+        spec.system, lambda x, u: spec.model.predict(spec.system, parameters, x, u)
+    )
     found = model_forecast(spec.system, spec.model, parameters)(states, inputs)
     np.testing.assert_allclose(found, by_mean(states, inputs), rtol=1e-10, atol=1e-12)
 
@@ -103,7 +105,10 @@ def test_forecasts_follow_the_mean() -> None:
     ("learner", "words"),
     [
         ({"name": "adam_window"}, "and model 'ensemble' with learner 'gauss_newton', but the two"),
-        ({"name": "ekf"}, "goes with model 'mlp' or 'linear' and model 'ensemble' with"),
+        (
+            {"name": "ekf"},
+            "goes with model 'mlp', 'affine', 'black_box' or 'linear' and model 'ensemble' with",
+        ),
         ({"name": "gauss_newton", "refit_every": 2}, "but learner.refit_every 2 was given"),
     ],
 )

@@ -86,9 +86,9 @@ def test_the_truth_at_the_points_is_that_of_the_system(name: str) -> None:
     rows = list(system.learned_rows)
     known = np.array(
         [
-            system.derivative(x, np.zeros(system.n_inputs))[rows]
-            - np.array(system.known(tuple(x), (0.0,) * system.n_inputs, system.parameters))[rows]
-            for x in points.states[::50]
+            system.derivative(x, u)[rows]
+            - np.array(system.known(tuple(x), tuple(u), system.parameters))[rows]
+            for x, u in zip(points.states[::50], points.inputs[::50], strict=True)
         ]
     )
     assert points.accelerations[::50] == pytest.approx(known, rel=1e-10, abs=1e-9)

@@ -9,13 +9,13 @@ import pytest
 
 from dopt.randomness import _STREAMS, draw, stream
 from dopt.systems import SYSTEMS
-from tests.dopt.trials import MODELS, PAIRS, trial
+from tests.dopt.trials import KNOWN_EFFECT, MODELS, PAIRS, trial
 
 NAMES = ("noise", "weights", "inputs", "components", "ties")
 STREAMS = tuple(_STREAMS)
 
 
-@pytest.mark.parametrize("env", SYSTEMS)
+@pytest.mark.parametrize("env", KNOWN_EFFECT)
 def test_policies_that_are_compared_share_noise_and_initial_weights(env: str) -> None:
     policies = [policy for e, policy in PAIRS if e == env]
     specs = [trial(env, policy, 11) for policy in policies if policy not in MODELS]

@@ -9,7 +9,7 @@ from dopt.reference.models import model_function
 from dopt.rerun import rerun
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS
+from tests.dopt.trials import KNOWN_EFFECT
 
 
 def specification(env: str = "pendulum", policy: str = "d_optimal", **model: object) -> TrialSpec:
@@ -62,7 +62,7 @@ def test_steps_must_ascend() -> None:
         rerun(specification(), [5, 5])
 
 
-@pytest.mark.parametrize("env", SYSTEMS)
+@pytest.mark.parametrize("env", KNOWN_EFFECT)
 @pytest.mark.parametrize("model", [{"depth": 1, "width": 5}, {"depth": 3, "width": 4}, None])
 def test_prediction_is_that_of_the_reference(env: str, model: dict[str, object] | None) -> None:
     spec = specification(env) if model is None else specification(env, **model)

@@ -17,6 +17,8 @@ SMALL_GRIDS = {
     "quadrotor": (4, 4),
     "drifting_pendulum": (4, 4),
     "chain": (16,),
+    "pendulum_unknown_gain": (4, 4),
+    "cartpole_unknown_gain": (3, 4, 3),
 }
 SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"count": 8}}
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}
@@ -32,7 +34,7 @@ def trial(env: str, policy: str, seed: int = 0, /, **fields: Mapping[str, Any]) 
     sections: dict[str, dict[str, Any]] = {
         "env": {"name": env, "horizon": 30, "grid_points": SMALL_GRIDS[env]},
         "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
-        "model": {"name": MODELS.get(policy, "mlp")},
+        "model": {"name": MODELS.get(policy, "affine" if SYSTEMS[env].reads_inputs else "mlp")},
         "learner": {"name": LEARNERS.get(policy, "adam_window")},
     }
     merged = {key: section | dict(fields.get(key, {})) for key, section in sections.items()}
@@ -48,6 +50,11 @@ def compatible(env: str, policy: str) -> bool:
     return True
 
 
-ALL_PAIRS = [(env, policy) for env in SYSTEMS for policy in POLICIES if compatible(env, policy)]
+KNOWN_EFFECT = [env for env, system in SYSTEMS.items() if not system.reads_inputs]
+"""Systems of which the effect of the inputs is known; tests of input models have the others."""
+
+ALL_PAIRS = [
+    (env, policy) for env in KNOWN_EFFECT for policy in POLICIES if compatible(env, policy)
+]
 PAIRS = [pair for pair in ALL_PAIRS if trial(*pair).config.path == "kernel"]
 """What the kernel runs; the others run on the reference alone."""

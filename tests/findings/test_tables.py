@@ -161,7 +161,12 @@ def test_numbers_of_the_periodic_inputs_are_rounded_once(
 
 
 @pytest.mark.parametrize(
-    ("words", "column"), [("loss", "final_loss"), ("loss of one network", "one_network_loss")]
+    ("words", "column"),
+    [
+        ("loss", "final_loss"),
+        ("loss of one network", "one_network_loss"),
+        ("loss, tuned for each system", "tuned_loss"),
+    ],
 )
 def test_the_lowest_losses_are_rounded_once(words: str, column: str) -> None:
     cells = []
@@ -175,6 +180,33 @@ def test_the_lowest_losses_are_rounded_once(words: str, column: str) -> None:
         )
         cells.append(f"{mean} [{low}, {high}]")
     assert f"| {words} | {' | '.join(cells)} |" in FINDINGS
+
+
+def test_the_gains_of_tuning_are_those_of_paired_seeds() -> None:
+    gains = []
+    for env in ("pendulum", "cartpole", "arm", "quadrotor"):
+        losses = BEST.loc[BEST["env"] == env]
+        ratios = np.log(losses["tuned_loss"] / losses["final_loss"]).to_numpy()[:, None]
+        found = band(ratios)
+        mean, low, high = (f"{np.exp(v[0]):.2f}" for v in (found.centre, found.low, found.high))
+        gains.append(f"{mean} [{low}, {high}]")
+    assert f"{', '.join(gains[:3])} and {gains[3]} times as large" in " ".join(FINDINGS.split())
+
+
+def test_the_tuned_settings_are_the_best_of_those_that_were_tried() -> None:
+    tried = pd.read_csv(DOCS / "best_tuning.csv")
+    best = tried.loc[tried.groupby("env")["final_loss"].idxmin()].set_index("env")["settings"]
+    assert dict(best) == {
+        "pendulum": "lookahead=100",
+        "cartpole": "lookahead=100",
+        "arm": "lookahead=30",
+        "quadrotor": "λ=0.0001, stride=5",
+    }
+    counts = tried.groupby("env").size()
+    assert f"among the {counts.min()} to {counts.max()} that were tried" in FINDINGS
+    losses = tried.pivot(index="env", columns="settings", values="final_loss")
+    worse = (losses["λ=0.0001"] / losses["experiment=best"]).drop("quadrotor")
+    assert f"λ = 0.0001 is {worse.min():.1f} to {worse.max():.1f} times worse" in FINDINGS
 
 
 def test_the_times_of_a_step_are_those_of_the_table_and_below_the_time_step() -> None:

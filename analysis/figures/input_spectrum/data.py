@@ -11,7 +11,7 @@ import pandas as pd
 from analysis.data.trial_selection import Entry, Selection
 from analysis.errors import AnalysisError
 from analysis.stats.spectrum import Spectrum, average_spectrum
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import system_of
 from dopt.systems.equilibrium import eigenmode
 from orchestrate.store import Reader
 
@@ -52,7 +52,7 @@ class InputSpectra:
 def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpectra:
     """Return the spectra of every selected policy of an environment with a finished trial."""
     entries = selection.of(env)
-    system = system_from_mapping(entries[0].config.config["env"])
+    system = system_of(entries[0].config.config)
     mode = eigenmode(system)
     spectra = [_spectrum(reader, entry, system.dt) for entry in entries]
     found = tuple(spectrum for spectrum in spectra if spectrum is not None)

@@ -18,7 +18,7 @@ from analysis.line_styles import LineStyle, policy_style, sequence_style
 from analysis.stats.intervals import Band, Statistic, band
 from analysis.stats.tolerance import BandKind, tolerance_band
 from analysis.units import loss_unit
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import is_prequential, system_of
 from orchestrate.store import Reader
 
 
@@ -33,7 +33,7 @@ class Axis(StrEnum):
 class LossCurve:
     """One entry in one environment: t in steps (T,), x on the axis (T,), band over trials.
 
-    ``unit`` is that of the loss.
+    ``unit`` is that of the loss, which is that of an exploration where ``is_prequential``.
     """
 
     env: str
@@ -46,6 +46,7 @@ class LossCurve:
     band: Band
     statistic: Statistic
     sample: Sample
+    is_prequential: bool = False
 
 
 def measure_curves(
@@ -105,13 +106,14 @@ def _measure(
 ) -> LossCurve:
     sample = read_sample(reader, entry, column, rule)
     t = np.arange(sample.values.shape[1])
-    system = system_from_mapping(entry.config.config["env"])
+    system = system_of(entry.config.config)
     scale = system.dt if axis is Axis.SECONDS else 1.0
     names = entry.config.env, entry.config.policy, entry.label
     x = scale * t.astype(float)
     limits = tolerance_band if band_kind is BandKind.TOLERANCE else band
     shown = limits(sample.values, statistic)
-    return LossCurve(*names, style, t, x, loss_unit(system), shown, statistic, sample)
+    unit, prequential = loss_unit(system), is_prequential(entry.config.config)
+    return LossCurve(*names, style, t, x, unit, shown, statistic, sample, prequential)
 
 
 def tabulate_curves(curves: tuple[LossCurve, ...]) -> pd.DataFrame:

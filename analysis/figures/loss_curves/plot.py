@@ -76,7 +76,7 @@ def draw(numbers: Numbers) -> Figure:
         panel = _panel(figure, grid[index], shown, options.spread, list(_absent(curves, env)))
         if index + columns >= len(envs):
             panel[-1].set_xlabel(f"time t [{unit}]")
-        panel[0].set_ylabel(loss_label(column, shown[0].unit))
+        panel[0].set_ylabel(loss_label(column, shown[0].unit, shown[0].is_prequential))
     ordered = sorted(curves, key=lambda curve: policy_rank(curve.policy))
     handles = legend_handles({curve.label: curve.style for curve in ordered}, options)
     per_row = 4 if columns > 1 else 2
@@ -141,8 +141,10 @@ def _bars(axes: Axes, curve: LossCurve, phase: float) -> None:
     )  # fmt: skip
 
 
-def loss_label(column: str, unit: str) -> str:
+def loss_label(column: str, unit: str, is_prequential: bool = False) -> str:
     """Return the label of an axis of losses, such as ``RMS error, grid [rad/s²]``."""
+    if is_prequential and column == "loss":
+        return f"prequential error [{unit}]"
     return f"RMS error, {PLACES.get(column, column)} [{unit}]"
 
 

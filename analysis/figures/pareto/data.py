@@ -29,7 +29,7 @@ from analysis.stats.geometric_means import Estimate, geometric_mean
 from analysis.stats.pareto import on_front
 from analysis.stats.trial_scores import final_losses
 from analysis.units import loss_unit
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
 
 FEWEST = 2
@@ -133,7 +133,7 @@ def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:
 
 def _point(reader: Reader, entry: Entry, policy: str, learner: str, rule: DivergenceRule) -> Point:
     scores = final_losses(reader, entry, "loss", rule)
-    system = system_from_mapping(entry.config.config["env"])
+    system = system_of(entry.config.config)
     return Point(
         env=entry.config.env,
         label=entry.label,

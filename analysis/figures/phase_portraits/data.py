@@ -15,7 +15,7 @@ from analysis.errors import AnalysisError
 from analysis.figures.phase_portraits.angles import wrapped_line
 from analysis.stats.intervals import mean, standard_error
 from dopt.coverage import Plane
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]
@@ -92,7 +92,7 @@ def measure_portraits(reader: Reader, selection: Selection, env: str) -> Portrai
     """Return the portraits of one environment."""
     entries = selection.of(env)
     seed = choose_seed(entries)
-    plane = DrawnPlane.of(system_from_mapping(entries[0].config.config["env"]))
+    plane = DrawnPlane.of(system_of(entries[0].config.config))
     panels = tuple(_portrait(reader, entry, seed, plane) for entry in entries)
     return Portraits(env, seed, plane, panels)
 

@@ -58,7 +58,8 @@ def profiles_part(selection: Selection) -> Selection:
     The oracle is left out: the loss of the others is thousands of times its own.
     """
     policies = set(selection.policies) - ({APART} - {selection.reference})
-    compared = selection.only(selection.environments, policies).compared()
+    simulated = selection.simulated()
+    compared = simulated.only(simulated.environments, policies).compared()
     return compared if len(compared.labels) > 1 else Selection(())
 
 

@@ -19,7 +19,7 @@ from analysis.stats.geometric_means import Estimate, geometric_mean
 from analysis.stats.trial_scores import Scores, final_losses
 from analysis.units import loss_unit
 from dopt.spec.label import flatten
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
 
 SETTINGS = ("policy.regularization", "learner.learning_rate", "learner.window")
@@ -131,7 +131,7 @@ def _measure(
         usual=_value(base, setting),
         losses=tuple(geometric_mean(one.values) for one in scores),
         scores=scores,
-        unit=loss_unit(system_from_mapping(base.config.config["env"])),
+        unit=loss_unit(system_of(base.config.config)),
     )
 
 

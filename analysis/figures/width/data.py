@@ -23,7 +23,7 @@ from analysis.stats.intervals import mean, standard_error
 from analysis.stats.trial_scores import final_losses
 from analysis.units import loss_unit
 from dopt.spec.label import flatten
-from dopt.systems import system_from_mapping
+from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
 
 PARTS = ("plan", "learn", "evaluate")
@@ -186,7 +186,7 @@ def measure_losses(reader: Reader, selection: Selection, rule: DivergenceRule) -
         mean=np.array([mean(values) for values in losses]),
         error=np.array([standard_error(values) for values in losses]),
         counts=tuple(final.describe() for final in finals),
-        unit=loss_unit(system_from_mapping(line[0].config.config["env"])),
+        unit=loss_unit(system_of(line[0].config.config)),
         n=tuple(len(values) for values in losses),
     )
 

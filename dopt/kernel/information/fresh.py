@@ -25,7 +25,7 @@ def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
     """
     visited, covariance = state.visited, state.covariance
     n, q = visited.n_states[0], state.theta.shape[0]
-    phi = np.empty(network.sizes[0])
+    phi = np.empty(network.feature_kinds.shape[0])
     features_at(network, x, phi)
     for i in range(phi.shape[0]):
         visited.features[i, n] = phi[i]

@@ -17,6 +17,7 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, contracted, squared
+from dopt.kernel.output_layer import output_inputs
 from dopt.kernel.structs import Network
 from dopt.types import Matrix, Stack, Vector
 
@@ -30,7 +31,7 @@ def normal_equations(
     ``inputs`` (p, N) are features, ``targets`` (r, N) accelerations, and e = y - a_θ(x).
     """
     total, errors, hidden = errors_of(network, theta, inputs, targets)
-    signals = nn.batch_back_signals(network, theta, hidden, targets.shape[0], inputs.shape[1])
+    signals = nn.batch_back_signals(network, theta, inputs, hidden, targets.shape[0])
     below = _completed(network, inputs, hidden)
     _write_slope(network, below, signals, errors, slope)
     _write_normal(network, below, signals, normal)
@@ -44,7 +45,7 @@ def normal_matrix(network: Network, theta: Vector, inputs: Matrix, r: int, norma
     hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * n))
     outputs = np.empty((r, n))
     nn.forward(network, theta, inputs, hidden, outputs)
-    signals = nn.batch_back_signals(network, theta, hidden, r, n)
+    signals = nn.batch_back_signals(network, theta, inputs, hidden, r)
     _write_normal(network, _completed(network, inputs, hidden), signals, normal)
 
 
@@ -83,18 +84,20 @@ def write_products(
     network: Network, theta: Vector, inputs: Matrix, hidden: Matrix, weights: Matrix, out: Vector
 ) -> None:
     """Write Jᵀv, (q,), for v (r, N), given the activations of :func:`errors_of`."""
-    signals = nn.batch_back_signals(network, theta, hidden, weights.shape[0], inputs.shape[1])
+    signals = nn.batch_back_signals(network, theta, inputs, hidden, weights.shape[0])
     _write_slope(network, _completed(network, inputs, hidden), signals, weights, out)
 
 
 @compiled
 def _completed(network: Network, inputs: Matrix, hidden: Matrix) -> Stack:
-    """Return the activations below every layer and a row of ones, (L + 1, units + 1, N)."""
+    """Return the inputs of every layer and a row of ones, (L + 1, most of these + 1, N)."""
     depth, width, n = network.offsets.shape[0] - 1, network.sizes[1], inputs.shape[1]
-    below = np.empty((depth + 1, max(width, inputs.shape[0]) + 1, n))
+    below = np.empty((depth + 1, np.max(network.layer_inputs) + 1, n))
     for index in range(depth + 1):
-        units = network.sizes[index]
+        units = network.layer_inputs[index]
         values = inputs if index == 0 else nn.units_by_points(hidden[index - 1], width, n)
+        if index == depth:
+            values = output_inputs(network, values, inputs)
         for i in range(units):
             below[index, i] = values[i]
         below[index, units] = 1.0
@@ -129,7 +132,7 @@ def _write_layer(
     network: Network, signal: Matrix, below: Matrix, index: int, slope: Vector
 ) -> None:
     dW, db = nn.layer(network, slope, index)
-    units = network.sizes[index]
+    units = network.layer_inputs[index]
     products = np.dot(signal, below[: units + 1].T)
     for i in range(db.shape[0]):
         db[i] = products[i, units]
@@ -140,7 +143,7 @@ def _write_layer(
 @compiled
 def _place(network: Network, index: int, i: int, j: int) -> int:
     """Return the place in θ of the weight of activation j for unit i; its bias comes last."""
-    n_in, n_out = network.sizes[index], network.sizes[index + 1]
+    n_in, n_out = network.layer_inputs[index], network.sizes[index + 1]
     place: int = network.offsets[index] + (n_in * n_out + i if j == n_in else i * n_in + j)
     return place
 
@@ -168,7 +171,7 @@ def _hidden_block(
     """Write the block of hidden layers a ≤ b, above the diagonal."""
     depth, width, n = network.offsets.shape[0] - 1, network.sizes[1], below.shape[2]
     r, symmetric = signals.shape[0] // depth, a == b
-    lower, upper = network.sizes[a] + 1, network.sizes[b] + 1
+    lower, upper = network.layer_inputs[a] + 1, network.layer_inputs[b] + 1
     n_units = width * (width + 1) // 2 if symmetric else width * width
     n_below = lower * (lower + 1) // 2 if symmetric else lower * upper
     left, right = np.empty((n_units, n)), np.empty((n_below, n))
@@ -199,25 +202,26 @@ def _write(normal: Matrix, i: int, j: int, value: float) -> None:
 def _output_blocks(network: Network, below: Stack, signals: Stack, normal: Matrix) -> None:
     """Write the blocks of the output layer with itself and with the hidden ones."""
     depth, width, n = network.offsets.shape[0] - 1, network.sizes[1], below.shape[2]
-    r, last = signals.shape[0] // depth, below[depth, : width + 1]
+    r, top = signals.shape[0] // depth, network.layer_inputs[depth] + 1
+    last = below[depth, :top]
     own = np.dot(last, last.T)
     start, stop = network.offsets[depth], normal.shape[0]
     for i in range(start, stop):
         for j in range(i, stop):
             normal[i, j] = 0.0
     for k in range(r):
-        for s in range(width + 1):
-            for v in range(s, width + 1):
+        for s in range(top):
+            for v in range(s, top):
                 i, j = _place(network, depth, k, s), _place(network, depth, k, v)
                 _write(normal, i, j, own[s, v])
         for index in range(depth):
-            units = network.sizes[index] + 1
+            units = network.layer_inputs[index] + 1
             rows = np.empty((width * units, n))
             _pairs(signals[k * depth + index], below[index, :units], False, False, rows)
             products = np.dot(rows, last.T)
             for i in range(width):
                 for s in range(units):
-                    for v in range(width + 1):
+                    for v in range(top):
                         normal[_place(network, index, i, s), _place(network, depth, k, v)] = (
                             products[i * units + s, v]
                         )

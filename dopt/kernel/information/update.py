@@ -14,7 +14,7 @@ from dopt.types import Matrix, Vector
 
 @compiled
 def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
-    """Return J, (r, q), at a state, and write a_θ(x), (r,)."""
+    """Return J, (r, q), at a point, and write a_θ, (r,), there."""
     if network.kind != ModelKind.MLP:
         rows = np.empty((value.shape[0], theta.shape[0]))
         regressors(plant, network, x, rows, value)

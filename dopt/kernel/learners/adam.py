@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled, contracted
-from dopt.kernel.learners.samples import store_sample
+from dopt.kernel.learners.samples import sampled_point, store_sample
 from dopt.kernel.network import loss_gradient
 from dopt.kernel.structs import Network, Scratch, State, Trial
 from dopt.types import Matrix, Vector
@@ -18,7 +18,7 @@ from dopt.types import Matrix, Vector
 def learn(trial: Trial, t: int, target: Vector) -> None:
     """Take Adam's step t + 1 on the newest samples, which the state's window holds."""
     features, targets = trial.state.window_features, trial.state.window_targets
-    store_sample(trial.network, features, targets, t, trial.record.states[t], target)
+    store_sample(trial.network, features, targets, t, sampled_point(trial, t), target)
     if t + 1 < features.shape[1]:
         features = features[:, : t + 1].copy()
         targets = targets[:, : t + 1].copy()

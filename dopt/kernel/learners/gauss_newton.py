@@ -12,7 +12,7 @@ from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.information.cholesky import factorize, solve, write_inverse
 from dopt.kernel.information.normal_equations import errors_of, normal_equations
 from dopt.kernel.learners.kalman import filter_sample
-from dopt.kernel.learners.samples import store_sample
+from dopt.kernel.learners.samples import sampled_point, store_sample
 from dopt.kernel.structs import Network, State, Trial
 from dopt.types import Matrix, Vector
 
@@ -23,7 +23,7 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     numbers, state = trial.algorithm.learner, trial.state
     noise_variance, refit_every, steps = numbers[1], int(numbers[2]), int(numbers[3])
     seen, observed = state.window_features, state.window_targets
-    store_sample(trial.network, seen, observed, t, trial.record.states[t], target)
+    store_sample(trial.network, seen, observed, t, sampled_point(trial, t), target)
     if t % refit_every != 0:
         filter_sample(trial, t, target, noise_variance, 1.0, 0, 0.0, 0.0)
         return

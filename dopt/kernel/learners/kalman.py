@@ -13,6 +13,7 @@ from dopt.kernel.information.cholesky import factorize, solve_columns
 from dopt.kernel.information.forgetting import forget
 from dopt.kernel.information.primal import quadratic_forms
 from dopt.kernel.information.update import filter_step, model_rows
+from dopt.kernel.learners.samples import sampled_point
 from dopt.kernel.structs import Covariance, Trial
 from dopt.types import Matrix, Vector
 
@@ -38,7 +39,7 @@ def filter_sample(
     """Update θ and M by the sample of step t, after M has faded by a factor."""
     theta, covariance = trial.state.theta, trial.state.covariance
     residuals = np.empty(target.shape[0])
-    rows = model_rows(trial.plant, trial.network, theta, trial.record.states[t], residuals)
+    rows = model_rows(trial.plant, trial.network, theta, sampled_point(trial, t), residuals)
     for k in range(target.shape[0]):
         residuals[k] = target[k] - residuals[k]
     if forgetting < 1.0:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dopt.kernel.compiler import compiled
 from dopt.kernel.learners.adam import adam_step
-from dopt.kernel.learners.samples import store_sample
+from dopt.kernel.learners.samples import sampled_point, store_sample
 from dopt.kernel.structs import Trial
 from dopt.types import Vector
 
@@ -19,7 +19,7 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     """Take Adam's steps of time t, one for each row of places in the buffer, (steps, batch)."""
     network, state, places = trial.network, trial.state, trial.randomness.replay[t]
     seen, observed = state.window_features, state.window_targets
-    store_sample(network, seen, observed, t, trial.record.states[t], target)
+    store_sample(network, seen, observed, t, sampled_point(trial, t), target)
     steps, batch = places.shape
     features = np.empty((seen.shape[0], batch))
     targets = np.empty((observed.shape[0], batch))

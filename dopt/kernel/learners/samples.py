@@ -1,4 +1,4 @@
-"""Ring of the newest samples in compiled code."""
+"""Points of samples, and a ring of the newest, in compiled code."""
 
 from __future__ import annotations
 
@@ -6,17 +6,24 @@ import numpy as np
 
 from dopt.kernel.compiler import compiled
 from dopt.kernel.network import features_at
-from dopt.kernel.structs import Network
+from dopt.kernel.points import model_point
+from dopt.kernel.structs import Network, Trial
 from dopt.types import Matrix, Vector
+
+
+@compiled
+def sampled_point(trial: Trial, t: int) -> Vector:
+    """Return where the accelerations of step t were observed: x_t, or (x_t, u_t)."""
+    return model_point(trial.network, trial.record.states[t], trial.record.inputs[t])
 
 
 @compiled
 def store_sample(
     network: Network, features: Matrix, targets: Matrix, t: int, x: Vector, target: Vector
 ) -> None:
-    """Put the features of x_t, (d,), and the observed accelerations, (r,), into a ring."""
+    """Put the features of a point and the accelerations observed there, (r,), into a ring."""
     slot = t % features.shape[1]
-    phi = np.empty(network.sizes[0])
+    phi = np.empty(network.feature_kinds.shape[0])
     features_at(network, x, phi)
     for i in range(phi.shape[0]):
         features[i, slot] = phi[i]

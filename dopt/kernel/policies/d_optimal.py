@@ -1,6 +1,7 @@
 """D-optimal exploration (Algorithm 2) in compiled code (:mod:`dopt.policies.d_optimal`).
 
-``algorithm.policy[0]`` is 1 if all learned components count at each step, 0 if one is drawn.
+``algorithm.policy[0]`` is 1 if all learned components count at each step, 0 if one is drawn. For a
+model that reads inputs the input of the next sample is drawn as well, uniformly on the sphere.
 """
 
 from __future__ import annotations
@@ -8,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compilable, compiled
-from dopt.kernel.policies.prediction import input_columns, predicted_state
+from dopt.kernel.information.primal import inner
+from dopt.kernel.points import model_point
+from dopt.kernel.policies.prediction import learned_columns, point_columns, predicted_state
 from dopt.kernel.structs import Trial
 from dopt.math.sphere import sphere_maximizer
 from dopt.types import Vector
@@ -22,9 +25,9 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
     plant, network, state = trial.plant, trial.network, trial.state
     all_components = trial.algorithm.policy[0] != 0.0
     component, tie = trial.randomness.components[t], trial.randomness.ties[t]
-    bar = predicted_state(plant, network, state.theta, trial.record.states[t])
-    columns = input_columns(plant, bar)
-    m = columns.shape[0]
+    center = predicted_state(plant, network, state.theta, trial.record.states[t])
+    columns = point_columns(network, learned_columns(plant, network, state.theta, center))
+    m, bar = columns.shape[0], model_point(network, center, on_sphere(tie, plant.gamma))
     S = np.zeros((1 if m == 1 else 1 + m, 1 + m))
     for k in range(plant.learned_rows.shape[0]):
         if all_components or k == component:
@@ -44,3 +47,10 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
     chosen = sphere_maximizer(Q, v, plant.gamma, tie)
     for i in range(m):
         u[i] = chosen[i]
+
+
+@compiled
+def on_sphere(direction: Vector, gamma: float) -> Vector:
+    """Return the vector of norm γ along a direction, (m,)."""
+    scaled: Vector = direction * (gamma / np.sqrt(inner(direction, direction)))
+    return scaled

@@ -9,7 +9,7 @@ import numpy as np
 
 from dopt.algorithm import TIE_MARGIN
 from dopt.kernel.compiler import compiled, squared
-from dopt.kernel.policies.prediction import input_columns, predicted_state
+from dopt.kernel.policies.prediction import learned_columns, predicted_state
 from dopt.kernel.structs import Trial
 from dopt.types import Matrix, Vector
 
@@ -20,7 +20,7 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
     plant, states, steps = trial.plant, trial.record.states, int(trial.algorithm.policy[0])
     x = states[t]
     center = predicted_state(plant, trial.network, trial.state.theta, x)
-    columns = input_columns(plant, x)
+    columns = learned_columns(plant, trial.network, trial.state.theta, x)
     m = columns.shape[0]
     best_value = -1.0
     tried, gradient = np.empty(m), np.empty(m)

@@ -1,6 +1,6 @@
 """Paths of the learned model and the rows of J along them, in compiled code.
 
-Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, n rows along a path.
+Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, R rows of a state, n rows along a path.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from dopt.kernel import network as nn
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.information.primal import add_multiple, inner, multiply_rows
-from dopt.kernel.model import add_linear, euler_step, regressors
+from dopt.kernel.model import add_linear, euler_step, model_accelerations, regressors, rows_at
+from dopt.kernel.points import model_point, n_next_points, next_points
 from dopt.kernel.structs import Covariance, Network, Plant, Search
 from dopt.types import Matrix, Vector
 
@@ -27,11 +28,12 @@ class Path(NamedTuple):
 
     states: Matrix  # (H + 1, d)
     outputs: Matrix  # (H + 1, r), a_θ at the states
-    rows: Matrix  # (n + r, q), J/√ρ along the path; the last r are spare
+    rows: Matrix  # (n + R, q), J/√ρ along the path; the last R are spare
     products: Matrix  # (n, q), J M⁻¹, or L⁻¹ J M⁻¹ once a score has needed it
     factor: Matrix  # (n, n), the Cholesky factor L of I + J M⁻¹ Jᵀ in the lower triangle
     inverse: Matrix  # (q, q), A of M⁻¹ = A - VᵀV; empty where few products are needed
     flow: Vector  # (d,)
+    u: Vector  # (m,) input that counts at a state, where the model reads inputs
     phi: Vector  # (p,)
     hidden: Matrix  # (L, w)
     deltas: Matrix  # (L, w)
@@ -43,18 +45,19 @@ def new_path(
 ) -> Path:
     """Return an empty path."""
     r, q = plant.learned_rows.shape[0], covariance.upper.shape[0]
-    C, H = search.candidates.shape[0], search.steps
-    n = r * (H // search.stride)
+    C, H, R = search.candidates.shape[0], search.steps, rows_of_state(plant, network)
+    n = R * (H // search.stride)
     size = q if n * C > FEW_ROWS else 0
     path = Path(
         np.empty((H + 1, d)),
         np.empty((H + 1, r)),
-        np.empty((n + r, q)),
+        np.empty((n + R, q)),
         np.empty((n, q)),
         np.zeros((n, n)),
         np.empty((size, size)),
         np.empty(d),
-        np.empty(network.sizes[0]),
+        np.zeros(plant.n_inputs),
+        np.empty(network.feature_kinds.shape[0]),
         np.empty((network.offsets.shape[0] - 1, network.sizes[1])),
         np.empty((network.offsets.shape[0] - 1, network.sizes[1])),
     )
@@ -66,11 +69,29 @@ def new_path(
 
 
 @compiled
+def rows_of_state(plant: Plant, network: Network) -> int:
+    """Return R, the number of rows of J that belong to one state of a path."""
+    count: int = plant.learned_rows.shape[0] * n_next_points(network)
+    return count
+
+
+@compiled
 def model_and_jacobian(
     plant: Plant, network: Network, theta: Vector, path: Path, i: int, rows: Matrix
 ) -> None:
-    """Write a_θ and J, (r, q), at state i of the path."""
+    """Write a_θ, under the present input, and the rows of J at state i of the path, (R, q).
+
+    For a model that reads inputs the rows are those of :func:`next_points`, weighted so that the
+    sum of their JᵀJ is the mean.
+    """
     x, out = path.states[i], path.outputs[i]
+    if network.n_inputs_read > 0:
+        model_accelerations(plant, network, theta, model_point(network, x, path.u), out)
+        if rows.shape[0] > 0:
+            points = next_points(network, x, plant.gamma)
+            rows[:] = rows_at(plant, network, theta, points)
+            scale(rows, 1.0 / np.sqrt(points.shape[0]))
+        return
     if network.kind != ModelKind.MLP:
         regressors(plant, network, x, rows, out)
         add_linear(rows, theta, out)
@@ -78,7 +99,7 @@ def model_and_jacobian(
     nn.features_at(network, x, path.phi)
     nn.activations_at(network, theta, path.phi, path.hidden, out)
     for k in range(rows.shape[0]):
-        nn.back_signals(network, theta, path.hidden, k, path.deltas)
+        nn.back_signals(network, theta, path.phi, path.hidden, k, path.deltas)
         nn.parameter_gradient(network, path.phi, path.hidden, path.deltas, k, rows[k])
 
 
@@ -98,17 +119,21 @@ def rollout(
     x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written in the units
     of M, for the determinant of all of them together times the root of the stride.
     """
-    r, stride = plant.learned_rows.shape[0], search.stride
+    R, stride = rows_of_state(plant, network), search.stride
     spare = path.products.shape[0]
+    if network.n_inputs_read > 0:
+        path.u[:] = u
+        point = model_point(network, path.states[first], u)
+        model_accelerations(plant, network, theta, point, path.outputs[first])
     for i in range(first, last):
         x, following = path.states[i], path.states[i + 1]
         euler_step(plant, x, u, path.outputs[i], path.flow, following)
         if not within(following, plant.state_limit):
             return False
         wanted = (i + 1) % stride == 0
-        block = r * ((i + 1) // stride - 1) if wanted else spare
+        block = R * ((i + 1) // stride - 1) if wanted else spare
         # A network's output comes without rows; those of a linear model are its output.
-        count = r if wanted or network.kind != ModelKind.MLP else 0
+        count = R if wanted or network.kind != ModelKind.MLP else 0
         rows = path.rows[block : block + count]
         model_and_jacobian(plant, network, theta, path, i + 1, rows)
         weight = search.row_scale

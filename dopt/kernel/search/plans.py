@@ -15,6 +15,7 @@ from dopt.kernel.search.path import (
     model_and_jacobian,
     new_path,
     rollout,
+    rows_of_state,
 )
 from dopt.kernel.search.scores import ScoreContext, score_context, score_of_path
 from dopt.kernel.structs import Covariance, Network, Plant, Search, Trial
@@ -161,10 +162,10 @@ def _roll(problem: Problem, c: int, first: int, last: int) -> bool:
 def _gain(problem: Problem, first: int, last: int) -> float:
     """Return the growth of log det by the rows of steps ``first`` to ``last``."""
     path, search = problem.path, problem.search
-    r = problem.plant.learned_rows.shape[0]
-    first, last = r * (first // search.stride), r * (last // search.stride)
+    R = rows_of_state(problem.plant, problem.network)
+    first, last = R * (first // search.stride), R * (last // search.stride)
     apply_inverse(problem.covariance, path, first, last)
-    block = r if search.score == Score.SUM else path.products.shape[0]
+    block = R if search.score == Score.SUM else path.products.shape[0]
     gain: float = log_determinant(path, first, last, block)
     return gain
 

@@ -22,6 +22,7 @@ from dopt.kernel.information.cholesky import (
     solve_transposed_columns,
 )
 from dopt.kernel.model import regressors, write_features
+from dopt.kernel.output_layer import output_inputs
 from dopt.kernel.structs import Covariance, Network, Plant, State
 from dopt.types import Matrix, Stack, Vector
 
@@ -108,7 +109,7 @@ def _write_reversed(covariance: Covariance, out: Matrix) -> None:
 def changes_along(
     plant: Plant, network: Network, theta: Vector, states: Matrix, along: Matrix, out: Stack
 ) -> None:
-    """Write J W, (r, s, N), at states, (N, d), for directions Wᵀ, (s, q)."""
+    """Write J W, (r, s, N), at points, (N, ·), for directions Wᵀ, (s, q)."""
     N, r = states.shape[0], out.shape[0]
     if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)
@@ -118,22 +119,24 @@ def changes_along(
                 out[k, :, n] = np.dot(along, rows[k])
         return
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    features, outputs = np.empty((network.sizes[0], N)), np.empty((r, N))
+    features, outputs = np.empty((network.feature_kinds.shape[0], N)), np.empty((r, N))
     hidden = np.empty((depth, width * N))
     write_features(network, states, features)
     nn.forward(network, theta, features, hidden, outputs)
-    signals = nn.batch_back_signals(network, theta, hidden, r, N)
+    signals = nn.batch_back_signals(network, theta, features, hidden, r)
+    last = nn.units_by_points(hidden[depth - 1], width, N)
+    top = output_inputs(network, last, features)
     change = np.empty((width, N))
     for j in range(along.shape[0]):
         dW, db = nn.layer(network, along[j], depth)
-        np.dot(dW, nn.units_by_points(hidden[depth - 1], width, N), outputs)
+        np.dot(dW, top, outputs)
         for k in range(r):
             for n in range(N):
                 out[k, j, n] = outputs[k, n] + db[k]
         for index in range(depth):
             dW, db = nn.layer(network, along[j], index)
             below = features if index == 0 else nn.units_by_points(hidden[index - 1], width, N)
-            np.dot(dW, below, change)
+            np.dot(dW, below[: dW.shape[1]], change)
             for k in range(r):
                 _add_products(signals[k * depth + index], change, db, out[k, j])
 

@@ -15,6 +15,7 @@ from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import add_multiple, inner
 from dopt.kernel.model import accelerations_at, euler_step, rows_at
+from dopt.kernel.points import n_next_points, next_points
 from dopt.kernel.search.posterior import Directions, changes_along, directions
 from dopt.kernel.structs import Trial
 from dopt.types import Booleans, Integers, Matrix, Stack, Vector
@@ -141,10 +142,14 @@ def _scale_inputs(inputs: Matrix, gamma: float) -> None:
 def _directions(trial: Trial, settings: Settings, t: int) -> tuple[bool, Directions]:
     """Return the directions of the parameters of step t, exact for the rows at task states."""
     states, count = trial.algorithm.search.task_states, settings.task_count
-    chosen = np.empty((count, states.shape[1]))
+    network, gamma, per_state = trial.network, trial.plant.gamma, n_next_points(trial.network)
+    chosen = np.empty((count * per_state, states.shape[1] + network.n_inputs_read))
     for i in range(count):
-        chosen[i] = states[(t * count + i) % states.shape[0]]
-    rows = rows_at(trial.plant, trial.network, trial.state.theta, chosen)
+        at = states[(t * count + i) % states.shape[0]]
+        chosen[i * per_state : (i + 1) * per_state] = next_points(network, at, gamma)
+    rows = rows_at(trial.plant, network, trial.state.theta, chosen)
+    if per_state > 1:
+        rows /= np.sqrt(per_state)
     return directions(trial.state, trial.randomness.parameters, rows)
 
 
@@ -155,36 +160,48 @@ def _score(
     """Write the scores of plans, (P, K, m); -∞ where a path leaves the bounds of a state."""
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     P, n, r = inputs.shape[0], settings.steps // settings.stride, plant.learned_rows.shape[0]
-    inside, states = _paths(trial, settings, t, inputs)
-    changes = np.empty((r, draws.rows.shape[0], P * n))
-    changes_along(plant, network, theta, states, draws.rows, changes)
-    rows, factor = np.empty((n * r, draws.rows.shape[0])), np.empty((n * r, n * r))
+    inside, points = _paths(trial, settings, t, inputs)
+    d, per_state = trial.record.states.shape[1], n_next_points(network)
+    changes, R = np.empty((r, draws.rows.shape[0], points.shape[0])), r * per_state
+    changes_along(plant, network, theta, points, draws.rows, changes)
+    rows, factor = np.empty((n * R, draws.rows.shape[0])), np.empty((n * R, n * R))
     joint = settings.score in (Score.JOINT, Score.TASK)
     scale = trial.algorithm.search.row_scale * (np.sqrt(settings.stride) if joint else 1.0)
+    if per_state > 1:
+        scale /= np.sqrt(per_state)
     for p in range(P):
-        for i in range(n):
-            weight = scale * domain_weight(trial.algorithm.search.domain, states[p * n + i])
+        for i in range(n * per_state):
+            place = p * n * per_state + i
+            weight = scale * domain_weight(trial.algorithm.search.domain, points[place, :d])
             for k in range(r):
                 for j in range(rows.shape[1]):
-                    rows[i * r + k, j] = weight * changes[k, j, p * n + i]
-        value = score_of_rows(settings.score, rows, draws.exact, r, factor)
+                    rows[i * r + k, j] = weight * changes[k, j, place]
+        value = score_of_rows(settings.score, rows, draws.exact, R, factor)
         values[p] = value if inside[p] and np.isfinite(value) else -np.inf
 
 
 @compiled
 def _paths(trial: Trial, settings: Settings, t: int, inputs: Stack) -> tuple[Booleans, Matrix]:
-    """Return which paths stay in bounds, and their states that count, (P n, d), path by path."""
+    """Return which paths stay in bounds, and the points of their states that count, path by path.
+
+    They are (P n, d), or those of :func:`next_points` one state after the other, (2 m P n, d + m).
+    """
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     P, d, stride = inputs.shape[0], trial.record.states.shape[1], settings.stride
-    n = settings.steps // stride
-    kept, inside = np.empty((P * n, d)), np.ones(P, np.bool_)
+    n, per_state = settings.steps // stride, n_next_points(network)
+    kept = np.empty((P * n * per_state, d + network.n_inputs_read))
+    inside = np.ones(P, np.bool_)
     states, flow, value = np.empty((P, d)), np.empty(d), np.empty(plant.learned_rows.shape[0])
     outputs = np.empty((value.shape[0], P))
     following = np.empty(d)
     states[:] = trial.record.states[t]
+    points = states if network.n_inputs_read == 0 else np.empty((P, d + network.n_inputs_read))
     for i in range(n * stride):
-        accelerations_at(plant, network, theta, states, outputs)
         k = (t + i) // settings.hold - t // settings.hold
+        if network.n_inputs_read > 0:
+            points[:, :d] = states
+            points[:, d:] = inputs[:, k]
+        accelerations_at(plant, network, theta, points, outputs)
         for p in range(P):
             for j in range(value.shape[0]):
                 value[j] = outputs[j, p]
@@ -192,7 +209,8 @@ def _paths(trial: Trial, settings: Settings, t: int, inputs: Stack) -> tuple[Boo
             inside[p] = inside[p] and within(following, plant.state_limit)
             states[p] = following
             if (i + 1) % stride == 0:
-                kept[p * n + (i + 1) // stride - 1] = following
+                place = per_state * (p * n + (i + 1) // stride - 1)
+                kept[place : place + per_state] = next_points(network, following, plant.gamma)
     return inside, kept
 
 

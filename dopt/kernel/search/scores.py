@@ -10,7 +10,7 @@ from dopt.algorithm import Score
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import inner
 from dopt.kernel.search.krylov import krylov_space, largest_eigenvalue
-from dopt.kernel.search.path import Path, model_and_jacobian, whiten
+from dopt.kernel.search.path import Path, model_and_jacobian, rows_of_state, whiten
 from dopt.kernel.structs import Covariance, Network, Plant, Search
 from dopt.types import Matrix, Vector
 
@@ -51,14 +51,14 @@ def score_context(
     path: Path,
 ) -> ScoreContext:
     """Return what the score needs at these parameters and this M⁻¹."""
-    q, r = theta.shape[0], plant.learned_rows.shape[0]
+    q, R = theta.shape[0], rows_of_state(plant, network)
     if search.score == Score.E:
         basis, projected = krylov_space(covariance, search.starts, search.subspace)
         return ScoreContext(basis, projected)
     n = search.task_states.shape[0] if search.score == Score.TASK else 0
-    rows = np.empty((n * r, q))
+    rows = np.empty((n * R, q))
     for s in range(n):
         for i in range(path.flow.shape[0]):
             path.states[0, i] = search.task_states[s, i]
-        model_and_jacobian(plant, network, theta, path, 0, rows[s * r : (s + 1) * r])
+        model_and_jacobian(plant, network, theta, path, 0, rows[s * R : (s + 1) * R])
     return ScoreContext(rows, np.empty((0, 0)))

@@ -20,7 +20,8 @@ from analysis.figures.input_spectrum.plot import spectrum_plot
 from analysis.figures.loss_curves.plot import _title, loss_plot
 from analysis.figures.phase_portraits.data import Portrait
 from analysis.figures.phase_portraits.plot import coverage_text, phase_plot
-from analysis.outputs.registry import NAMES, PLOTS, build
+from analysis.outputs.names import FIGURES, NAMES
+from analysis.outputs.registry import PLOTS, build
 from analysis.plot_options import PlotOptions
 from orchestrate.store import Reader
 
@@ -47,6 +48,10 @@ def make(reader: Reader, selection: Selection, target: Path, **options: bool) ->
         for outcome in build(reader, selection, PlotOptions(), target, QUICK, **options)
         if outcome.name in QUICK
     ]
+
+
+def test_the_names_are_those_of_the_registry() -> None:
+    assert tuple(PLOTS) == FIGURES
 
 
 @pytest.mark.parametrize("name", PLOTS)

@@ -12,8 +12,7 @@ from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError
 from analysis.figures.loss_curves.data import Axis, measure_curves, tabulate_curves
 from analysis.formatting import count_text, number, p_text, plus_minus
-from analysis.report.forest_plot import CAPTION
-from analysis.report.page import EXPLAINED
+from analysis.report.page import CAPTION, EXPLAINED
 from analysis.stats.trial_scores import Measure
 from analysis.tables.comparisons import compare_policies
 from analysis.tables.rendering import comparison_table, control_table, summary_table

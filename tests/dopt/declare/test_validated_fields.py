@@ -45,7 +45,7 @@ POSITIVE = {
     ),
 }
 NONNEGATIVE = {
-    *("noise", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
+    *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
 }
 FRACTIONS = {"beta_1", "beta_2"}

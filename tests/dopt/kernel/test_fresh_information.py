@@ -209,7 +209,10 @@ def test_a_learner_that_updates_the_matrix_decides_about_it(learner: str) -> Non
 @pytest.mark.parametrize("model", ["linear", "linear_state", "rff"])
 def test_it_is_refused_where_it_would_be_the_accumulated_one(model: str) -> None:
     least_squares = {"name": "recursive_least_squares"}
-    with pytest.raises(IncompatibleError, match=rf"goes with model 'mlp', but model '{model}'"):
+    with pytest.raises(
+        IncompatibleError,
+        match=rf"goes with model 'mlp', 'affine' or 'black_box', but model '{model}'",
+    ):
         trial(
             "mass_spring" if model == "linear_state" else "arm",
             "d_optimal",

@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba import float64
 
 from dopt.errors import IncompatibleError
 from dopt.forecasts import model_forecast
 from dopt.kernel.evaluation_points import points_of_trial
-from dopt.kernel.from_spec import constants
+from dopt.kernel.from_spec import shared_points
 from dopt.kernel.information.primal import dense
 from dopt.kernel.model import rows_at
+from dopt.kernel.pointers import compiled_for, kind_of
 from dopt.kernel.random_features import write_row_along
 from dopt.kernel.run import KernelTrial
 from dopt.policies import POLICIES
@@ -87,12 +89,14 @@ def test_the_inverse_information_is_that_of_all_rows_of_the_learned_parameters(p
 @pytest.mark.parametrize("env", ["pendulum", "arm", "quadrotor"])
 def test_change_of_the_rows_is_that_of_finite_differences(env: str) -> None:
     fast, rng = KernelTrial(features(env)), np.random.default_rng(0)
-    plant, network = fast.constants[:2]
-    theta, d, h = fast.state.theta, fast.spec.system.n_states, 1e-5
+    plant, network, theta = fast.trial.plant, fast.trial.network, fast.state.theta
+    given, d, h = (plant, network, theta), fast.spec.system.n_states, 1e-5
+    # Compiled once for all systems, whose functions are pointers to it.
+    rows: Any = compiled_for("rows_at", rows_at, (*map(kind_of, given), float64[:, ::1]))
     for _ in range(5):
         x, direction = rng.normal(size=d), rng.normal(size=d)
         ends = np.stack([x + h * direction, x - h * direction])
-        ahead, behind = np.split(rows_at(plant, network, theta, ends), 2)
+        ahead, behind = np.split(rows(*given, ends), 2)
         differences = (ahead - behind) / (2.0 * h)
         for k, expected in enumerate(differences):
             change = np.empty(len(theta))
@@ -132,7 +136,7 @@ def test_an_assessment_predicts_with_all_parameters() -> None:
 
 def test_memory_counts_the_features_at_the_evaluation_points() -> None:
     spec = features("pendulum", env={"grid_points": [64, 64]}, model={"n_features": 200})
-    points = points_of_trial(constants(spec.config)[3], KernelTrial(spec).constants[1], 9)
+    points = points_of_trial(shared_points(spec.config), KernelTrial(spec).trial.network, 9)
     q = 200
     assert spec.config.memory >= points.basis.nbytes + 8 * q**2
     assert spec.config.largest_setting == "model.n_features"

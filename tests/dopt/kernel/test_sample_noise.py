@@ -14,6 +14,7 @@ from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
 from dopt.policies import Search
 from dopt.reference import search
+from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.exact_gain import ExactGain, Situation
 from dopt.reference.models import model_function
 from dopt.reference.search import paths
@@ -42,7 +43,8 @@ def candidate_rows(fast: KernelTrial) -> Array:
     model = model_function(system, fast.spec.model)
     theta, x = torch.tensor(fast.state.theta), torch.tensor(fast.record.states[fast.done])
     inputs = torch.tensor(policy.compared_inputs(system))
-    states = paths(policy, system, model, theta, x, torch.stack([inputs, inputs], 1))[:, 0]
+    held = torch.stack([inputs, inputs], 1)
+    states = paths(policy, LearnedDynamics(system, model), theta, x, held)[:, 0]
     rows: Array = vmap(jacrev(model), (None, 0))(theta, states).numpy()
     return rows
 

@@ -26,13 +26,20 @@ from tests.dopt.trials import trial
 
 SMALL = {"lookahead": 7, "hold": 3, "stride": 2, "plans": 9, "iterations": 2, "elites": 3}
 GAUSS_NEWTON = {"name": "gauss_newton"}
+STEPS = 16
+"""More than twice the steps of a plan: its first input is held to its end five times."""
 
 
 def spec_of(
-    env: str, criterion: str = "joint", learner: dict[str, Any] | None = None, **fields: Any
+    env: str,
+    criterion: str = "joint",
+    learner: dict[str, Any] | None = None,
+    horizon: int = STEPS,
+    **fields: Any,
 ) -> TrialSpec:
     given = SMALL | {"criterion": criterion, "samples": 6, "count": 3} | fields
-    return trial(env, "icem", 3, policy=given, model={"width": 8}, learner=learner or {})
+    size = {"env": {"horizon": horizon}, "model": {"width": 8}}
+    return trial(env, "icem", 3, policy=given, learner=learner or {}, **size)
 
 
 @pytest.mark.parametrize("criterion", ["joint", "sum", "variance", "task"])
@@ -113,13 +120,13 @@ def test_products_with_the_rows_at_task_states_are_exact_and_all_others_unbiased
 def test_scores_are_those_of_dense_matrices(criterion: str) -> None:
     """As many exact directions as parameters leave nothing to chance."""
     spec = spec_of("arm", criterion, samples=20_000)
-    batch, plan = planned(spec, 10)
+    batch, plan = planned(spec, 4)
     assert batch.information is not None
     inputs = plan._elites
-    values = plan._values(10, inputs, *plan._directions(10))[0]
-    states = plan._paths(10, inputs)[0][0]
+    values = plan._values(4, inputs, *plan._directions(4))[0]
+    states = plan._paths(4, inputs)[0][0]
     M, r = batch.information[0], batch.system.n_learned
-    G = rows_at(batch, box_states(batch.system)[30:33])
+    G = rows_at(batch, box_states(batch.system)[12:15])
     for path, value in zip(states, values, strict=True):
         J = rows_at(batch, path.numpy()) * (2**0.5 if criterion in ("joint", "task") else 1.0)
         expected = [dense_score(criterion, M, J[: r * (i + 1)], G, r) for i in range(len(path))]
@@ -146,8 +153,8 @@ def test_outside_of_the_domain_rows_count_less(path: str) -> None:
     inputs = {}
     for name, half_widths in (("wide", (7.0, 1e6)), ("narrow", (0.02, 0.02))):
         for domain in ("everywhere", "box"):
-            fields = SMALL | {"domain": domain, "lookahead": 28, "stride": 7}
-            env = {"grid_half_widths": half_widths}
+            fields = SMALL | {"domain": domain, "lookahead": 12, "stride": 6}
+            env = {"grid_half_widths": half_widths, "horizon": 14}
             spec = trial("pendulum", "icem", 3, env=env, policy=fields)
             inputs[name, domain] = run_trial(spec, path).inputs
     assert np.array_equal(inputs["wide", "box"], inputs["wide", "everywhere"])
@@ -182,7 +189,8 @@ def test_more_iterations_find_better_plans() -> None:
     """Over the steps of a trial, whose states differ little: the sum of the scores grows."""
     found = []
     for iterations in (1, 4):
-        batch, plan = planned(spec_of("arm", lookahead=24, stride=4, iterations=iterations), 2)
+        fields = {"lookahead": 24, "stride": 4, "iterations": iterations, "horizon": 30}
+        batch, plan = planned(spec_of("arm", **fields), 2)
         batch.states[:, 2] = torch.tensor([[0.1, 0.2, -0.1, 0.1]])
         plan.plan(2)
         found.append(float(plan._values(2, plan._elites, *plan._directions(2)).max()))

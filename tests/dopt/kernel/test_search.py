@@ -14,6 +14,7 @@ from dopt.kernel.run import KernelTrial
 from dopt.policies import Search, TaskOptimal
 from dopt.policies.task_states import task_states
 from dopt.randomness import draw
+from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.models import model_function
 from dopt.reference.search import paths, plans, score_function
 from dopt.run import run_trial
@@ -206,8 +207,9 @@ class TestBudget:
         theta, x = torch.tensor(fast.state.theta), torch.tensor(fast.record.states[fast.done])
         candidates = torch.tensor(policy.compared_inputs(system))
         pairs = plans(policy, system, len(candidates))
-        states = paths(policy, system, model, theta, x, candidates[torch.tensor(pairs)])
-        score = score_function(policy, system, model)
+        learned = LearnedDynamics(system, model)
+        states = paths(policy, learned, theta, x, candidates[torch.tensor(pairs)])
+        score = score_function(policy, learned)
         inverse = torch.tensor(dense(fast.state.covariance))
         rows = vmap(vmap(jacrev(model), (None, 0)), (None, 0))(theta, states)
         return pairs, [float(score(J, theta, inverse)) for J in rows]

@@ -18,6 +18,7 @@ from dopt.policies.lookahead import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
 from dopt.policies.task_states import goal_weights, task_states
 from dopt.randomness import draw
 from dopt.reference import search
+from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig
@@ -173,12 +174,13 @@ def test_a_state_counts_stride_times_in_the_joint_determinant_alone(
         return lambda rows, *_: seen.append(rows) or (rows**2).sum()  # type: ignore[func-returns-value]
 
     monkeypatch.setattr(search, "score_function", scored)
+    learned = LearnedDynamics(spec.system, model)
     information = torch.eye(theta.shape[1], dtype=torch.float64)[None]
     ties = torch.ones(1, 1, dtype=torch.float64)
     values: list[torch.Tensor] = []
     monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
-    search.searched_inputs(spec.policy, spec.system, model, theta, information, x, ties)
+    search.searched_inputs(spec.policy, learned, theta, information, x, ties)
     inputs = torch.tensor(spec.policy.compared_inputs(spec.system))[[0, 0]][None]
-    path = search.paths(spec.policy, spec.system, model, theta[0], x[0], inputs)[0, 2::3]
+    path = search.paths(spec.policy, learned, theta[0], x[0], inputs)[0, 2::3]
     rows = vmap(jacrev(model), (None, 0))(theta[0], path)
     assert float(values[0][0, 0]) == pytest.approx(weight * float((rows**2).sum()))

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from dopt.math.sphere import maximize_on_sphere
+from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
@@ -53,12 +54,12 @@ def whole(rows: Tensor) -> Tensor:
 def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return Q, v and the chosen input of the reference."""
     problem = quadratic_problem(
-        spec.system,
-        now.model,
+        LearnedDynamics(spec.system, now.model),
         now.theta[None],
         now.information[None],
         now.state[None],
         torch.tensor([component]),
+        torch.zeros(1, spec.system.n_inputs, dtype=torch.float64),
         whole,
     )
     ties = torch.ones(1, spec.system.n_inputs, dtype=torch.float64)
@@ -138,12 +139,12 @@ def test_each_trial_of_a_batch_has_its_own_problem() -> None:
     spec = trial("arm", "d_optimal")
     several = [situation(spec, seed) for seed in range(3)]
     problem = quadratic_problem(
-        spec.system,
-        several[0].model,
+        LearnedDynamics(spec.system, several[0].model),
         torch.stack([now.theta for now in several]),
         torch.stack([now.information for now in several]),
         torch.stack([now.state for now in several]),
         torch.tensor([0, 1, 1]),
+        torch.zeros(3, 2, dtype=torch.float64),
         whole,
     )
     ties = torch.ones(3, 2, dtype=torch.float64)

@@ -14,8 +14,7 @@ from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.gaussian_process import Posterior
 from dopt.reference.models import features, model_function
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS
-from tests.dopt.trials import trial
+from tests.dopt.trials import KNOWN_EFFECT, trial
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
     "gaussian_process": "conditioning"
@@ -46,7 +45,7 @@ def run(spec: TrialSpec) -> Lockstep:
 
 
 @pytest.mark.parametrize("model", LEARNERS)
-@pytest.mark.parametrize("env", SYSTEMS)
+@pytest.mark.parametrize("env", KNOWN_EFFECT)
 def test_prediction_is_that_of_the_reference(env: str, model: str) -> None:
     spec = regression(env, model)
     rng = np.random.default_rng(1)

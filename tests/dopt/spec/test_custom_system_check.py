@@ -58,6 +58,11 @@ CASES: list[tuple[str, Any, str]] = [
         lambda state, inputs, *_: (state[1], inputs[0] ** 2),
         r"known\(\) of env 'pendulum' is not affine in the inputs",
     ),
+    (
+        "known",
+        lambda state, inputs, *_: (state[1], abs(inputs[0])),
+        r"known\(\) of env 'pendulum' is not affine in the inputs",
+    ),
 ]
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from dopt.control.episode import run_episode
 from dopt.control.free_run import free_run_error
-from dopt.control.prediction import forecast_by
+from dopt.control.prediction import forecast_by_equations
 from dopt.errors import SpecificationError
 from dopt.kernel import from_spec
 from dopt.policies import DOptimal
@@ -142,7 +142,7 @@ def test_the_planner_of_a_task_is_reckoned(env: str, sizes: dict[str, Any], sett
     assert spec.config.largest_setting == setting
     assert spec.task is not None
     system, task, rng = spec.system, spec.task, np.random.default_rng(0)
-    truth = forecast_by(system, system.learned)
+    truth = forecast_by_equations(system)
     tracemalloc.start()
     run_episode(system, task, truth, truth, np.zeros((1, system.n_states)), rng)
     peak = tracemalloc.get_traced_memory()[1]
@@ -154,7 +154,7 @@ def test_the_planner_of_a_task_is_reckoned(env: str, sizes: dict[str, Any], sett
 def test_the_free_run_of_a_task_is_reckoned(env: str) -> None:
     spec = with_task(env, free_run_steps=500)
     assert spec.config.largest_setting == "task.free_run_steps"
-    truth = forecast_by(spec.system, spec.system.learned)
+    truth = forecast_by_equations(spec.system)
     tracemalloc.start()
     free_run_error(spec.system, truth, 500)
     peak = tracemalloc.get_traced_memory()[1]

@@ -1,0 +1,228 @@
+"""Models that learn what the inputs do, and systems of which that is unknown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.func import jacrev
+
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.evaluation import evaluation_set
+from dopt.kernel.model import model_accelerations, network_jacobian
+from dopt.kernel.run import KernelTrial
+from dopt.models import MODELS
+from dopt.offline_fit import fit_offline
+from dopt.randomness import draw
+from dopt.reference.models import model_function
+from dopt.reference.planning import predicted_states, quadratic_problem
+from dopt.reference.state import BatchState
+from dopt.run import run_trial
+from dopt.samples import uniform_samples
+from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS
+from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES
+
+READERS = ("affine", "black_box")
+UNKNOWN = [name for name, system in SYSTEMS.items() if system.reads_inputs]
+
+
+def small(
+    env: str, model: str = "affine", policy: str = "d_optimal", learner: str = "adam_window",
+    /, *, seed: int = 0, **sections: dict[str, Any],
+) -> TrialSpec:  # fmt: skip
+    parts: dict[str, dict[str, Any]] = {
+        "env": {"name": env, "horizon": 12, "grid_points": SMALL_GRIDS[env]},
+        "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
+        "model": {"name": model} | ({"width": 6} if model in READERS else {}),
+        "learner": {"name": learner},
+    }
+    merged = {key: part | sections.get(key, {}) for key, part in parts.items()}
+    return TrialSpec.from_mapping(merged | {"seed": seed})
+
+
+PATH_CASES = [
+    *[("arm", model, "d_optimal", "adam_window") for model in READERS],
+    *[("cartpole_unknown_gain", "affine", "d_optimal", name)
+      for name in ("adam", "adam_replay", "ekf", "gauss_newton")],
+    ("arm", "black_box", "d_optimal", "gauss_newton"),
+    ("arm", "affine", "d_optimal", "gauss_newton"),
+    *[("cartpole_unknown_gain", "affine", name, "adam_window")
+      for name in ("random", "uniform", "exact", "lookahead", "task", "trace_linearized")],
+    ("arm", "affine", "icem", "gauss_newton"),
+    ("cartpole_unknown_gain", "linear", "oracle", "recursive_least_squares"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("env", "model", "policy", "learner"), PATH_CASES)
+def test_both_paths_agree(env: str, model: str, policy: str, learner: str) -> None:
+    spec = small(env, model, policy, learner)
+    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
+    assert np.isfinite(plain.loss).all()
+    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
+    assert relative_gap(fast.parameters, plain.parameters) < 1e-6
+    # The loss is evaluated in single precision where that is enough.
+    assert relative_gap(fast.loss, plain.loss) < 1e-5
+    assert relative_gap(fast.reachable_loss, plain.reachable_loss) < 1e-5
+
+
+@pytest.mark.parametrize("policy", [{"information": "fresh", "refresh_every": 3},
+                                    {"form": "sketch", "sketch_size": 40}])  # fmt: skip
+@pytest.mark.parametrize("model", READERS)
+def test_forms_of_the_information_agree(model: str, policy: dict[str, Any]) -> None:
+    spec = small("cartpole_unknown_gain", model, policy=policy)
+    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
+    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
+    assert relative_gap(fast.parameters, plain.parameters) < 1e-8
+
+
+@pytest.mark.parametrize("model", READERS)
+def test_values_and_rows_are_those_of_automatic_differentiation(model: str) -> None:
+    spec = small("arm", model)
+    kernel, function = KernelTrial(spec).trial, model_function(spec.system, spec.model)
+    rng = np.random.default_rng(1)
+    theta = draw(spec).weights + 0.1 * rng.standard_normal(len(draw(spec).weights))
+    x, u = rng.standard_normal((5, 4)), 3.0 * rng.standard_normal((5, 2))
+    values = spec.model.predict(spec.system, theta, x, u)
+    for point, value in zip(np.hstack([x, u]), values, strict=True):
+        given = (torch.tensor(theta), torch.tensor(point))
+        out, rows_value = np.empty(2), np.empty(2)
+        model_accelerations(kernel.plant, kernel.network, theta, point, out)
+        rows = network_jacobian(kernel.network, theta, point, rows_value)
+        assert out == pytest.approx(value, rel=1e-12)
+        assert rows_value == pytest.approx(value, rel=1e-12)
+        assert function(*given).numpy() == pytest.approx(value, rel=1e-12)
+        np.testing.assert_allclose(rows, jacrev(function)(*given).numpy(), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", READERS)
+def test_only_one_is_affine_in_the_inputs(model: str) -> None:
+    spec, rng = small("arm", model), np.random.default_rng(2)
+    theta, x = draw(spec).weights, rng.standard_normal((7, 4))
+    first, second = rng.standard_normal((2, 7, 2))
+    free, one, other, both = (
+        spec.model.predict(spec.system, theta, x, u)
+        for u in (0 * first, first, second, first + second)
+    )
+    apart = np.abs(one + other - both - free).max()
+    assert apart < 1e-12 if model == "affine" else apart > 1e-3
+    assert np.array_equal(free, spec.model.predict(spec.system, theta, x))
+
+
+@pytest.mark.parametrize("model", READERS)
+def test_the_plan_is_for_the_change_of_the_gradient_with_the_state(model: str) -> None:
+    """D B by differences of the gradient at x̄ + B u, under the input that was drawn."""
+    spec = small("cartpole_unknown_gain", model)
+    batch, rng = BatchState([spec]), np.random.default_rng(3)
+    theta, x = batch.theta, torch.tensor(rng.standard_normal((1, 4)))
+    q, gamma = theta.shape[1], spec.system.gamma
+    root = torch.tensor(rng.standard_normal((q, q)))
+    M = (torch.eye(q) + root @ root.mT / q)[None]
+    v, learned = torch.tensor([[-gamma]], dtype=torch.float64), batch.learned
+    problem = quadratic_problem(learned, theta, M, x, torch.tensor([1]), v, lambda rows: rows)
+    bar = predicted_states(learned, theta, x)[0]
+    B = learned.input_matrix(theta[0], bar)[:, 0]
+
+    def gradient(share: float) -> torch.Tensor:
+        point = torch.cat([bar + share * B, v[0]])
+        return jacrev(learned.model)(theta[0], point)[1]
+
+    change = (gradient(1e-5) - gradient(-1e-5)) / 2e-5
+    solved = torch.linalg.solve(M[0], change)
+    assert float(problem.Q) == pytest.approx(float(change @ solved), rel=1e-6)
+    assert float(problem.v) == pytest.approx(-float(gradient(0.0) @ solved), rel=1e-6)
+
+
+def test_the_effect_of_inputs_is_that_of_the_model_and_the_known_part() -> None:
+    """B by differences of the predicted next state."""
+    spec = small("cartpole_unknown_gain")
+    batch, rng = BatchState([spec]), np.random.default_rng(4)
+    theta, x = batch.theta[0], torch.tensor(rng.standard_normal(4))
+    both = torch.tensor([[0.5], [-0.5]], dtype=torch.float64)
+    ahead, behind = batch.learned.following(theta, x.expand(2, -1), both)
+    B = batch.learned.input_matrix(theta, x)
+    np.testing.assert_allclose(B[:, 0], ahead - behind, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_an_unknown_effect_moves_the_system_as_a_known_one(name: str) -> None:
+    unknown, known = SYSTEMS[name](), SYSTEMS[name.removesuffix("_unknown_gain")]()
+    rng = np.random.default_rng(5)
+    for x, u in zip(rng.standard_normal((9, known.n_states)), rng.standard_normal(9), strict=True):
+        expected = known.derivative(x, [u])
+        assert unknown.derivative(x, [u]) == pytest.approx(expected, rel=1e-12)
+        assert not np.any(
+            np.array(unknown.known(x, [u], unknown.parameters))[list(unknown.learned_rows)]
+        )
+    weak = SYSTEMS[name](gain=0.5)  # type: ignore[call-arg]
+    assert weak.derivative(x, [u]) == pytest.approx(known.derivative(x, [0.5 * u]), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_the_oracle_learns_the_gain(name: str) -> None:
+    spec = small(name, "linear", "oracle", "recursive_least_squares",
+                 env={"horizon": 200, "gain": 1.3})  # fmt: skip
+    result = run_trial(spec)
+    assert result.parameters[-1] == pytest.approx(1.3, rel=0.02)
+
+
+@pytest.mark.parametrize("model", READERS)
+def test_the_loss_is_the_error_over_states_and_inputs(model: str) -> None:
+    spec = small("cartpole_unknown_gain", model)
+    result, points = run_trial(spec), evaluation_set(spec.system)
+    assert np.abs(points.inputs[: points.n_grid]).max() <= spec.system.gamma
+    truth = spec.system.learned(points.states, inputs=points.inputs)
+    errors = truth - spec.model.predict(
+        spec.system, result.parameters, points.states, points.inputs
+    )
+    squares = np.sum(errors**2, axis=1)
+    assert result.loss[-1] == pytest.approx(np.sqrt(squares[: points.n_grid].mean()), rel=1e-5)
+    reachable = np.sqrt(squares[points.n_grid :].mean())
+    assert result.reachable_loss[-1] == pytest.approx(reachable, rel=1e-5)
+
+
+def test_samples_of_states_and_inputs_are_fitted_offline() -> None:
+    spec = small("pendulum_unknown_gain", env={"horizon": 300, "grid_points": [8, 8]})
+    samples = uniform_samples(spec)
+    given = (spec, samples.states, samples.accelerations)
+    fitted = fit_offline(*given, inputs=samples.inputs)
+    size = float(np.sqrt(np.mean(samples.accelerations**2)))
+    assert fitted.loss < 0.02 * size
+    with pytest.raises(SpecificationError, match="'affine' reads inputs, but none were given"):
+        fit_offline(*given)
+    with pytest.raises(SpecificationError, match="300 states and 299 inputs"):
+        fit_offline(*given, inputs=samples.inputs[1:])
+
+
+def test_d_optimal_inputs_teach_more_than_random_ones() -> None:
+    """On the pendulum with an unknown gain, in the median of ten seeds."""
+
+    def paper(policy: str, seed: int) -> TrialSpec:
+        env = {"horizon": 500, "grid_points": [16, 16]}
+        return small("pendulum_unknown_gain", "affine", policy, seed=seed, env=env)
+
+    losses = [
+        [run_trial(paper(policy, seed)).loss[-1] for seed in range(10)]
+        for policy in ("d_optimal", "random")
+    ]
+    assert np.median(np.array(losses[0]) / np.array(losses[1])) < 0.5
+
+
+def test_what_reads_no_inputs_is_refused() -> None:
+    with pytest.raises(IncompatibleError, match="a model that learns the effect of the inputs"):
+        small("pendulum_unknown_gain", "mlp")
+    with pytest.raises(IncompatibleError, match="policy 'gradient' goes with a model of the state"):
+        small("arm", "affine", "gradient")
+    with pytest.raises(IncompatibleError, match="'primal' or 'sketch'"):
+        small("arm", "affine", policy={"form": "dual"})
+    with pytest.raises(IncompatibleError, match="'auto', which takes 'dual' here"):
+        small("arm", "affine", model={"width": 64}, env={"horizon": 500})
+    small("arm", "black_box", policy={"form": "dual"})
+
+
+def test_the_models_that_read_inputs_are_these() -> None:
+    system = SYSTEMS["arm"]()
+    assert {name for name, model in MODELS.items() if model().n_inputs_read(system)} == set(READERS)

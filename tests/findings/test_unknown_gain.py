@@ -1,0 +1,45 @@
+"""The numbers on systems with an unknown effect of the input are those of their table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from tests.findings.report_columns import FINDINGS
+from tests.pages import DOCS
+
+TABLE = pd.read_csv(DOCS / "unknown_gain.csv")
+
+
+def losses(env: str, model: str, learner: str) -> pd.DataFrame:
+    """Return the final losses of a system by seed, one column for each policy."""
+    rows = TABLE[(TABLE.env == env) & (TABLE.model == model) & (TABLE.learner == learner)]
+    return rows.pivot_table(index="seed", columns="policy", values="final_loss")
+
+
+def geometric_mean(values: pd.Series[float]) -> float:
+    return float(np.exp(np.log(values).mean()))
+
+
+@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton"])
+@pytest.mark.parametrize("model", ["affine", "black_box"])
+@pytest.mark.parametrize("env", ["pendulum", "cartpole"])
+def test_rows_are_those_of_the_table(env: str, model: str, learner: str) -> None:
+    found = losses(f"{env}_unknown_gain", model, learner)
+    known = losses(env, "mlp", learner).d_optimal
+    means = (geometric_mean(found.d_optimal), geometric_mean(found.random))
+    ratios = (geometric_mean(found.d_optimal / known), means[0] / means[1])
+    cells = " | ".join(f"{value:.3g}" for value in (geometric_mean(known), *means, *ratios))
+    assert f"| {env} | `{model}` | `{learner}` | {len(found)} | {cells} |" in FINDINGS
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole"])
+def test_d_optimal_inputs_are_below_random_ones(env: str) -> None:
+    """As the page says: under the model that is affine in the input, each with p < 1e-38."""
+    found = losses(f"{env}_unknown_gain", "affine", "adam_window")
+    gaps = np.log(found.d_optimal / found.random)
+    assert len(gaps) == 100
+    assert gaps.mean() < 0
+    assert stats.ttest_1samp(gaps, 0.0).pvalue < 1e-38
