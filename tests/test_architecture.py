@@ -19,6 +19,9 @@ from tests.paths import ROOT, without_coverage
 
 PACKAGES = ("dopt", "orchestrate", "analysis", "hydra_plugins")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
+SAVES = {"orchestrate.runner.saving"}
+"""What the saves of an exploration import of the other packages."""
+
 ONLY_IN = {
     "hydra": ("orchestrate/config/", "hydra_plugins/"),
     "omegaconf": ("orchestrate/config/", "hydra_plugins/"),
@@ -147,8 +150,14 @@ def loaded_by(module: str) -> set[str]:
 
 def test_the_science_knows_no_effects() -> None:
     for path in sources("dopt"):
-        tops = {name.split(".")[0] for name in imports(path)}
+        own = SAVES if path == ROOT / "dopt/explorer/saving.py" else set()
+        tops = {name.split(".")[0] for name in imports(path) - own}
         assert not tops & (EFFECTS | {"orchestrate", "analysis", "pandas"}), path
+
+
+def test_what_saves_an_exploration_is_loaded_by_the_first_save() -> None:
+    assert imports(ROOT / "dopt/explorer/saving.py") >= SAVES
+    assert not loaded_by("dopt.explorer.saving") & (EFFECTS | {"orchestrate"})
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
@@ -243,7 +252,7 @@ def test_the_read_side_loads_neither_torch_nor_ray_nor_hydra() -> None:
 
 def test_numbers_load_no_plotting_library() -> None:
     modules = "analysis.report.variant_table, analysis.report.control, analysis.tables.registry"
-    assert "matplotlib" not in loaded_by(f"{modules}, analysis.serve.policy_labels")
+    assert "matplotlib" not in loaded_by(f"{modules}, analysis.serve.policy_labels, analysis.cli")
 
 
 def test_every_package_is_typed_and_described() -> None:
