@@ -4,6 +4,10 @@ Numba looks for machine code under the path of its source, and stores a function
 compiles one, also one that only another function calls, whose code holds it already. Here the
 folder is that of a state of the sources (:mod:`dopt.kernel.cache`), the same for every checkout on
 a machine, and what another function's compilation needed is not stored once more.
+
+Nor is code for arguments that are compiled functions themselves, as in a test that hands a plant to
+a function of the kernel: the entry would hold the argument, and whoever opens the file would compile
+it. A trial hands over pointers.
 """
 
 from __future__ import annotations
@@ -14,10 +18,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
+from numba import types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.targetconfig import ConfigStack
 
 from dopt.kernel.cache import CACHE_FOLDER
+from dopt.types import NumbaType
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -57,8 +63,15 @@ class StoredCode(FunctionCache):  # type: ignore[misc]
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store a function that Python calls; one compiled on the way is part of its caller."""
-        if not len(ConfigStack()):
+        if not len(ConfigStack()) and not any(map(_holds_compiled, data.signature.args)):
             super().save_overload(sig, data)
+
+
+def _holds_compiled(kind: NumbaType) -> bool:
+    """Tell whether the type of an argument is that of a compiled function, or has it as a part."""
+    return isinstance(kind, types.Dispatcher) or any(
+        map(_holds_compiled, getattr(kind, "types", ()))
+    )
 
 
 def stored(dispatcher: Any) -> Any:

@@ -195,6 +195,26 @@ def test_a_function_compiled_for_another_is_not_stored(tmp_path: Path) -> None:
     assert found == ["pair.outer"]
 
 
+def test_code_for_compiled_functions_as_arguments_is_not_stored(tmp_path: Path) -> None:
+    """Whoever opened the file would compile the argument, without what its module prepares."""
+    (tmp_path / "called.py").write_text(
+        "from pathlib import Path\n"
+        "from dopt.kernel import stored_code\n"
+        "stored_code._PACKAGE = Path(__file__).parent\n"
+        "from dopt.kernel.compiler import compiled\n"
+        "@compiled\n"
+        "def inner(x):\n"
+        "    return x + 1.0\n"
+        "@compiled\n"
+        "def outer(functions, x):\n"
+        "    return 2.0 * functions[0](x)\n"
+        "assert outer((inner,), 1.0) == 4.0\n"
+    )
+    environment = os.environ | {"DOPT_CACHE": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, tmp_path / "called.py"], check=True, env=environment)
+    assert not list(tmp_path.rglob("called.outer*"))
+
+
 ROUNDED = 1.0 + 2.0**-27
 """A number whose square is not a double: fused, x² - fl(x²) is not zero."""
 
