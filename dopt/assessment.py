@@ -16,6 +16,7 @@ from dopt.control.prediction import Forecast
 from dopt.control.task import Control
 from dopt.coverage import Plane
 from dopt.forecasts import model_forecast, true_forecast
+from dopt.limits import VIOLATIONS, WORST, Limits
 from dopt.models.base import Model
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
@@ -34,6 +35,8 @@ MEASURES = {
     "true_model_cost": "its cost, at t = 0",
     "free_run_error": "relative root mean square error of predictions over n steps",
     "coverage": "share of the phase plane's box that the states up to t have visited",
+    VIOLATIONS: "number of states up to t that are beyond a bound of the limits",
+    WORST: "farthest distance beyond a bound up to t, in the unit of the state; 0 if there is none",
 }
 """Every measure with its meaning; t is the number of steps explored, 0 the untrained model."""
 
@@ -106,8 +109,19 @@ def _measured(t: int, name: str, outcome: Outcome) -> Iterator[Assessment]:
 
 def assessed(spec: TrialSpec, result: TrialResult) -> TrialResult:
     """Return the result with its assessments, where the trial asks for them."""
-    task = spec.task
-    if task is None:
-        return result
-    rows = assess(spec, task, result.checkpoints, result.states)
-    return dataclasses.replace(result, assessments=rows)
+    rows: tuple[Assessment, ...] = ()
+    if spec.task is not None:
+        rows += assess(spec, spec.task, result.checkpoints, result.states)
+    if spec.limits is not None:
+        rows += violations(spec.system, spec.limits, result.states[: result.n_steps + 1])
+    return dataclasses.replace(result, assessments=rows) if rows else result
+
+
+def violations(system: System, limits: Limits, states: Array) -> tuple[Assessment, ...]:
+    """Return the measures of limits over the states, (t + 1, d), of t steps."""
+    excess = limits.excess(system, states[1:])
+    t = len(excess)
+    return (
+        Assessment(t, VIOLATIONS, float(np.count_nonzero(excess))),
+        Assessment(t, WORST, float(excess.max(initial=0.0))),
+    )

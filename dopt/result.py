@@ -55,7 +55,7 @@ class TrialResult:
         Parameters of the model after the numbers of steps at which the trial is to be assessed, up
         to a divergence.
     assessments : tuple of Assessment
-        What was measured there; empty where the trial has no task.
+        What was measured there, and violations of limits; empty without a task and limits.
     """
 
     loss: Array

@@ -215,12 +215,13 @@ def nearness(config: ConfigRow) -> tuple[int, int, int]:
 
 
 def defaults(config: ConfigRow) -> dict[str, object]:
-    """Return the defaults of what a configuration names, without a task, as dotted paths.
+    """Return the defaults of what a configuration names, without task and limits, as dotted paths.
 
     There are none where it holds a system or policy of a user's own, which is not registered here.
     """
     names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
     names.pop("task", None)
+    names.pop("limits", None)
     try:
         return flatten(TrialSpec.from_mapping(names).to_mapping())
     except (SpecificationError, KeyError):  # a plant is more than its name

@@ -73,6 +73,11 @@ def parameter(
     return dataclasses.field(default=default, metadata=about)
 
 
+def unvalidated(default: Any) -> Any:
+    """Declare a field that its class checks by itself."""
+    return dataclasses.field(default=default, metadata={"validated": False})
+
+
 @dataclasses.dataclass(frozen=True)
 class Validated:
     """Base of the frozen specification dataclasses: types and bounds hold once one exists.
@@ -86,6 +91,8 @@ class Validated:
     def __post_init__(self) -> None:
         kinds = _kinds(type(self))
         for field in dataclasses.fields(self):
+            if field.name not in kinds:
+                continue
             path, value = self._path(field.name), getattr(self, field.name)
             object.__setattr__(self, field.name, _converted(path, field, kinds[field.name], value))
 
@@ -105,7 +112,8 @@ class _Kind(NamedTuple):
 def _kinds(cls: type[Validated]) -> dict[str, _Kind]:
     """Return what the fields of a class hold, read once from their annotations."""
     if cls not in _known:
-        _known[cls] = {field.name: _kind(cls, field) for field in dataclasses.fields(cls)}
+        fields = [f for f in dataclasses.fields(cls) if f.metadata.get("validated", True)]
+        _known[cls] = {field.name: _kind(cls, field) for field in fields}
     return _known[cls]
 
 

@@ -70,6 +70,10 @@ class Explorer(SavedExplored):
         its horizon how many steps there are.
     policy, model, learner : str or mapping
         As those of :meth:`dopt.TrialSpec.from_names`.
+    limits : mapping, optional
+        Bounds of states and inputs that inputs are to heed, and rates of inputs, such as
+        ``{"bounds": {"angle": [-2, 2], "voltage": [-5, 5]}, "rates": {"voltage": 100}}``
+        (:class:`dopt.limits.Limits`).
     seed : int
         Seed of the initial parameters and of the policy's own draws.
     steps : int
@@ -101,6 +105,7 @@ class Explorer(SavedExplored):
         policy: str | Mapping[str, object] = "d_optimal",
         model: str | Mapping[str, object] = "mlp",
         learner: str | Mapping[str, object] = "adam_window",
+        limits: Mapping[str, object] | None = None,
         seed: int = 0,
         steps: int = STEPS,
         journal: str | Path | None = None,
@@ -111,8 +116,9 @@ class Explorer(SavedExplored):
         path: str | None = None,
     ) -> None:
         system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
-        given = {"model": model, "learner": learner}
-        spec = TrialSpec.of_system(system, policy, **given, seed=seed, path=path)
+        spec = TrialSpec.of_system(
+            *(system, policy), model=model, learner=learner, limits=limits, seed=seed, path=path
+        )
         self._tolerance = within("tolerance", tolerance, 1.0)
         deadline = None if deadline is None else within("deadline", deadline, math.inf)
         self._fallback = safe_input(spec, fallback)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from dopt.assessment import violations
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.explored import Explored, free_run_error, predict
 from dopt.result import Assessment, TrialResult
@@ -90,7 +91,11 @@ class SavedExplored(Explored):
         n = len(errors) if at is None else at
         errors[n:] = np.nan
         unknown = np.full(len(errors), np.nan)
-        tested = () if test is None else (self._tested(test, n, parameters),)
+        tested: tuple[Assessment, ...] = ()
+        if test is not None:
+            tested += (self._tested(test, n, parameters),)
+        if self.spec.limits is not None:
+            tested += violations(self.spec.system, self.spec.limits, states[: n + 1])
         return TrialResult(
             loss=errors,
             reachable_loss=unknown,

@@ -50,6 +50,13 @@ def _cos(x: NumbaType) -> NumbaType:
     return lambda x: math.cos(x)
 
 
+@overload(elementary.tanh, strict=False)
+def _tanh(x: NumbaType) -> NumbaType:
+    if isinstance(x, types.Complex):
+        return lambda x: cmath.tanh(x)
+    return lambda x: math.tanh(x)
+
+
 @overload(elementary.magnitude, strict=False)
 def _magnitude(x: NumbaType) -> NumbaType:
     if isinstance(x, types.Complex):

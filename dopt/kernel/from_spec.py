@@ -14,6 +14,7 @@ from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_n
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
 from dopt.kernel.model_from_spec import members_of, network_of, network_of_trial
 from dopt.learning import GaussNewton, Learner
+from dopt.limits import Limits
 from dopt.models import MLP, GaussianProcess
 from dopt.policies import (
     ICEM,
@@ -61,6 +62,7 @@ def trial_of(spec: TrialSpec, draws: Draws) -> args.Trial:
         network,
         algorithm,
         information_of(spec.config),
+        limits_of(spec.config),
         randomness_of(spec, draws),
         initial_state(spec, draws.weights),
         empty_scratch(spec, network),
@@ -176,6 +178,7 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
         *_information(spec, q),
         _visited(spec),
         _posterior(spec),
+        _prediction_error(spec),
         np.zeros((len(spec.model.features(system)), window)),
         np.zeros((system.n_learned, window)),
         *(np.zeros(part.memory_size(system, q)) for part in (spec.policy, spec.learner)),
@@ -234,6 +237,29 @@ def _visited(spec: TrialSpec) -> args.Visited:
         refresh_every,
         _regularization(spec.config),
     )
+
+
+def limits_of(config: TrialConfig) -> args.Limits:
+    """Return the limits of a configuration; one without any has none."""
+    system, limits = config.system, config.limits or Limits()
+    lower, upper = (column.copy() for column in limits.of_states(system).T)
+    input_lower, input_upper = (column.copy() for column in limits.of_inputs(system).T)
+    bounded = bool(np.isfinite(lower).any() or np.isfinite(upper).any())
+    return args.Limits(
+        limits.enforced and config.limits is not None,
+        lower,
+        upper,
+        input_lower,
+        input_upper,
+        limits.changes(system),
+        limits.steps if bounded else 0,
+        limits.margin,
+    )
+
+
+def _prediction_error(spec: TrialSpec) -> args.PredictionError:
+    r = spec.system.n_learned if limits_of(spec.config).enforced else 0
+    return args.PredictionError(np.zeros(r), np.zeros((2, r)))
 
 
 def _posterior(spec: TrialSpec) -> args.Posterior:

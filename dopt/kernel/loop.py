@@ -12,6 +12,7 @@ from dopt.algorithm import ModelKind
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
 from dopt.kernel.evaluation import add_sample, evaluation_buffers, follow_truth, model_error
+from dopt.kernel.limits import limit_input, note_error
 from dopt.kernel.members import learn_members, members_or_one
 from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import model_point, plant_point
@@ -21,12 +22,16 @@ from dopt.types import Vector
 
 @compiled
 def plan_input(trial: Trial, plan: Plan, t: int) -> None:
-    """Write u_t, the first of which was drawn before the trial, and the time that it took."""
+    """Write u_t, the first of which was drawn before the trial, and the time that it took.
+
+    It is what the policy chooses, unless the limits of the trial demand another one.
+    """
     start, u = monotonic_microseconds(), trial.record.inputs[t]
     if t > 0:
         plan(trial, t, u)
     else:
         u[:] = trial.randomness.inputs[0]
+    limit_input(trial, t, u)
     trial.record.plan_us[t] = monotonic_microseconds() - start
 
 
@@ -64,6 +69,7 @@ def take_in(trial: Trial, learn: Learn, t: int, dt: float) -> bool:
     plant, state, record = trial.plant, trial.state, trial.record
     target = np.empty(plant.learned_rows.shape[0])
     observe(plant, record.states[t], record.inputs[t], record.states[t + 1], dt, target)
+    note_error(trial, t, target)
     clock_0 = monotonic_microseconds()
     learn_members(trial, learn, t, target)
     clock_1 = monotonic_microseconds()

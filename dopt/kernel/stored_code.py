@@ -5,9 +5,9 @@ compiles one, also one that only another function calls, whose code holds it alr
 folder is that of a state of the sources (:mod:`dopt.kernel.cache`), the same for every checkout on
 a machine, and what another function's compilation needed is not stored once more.
 
-Nor is code for arguments that are compiled functions themselves, as in a test that hands a plant to
-a function of the kernel: the entry would hold the argument, and whoever opens the file would compile
-it. A trial hands over pointers.
+Nor is code for arguments that are compiled functions themselves, as in a test that hands a plant
+to a function of the kernel: the entry would hold the argument, and whoever opens the file would
+compile it. A trial hands over pointers.
 """
 
 from __future__ import annotations

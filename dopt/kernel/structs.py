@@ -96,6 +96,19 @@ class Algorithm(NamedTuple):
     search: Search
 
 
+class Limits(NamedTuple):
+    """Bounds of states and inputs, infinite where there are none (:mod:`dopt.kernel.limits`)."""
+
+    enforced: bool
+    lower: Vector  # (d,)
+    upper: Vector  # (d,)
+    input_lower: Vector  # (m,)
+    input_upper: Vector  # (m,)
+    input_change: Vector  # (m,) largest from one step to the next
+    steps: int  # H of a predicted path, 0 where no state is bounded
+    margin: float  # of the error of a prediction, in its standard deviations
+
+
 class Randomness(NamedTuple):
     """Numbers of :class:`dopt.randomness.Draws`."""
 
@@ -203,6 +216,13 @@ class Members(NamedTuple):
     priors: Matrix  # (E, q) before the first step
 
 
+class PredictionError(NamedTuple):
+    """What the limits of a trial need to know of the model's error; empty in other trials."""
+
+    scale: Vector  # (r,) mean of e²/(1 + h) over the newest samples
+    variances: Matrix  # (2, r), h = g M⁻¹ gᵀ at the present and at the predicted state
+
+
 class State(NamedTuple):
     """Everything that changes from step to step; written in place."""
 
@@ -217,6 +237,7 @@ class State(NamedTuple):
     sketch: Sketch
     visited: Visited
     posterior: Posterior
+    prediction: PredictionError
     window_features: Matrix  # (p, window) newest samples, a ring
     window_targets: Matrix  # (r, window)
     policy_memory: Vector  # what a compiled policy of a user's own keeps
@@ -273,6 +294,7 @@ class Trial(NamedTuple):
     network: Network
     algorithm: Algorithm
     information: Information
+    limits: Limits
     randomness: Randomness
     state: State
     scratch: Scratch

@@ -13,6 +13,7 @@ from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
 from dopt.reference.dynamics import known_flow
 from dopt.reference.learner_registry import batch_learner
 from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
+from dopt.reference.limits import BatchLimits
 from dopt.reference.planner_registry import plan_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
 from dopt.reference.search import searched_inputs
@@ -32,9 +33,18 @@ class BatchSteps(BatchState):
         self.learner = batch_learner(self, points)
         self.own_plan = plan_for(self, self.learner)
         self._rows = vmap(jacrev(self.model))
+        limits = self.config.limits
+        self.limits = BatchLimits(self, limits) if limits and limits.enforced else None
 
     def plan(self, t: int) -> Tensor:
-        """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
+        """Return the inputs u_t, (n, m); the first of a closed-loop policy is random.
+
+        They are those that the policy chooses, unless the limits of the trials demand others.
+        """
+        u = self._planned(t)
+        return self.limits.limited(t, u) if self.limits else u
+
+    def _planned(self, t: int) -> Tensor:
         policy, x = self.config.policy, self.states[:, t]
         if isinstance(policy, OpenLoop) or t == 0:
             return self.open_loop[:, t]
@@ -73,6 +83,8 @@ class BatchSteps(BatchState):
 
         Of an ensemble that is the member whose turn it is, and then the first one, whose M stays.
         """
+        if self.limits:
+            self.limits.note_error(t)
         if self.members is None:
             self._learn(t)
             return

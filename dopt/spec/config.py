@@ -15,6 +15,7 @@ from dopt.declare.validated_fields import Validated
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.learning import LEARNERS, InformationLearner, Learner
 from dopt.learning.base import CompiledLearner, CustomLearner
+from dopt.limits import Limits
 from dopt.models import Model
 from dopt.policies import POLICIES, GradientDOptimal, Policy, Search
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop
@@ -55,7 +56,8 @@ class TrialConfig:
     ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
     agree to rounding only, which grows over a trial: so it is part of the trial's identity. What
     the kernel does not know runs on the reference alone. ``task`` is what the trial is assessed by
-    on the way, and no part of its identity where there is none.
+    on the way, and ``limits`` what its states and inputs heed; each is no part of its identity
+    where there is none.
     """
 
     system: System
@@ -64,6 +66,7 @@ class TrialConfig:
     learner: Learner
     path: str = "kernel"
     task: Control | None = None
+    limits: Limits | None = None
 
     def __post_init__(self) -> None:
         if self.path not in PATHS:
@@ -73,6 +76,8 @@ class TrialConfig:
                 raise mismatch("a task", "a system with equations", f"env '{self.system.name}'")
             object.__setattr__(self, "task", self.task.resolved(self.system))
         self._check_runnable()
+        if self.limits is not None:
+            self.limits.check(self.system)
         if type(self.system) not in SYSTEMS.values():
             check_system(self.system)
             warn_of_scale(self.system, self.model)
@@ -175,6 +180,8 @@ class TrialConfig:
         if self.task is not None:
             content["task"] = written(self.task)
             content["assessment_version"] = ASSESSMENT_VERSION
+        if self.limits is not None:
+            content["limits"] = written(self.limits)
         if self._scales_criterion():
             content["criterion_version"] = CRITERION_VERSION
         return content

@@ -42,6 +42,9 @@ _COLUMNS = {
 
 _LOSS = "env.loss"
 
+_NAMED = ("limits.bounds.", "limits.rates.")
+"""Settings that have no default: each stands under a name of the system."""
+
 _FORMATS = {
     "env.gamma": "γ={}",
     "env.noise": "σ={}",
@@ -53,6 +56,7 @@ _FORMATS = {
     "learner.regularization": "learner λ={}",
     "learner.steps": "×{}",
     "task.name": "task {}",
+    "limits.name": "limits",
     "path": "{} path",
 }
 
@@ -142,7 +146,9 @@ def usual_values(config: Mapping[str, object]) -> dict[str, object]:
             usual |= {f"{key}.{name}": value for name, value in own.items()}
     model = _MODEL_OF.get(section_name(config, "policy"), "mlp")
     learner = _LEARNER_OF.get(section_name(config, "model"), "recursive_least_squares")
-    usual |= {"model.name": model, "learner.name": learner, "task.name": None, _LOSS: None}
+    usual |= {"model.name": model, "learner.name": learner}
+    usual |= {"task.name": None, "limits.name": None, _LOSS: None}
+    usual |= {path: None for path in flatten(config) if path.startswith(_NAMED)}
     parts = [classes[key] for key in SECTIONS]
     if None not in parts:
         compiled = all(getattr(cls, "compiled", False) for cls in parts)

@@ -9,6 +9,7 @@ from dopt.control import TASKS
 from dopt.declare.registry import TARGET
 from dopt.declare.validated_fields import Validated
 from dopt.learning import LEARNERS
+from dopt.limits import LIMITS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
 from dopt.systems import SYSTEMS
@@ -19,6 +20,7 @@ REGISTRIES: Mapping[str, Mapping[str, type[Validated]]] = {
     "model": MODELS,
     "learner": LEARNERS,
     "task": TASKS,
+    "limits": LIMITS,
 }
 """Registered classes of every section."""
 

@@ -14,6 +14,7 @@ from dopt.declare.registry import TARGET, build
 from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError, unknown_name
 from dopt.learning import LEARNERS, Learner
+from dopt.limits import Limits, limits_from
 from dopt.models import MODELS, Model
 from dopt.models.mlp import MLP
 from dopt.policies import POLICIES, Policy
@@ -24,7 +25,7 @@ from dopt.systems import System, system_from_mapping
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
 
-_KEYS = (*SECTIONS, "task", "path", "seed")
+_KEYS = (*SECTIONS, "task", "limits", "path", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +59,8 @@ class TrialSpec(Validated):
             Sections ``env``, ``policy``, ``model`` and ``learner``, each with a ``name`` and the
             fields that differ from their defaults, the ``seed`` and the execution ``path``; without
             one, it is the kernel where that knows all parts, and the reference elsewhere. A
-            section ``task`` with a name other than "none" says how the trial is assessed.
+            section ``task`` with a name other than "none" says how the trial is assessed, and a
+            section ``limits`` what its states and inputs heed (:class:`dopt.limits.Limits`).
 
         Raises
         ------
@@ -85,7 +87,8 @@ class TrialSpec(Validated):
         learner = build("learner", LEARNERS, sections["learner"])
         compiled = all(part.compiled for part in (system, policy, model, learner))
         path = str(given.get("path", "kernel" if compiled else "reference"))
-        config = TrialConfig(system, policy, model, learner, path, task_from(given.get("task")))
+        optional = task_from(given.get("task")), limits_from(given.get("limits"))
+        config = TrialConfig(system, policy, model, learner, path, *optional)
         return cls(config, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation
 
     @classmethod
@@ -96,6 +99,7 @@ class TrialSpec(Validated):
         *,
         model: str | Mapping[str, object] = "mlp",
         learner: str | Mapping[str, object] = "adam_window",
+        limits: Mapping[str, object] | None = None,
         seed: int = 0,
     ) -> TrialSpec:
         """Return the trial of parts given by name, such as ``env="pendulum"``.
@@ -105,6 +109,9 @@ class TrialSpec(Validated):
         env, policy, model, learner : str or mapping
             Name of a registered class, with the defaults of its fields; or a section with the
             ``name`` and the fields that differ: ``env={"name": "pendulum", "gamma": 3.0}``.
+        limits : mapping, optional
+            Bounds and rates (:meth:`dopt.limits.Limits.from_section`), such as
+            ``{"bounds": {"y": [-2, 2]}}``.
         seed : int
             Seed of the noise, the initial parameters and the policy's own draws.
 
@@ -114,7 +121,7 @@ class TrialSpec(Validated):
             As :meth:`from_mapping`.
         """
         parts = {"env": env, "policy": policy, "model": model, "learner": learner}
-        return cls.from_mapping({**_sections(parts), "seed": seed})
+        return cls.from_mapping({**_sections(parts), "limits": limits, "seed": seed})
 
     @classmethod
     def of_system(
@@ -124,6 +131,7 @@ class TrialSpec(Validated):
         *,
         model: str | Mapping[str, object] = "mlp",
         learner: str | Mapping[str, object] = "adam_window",
+        limits: Mapping[str, object] | None = None,
         seed: int = 0,
         path: str | None = None,
     ) -> TrialSpec:
@@ -132,7 +140,8 @@ class TrialSpec(Validated):
         ``path`` is the execution path; without one it is chosen as in :meth:`from_mapping`.
         """
         parts = {"policy": policy, "model": model, "learner": learner}
-        rest: dict[str, object] = {"seed": seed} | ({"path": path} if path else {})
+        rest: dict[str, object] = {"seed": seed, "limits": limits}
+        rest |= {"path": path} if path else {}
         return cls._of_parts(system, _sections(parts), rest)
 
     def with_seed(self, seed: int) -> TrialSpec:
@@ -158,6 +167,10 @@ class TrialSpec(Validated):
     @property
     def task(self) -> Control | None:
         return self.config.task
+
+    @property
+    def limits(self) -> Limits | None:
+        return self.config.limits
 
     @property
     def assessed_steps(self) -> tuple[int, ...]:

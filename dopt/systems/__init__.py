@@ -15,6 +15,7 @@ from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
 from dopt.systems.pendulum import Pendulum, PendulumUnknownGain
 from dopt.systems.quadrotor import Quadrotor
+from dopt.systems.unbalanced_disk import UnbalancedDisk
 
 SYSTEMS: dict[str, type[System]] = {
     system.name: system
@@ -28,6 +29,7 @@ SYSTEMS: dict[str, type[System]] = {
         Chain,
         PendulumUnknownGain,
         CartpoleUnknownGain,
+        UnbalancedDisk,
     )
 }
 
@@ -52,5 +54,6 @@ __all__ = [
     "PendulumUnknownGain",
     "Quadrotor",
     "System",
+    "UnbalancedDisk",
     "system_from_mapping",
 ]

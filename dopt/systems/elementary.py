@@ -27,6 +27,11 @@ def cos(x: Scalar) -> Scalar:
     return _apply(x, "cos")
 
 
+def tanh(x: Scalar) -> Scalar:
+    """Hyperbolic tangent; dry friction without a jump is ``-c * tanh(v / v_c)``."""
+    return _apply(x, "tanh")
+
+
 def magnitude(x: Scalar) -> Scalar:
     """Absolute value of a real quantity, continued to complex arguments along the real axis.
 

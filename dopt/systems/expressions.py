@@ -17,6 +17,7 @@ FUNCTIONS = {
     for function in (
         elementary.sin,
         elementary.cos,
+        elementary.tanh,
         elementary.magnitude,
         elementary.sign,
         elementary.where,

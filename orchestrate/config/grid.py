@@ -11,7 +11,7 @@ from dopt.errors import IncompatibleError, SpecificationError
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 
-TRIAL_SECTIONS = ("env", "policy", "model", "learner", "task", "seed")
+TRIAL_SECTIONS = ("env", "policy", "model", "learner", "task", "limits", "seed")
 """Sections of a configuration that define a trial."""
 
 

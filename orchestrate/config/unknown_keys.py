@@ -21,6 +21,7 @@ KNOWN = (
     "model",
     "learner",
     "task",
+    "limits",
     "seed",
     "width",
     "launch",

@@ -11,8 +11,8 @@ from orchestrate.config.grid import Grid
 from orchestrate.runner.text_table import aligned
 from orchestrate.store import FINISHED, RETRIED, NoDatabaseError, Reader
 
-SECTIONS = ("env", "policy", "model", "learner", "task")
-NO_TASK = {"name": "none"}
+SECTIONS = ("env", "policy", "model", "learner", "task", "limits")
+ABSENT = {"name": "none"}
 ALWAYS = ("env", "policy")
 COUNTS = ("trials", "done", "failed", "to run")
 
@@ -73,7 +73,7 @@ def _values(trial: TrialSpec) -> Values:
     content = trial.to_mapping()
     values: Values = {}
     for section in SECTIONS:
-        fields = content.get(section, NO_TASK)
+        fields = content.get(section, ABSENT)
         assert isinstance(fields, dict)
         # The goal belongs to the system, so that it distinguishes no configurations.
         shown = {key: value for key, value in fields.items() if key not in GOAL_FIELDS}

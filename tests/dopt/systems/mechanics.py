@@ -26,6 +26,7 @@ from dopt.systems import (
     PendulumUnknownGain,
     Quadrotor,
     System,
+    UnbalancedDisk,
 )
 
 
@@ -105,6 +106,25 @@ class PendulumMechanics(Mechanics):
 
     def friction(self, rates: Tensor) -> Tensor:
         return -self.system.friction * rates
+
+
+class UnbalancedDiskMechanics(Mechanics):
+    """Unit inertia: a unit mass at the end of a rod of 1 m."""
+
+    coordinates = (0,)
+
+    def masses(self) -> list[float]:
+        return [1.0]
+
+    def positions(self, q: Tensor) -> Tensor:
+        return torch.stack([q[0].sin(), -q[0].cos()]).unsqueeze(0)
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        return self.system.motor_gain * u
+
+    def friction(self, rates: Tensor) -> Tensor:
+        dry = self.system.dry_friction * torch.tanh(rates / self.system.dry_rate)
+        return -self.system.friction * rates - dry
 
 
 class CartpoleMechanics(Mechanics):
@@ -246,6 +266,7 @@ MECHANICS: dict[type[System], type[Mechanics]] = {
     Chain: ChainMechanics,
     PendulumUnknownGain: PendulumUnknownGainMechanics,
     CartpoleUnknownGain: CartpoleUnknownGainMechanics,
+    UnbalancedDisk: UnbalancedDiskMechanics,
 }
 
 FRICTION = {
@@ -258,4 +279,5 @@ FRICTION = {
     "chain": ("friction",),
     "pendulum_unknown_gain": ("friction",),
     "cartpole_unknown_gain": ("pivot_friction", "cart_friction"),
+    "unbalanced_disk": ("friction", "dry_friction"),
 }

@@ -13,7 +13,7 @@ import torch
 from dopt.errors import SpecificationError
 from dopt.kernel.equations import compiled_equations
 from dopt.spec.custom_system_check import check_system
-from dopt.systems.elementary import cos, magnitude, sign, sin, where
+from dopt.systems.elementary import cos, magnitude, sign, sin, tanh, where
 from tests.dopt.spec.test_custom_system_check import broken
 
 Function = Callable[[Any], Any]
@@ -21,6 +21,7 @@ Function = Callable[[Any], Any]
 FUNCTIONS: dict[str, Function] = {
     "sin": sin,
     "cos": cos,
+    "tanh": tanh,
     "magnitude": magnitude,
     "sign": sign,
     "where": lambda x: where(x > 0, 2.0 * x, x * x),

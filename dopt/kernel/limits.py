@@ -1,0 +1,168 @@
+"""Inputs that keep the states of a plant within bounds, in compiled code (:mod:`dopt.limits`).
+
+An input is accepted if after it some backup input keeps the predicted states within the bounds,
+also where the predicted accelerations are off by the margin. Otherwise the first of a few other
+inputs for which that holds takes its place, or the one that leads least far beyond the bounds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
+from dopt.kernel.compiler import compiled
+from dopt.kernel.model import euler_step, model_accelerations
+from dopt.kernel.points import model_point
+from dopt.kernel.policies.prediction import predicted_state
+from dopt.kernel.structs import Limits, Trial
+from dopt.types import Matrix, Vector
+
+
+@compiled
+def limit_input(trial: Trial, t: int, u: Vector) -> None:
+    """Replace u_t by an input that is within the limits; one that is not finite stays."""
+    limits, record = trial.limits, trial.record
+    if not limits.enforced or not np.isfinite(u).all():
+        return
+    before = record.inputs[t - 1] if t > 0 else np.zeros(u.shape[0])
+    move_within(limits, before, u)
+    if limits.steps == 0:
+        return
+    x = record.states[t]
+    backups = backup_inputs(trial.plant.gamma, u.shape[0])
+    errors = error_bounds(trial, x)
+    tried, best = np.empty(u.shape[0]), np.inf
+    chosen = u.copy()
+    for i in range(2 + backups.shape[0]):
+        if i < 2:
+            tried[:] = u if i == 0 else -u
+        else:
+            tried[:] = backups[i - 2]
+        move_within(limits, before, tried)
+        excess = largest_excess(trial, x, tried, backups, errors, best)
+        if excess < best * (1.0 - TIE_MARGIN):
+            best = excess
+            chosen[:] = tried
+        if best <= 0.0:
+            break
+    u[:] = chosen
+
+
+@compiled
+def move_within(limits: Limits, before: Vector, u: Vector) -> None:
+    """Move an input, (m,), into its box, and then towards the one before it to heed the rates."""
+    share = 1.0
+    for j in range(u.shape[0]):
+        u[j] = min(max(u[j], limits.input_lower[j]), limits.input_upper[j])
+        change = abs(u[j] - before[j])
+        if change > limits.input_change[j]:
+            share = min(share, limits.input_change[j] / change)
+    if share < 1.0:
+        for j in range(u.shape[0]):
+            u[j] = before[j] + share * (u[j] - before[j])
+
+
+@compiled
+def backup_inputs(gamma: float, m: int) -> Matrix:
+    """Return ±γ along each axis and 0, (2 m + 1, m), by which a plant may be kept within bounds."""
+    inputs = np.zeros((2 * m + 1, m))
+    for j in range(m):
+        inputs[2 * j, j] = gamma
+        inputs[2 * j + 1, j] = -gamma
+    return inputs
+
+
+@compiled
+def error_bounds(trial: Trial, x: Vector) -> Vector:
+    """Return the largest errors of predicted accelerations that are reckoned with, (r,).
+
+    They are the margin times √(s² (1 + h)): h = g M⁻¹ gᵀ at the predicted state is the model's own
+    uncertainty, 0 where no M is held, and s² is what it has proved to be worth so far.
+    """
+    plant, state, network = trial.plant, trial.state, trial.network
+    error, r = state.prediction, plant.learned_rows.shape[0]
+    bar = predicted_state(plant, network, state.theta, x)
+    point = model_point(network, bar, np.zeros(plant.n_inputs))
+    columns = np.zeros((plant.n_inputs, point.shape[0]))
+    bounds = np.empty(r)
+    for k in range(r):
+        forms = trial.information.planning_forms(plant, network, state, point, columns, k)
+        h = forms[0, 0]
+        error.variances[0, k] = error.variances[1, k]
+        error.variances[1, k] = h if h > 0.0 else 0.0
+        bounds[k] = trial.limits.margin * np.sqrt(error.scale[k] * (1.0 + error.variances[1, k]))
+    return bounds
+
+
+@compiled
+def note_error(trial: Trial, t: int, target: Vector) -> None:
+    """Take the error of the accelerations observed at step t, (r,), before they are learned."""
+    if not trial.limits.enforced:
+        return
+    record, error, value = trial.record, trial.state.prediction, np.empty(target.shape[0])
+    point = model_point(trial.network, record.states[t], record.inputs[t])
+    model_accelerations(trial.plant, trial.network, trial.state.theta, point, value)
+    share = max(1.0 / (t + 1.0), 1.0 / NEWEST_ERRORS)
+    for k in range(target.shape[0]):
+        square = (target[k] - value[k]) ** 2 / (1.0 + error.variances[0, k])
+        error.scale[k] += share * (square - error.scale[k])
+
+
+@compiled
+def largest_excess(
+    trial: Trial, x: Vector, u: Vector, backups: Matrix, errors: Vector, best: float
+) -> float:
+    """Return how far beyond the bounds an input leads, at most 0 if not at all.
+
+    It is the largest over the errors of the accelerations, none or one of ±``errors`` (r,), of the
+    smallest over the backup inputs. It may stop at ``best``.
+    """
+    largest, kept = -np.inf, 0  # the backup input that has kept the states within bounds
+    for case in range(1 + 2 * errors.shape[0]):
+        smallest = np.inf
+        for i in range(backups.shape[0]):
+            backup = (kept + i) % backups.shape[0]
+            excess = path_excess(trial, x, u, backups[backup], errors, case, smallest)
+            smallest = min(smallest, excess)
+            if smallest <= 0.0:
+                kept = backup
+                break
+        largest = max(largest, smallest)
+        if largest >= best:
+            break
+    return largest
+
+
+@compiled
+def path_excess(
+    trial: Trial, x: Vector, first: Vector, backup: Vector, errors: Vector, case: int, stop: float
+) -> float:
+    """Return the largest excess on the path of an input and a backup input that is held after it.
+
+    It is in the units of the states, or ``stop`` or more where it is no less than that.
+    """
+    plant, limits, network = trial.plant, trial.limits, trial.network
+    d, r = x.shape[0], errors.shape[0]
+    state, following, flow = x.copy(), np.empty(d), np.empty(d)
+    accelerations, u, target = np.empty(r), first.copy(), np.empty(first.shape[0])
+    largest = -np.inf
+    for step in range(limits.steps):
+        if step > 0:
+            target[:] = backup
+            move_within(limits, u, target)
+            u[:] = target
+        point = model_point(network, state, u)
+        model_accelerations(plant, network, trial.state.theta, point, accelerations)
+        if case > 0:
+            k = (case - 1) // 2
+            accelerations[k] += errors[k] if case % 2 == 1 else -errors[k]
+        euler_step(plant, state, u, accelerations, flow, following)
+        for i in range(d):
+            if not np.isfinite(following[i]):
+                return np.inf
+            excess = max(limits.lower[i] - following[i], following[i] - limits.upper[i])
+            largest = max(largest, excess)
+        if largest >= stop:
+            return largest
+        state[:] = following
+    return largest

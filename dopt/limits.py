@@ -1,0 +1,197 @@
+"""Limits of a trial: bounds of states and inputs, and rates at which inputs may change.
+
+The input that a policy chooses is moved into the box of inputs and towards the input before it, as
+far as the rates demand. Then the states that would follow are predicted with the model, over some
+steps in which a backup input is held: ±γ along an axis, or 0. If none of them keeps the states
+within their bounds, also with accelerations that are wrong by ``margin`` standard deviations, the
+input is replaced (:mod:`dopt.kernel.limits`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dopt.declare.validated_fields import Validated, parameter, unvalidated
+from dopt.errors import SpecificationError, unknown_name
+from dopt.systems.base import System
+from dopt.types import Array
+
+VIOLATIONS, WORST = "violations", "worst"
+"""Measures: number of states beyond a bound, and the farthest distance beyond one."""
+
+Interval = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Limits(Validated):
+    """Bounds that a trial has to heed.
+
+    >>> Limits.from_section({"name": "box", "bounds": {"y": [-2, 2]}, "rates": {"u": 100}})
+
+    Parameters
+    ----------
+    bounds : tuple of (name, lower, upper)
+        Bounds of states and inputs by name, in their units; infinite where there is none. Those of
+        an input hold 0.
+    rates : tuple of (name, rate)
+        Largest change of inputs, in their unit per second.
+    steps : int
+        Number of predicted steps.
+    margin : float
+        Error of the predicted accelerations that is reckoned with, in standard deviations: of the
+        model's own uncertainty, scaled by the errors it has made.
+    enforced : bool
+        Whether inputs are replaced. Otherwise states beyond the bounds are counted alone.
+    """
+
+    section: ClassVar[str] = "limits"
+    name: ClassVar[str] = "box"
+
+    steps: int = parameter(50, "steps", "positive")
+    margin: float = parameter(3.0, bound="nonnegative")
+    bounds: tuple[tuple[str, float, float], ...] = unvalidated(())
+    rates: tuple[tuple[str, float], ...] = unvalidated(())
+    enforced: bool = unvalidated(True)
+
+    @classmethod
+    def from_section(cls, section: Mapping[str, Any]) -> Limits:
+        """Return the limits that a section of a configuration describes.
+
+        There ``bounds`` maps names to pairs, with null where there is no bound, and ``rates`` names
+        to numbers.
+
+        Raises
+        ------
+        SpecificationError
+            If a key is unknown, or a value is not as described.
+        """
+        keys = [field.name for field in dataclasses.fields(cls)]
+        for key in section:
+            if key not in ("name", *keys):
+                raise unknown_name("limits field", key, keys)
+        given = {key: value for key, value in section.items() if key in ("steps", "margin")}
+        enforced = section.get("enforced", True)
+        if not isinstance(enforced, bool):
+            raise _unlike("enforced", enforced, "true or false")
+        bounds = tuple((name, *_interval(name, pair)) for name, pair in _named(section, "bounds"))
+        rates = tuple((name, _rate(name, rate)) for name, rate in _named(section, "rates"))
+        return cls(**given, bounds=bounds, rates=rates, enforced=enforced)
+
+    def to_section(self) -> dict[str, object]:
+        """Return the section that :meth:`from_section` turns into these limits."""
+        return {
+            "name": self.name,
+            "bounds": {name: [_finite(low), _finite(high)] for name, low, high in self.bounds},
+            "rates": dict(self.rates),
+            "steps": self.steps,
+            "margin": self.margin,
+            "enforced": self.enforced,
+        }
+
+    def check(self, system: System) -> None:
+        """Refuse a name that a system does not have, and bounds that it cannot heed."""
+        states, inputs = names_of(system.state_labels), names_of(system.input_labels)
+        for name, low, high in self.bounds:
+            if name not in (*states, *inputs):
+                raise unknown_name("state or input in limits.bounds", name, (*states, *inputs))
+            if name in inputs and not low <= 0.0 <= high:
+                raise _unlike(f"bounds.{name}", [low, high], "an interval with 0 in it")
+        for name, _ in self.rates:
+            if name not in inputs:
+                raise unknown_name("input in limits.rates", name, inputs)
+
+    def of_states(self, system: System) -> Array:
+        """Return the lower and the upper bound of each state, (d, 2)."""
+        return self._of(names_of(system.state_labels))
+
+    def of_inputs(self, system: System) -> Array:
+        """Return the lower and the upper bound of each input, (m, 2)."""
+        return self._of(names_of(system.input_labels))
+
+    def _of(self, names: Sequence[str]) -> Array:
+        given = {name: (low, high) for name, low, high in self.bounds}
+        return np.array([given.get(name, (-math.inf, math.inf)) for name in names])
+
+    def changes(self, system: System) -> Array:
+        """Return the largest change of each input from one step to the next, (m,)."""
+        rates = dict(self.rates)
+        names = names_of(system.input_labels)
+        return np.array([rates.get(name, math.inf) * system.dt for name in names])
+
+    def excess(self, system: System, states: Array) -> Array:
+        """Return how far each state, (N, d), is beyond its bounds, (N,), in units of the states.
+
+        It is 0 within the bounds, and of several states the largest.
+        """
+        low, high = self.of_states(system).T
+        beyond: Array = np.maximum(low - states, states - high).max(axis=1, initial=0.0)
+        return beyond
+
+
+LIMITS: dict[str, type[Limits]] = {Limits.name: Limits}
+
+
+def limits_from(section: object) -> Limits | None:
+    """Return the limits that a configuration section describes; None without, or for "none"."""
+    if section is None or isinstance(section, Limits):
+        return section
+    if not isinstance(section, Mapping):
+        raise SpecificationError(
+            f"configuration key 'limits' is {section!r}, but a section with a name and fields is "
+            f"expected: choose limits=box, or limits=none."
+        )
+    name = section.get("name", Limits.name)
+    if name == "none":
+        return None
+    if name not in LIMITS:
+        raise unknown_name("limits", name, [*LIMITS, "none"])
+    return Limits.from_section(section)
+
+
+def names_of(labels: Sequence[str]) -> list[str]:
+    """Return the names in labels such as ``"y [m]"``."""
+    return [label.partition(" [")[0] for label in labels]
+
+
+def _named(section: Mapping[str, Any], key: str) -> list[tuple[str, Any]]:
+    given = section.get(key) or {}
+    if not isinstance(given, Mapping):
+        raise _unlike(key, given, "a mapping of names")
+    return [(str(name), value) for name, value in given.items()]
+
+
+def _interval(name: str, given: object) -> Interval:
+    what, expected = f"bounds.{name}", "a pair of numbers, the lower one first, or null for none"
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 2:
+        raise _unlike(what, given, expected)
+    low, high = given
+    low = -math.inf if low is None else low
+    high = math.inf if high is None else high
+    if not (_is_number(low) and _is_number(high) and low < high):
+        raise _unlike(what, given, expected)
+    return float(low), float(high)
+
+
+def _rate(name: str, given: object) -> float:
+    if not _is_number(given) or not 0.0 < float(given) < math.inf:  # type: ignore[arg-type]
+        raise _unlike(f"rates.{name}", given, "a positive number")
+    return float(given)  # type: ignore[arg-type]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+
+
+def _finite(bound: float) -> float | None:
+    return bound if math.isfinite(bound) else None
+
+
+def _unlike(what: str, given: object, expected: str) -> SpecificationError:
+    return SpecificationError(
+        f"limits.{what} is {given!r}, but {expected} is expected: correct it."
+    )

@@ -1,0 +1,183 @@
+"""Limits: inputs stay within their bounds and rates, and keep the states of a plant within theirs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt import Explorer
+from dopt.errors import SpecificationError
+from dopt.limits import Limits
+from dopt.result import TrialResult
+from dopt.run import run_trial
+from dopt.spec.label import config_label
+from dopt.spec.trial import TrialSpec
+from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.trials import LEARNERS, MODELS, SMALL_GRIDS, SMALL_SEARCHES
+
+RAIL: dict[str, Any] = {"bounds": {"y": [-2.0, 2.0]}}
+TIGHT: dict[str, Any] = {"bounds": {"y": [-0.3, 0.3], "u": [-5.0, 6.0]}, "rates": {"u": 150.0}}
+
+
+def limited(
+    env: str, limits: object, policy: str = "d_optimal", /, *, horizon: int = 60, seed: int = 0,
+    model: str | None = None, learner: str | None = None, **fields: Any,
+) -> TrialSpec:  # fmt: skip
+    mapping = {
+        "env": {"name": env, "horizon": horizon, "grid_points": SMALL_GRIDS[env], **fields},
+        "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
+        "model": {"name": model or MODELS.get(policy, "mlp")},
+        "learner": {"name": learner or LEARNERS.get(policy, "adam_window")},
+        "limits": limits,
+        "seed": seed,
+    }
+    return TrialSpec.from_mapping(mapping)
+
+
+def measures(result: TrialResult) -> dict[str, float]:
+    return {row.measure: row.value for row in result.assessments}
+
+
+BOTH_PATHS = [
+    ("cartpole", TIGHT, "d_optimal", None, None),
+    ("cartpole", TIGHT, "random", None, None),
+    ("cartpole", TIGHT, "oracle", None, None),
+    ("cartpole", TIGHT | {"margin": 0.0}, "d_optimal", None, "gauss_newton"),
+    ("cartpole", TIGHT, "d_optimal", "affine", None),
+    ("cartpole", TIGHT, "d_optimal", None, "ekf"),
+    ("cartpole", TIGHT, "d_optimal", "ensemble", "gauss_newton"),
+    ("unbalanced_disk", {"bounds": {"y": [-0.5, None]}}, "lookahead", None, None),
+    ("arm", {"bounds": {"0": [-0.2, 0.2]}}, "d_optimal", None, None),
+]
+
+
+@pytest.mark.parametrize(("env", "limits", "policy", "model", "learner"), BOTH_PATHS)
+def test_both_paths_choose_the_same_inputs(
+    env: str, limits: dict[str, Any], policy: str, model: str | None, learner: str | None
+) -> None:
+    spec = limited(env, limits | {"steps": 20}, policy, horizon=40, model=model, learner=learner)
+    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
+    free = run_trial(limited(env, None, policy, horizon=40, model=model, learner=learner))
+    assert not np.array_equal(fast.inputs, free.inputs)
+    assert relative_gap(fast.inputs, plain.inputs) < 1e-7
+    assert relative_gap(fast.parameters, plain.parameters) < 1e-6
+    assert measures(fast) == pytest.approx(measures(plain), abs=1e-9)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "random", "uniform", "periodic"])
+def test_inputs_stay_within_their_box_and_rates(policy: str) -> None:
+    spec = limited("cartpole", TIGHT, policy)
+    inputs = run_trial(spec).inputs[:, 0]
+    changes = np.diff(np.concatenate([[0.0], inputs]))
+    assert inputs.min() >= -5.0
+    assert inputs.max() <= 6.0
+    assert np.abs(changes).max() == pytest.approx(150.0 * spec.system.dt)
+
+
+def test_inputs_of_several_axes_stay_within_the_ball() -> None:
+    spec = limited("quadrotor", {"rates": {"0": 3.0, "1": 40.0}}, "random")
+    result = run_trial(spec)
+    assert np.linalg.norm(result.inputs, axis=1).max() <= spec.system.gamma * (1 + 1e-12)
+    assert np.abs(np.diff(result.inputs[:, 0])).max() <= 3.0 * spec.system.dt * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "random_held"])
+def test_the_cart_stays_on_its_rail(policy: str) -> None:
+    """Without limits it leaves it, also under inputs that know nothing of the model."""
+    free, kept = (
+        [run_trial(limited("cartpole", RAIL | {"enforced": on}, policy, horizon=300, seed=seed))
+         for seed in range(3)]
+        for on in (False, True)
+    )  # fmt: skip
+    assert min(np.abs(result.states[:, 0]).max() for result in free) > 2.0
+    assert sum(measures(result)["violations"] for result in kept) <= 0.01 * 3 * 300
+
+
+def test_a_model_that_is_right_breaks_no_bound() -> None:
+    """The oracle's model is exact after a few samples, so that no margin is needed."""
+    limits = {"bounds": {"y": [-0.5, 0.8]}, "margin": 0.0}
+    result = run_trial(limited("cartpole", limits, "oracle", horizon=300, noise=0.0))
+    assert measures(result) == {"violations": 0.0, "worst": 0.0}
+    assert result.states[:, 0].max() > 0.7
+    assert result.states[:, 0].min() < -0.4
+
+
+def test_limits_that_are_not_enforced_change_nothing_and_are_counted() -> None:
+    counted = run_trial(limited("cartpole", TIGHT | {"enforced": False}, horizon=200))
+    plain = run_trial(limited("cartpole", None, horizon=200))
+    assert np.array_equal(counted.inputs, plain.inputs)
+    assert np.array_equal(counted.loss, plain.loss)
+    beyond = np.abs(plain.states[1:, 0]) - 0.3
+    assert measures(counted)["violations"] == np.count_nonzero(beyond > 0)
+    assert measures(counted)["worst"] == pytest.approx(beyond.max())
+    assert measures(counted)["violations"] > 10
+    assert plain.assessments == ()
+
+
+def test_bounds_that_nothing_reaches_change_nothing() -> None:
+    wide = {"bounds": {"y": [-1e6, 1e6], "u": [-100.0, 100.0]}, "rates": {"u": 1e6}}
+    wide_trial, plain = (run_trial(limited("cartpole", given)) for given in (wide, None))
+    assert np.array_equal(wide_trial.inputs, plain.inputs)
+    assert np.array_equal(wide_trial.parameters, plain.parameters)
+
+
+def test_a_start_beyond_the_bounds_comes_back() -> None:
+    start = (1.5, 0.0, np.pi, 0.0)
+    spec = limited("cartpole", {"bounds": {"y": [-1.0, 1.0]}}, horizon=150, initial_state=start)
+    places = run_trial(spec).states[:, 0]
+    assert places[0] == 1.5
+    assert np.abs(places[100:]).max() <= 1.0
+
+
+def test_an_explorer_fed_the_states_of_a_trial_chooses_its_inputs() -> None:
+    spec = limited("cartpole", TIGHT)
+    result = run_trial(spec)
+    explorer = Explorer(spec.system, limits=TIGHT)
+    for x, following, u in zip(result.states, result.states[1:], result.inputs, strict=False):
+        assert explorer.ask(x) == pytest.approx(u, abs=1e-12)
+        explorer.tell(following)
+
+
+def test_sections_describe_their_limits() -> None:
+    spec = limited("cartpole", TIGHT | {"steps": 20})
+    assert TrialSpec.from_mapping(spec.to_mapping()) == spec
+    assert spec.limits == Limits(
+        bounds=(("y", -0.3, 0.3), ("u", -5.0, 6.0)), rates=(("u", 150.0),), steps=20
+    )
+    one_sided = Limits.from_section({"bounds": {"y": [None, 2]}})
+    assert one_sided.to_section()["bounds"] == {"y": [None, 2.0]}
+    assert limited("cartpole", {"name": "none"}).limits is None
+    assert "limits" not in limited("cartpole", None).config_json
+
+
+def test_labels_name_the_bounds() -> None:
+    content = limited("cartpole", RAIL).config.content()
+    assert config_label(content).endswith("limits, y=[-2, 2]")
+
+
+WRONG = [
+    (RAIL | {"margins": 1}, "limits field 'margins' is unknown: did you mean 'margin'"),
+    ({"bounds": {"x": [-1, 1]}}, "state or input in limits.bounds 'x' is unknown"),
+    ({"bounds": {"y": [1, -1]}}, r"limits\.bounds\.y is \[1, -1\], but a pair of numbers"),
+    ({"bounds": {"y": 2.0}}, r"limits\.bounds\.y is 2\.0, but a pair"),
+    ({"bounds": {"y": ["a", 2]}}, r"limits\.bounds\.y is .* but a pair"),
+    ({"bounds": {"u": [1, 2]}}, r"limits\.bounds\.u is .* but an interval with 0 in it"),
+    ({"bounds": [2.0]}, r"limits\.bounds is \[2\.0\], but a mapping of names"),
+    ({"rates": {"y": 1.0}}, "input in limits.rates 'y' is unknown"),
+    ({"rates": {"u": 0.0}}, r"limits\.rates\.u is 0\.0, but a positive number"),
+    ({"rates": {"u": True}}, r"limits\.rates\.u is True"),
+    (RAIL | {"steps": 0}, r"limits\.steps is 0 steps, but it has to be"),
+    (RAIL | {"margin": -1.0}, r"limits\.margin is -1\.0"),
+    (RAIL | {"enforced": "no"}, r"limits\.enforced is 'no', but true or false"),
+    ("rail", "configuration key 'limits' is 'rail', but a section"),
+    ({"name": "sphere"}, "limits 'sphere' is unknown"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), WRONG)
+def test_wrong_limits_are_refused_in_a_sentence(given: object, message: str) -> None:
+    with pytest.raises(SpecificationError, match=message) as caught:
+        limited("cartpole", given)
+    assert "\n" not in str(caught.value)
