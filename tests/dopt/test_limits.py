@@ -1,4 +1,4 @@
-"""Limits: inputs stay within their bounds and rates, and keep the states of a plant within theirs."""
+"""Limits: inputs heed their bounds and rates, and keep the states of a plant within theirs."""
 
 from __future__ import annotations
 
