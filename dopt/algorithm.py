@@ -41,6 +41,19 @@ class Score(IntEnum):
     TASK = 5
 
 
+class Integrator(IntEnum):
+    """How a state follows from the one before it."""
+
+    EULER = 0
+    RK4 = 1
+
+
+RUNGE_KUTTA_SHARES = (0.5, 0.5, 1.0)
+"""Parts of a step after which the derivative is asked for again."""
+
+RUNGE_KUTTA_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+"""Weights of the derivatives in their mean."""
+
 TIE_MARGIN = 1e-9
 """Values that differ by less than this relative margin are equal: rounding must not choose."""
 

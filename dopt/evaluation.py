@@ -13,6 +13,7 @@ from dopt.policies.base import on_sphere
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox, transitions
 from dopt.systems.equilibrium import eigenmode
+from dopt.systems.integration import next_state
 
 Array = npt.NDArray[np.float64]
 
@@ -130,7 +131,7 @@ def reachable_points(system: System) -> tuple[Array, Array]:
 
 
 def simulate(system: System, inputs: Array) -> Array:
-    """Return the noise-free states, (T + 1, n, d), under inputs (T, n, m), by the Euler map.
+    """Return the noise-free states, (T + 1, n, d), under inputs (T, n, m).
 
     States that overflow become infinite or NaN, and stay so.
     """
@@ -139,7 +140,8 @@ def simulate(system: System, inputs: Array) -> Array:
     states[0] = system.initial_state
     with np.errstate(over="ignore", invalid="ignore"):
         for t in range(steps):
-            states[t + 1] = states[t] + system.dt * _flows(system, states[t], inputs[t], t)
+            rate = functools.partial(_flows, system, inputs=inputs[t], step=t)
+            states[t + 1] = next_state(system.integrator, rate, states[t], system.dt)
     return states
 
 

@@ -64,10 +64,11 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
     """Return the samples of a trial, from its states (T + 1, d) and inputs (T, m).
 
     The observed accelerations are those that its learner was given: (x_{t+1} - x_t)/dt less the
-    known part at x_t and u_t, in the learned rows.
+    known part at x_t and u_t, in the learned rows. With the integrator of Runge and Kutta they are
+    taken in the middle of the step, without what the learner's model adds to them.
     """
-    before, after = states[:-1], states[1:]
-    known = system.known(tuple(before.T), tuple(inputs.T), system.parameters)
-    flow = np.stack(np.broadcast_arrays(*known, before[:, 0])[:-1], axis=-1)
-    observed = (after - before) / system.dt - flow
-    return Samples(before, inputs, observed[:, list(system.learned_rows)])
+    at = system.sampled_states(states)
+    known = system.known(tuple(at.T), tuple(inputs.T), system.parameters)
+    flow = np.stack(np.broadcast_arrays(*known, at[:, 0])[:-1], axis=-1)
+    observed = np.diff(states, axis=0) / system.dt - flow
+    return Samples(at, inputs, observed[:, list(system.learned_rows)])

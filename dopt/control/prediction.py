@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 
 from dopt.systems.base import System
+from dopt.systems.integration import next_state
 
 Array = npt.NDArray[np.float64]
 
@@ -31,8 +33,10 @@ def forecast_by_equations(system: System) -> Forecast:
 def predict(system: System, accelerations: Accelerations, states: Array, inputs: Array) -> Array:
     """Return the states, (H, N, d), after each step from states (N, d) under inputs (N, H, m).
 
-    The Euler map of equation 2 without noise; numbers that overflow become infinite or NaN.
+    The system's integrator without noise; numbers that overflow become infinite or NaN.
     """
+    if system.integrator != "euler":
+        return _predict_in_stages(system, accelerations, states, inputs)
     by_step = np.ascontiguousarray(np.moveaxis(inputs, (1, 2), (0, 1)))
     visited = np.empty((len(by_step) + 1, system.n_states, len(states)))
     visited[0] = states.T
@@ -45,3 +49,23 @@ def predict(system: System, accelerations: Accelerations, states: Array, inputs:
             following *= system.dt
             following += x
     return visited[1:].swapaxes(1, 2)
+
+
+def _predict_in_stages(
+    system: System, accelerations: Accelerations, states: Array, inputs: Array
+) -> Array:
+    visited = np.empty((inputs.shape[1] + 1, *states.shape))
+    visited[0] = states
+    with np.errstate(over="ignore", invalid="ignore"):
+        for t in range(inputs.shape[1]):
+            rate = functools.partial(_rate, system, accelerations, inputs[:, t])
+            visited[t + 1] = next_state(system.integrator, rate, visited[t], system.dt)
+    return visited[1:]
+
+
+def _rate(system: System, accelerations: Accelerations, inputs: Array, states: Array) -> Array:
+    """Return dx/dt, (N, d), of states (N, d) under inputs (N, m)."""
+    known = system.known(tuple(states.T), tuple(inputs.T), system.parameters)
+    rate = np.stack(np.broadcast_arrays(*known, states[:, 0])[:-1], axis=-1)
+    rate[:, list(system.learned_rows)] += accelerations(states, inputs)
+    return rate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ from gymnasium.spaces import Box
 
 from dopt.models import MLP
 from dopt.systems import SYSTEMS, System, system_from_mapping
+from dopt.systems.integration import next_state
 
 Array = npt.NDArray[np.float64]
 
@@ -69,21 +71,17 @@ class Exploration(gymnasium.Env):
         system, u = self.system, np.asarray(action, dtype=np.float64)
         u = u * min(1.0, system.gamma / max(float(np.linalg.norm(u)), 1e-300))
         noise = system.noise * np.sqrt(system.dt) * self.np_random.standard_normal(system.n_states)
-        self._state = self._state + system.dt * self._flow(u) + noise
+        rate = functools.partial(self._flow, u=u)
+        self._state = next_state(system.integrator, rate, self._state, system.dt) + noise
         self._steps += 1
         limit = system.state_limit
         terminated = not bool(np.all(np.abs(self._state) <= limit))
         observed = np.clip(np.nan_to_num(self._state, nan=limit), -limit, limit)
         return observed, self._gain(observed), terminated, False, {"input": u}
 
-    def _flow(self, u: Array) -> Array:
-        """Return f(x_t, u), (d,), of the system as it is at step t."""
-        system = self.system
-        flow = np.array(system.known(tuple(self._state), tuple(u), system.parameters), dtype=float)
-        flow[list(system.learned_rows)] += system.learned(self._state[None], self._steps, u[None])[
-            0
-        ]
-        return flow
+    def _flow(self, x: Array, u: Array) -> Array:
+        """Return f(x, u), (d,), of the system as it is at step t."""
+        return self.system.derivative(x, u, self._steps)
 
     def _gain(self, state: Array) -> float:
         """Return the information gained at a state, and take it in (Sherman and Morrison)."""

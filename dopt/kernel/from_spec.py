@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from dopt.algorithm import Form, Score, switch_step
+from dopt.algorithm import Form, Integrator, Score, switch_step
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.evaluation_points import evaluation_points
@@ -83,6 +83,7 @@ def plant_of(system: System) -> args.Plant:
         system.dt,
         system.gamma,
         system.state_limit,
+        int(Integrator[system.integrator.upper()]),
     )
 
 

@@ -11,7 +11,9 @@ import numpy as np
 
 from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
 from dopt.kernel.compiler import compiled
-from dopt.kernel.model import euler_step, model_accelerations
+from dopt.kernel.integration import add_stage, n_stages, write_rate
+from dopt.kernel.learners.samples import sampled_point
+from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import model_point
 from dopt.kernel.policies.prediction import predicted_state
 from dopt.kernel.structs import Limits, Trial
@@ -99,8 +101,8 @@ def note_error(trial: Trial, t: int, target: Vector) -> None:
     """Take the error of the accelerations observed at step t, (r,), before they are learned."""
     if not trial.limits.enforced:
         return
-    record, error, value = trial.record, trial.state.prediction, np.empty(target.shape[0])
-    point = model_point(trial.network, record.states[t], record.inputs[t])
+    error, value = trial.state.prediction, np.empty(target.shape[0])
+    point = sampled_point(trial, t)
     model_accelerations(trial.plant, trial.network, trial.state.theta, point, value)
     share = max(1.0 / (t + 1.0), 1.0 / NEWEST_ERRORS)
     for k in range(target.shape[0]):
@@ -143,7 +145,7 @@ def path_excess(
     """
     plant, limits, network = trial.plant, trial.limits, trial.network
     d, r = x.shape[0], errors.shape[0]
-    state, following, flow = x.copy(), np.empty(d), np.empty(d)
+    state, following, rate, total = x.copy(), np.empty(d), np.empty(d), np.empty(d)
     accelerations, u, target = np.empty(r), first.copy(), np.empty(first.shape[0])
     largest = -np.inf
     for step in range(limits.steps):
@@ -151,12 +153,15 @@ def path_excess(
             target[:] = backup
             move_within(limits, u, target)
             u[:] = target
-        point = model_point(network, state, u)
-        model_accelerations(plant, network, trial.state.theta, point, accelerations)
-        if case > 0:
-            k = (case - 1) // 2
-            accelerations[k] += errors[k] if case % 2 == 1 else -errors[k]
-        euler_step(plant, state, u, accelerations, flow, following)
+        following[:] = state
+        for stage in range(n_stages(plant)):
+            point = model_point(network, following, u)
+            model_accelerations(plant, network, trial.state.theta, point, accelerations)
+            if case > 0:
+                k = (case - 1) // 2
+                accelerations[k] += errors[k] if case % 2 == 1 else -errors[k]
+            write_rate(plant, following, u, accelerations, rate)
+            add_stage(plant, stage, plant.dt, state, rate, total, following)
         for i in range(d):
             if not np.isfinite(following[i]):
                 return np.inf

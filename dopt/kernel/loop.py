@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import ModelKind
+from dopt.algorithm import Integrator, ModelKind
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
 from dopt.kernel.evaluation import add_sample, evaluation_buffers, follow_truth, model_error
+from dopt.kernel.integration import next_model_state, next_true_state
+from dopt.kernel.learners.samples import sampled_point
 from dopt.kernel.limits import limit_input, note_error
 from dopt.kernel.members import learn_members, members_or_one
 from dopt.kernel.model import model_accelerations
-from dopt.kernel.points import model_point, plant_point
+from dopt.kernel.points import model_point, sampled_state
 from dopt.kernel.structs import Evaluation, Learn, Plan, Plant, Trial
 from dopt.types import Vector
 
@@ -38,26 +40,36 @@ def plan_input(trial: Trial, plan: Plan, t: int) -> None:
 @compiled
 def act(plant: Plant, x: Vector, u: Vector, noise: Vector, t: int, following: Vector) -> None:
     """Write x_{t+1} (equation 2) of the simulated system."""
-    flow, learned = np.empty(x.shape[0]), np.empty(plant.learned_rows.shape[0])
-    plant.known(x, u, plant.parameters, flow)
     parameters = plant.history[min(t, plant.history.shape[0] - 1)]
-    plant.accelerations(plant_point(plant, x, u), parameters, learned)
-    for k in range(learned.shape[0]):
-        flow[plant.learned_rows[k]] += learned[k]
+    next_true_state(plant, parameters, x, u, following)
     for i in range(x.shape[0]):
-        following[i] = x[i] + plant.dt * flow[i] + noise[i]
+        following[i] += noise[i]
 
 
 @compiled
-def observe(
-    plant: Plant, x: Vector, u: Vector, following: Vector, dt: float, target: Vector
-) -> None:
-    """Write the accelerations observed from x_t to x_{t+1}, (r,), after dt seconds."""
-    flow = np.empty(x.shape[0])
-    plant.known(x, u, plant.parameters, flow)
+def observe(trial: Trial, t: int, dt: float, target: Vector) -> None:
+    """Write the accelerations observed from x_t to x_{t+1}, (r,), after dt seconds.
+
+    With the integrator of Runge and Kutta they are those in the middle of the step, plus what the
+    model's own step differs from the acceleration that it has there: a model whose error at them is
+    0 predicts x_{t+1}.
+    """
+    plant, states, u = trial.plant, trial.record.states, trial.record.inputs[t]
+    x, following = states[t], states[t + 1]
+    at, flow = sampled_state(plant, states, t), np.empty(x.shape[0])
+    plant.known(at, u, plant.parameters, flow)
     for k in range(target.shape[0]):
         row = plant.learned_rows[k]
         target[k] = (following[row] - x[row]) / dt - flow[row]
+    if plant.integrator == Integrator.EULER:
+        return
+    network, theta = trial.network, trial.state.theta
+    value, end = np.empty(target.shape[0]), np.empty(x.shape[0])
+    model_accelerations(plant, network, theta, model_point(network, at, u), value)
+    next_model_state(plant, network, theta, x, u, dt, end)
+    for k in range(target.shape[0]):
+        row = plant.learned_rows[k]
+        target[k] -= (end[row] - x[row]) / dt - (flow[row] + value[k])
 
 
 @compiled
@@ -68,15 +80,14 @@ def take_in(trial: Trial, learn: Learn, t: int, dt: float) -> bool:
     """
     plant, state, record = trial.plant, trial.state, trial.record
     target = np.empty(plant.learned_rows.shape[0])
-    observe(plant, record.states[t], record.inputs[t], record.states[t + 1], dt, target)
+    observe(trial, t, dt, target)
     note_error(trial, t, target)
     clock_0 = monotonic_microseconds()
     learn_members(trial, learn, t, target)
     clock_1 = monotonic_microseconds()
     if not within(state.theta, np.inf):
         return False
-    point = model_point(trial.network, record.states[t], record.inputs[t])
-    trial.information.add_rows(plant, trial.network, state, point)
+    trial.information.add_rows(plant, trial.network, state, sampled_point(trial, t))
     record.learn_us[t] = clock_1 - clock_0
     record.plan_us[t] += monotonic_microseconds() - clock_1
     return True
@@ -88,12 +99,11 @@ def prediction_error(trial: Trial, t: int, dt: float) -> float:
 
     Of an ensemble the mean of the members is taken.
     """
-    plant, record, thetas = trial.plant, trial.record, members_or_one(trial.state)
-    x, u, r = record.states[t], record.inputs[t], plant.learned_rows.shape[0]
+    plant, thetas, r = trial.plant, members_or_one(trial.state), trial.plant.learned_rows.shape[0]
     target, value, mean = np.empty(r), np.empty(r), np.zeros(r)
-    observe(plant, x, u, record.states[t + 1], dt, target)
+    observe(trial, t, dt, target)
+    point = sampled_point(trial, t)
     for member in range(thetas.shape[0]):
-        point = model_point(trial.network, x, u)
         model_accelerations(plant, trial.network, thetas[member], point, value)
         mean += value
     square = 0.0
@@ -126,7 +136,7 @@ def advance(
             return t
         start = monotonic_microseconds()
         if network.kind == ModelKind.GAUSSIAN_PROCESS:
-            add_sample(network, points, x)
+            add_sample(network, points, sampled_state(plant, record.states, t))
         if plant.history.shape[0] > 1:
             follow_truth(plant, network, points, t)
         loss = model_error(network, thetas, points, 0, points.n_grid, buffers)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dopt.algorithm import Integrator
 from dopt.kernel.compiler import compiled
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Vector
@@ -22,6 +23,18 @@ def plant_point(plant: Plant, x: Vector, u: Vector) -> Vector:
 def model_point(network: Network, x: Vector, u: Vector) -> Vector:
     """Return what the model depends on at a state and an input."""
     return joined(x, u, network.n_inputs_read)
+
+
+@compiled
+def sampled_state(plant: Plant, states: Matrix, t: int) -> Vector:
+    """Return where the accelerations of step t are observed: at x_t, or in the middle of the step.
+
+    ``states`` are x_0 ... x_T (:meth:`dopt.systems.base.System.sampled_states`).
+    """
+    state: Vector = states[t]
+    if plant.integrator != Integrator.EULER:
+        state = 0.5 * (state + states[t + 1])
+    return state
 
 
 @compiled

@@ -9,8 +9,8 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import called_from_python
-from dopt.kernel.model import euler_step, write_point_features
-from dopt.kernel.points import plant_point
+from dopt.kernel.integration import add_stage, n_stages, next_true_state, write_rate
+from dopt.kernel.model import write_point_features
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
 
@@ -18,12 +18,9 @@ from dopt.types import Matrix, Stack, Vector
 @called_from_python
 def follow_equations(plant: Plant, parameters: Vector, inputs: Stack, states: Stack) -> None:
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m)."""
-    flow, value = np.empty(states.shape[2]), np.empty(plant.learned_rows.shape[0])
     for t in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
-            point = plant_point(plant, states[t, i], inputs[t, i])
-            plant.accelerations(point, parameters, value)
-            euler_step(plant, states[t, i], inputs[t, i], value, flow, states[t + 1, i])
+            next_true_state(plant, parameters, states[t, i], inputs[t, i], states[t + 1, i])
 
 
 @called_from_python
@@ -34,17 +31,21 @@ def follow_network(
 
     They follow the mean of the networks with parameters ``thetas``, (E, q).
     """
-    n, r = inputs.shape[1], plant.learned_rows.shape[0]
+    n, d, r = inputs.shape[1], states.shape[2], plant.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    flow, value = np.empty(states.shape[2]), np.empty(r)
+    rate, value, total = np.empty(d), np.empty(r), np.empty((n, d))
     features, outputs = np.empty((network.feature_kinds.shape[0], n)), np.empty((r, n))
     one = np.empty((r, n))
     hidden = np.empty((depth, width * n))
     for t in range(inputs.shape[0]):
-        for i in range(n):
-            write_point_features(network, states[t, i], inputs[t, i], features, i)
-        nn.mean_forward(network, thetas, features, hidden, outputs, one)
-        for i in range(n):
-            for k in range(r):
-                value[k] = outputs[k, i]
-            euler_step(plant, states[t, i], inputs[t, i], value, flow, states[t + 1, i])
+        states[t + 1] = states[t]
+        for stage in range(n_stages(plant)):
+            for i in range(n):
+                write_point_features(network, states[t + 1, i], inputs[t, i], features, i)
+            nn.mean_forward(network, thetas, features, hidden, outputs, one)
+            for i in range(n):
+                x, following = states[t, i], states[t + 1, i]
+                for k in range(r):
+                    value[k] = outputs[k, i]
+                write_rate(plant, following, inputs[t, i], value, rate)
+                add_stage(plant, stage, plant.dt, x, rate, total[i], following)

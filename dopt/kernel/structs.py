@@ -38,6 +38,7 @@ class Plant(NamedTuple):
     dt: float
     gamma: float
     state_limit: float
+    integrator: int  # dopt.algorithm.Integrator
 
 
 class Waves(NamedTuple):

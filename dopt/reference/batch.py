@@ -12,7 +12,7 @@ from torch.func import vmap
 
 from dopt.evaluation import evaluation_set
 from dopt.reference.black_box import episodes_for, initial_states, stepped
-from dopt.reference.dynamics import flow, true_accelerations
+from dopt.reference.dynamics import next_states, true_accelerations
 from dopt.reference.gaussian_process import Posterior
 from dopt.reference.steps import BatchSteps
 from dopt.result import TrialResult
@@ -50,8 +50,11 @@ class Lockstep(BatchSteps):
         if self.episodes:
             u, following = stepped(self.episodes, u)
         else:
-            step = flow(self.system, x, u, true_accelerations(self.system, x, u, t))
-            following = x + self.system.dt * step + self.noise[:, t]
+            system = self.system
+            following = next_states(
+                system, x, u, lambda z: true_accelerations(system, z, u, t), system.dt
+            )
+            following = following + self.noise[:, t]
         self.inputs[:, t] = u
         self.states[:, t + 1] = following
         self.observe(t, self.system.dt)

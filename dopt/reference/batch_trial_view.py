@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, jvp, vmap
 
-from dopt.reference.dynamics import flow, input_matrix
+from dopt.reference.dynamics import input_matrix, next_states
 from dopt.reference.state import BatchState
 from dopt.trial_view import Array, TrialView
 
@@ -47,8 +47,9 @@ class BatchTrialView(TrialView):
     def following(self, state: Array, inputs: Array) -> Array:
         x, u = self.tensor(state), self.tensor(inputs)
         x = x.expand(len(u), -1)
-        accelerations = vmap(self.model, in_dims=(None, 0))(self.theta, x)
-        return _array(x + self.system.dt * flow(self.system, x, u, accelerations))
+        modelled = vmap(self.model, in_dims=(None, 0))
+        system = self.system
+        return _array(next_states(system, x, u, lambda z: modelled(self.theta, z), system.dt))
 
     def input_matrix(self, state: Array) -> Array:
         return _array(input_matrix(self.system, self.tensor(state)))

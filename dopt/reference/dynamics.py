@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch.func import jacrev, vmap
 
 from dopt.reference.models import Accelerations, stack
 from dopt.systems.base import System
+from dopt.systems.integration import next_state
 
 
 def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:
@@ -28,6 +30,21 @@ def flow(system: System, x: Tensor, u: Tensor, accelerations: Tensor) -> Tensor:
     """Return known(x, u) + E a, (..., d)."""
     rows = torch.tensor(system.learned_rows, device=x.device)
     return known_flow(system, x, u).index_add(-1, rows, accelerations)
+
+
+def next_states(
+    system: System, x: Tensor, u: Tensor, accelerations: Callable[[Tensor], Tensor], dt: float
+) -> Tensor:
+    """Return the states, (..., d), dt seconds after (..., d) under held inputs, (..., m).
+
+    ``accelerations`` gives those, (..., r), of states.
+    """
+
+    def rate(z: Tensor) -> Tensor:
+        return flow(system, z, u, accelerations(z))
+
+    following: Tensor = next_state(system.integrator, rate, x, dt)
+    return following
 
 
 def input_matrix(system: System, x: Tensor) -> Tensor:
@@ -84,9 +101,17 @@ class LearnedDynamics:
         return rows
 
     def following(self, theta: Tensor, x: Tensor, u: Tensor) -> Tensor:
-        """Return x + dt f_θ(x, u), (n, d), for parameters (q,), states (n, d), inputs (n, m)."""
+        """Return x + dt f_θ(x, u), (n, d), for parameters (q,), states (n, d), inputs (n, m).
+
+        Searches plan by this Euler map, whatever the integrator.
+        """
         accelerations = vmap(self.model, (None, 0))(theta, self.points(x, u))
         return x + self.system.dt * flow(self.system, x, u, accelerations)
+
+    def next_states(self, theta: Tensor, x: Tensor, u: Tensor, dt: float) -> Tensor:
+        """Return the states dt seconds later, (n, d), for (n, q), (n, d) and (n, m)."""
+        modelled = vmap(self.model)
+        return next_states(self.system, x, u, lambda z: modelled(theta, self.points(z, u)), dt)
 
     def input_matrix(self, theta: Tensor, x: Tensor) -> Tensor:
         """Return B = dt ∂f_θ/∂u, (d, m), at one state (d,).

@@ -13,7 +13,7 @@ from torch.func import jacrev, vmap
 from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
 from dopt.limits import Limits
 from dopt.policies import ICEM, InformationPolicy, Search
-from dopt.reference.dynamics import flow
+from dopt.reference.dynamics import next_states
 from dopt.reference.planning import predicted_states
 from dopt.reference.state import BatchState
 
@@ -46,11 +46,13 @@ class BatchLimits:
             moved = self._kept(t, before, moved)
         return torch.where(u.isfinite().all(dim=1, keepdim=True), moved, u)
 
-    def note_error(self, t: int) -> None:
-        """Take the errors of the accelerations observed at step t, before they are learned."""
+    def note_error(self, t: int, sampled: Tensor) -> None:
+        """Take the errors of the accelerations observed at step t, before they are learned.
+
+        ``sampled``, (n, ·), are the points at which they were observed.
+        """
         batch = self._batch
-        points = batch.points(batch.states[:, t], batch.inputs[:, t])
-        value = vmap(batch.model)(batch.theta, points)
+        value = vmap(batch.model)(batch.theta, sampled)
         square = (batch.targets[:, t] - value).square() / (1 + self._variances[0])
         self._scale += max(1 / (t + 1), 1 / NEWEST_ERRORS) * (square - self._scale)
 
@@ -118,9 +120,12 @@ class BatchLimits:
         return largest.amin(dim=3).amax(dim=2)
 
     def _next_states(self, x: Tensor, u: Tensor, off: Tensor) -> Tensor:
-        """Return x + dt f_θ(x, u) for states (n, ..., d), with errors of accelerations."""
+        """Return the states after (n, ..., d) under the model, with errors of accelerations."""
         batch = self._batch
-        points = batch.points(x, u)
-        over_points = vmap(batch.model, in_dims=(None, 0))
-        values = vmap(over_points)(batch.theta, points.flatten(1, -2)).view(off.shape)
-        return x + batch.system.dt * flow(batch.system, x, u, values + off)
+        over_points = vmap(vmap(batch.model, in_dims=(None, 0)))
+
+        def accelerations(z: Tensor) -> Tensor:
+            values: Tensor = over_points(batch.theta, batch.points(z, u).flatten(1, -2))
+            return values.view(off.shape) + off
+
+        return next_states(batch.system, x, u, accelerations, batch.system.dt)

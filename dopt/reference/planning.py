@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.func import grad, jvp, vmap
 
 from dopt.algorithm import TIE_MARGIN
-from dopt.reference.dynamics import LearnedDynamics, flow
+from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.sphere import maximize_on_spheres
 
 
@@ -36,8 +36,7 @@ def predicted_states(learned: LearnedDynamics, theta: Tensor, x: Tensor) -> Tens
     """Return x̄ of every trial, (n, d), for parameters (n, q) and states (n, d)."""
     system = learned.system
     zero = torch.zeros(len(x), system.n_inputs, dtype=x.dtype, device=x.device)
-    accelerations = vmap(learned.model)(theta, learned.points(x, zero))
-    return x + system.dt * flow(system, x, zero, accelerations)
+    return learned.next_states(theta, x, zero, system.dt)
 
 
 def quadratic_problem(

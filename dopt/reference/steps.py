@@ -73,10 +73,19 @@ class BatchSteps(BatchState):
         return d_optimal_inputs(summed(problems), self.system.gamma, self.ties[:, t])
 
     def observe(self, t: int, dt: float) -> None:
-        """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later."""
-        x, u = self.states[:, t], self.inputs[:, t]
-        observed = (self.states[:, t + 1] - x) / dt - known_flow(self.system, x, u)
-        self.targets[:, t] = observed[:, list(self.system.learned_rows)]
+        """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later.
+
+        With the integrator of Runge and Kutta, they are those of :func:`dopt.kernel.loop.observe`.
+        """
+        system, x, u = self.system, self.states[:, t], self.inputs[:, t]
+        rows, at = list(system.learned_rows), self._sampled_states(t)
+        known = known_flow(system, at, u)
+        observed = ((self.states[:, t + 1] - x) / dt - known)[:, rows]
+        if system.integrator != "euler":
+            end = self.learned.next_states(self.theta, x, u, dt)
+            value = vmap(self.model)(self.theta, self.points(at, u))
+            observed = observed - (((end - x) / dt - known)[:, rows] - value)
+        self.targets[:, t] = observed
 
     def learn(self, t: int) -> None:
         """Update the parameters with the samples up to time t; diverged trials keep theirs.
@@ -84,7 +93,7 @@ class BatchSteps(BatchState):
         Of an ensemble that is the member whose turn it is, and then the first one, whose M stays.
         """
         if self.limits:
-            self.limits.note_error(t)
+            self.limits.note_error(t, self.sampled(t))
         if self.members is None:
             self._learn(t)
             return
@@ -112,7 +121,14 @@ class BatchSteps(BatchState):
 
     def sampled(self, steps: int | slice) -> Tensor:
         """Return the points at which the accelerations of some steps were observed, (n, ..., ·)."""
-        return self.points(self.states[:, steps], self.inputs[:, steps])
+        return self.points(self._sampled_states(steps), self.inputs[:, steps])
+
+    def _sampled_states(self, steps: int | slice) -> Tensor:
+        """Return x_t, or the middle of the step, (n, ..., d), for some steps."""
+        before, after = self.states[:, :-1], self.states[:, 1:]
+        if self.system.integrator == "euler":
+            return before[:, steps]
+        return 0.5 * (before[:, steps] + after[:, steps])
 
     def rows(self, t: int) -> Tensor:
         """Return J at (x_t, u_t) and the current parameters, (n, r, s), in the space of M."""

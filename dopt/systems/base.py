@@ -33,6 +33,7 @@ import numpy.typing as npt
 from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError
 from dopt.systems.features import Feature, feature_values
+from dopt.systems.integration import INTEGRATORS
 from dopt.systems.points import check_number, sobol_midpoints
 from dopt.types import Scalar
 
@@ -73,6 +74,7 @@ class System(Validated):
     grid_half_widths: tuple[float, ...] = parameter((), bound="positive")
     grid_points: tuple[int, ...] = parameter((), bound="positive")
     state_limit: float = parameter(1e4, bound="positive")
+    integrator: str = parameter("euler", choices=INTEGRATORS, added=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -207,6 +209,16 @@ class System(Validated):
         flow = flow.astype(kind)
         flow[list(self.learned_rows)] += rows
         return flow
+
+    def sampled_states(self, states: Array) -> Array:
+        """Return the states, (T, d), at which the accelerations between (T + 1, d) are observed.
+
+        A difference of two states is the acceleration in the middle of the step up to O(dt²), and
+        that at its start up to O(dt): of the Euler map it is exactly the latter.
+        """
+        if self.integrator == "euler":
+            return states[:-1]
+        return 0.5 * (states[:-1] + states[1:])
 
     @functools.cached_property
     def linear_form(self) -> tuple[tuple[float, ...], ...]:

@@ -83,11 +83,12 @@ class BlackBox(System):
             "another env."
         )
 
-    def observed(self, states: Array, following: Array, inputs: Array) -> Array:
-        """Return the accelerations, (N, r), seen in transitions: states (N, d), inputs (N, m)."""
-        known = self.known(tuple(states.T), tuple(inputs.T), self.parameters)
+    def observed(self, states: Array, inputs: Array) -> Array:
+        """Return the accelerations, (T, r), seen between states (T + 1, d) under (T, m)."""
+        at = self.sampled_states(states)
+        known = self.known(tuple(at.T), tuple(inputs.T), self.parameters)
         flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-        difference: Array = (following - states) / self.dt - flow
+        difference: Array = np.diff(states, axis=0) / self.dt - flow
         return difference[:, list(self.learned_rows)]
 
 
@@ -105,6 +106,6 @@ def transitions(
     for t, u in enumerate(inputs):
         applied[t] = episode.step(u)
         states[t + 1] = episode.state
-    seen = system.observed(states[:-1], states[1:], applied)
+    seen = system.observed(states, applied)
     inside = np.all(np.abs(states) <= system.state_limit, axis=1)
-    return states[:-1], applied, seen, inside[:-1] & inside[1:]
+    return system.sampled_states(states), applied, seen, inside[:-1] & inside[1:]

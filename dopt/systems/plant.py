@@ -76,6 +76,9 @@ class Plant:
     limit : float
         Largest magnitude of a state that can be a measurement, but for angles; what is beyond is
         left out.
+    integrator : {"euler", "rk4"}
+        How the model's accelerations are compared with two states: as that at the first one, or
+        integrated over the step, which is exact to O(dt⁴).
 
     Raises
     ------
@@ -93,6 +96,7 @@ class Plant:
     angles: Sequence[str] = ()
     constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
     limit: float = 1e4
+    integrator: str = "euler"
 
     def __post_init__(self) -> None:
         self._check_types()
@@ -153,7 +157,10 @@ class Plant:
             key: {name: float(value) for name, value in getattr(self, key).items()}
             for key in ("box", "constants")
         }
-        return {"name": NAME, **ordered, "known": self.known, **named, **lists, **numbers}
+        section = {"name": NAME, **ordered, "known": self.known, **named, **lists, **numbers}
+        if self.integrator != "euler":  # explorations were stored before there was another one
+            section["integrator"] = self.integrator
+        return section
 
     @classmethod
     def from_section(cls, section: Mapping[str, Any]) -> ExploredPlant:
@@ -175,6 +182,7 @@ class Plant:
             dt=self.dt,
             horizon=horizon,
             state_limit=self.limit,
+            integrator=self.integrator,
             grid_half_widths=tuple(half_widths[name] for name in axes),
             grid_points=(GRID_POINTS,) * len(axes),
         )

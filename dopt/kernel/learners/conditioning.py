@@ -18,6 +18,7 @@ from dopt.kernel.gaussian_process import mean_weights, sample_features, write_ke
 from dopt.kernel.information.cholesky import solve_lower, solve_lower_transposed
 from dopt.kernel.information.primal import inner
 from dopt.kernel.network import features_at
+from dopt.kernel.points import sampled_state
 from dopt.kernel.structs import Network, Posterior, Trial
 from dopt.types import Vector
 
@@ -28,7 +29,7 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     network, posterior, r = trial.network, trial.state.posterior, target.shape[0]
     n = posterior.n_samples[0]
     phi = sample_features(network, trial.state.theta, r)
-    features_at(network, trial.record.states[t], phi[n])
+    features_at(network, sampled_state(trial.plant, trial.record.states, t), phi[n])
     write_kernel(network, phi[n], phi[:n], posterior.factor[n, :n])
     _grow(network, posterior, target)
     alpha = mean_weights(network, trial.state.theta, r)

@@ -6,15 +6,16 @@ import numpy as np
 
 from dopt.kernel.compiler import compiled
 from dopt.kernel.network import features_at
-from dopt.kernel.points import model_point
+from dopt.kernel.points import model_point, sampled_state
 from dopt.kernel.structs import Network, Trial
 from dopt.types import Matrix, Vector
 
 
 @compiled
 def sampled_point(trial: Trial, t: int) -> Vector:
-    """Return where the accelerations of step t were observed: x_t, or (x_t, u_t)."""
-    return model_point(trial.network, trial.record.states[t], trial.record.inputs[t])
+    """Return where the accelerations of step t were observed: a state, or a state and u_t."""
+    state = sampled_state(trial.plant, trial.record.states, t)
+    return model_point(trial.network, state, trial.record.inputs[t])
 
 
 @compiled

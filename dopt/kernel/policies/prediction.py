@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled
-from dopt.kernel.model import euler_step, model_accelerations
+from dopt.kernel.integration import next_model_state
+from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import model_point
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Vector
@@ -13,12 +14,9 @@ from dopt.types import Matrix, Vector
 
 @compiled
 def predicted_state(plant: Plant, network: Network, theta: Vector, x: Vector) -> Vector:
-    """Return x̄ = x + dt f_θ(x, 0), (d,)."""
-    flow, following = np.empty(x.shape[0]), np.empty(x.shape[0])
-    a = np.empty(plant.learned_rows.shape[0])
-    u = np.zeros(plant.n_inputs)
-    model_accelerations(plant, network, theta, model_point(network, x, u), a)
-    euler_step(plant, x, u, a, flow, following)
+    """Return x̄, (d,), the state that follows without input: x + dt f_θ(x, 0) by the Euler map."""
+    following = np.empty(x.shape[0])
+    next_model_state(plant, network, theta, x, np.zeros(plant.n_inputs), plant.dt, following)
     return following
 
 
