@@ -41,7 +41,9 @@ def test_rows_are_those_of_the_table(env: str, policy: str, learner: str) -> Non
     assert len(free) == len(kept) == 100
     shares = " | ".join(f"{share(rows):.3g} %" for rows in (free, kept))
     losses = [geometric_mean(rows.final_loss) for rows in (free, kept)]
-    cells = " | ".join(f"{value:.3g}" for value in (kept.worst.max(), *losses, losses[1] / losses[0]))
+    cells = " | ".join(
+        f"{value:.3g}" for value in (kept.worst.max(), *losses, losses[1] / losses[0])
+    )
     assert f"| {env} | `{policy}` | `{learner}` | {shares} | {cells} |" in FINDINGS
 
 

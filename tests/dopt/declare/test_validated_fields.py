@@ -42,15 +42,18 @@ POSITIVE = {
         "steps",
         "noise_variance",
         "forgetting",
+        "dry_rate",
+        "motor_gain",
     ),
 }
 NONNEGATIVE = {
     *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
+    "dry_friction",
 }
 FRACTIONS = {"beta_1", "beta_2"}
 SHARES = {"forgetting", "band"}
-TEXTS = {"form", "criterion", "states", "information", "domain"}
+TEXTS = {"form", "criterion", "states", "information", "domain", "integrator"}
 OF_ANY_SIZE = {"goal"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)
 
