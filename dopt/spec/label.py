@@ -76,7 +76,8 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
     """Return a label for each configuration that says only what differs among those of its env.
 
     The policy is named where several are shown. Of the settings that differ, usual values are left
-    out, unless the label would be empty or equal to that of another configuration.
+    out, unless the label would be empty or equal to that of another configuration. Limits and a
+    loss of its own are always named.
     """
     flats = [flatten(completed(config)) for config in configs]
     titled = len({flat.get("policy.name") for flat in flats}) > 1
@@ -100,11 +101,17 @@ def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[
         words = _words(flat, [path for path in paths if _is_unusual(path, flat, own)])
         brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
         whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
-        if _LOSS in flat and _LOSS not in paths:  # never to be taken for another loss
-            brief, whole = ([*one, *_words(flat, [_LOSS])] for one in (brief, whole))
+        always = [path for path in _always(flat, own) if path not in paths]
+        brief, whole = ([*one, *_words(flat, always)] for one in (brief, whole))
         rows.append((", ".join(brief), ", ".join(whole)))
     counts = Counter(brief for brief, _ in rows)
     return [brief if counts[brief] == 1 else whole for brief, whole in rows]
+
+
+def _always(flat: Flat, usual: Flat) -> list[str]:
+    """Return what a label always names: another loss than usual, and unusual limits."""
+    paths = [path for path in _paths([flat]) if path == _LOSS or path.startswith("limits.")]
+    return [path for path in paths if _is_unusual(path, flat, usual)]
 
 
 def _telling(paths: Sequence[str]) -> list[str]:
@@ -192,9 +199,13 @@ def _title(flat: Flat) -> str:
 
 
 def _paths(flats: Sequence[Flat]) -> list[str]:
-    """Return all paths that a label can name, the model and the learner first."""
+    """Return all paths that a label can name, the model and the learner first.
+
+    The name of limits goes before what they are.
+    """
     paths = set().union(*flats) - set(_TITLED)
-    return [*(path for path in _FIRST if path in paths), *sorted(paths - set(_FIRST))]
+    rest = sorted(paths - set(_FIRST), key=lambda path: path.replace("limits.name", "limits."))
+    return [*(path for path in _FIRST if path in paths), *rest]
 
 
 def _words(flat: Flat, paths: Sequence[str], digits: int = 6) -> list[str]:
