@@ -21,7 +21,6 @@ from analysis.errors import AnalysisError
 from dopt.errors import SpecificationError
 from dopt.limits import Limits
 from dopt.spec.label import flatten
-from dopt.spec.prequential import is_prequential
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow
 
@@ -284,18 +283,3 @@ def check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
                 f"The database has no trial of {kind} '{name}', "
                 f"choose one of {', '.join(sorted(stored)) or 'none: it is empty'}."
             )
-
-
-def omissions(accepted: list[ConfigRow], chosen: list[ConfigRow]) -> Iterable[str]:
-    """Yield sentences on configurations that were left out, and on explorations."""
-    kept = {config.config_key for config in chosen}
-    left = Counter(config.env for config in accepted if config.config_key not in kept)
-    for env, count in sorted(left.items()):
-        yield f"{env}: {count} other stored configurations are not part of this (see --where)"
-    for env in sorted({config.env for config in chosen if config.config.get("limits")}):
-        yield f"{env}: these trials have limits, which their labels name"
-    for env in sorted({config.env for config in chosen if is_prequential(config.config)}):
-        yield (
-            f"{env}: the loss is prequential, the error of each predicted acceleration before it "
-            f"is learned; explorations take paths of their own, so that it is not compared"
-        )

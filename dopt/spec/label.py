@@ -42,6 +42,9 @@ _COLUMNS = {
 
 _LOSS = "env.loss"
 
+_ALWAYS = (_LOSS, "limits.name", "limits.enforced")
+"""What a label names wherever it is unusual: trials with it are not to be taken for others."""
+
 _NAMED = ("limits.bounds.", "limits.rates.")
 """Settings that have no default: each stands under a name of the system."""
 
@@ -76,8 +79,8 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
     """Return a label for each configuration that says only what differs among those of its env.
 
     The policy is named where several are shown. Of the settings that differ, usual values are left
-    out, unless the label would be empty or equal to that of another configuration. Limits and a
-    loss of its own are always named.
+    out, unless the label would be empty or equal to that of another configuration. A loss
+    of its own and limits are always named, the bounds only where they differ.
     """
     flats = [flatten(completed(config)) for config in configs]
     titled = len({flat.get("policy.name") for flat in flats}) > 1
@@ -101,17 +104,12 @@ def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[
         words = _words(flat, [path for path in paths if _is_unusual(path, flat, own)])
         brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
         whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
-        always = [path for path in _always(flat, own) if path not in paths]
+        rest = [path for path in _paths([flat]) if path in _ALWAYS and path not in paths]
+        always = [path for path in rest if _is_unusual(path, flat, own)]
         brief, whole = ([*one, *_words(flat, always)] for one in (brief, whole))
         rows.append((", ".join(brief), ", ".join(whole)))
     counts = Counter(brief for brief, _ in rows)
     return [brief if counts[brief] == 1 else whole for brief, whole in rows]
-
-
-def _always(flat: Flat, usual: Flat) -> list[str]:
-    """Return what a label always names: another loss than usual, and unusual limits."""
-    paths = [path for path in _paths([flat]) if path == _LOSS or path.startswith("limits.")]
-    return [path for path in paths if _is_unusual(path, flat, usual)]
 
 
 def _telling(paths: Sequence[str]) -> list[str]:
@@ -124,6 +122,13 @@ def _is_unusual(path: str, flat: Flat, usual: Flat) -> bool:
     """Whether a configuration has a setting other than the default, its versions apart."""
     hidden = path.endswith("_version")
     return not hidden and path in flat and (path not in usual or flat[path] != usual[path])
+
+
+def limits_label(config: Mapping[str, object]) -> str:
+    """Return the words for limits, such as ``limits, y=[-2, 2]``; empty without any."""
+    flat, usual = flatten(config), usual_values(config)
+    paths = [path for path in _paths([flat]) if path.startswith("limits.")]
+    return ", ".join(_words(flat, [path for path in paths if _is_unusual(path, flat, usual)]))
 
 
 def value_label(path: str, value: object) -> str:

@@ -41,9 +41,9 @@ class Panel:
 
     Attributes
     ----------
-    env, label, state : str
-        The environment, what sets the configuration apart from others of it, and the label of the
-        state with its unit.
+    env, policy, label, state : str
+        The environment, the policy, what sets the configuration apart from others of these, and the
+        label of the state with its unit.
     enforced : bool
         Whether inputs heed the limits.
     time : (T + 1,)
@@ -62,6 +62,7 @@ class Panel:
     """
 
     env: str
+    policy: str
     label: str
     state: str
     enforced: bool
@@ -155,15 +156,17 @@ def _row_panels(reader: Reader, pair: Pair, label: str) -> Iterator[Panel]:
     seeds = _drawn_seeds(pair)
     bounds, places = _bounds(first)
     states = {key: _states(reader, entry, seeds, system) for key, entry in pair.items()}
+    time: Array = system.dt * np.arange(system.horizon + 1, dtype=np.float64)
     shares = {key: _shares(reader, entry) for key, entry in pair.items()}
     for place in places:
         for enforced, entry in pair.items():
             yield Panel(
                 env=entry.config.env,
+                policy=entry.config.policy,
                 label=label,
                 state=system.state_labels[place],
                 enforced=enforced,
-                time=system.dt * np.arange(system.horizon + 1),
+                time=time,
                 lines=states[enforced][:, :, place],
                 seeds=seeds,
                 bounds=bounds[place],
@@ -209,6 +212,7 @@ def tabulate_panels(panels: Panels) -> pd.DataFrame:
 def _table(panel: Panel) -> pd.DataFrame:
     columns = {
         "env": panel.env,
+        "policy": panel.policy,
         "label": panel.label,
         "state": panel.state,
         "enforced": panel.enforced,

@@ -23,6 +23,7 @@ from analysis.figures.plot import Plot
 from analysis.figures.style import GUIDE, TEXT_WIDTH, mathematical
 from analysis.formatting import but_diverged, plus_minus
 from analysis.line_styles import BLUE, GREY, environment_title
+from dopt.policies.titles import policy_title
 
 ROW_HEIGHT = 1.75
 LEGEND_HEIGHT = 0.4
@@ -136,8 +137,8 @@ def caption(panels: Panels) -> str:
             for row in rows
         )
     return (
-        f"States with bounds against time under the reference policy, a line for each trial: where "
-        f"limits are counted only, and where they are enforced. Dashed: bounds. At most "
+        f"States with bounds against time, {policy_title(panels[0].policy)}, a line for each "
+        f"trial. Left: limits are counted only; right: they are enforced. Dashed: bounds. At most "
         f"{MOST_SEEDS} trials are drawn, those of the first seeds; drawn seeds: {seeds}. The axis "
         f"shows at most {WIDTHS:g} widths of the bounds, lines beyond it are cut off; angles are "
         f"not wrapped. Percentage: steps after which any state is beyond a bound, mean over n "
