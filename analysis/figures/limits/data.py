@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from analysis.data.bounded_states import bounded_states
 from analysis.data.config_matching import nearness
 from analysis.data.trial_selection import Entry, Selection, environment_rank, labelled, labels_of
 from analysis.data.variants import unfinished
 from analysis.stats.intervals import mean, standard_error
-from dopt.limits import VIOLATIONS, Limits, limits_from
+from dopt.limits import VIOLATIONS
 from dopt.spec.label import flatten
 from dopt.spec.prequential import system_of
 from dopt.systems import System
@@ -96,9 +97,9 @@ def pairs(entries: Sequence[Entry], policy: str) -> list[Pair]:
     """
     found: dict[str, Pair] = {}
     for entry in entries:
-        if entry.config.policy == policy and entry.finished and _bounds(entry)[1]:
+        if entry.config.policy == policy and entry.finished and _bounds(entry):
             pair = found.setdefault(_common(entry), {})
-            enforced = _limits(entry).enforced
+            enforced = bool(entry.config.config["limits"]["enforced"])
             if enforced not in pair or len(entry.trials) > len(pair[enforced].trials):
                 pair[enforced] = entry
     return [dict(sorted(pair.items())) for _, pair in sorted(found.items(), key=_rank)]
@@ -117,16 +118,9 @@ def _common(entry: Entry) -> str:
     return json.dumps(kept, sort_keys=True)
 
 
-def _limits(entry: Entry) -> Limits:
-    return limits_from(entry.config.config.get("limits")) or Limits()
-
-
-def _bounds(entry: Entry) -> tuple[Array, list[int]]:
-    """Return the bounds (d, 2) of the states of an entry, and the places of those that have one."""
-    if not entry.config.config.get("limits"):
-        return np.empty((0, 2)), []
-    bounds = _limits(entry).of_states(system_of(entry.config.config))
-    return bounds, np.flatnonzero(np.isfinite(bounds).any(axis=1)).tolist()
+def _bounds(entry: Entry) -> dict[int, Array]:
+    config = entry.config.config
+    return bounded_states(config, system_of(config)) if config.get("limits") else {}
 
 
 def measure_panels(reader: Reader, selection: Selection) -> Panels:
@@ -154,11 +148,10 @@ def _row_panels(reader: Reader, pair: Pair, label: str) -> Iterator[Panel]:
     first = next(iter(pair.values()))
     system = system_of(first.config.config)
     seeds = _drawn_seeds(pair)
-    bounds, places = _bounds(first)
     states = {key: _states(reader, entry, seeds, system) for key, entry in pair.items()}
     time: Array = system.dt * np.arange(system.horizon + 1, dtype=np.float64)
     shares = {key: _shares(reader, entry) for key, entry in pair.items()}
-    for place in places:
+    for place, bounds in _bounds(first).items():
         for enforced, entry in pair.items():
             yield Panel(
                 env=entry.config.env,
@@ -169,7 +162,7 @@ def _row_panels(reader: Reader, pair: Pair, label: str) -> Iterator[Panel]:
                 time=time,
                 lines=states[enforced][:, :, place],
                 seeds=seeds,
-                bounds=bounds[place],
+                bounds=bounds,
                 share=float(mean(shares[enforced])),
                 share_error=float(standard_error(shares[enforced])),
                 n=len(shares[enforced]),

@@ -127,15 +127,9 @@ def share_text(panel: Panel) -> str:
 
 def caption(panels: Panels) -> str:
     """Return the caption, with the drawn trials and what the share is."""
-    rows = rows_of(panels)
-    drawn = {ranges(row[0].seeds) for row in rows}
-    if len(drawn) == 1:
-        seeds = drawn.pop()
-    else:
-        seeds = "; ".join(
-            f"{environment_title(row[0].env)}, {row[0].label}: {ranges(row[0].seeds)}"
-            for row in rows
-        )
+    drawn = {f"{environment_title(one.env)}, {one.label}": ranges(one.seeds) for one in panels}
+    words = [f"{name}: {own}" for name, own in drawn.items()]
+    seeds = "; ".join(words) if len(set(drawn.values())) > 1 else next(iter(drawn.values()))
     return (
         f"States with bounds against time, {policy_title(panels[0].policy)}, a line for each "
         f"trial. Left: limits are counted only; right: they are enforced. Dashed: bounds. At most "
