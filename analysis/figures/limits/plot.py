@@ -130,9 +130,12 @@ def caption(panels: Panels) -> str:
     drawn = {f"{environment_title(one.env)}, {one.label}": ranges(one.seeds) for one in panels}
     words = [f"{name}: {own}" for name, own in drawn.items()]
     seeds = "; ".join(words) if len(set(drawn.values())) > 1 else next(iter(drawn.values()))
+    kinds = {panel.enforced for panel in panels}
+    sides = "limits are counted only on the left and enforced on the right"
+    only = f"limits are {WORDS[panels[0].enforced]}"
     return (
         f"States with bounds against time, {policy_title(panels[0].policy)}, a line for each "
-        f"trial. Left: limits are counted only; right: they are enforced. Dashed: bounds. At most "
+        f"trial; {sides if len(kinds) > 1 else only}. Dashed: bounds. At most "
         f"{MOST_SEEDS} trials are drawn, those of the first seeds; drawn seeds: {seeds}. The axis "
         f"shows at most {WIDTHS:g} widths of the bounds, lines beyond it are cut off; angles are "
         f"not wrapped. Percentage: steps after which any state is beyond a bound, mean over n "

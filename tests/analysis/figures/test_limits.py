@@ -115,6 +115,8 @@ def test_the_figure_has_a_panel_for_each_and_dashed_bounds(railed: str) -> None:
     assert table[~table["enforced"]]["seed_3"].iloc[:61].tolist() == panels[0].lines[3].tolist()
     alone = tuple(panel for panel in panels if panel.enforced)
     assert len(draw(alone).axes) == 4
+    assert "on the left" in words
+    assert "; limits are enforced." in caption(alone)
 
 
 def panel(bounds: tuple[float, float], *states: float) -> Panel:
