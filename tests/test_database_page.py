@@ -32,6 +32,8 @@ def small(request: pytest.FixtureRequest) -> str:
     url = str(request.getfixturevalue(f"{request.param}_url"))
     fill(url, make_grid(("pendulum", "cartpole"), seeds=range(8), **SHORT))
     fill(url, make_grid(("pendulum",), ("random",), seeds=range(8), **SHORT, **TASK))
+    rail = {"limits": {"bounds": {"y": [-1.0, 1.0]}, "enforced": False}}
+    fill(url, make_grid(("cartpole",), ("random",), seeds=range(8), **SHORT, **rail))
     return url
 
 

@@ -1,11 +1,11 @@
 """Which stored configuration stands for a policy in an environment.
 
 A database may hold the paper's grid beside other widths, bounds and learners. A picture compares
-policies under one setting, the triple (env, model, learner) of an environment. A setting with the
+policies under one setting of an environment: its env, model, learner and limits. A setting with the
 reference policy and a baseline goes before one with the reference alone, such as another width;
 then the one with most trials wins, then the one nearest to the defaults, which are the paper's
 setting. A policy that exists only with a model of its own (the oracle) is taken with that model, in
-the same env section. What was left out is said; a tie is an error.
+the same env section and under the same limits. What was left out is said; a tie is an error.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Any
 
 from analysis.errors import AnalysisError
 from dopt.errors import SpecificationError
+from dopt.limits import Limits
 from dopt.spec.label import flatten
-from dopt.spec.prequential import is_prequential
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow
 
@@ -36,8 +36,11 @@ USUAL = {"model": "mlp", "learner": "adam_window"}
 COLUMNS = tuple(name for name in CONFIG_COLUMNS if name not in ("env", "label"))
 """Settings that have a column of their own."""
 
-Setting = tuple[str, str, str]
-"""JSON of the sections env, model and learner."""
+Setting = tuple[str, str, str, str]
+"""JSON of the sections env, limits, model and learner; null for none."""
+
+_WORLD = 2
+"""Number of sections, from the first, that all policies of a picture share."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,11 @@ def _choose_policies(group: Sequence[Candidate], reference: str) -> list[ConfigR
     for policy in sorted({candidate.config.policy for candidate in group}):
         own = [candidate for candidate in group if candidate.config.policy == policy]
         same = [candidate for candidate in own if _setting(candidate.config) == setting]
-        world = [candidate for candidate in own if _setting(candidate.config)[0] == setting[0]]
+        world = [
+            candidate
+            for candidate in own
+            if _setting(candidate.config)[:_WORLD] == setting[:_WORLD]
+        ]
         if same or world:
             chosen.append(_most(same or world).config)
     return chosen
@@ -215,15 +222,18 @@ def nearness(config: ConfigRow) -> tuple[int, int, int]:
 
 
 def defaults(config: ConfigRow) -> dict[str, object]:
-    """Return the defaults of what a configuration names, without task and limits, as dotted paths.
+    """Return the defaults of what a configuration names, without its task, as dotted paths.
 
-    There are none where it holds a system or policy of a user's own, which is not registered here.
+    Of limits these are all settings but the name, so that none are nearer than any. There are none
+    where it holds a system or policy of a user's own, which is not registered here.
     """
     names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
     names.pop("task", None)
-    names.pop("limits", None)
+    limits = Limits().to_section() if names.pop("limits", None) else {}
+    limits.pop("name", None)
     try:
-        return flatten(TrialSpec.from_mapping(names).to_mapping())
+        usual = TrialSpec.from_mapping(names).to_mapping()
+        return flatten({**usual, "limits": limits})
     except (SpecificationError, KeyError):  # a plant is more than its name
         return {}
 
@@ -244,11 +254,11 @@ def _tie(pool: Sequence[Candidate]) -> AnalysisError:
 
 
 def _setting(config: ConfigRow) -> Setting:
-    env, model, learner = (
+    env, limits, model, learner = (
         json.dumps(config.config.get(section), sort_keys=True)
-        for section in ("env", "model", "learner")
+        for section in ("env", "limits", "model", "learner")
     )
-    return env, model, learner
+    return env, limits, model, learner
 
 
 def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]:
@@ -273,16 +283,3 @@ def check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
                 f"The database has no trial of {kind} '{name}', "
                 f"choose one of {', '.join(sorted(stored)) or 'none: it is empty'}."
             )
-
-
-def omissions(accepted: list[ConfigRow], chosen: list[ConfigRow]) -> Iterable[str]:
-    """Yield sentences on configurations that were left out, and on explorations."""
-    kept = {config.config_key for config in chosen}
-    left = Counter(config.env for config in accepted if config.config_key not in kept)
-    for env, count in sorted(left.items()):
-        yield f"{env}: {count} other stored configurations are not part of this (see --where)"
-    for env in sorted({config.env for config in chosen if is_prequential(config.config)}):
-        yield (
-            f"{env}: the loss is prequential, the error of each predicted acceleration before it "
-            f"is learned; explorations take paths of their own, so that it is not compared"
-        )

@@ -17,10 +17,10 @@ from analysis.data.config_matching import (
     choose,
     choose_by,
     nearness,
-    omissions,
     setting_value,
 )
 from analysis.data.missing_trials import Compatible, Gap, absent_pairs, is_possible
+from analysis.data.selection_notes import omissions
 from analysis.errors import AnalysisError
 from dopt.policies.titles import TITLES
 from dopt.spec.label import labels, value_label

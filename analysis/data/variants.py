@@ -10,16 +10,20 @@ from analysis.data.trial_selection import Entry
 
 Weight = Callable[[Entry], tuple[int, ...]]
 
-_IDENTITY = ("policy", "model", "learner", "path")
+_IDENTITY = ("policy", "model", "learner", "limits", "path")
 
 
-def one_world(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the entries of the env section with most trials; entries are of one environment."""
+def one_world(entries: Sequence[Entry], name: str = "env") -> list[Entry]:
+    """Return the entries of the env section with most trials; entries are of one environment.
+
+    ``name`` is that of another section by which they are told apart; of as many trials those
+    without such a section come first.
+    """
     totals: Counter[str] = Counter()
     for entry in entries:
-        totals[section_text(entry, "env")] += len(entry.trials)
-    world = max(totals, key=lambda section: (totals[section], section))
-    return [entry for entry in entries if section_text(entry, "env") == world]
+        totals[section_text(entry, name)] += len(entry.trials)
+    world = max(totals, key=lambda section: (totals[section], section == "null", section))
+    return [entry for entry in entries if section_text(entry, name) == world]
 
 
 def number_of_trials(entry: Entry) -> tuple[int, ...]:
@@ -28,7 +32,7 @@ def number_of_trials(entry: Entry) -> tuple[int, ...]:
 
 
 def one_each(entries: Sequence[Entry], weight: Weight = number_of_trials) -> list[Entry]:
-    """Return the entry of the largest weight for each policy, model, learner and path.
+    """Return the entry of the largest weight for each policy, model, learner, limits and path.
 
     Several differ in their task alone: the losses of a trial are the same with any and without one.
     """

@@ -17,6 +17,7 @@ FIGURES = (
     "figure6_pareto",
     "figure7_profiles",
     "figure8_sensitivity",
+    "figure9_limits",
 )
 """Figures in the order of the registry."""
 

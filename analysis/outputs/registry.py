@@ -11,6 +11,7 @@ from analysis.data import provenance
 from analysis.data.trial_selection import Selection
 from analysis.figures.control.plot import control_plot
 from analysis.figures.input_spectrum.plot import spectrum_plot
+from analysis.figures.limits.plot import limits_plot
 from analysis.figures.loss_curves.plot import loss_plot
 from analysis.figures.pareto.plot import pareto_plot
 from analysis.figures.phase_portraits.plot import phase_plot
@@ -41,6 +42,7 @@ PLOTS: dict[str, Plot[Any]] = {
         pareto_plot("figure6_pareto"),
         profiles_plot("figure7_profiles"),
         sensitivity_plot("figure8_sensitivity"),
+        limits_plot("figure9_limits"),
     )
 }
 WITH_EXPLORATIONS = ("figure1", *(name for name in PLOTS if name.startswith("figure2")), "summary")

@@ -19,7 +19,7 @@ from analysis.stats.control import common_task, task_of
 from dopt.spec.prequential import is_prequential
 from orchestrate.store import Reader
 
-_SETTING = ("model", "learner")
+_SETTING = ("model", "learner", "limits")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class VariantGroup:
         return tuple(one for one in self.variants if task_of(one) == self.task)
 
     def reference_with_setting_of(self, variant: Entry) -> Entry | None:
-        """Return the reference policy under the model and the learner of a variant, if it is here.
+        """Return the reference policy with the model, learner and limits of a variant, if any.
 
         Among several it is the one nearest to the defaults.
         """
@@ -136,7 +136,7 @@ def _of_other_tasks(variants: Sequence[Entry], task: str | None) -> Iterator[str
 
 
 def _company(entry: Entry, entries: Sequence[Entry]) -> int:
-    """Return how many entries share the model and the learner of this one."""
+    """Return how many entries share the model, the learner and the limits of this one."""
     own = _setting(entry)
     return sum(_setting(one) == own for one in entries)
 

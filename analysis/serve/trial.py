@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from analysis.data.bounded_states import bounded_states
 from analysis.figures.phase_portraits.data import DrawnPlane
 from analysis.serve.errors import NotFoundError
 from analysis.serve.policy_labels import legend_entry
@@ -55,6 +56,7 @@ def trial(state: ServerState, params: QueryParams) -> dict[str, Any]:
     reader = state.database.reader()
     row = _row(reader, params)
     config = completed(json.loads(row.pop("config_json")))
+    system = _system(config)
     return {
         "progress": read_progress(reader),
         "trial": row,
@@ -67,7 +69,8 @@ def trial(state: ServerState, params: QueryParams) -> dict[str, Any]:
         "assessments": _table(reader, _ASSESSED, row["trial_id"]),
         "has_arrays": row["status"] in ("done", "diverged"),
         "exploration": _exploration(reader, row["trial_key"]),
-        "system_is_known": _system(config) is not None,
+        "system_is_known": system is not None,
+        "has_bounded_states": bool(system and bounded_states(config, system)),
         "legend_entry": legend_entry(row["policy"]),
     }
 
@@ -101,6 +104,7 @@ def arrays(state: ServerState, params: QueryParams) -> dict[str, Any]:
         ],
         "spectrum": _spectrum(trajectory, row["dt"], system),
         "phase": _phase(trajectory, system) if system else None,
+        "bounded": _bounded(trajectory, config, system) if system else [],
     }
 
 
@@ -151,6 +155,20 @@ def _phase(trajectory: Trajectory, system: System) -> dict[str, Any]:
         "angles": plane.angles,
         "box": plane.box,
     }
+
+
+def _bounded(
+    trajectory: Trajectory, config: dict[str, Any], system: System
+) -> list[dict[str, Any]]:
+    """Return the states that limits bound, after each step, with their bounds; None for none."""
+    return [
+        {
+            "label": system.state_labels[place],
+            "values": trajectory.states[1:, place],
+            "bounds": [float(bound) if math.isfinite(bound) else None for bound in bounds],
+        }
+        for place, bounds in bounded_states(config, system).items()
+    ]
 
 
 def _spectrum(trajectory: Trajectory, dt: float, system: System | None) -> dict[str, Any]:

@@ -42,6 +42,9 @@ _COLUMNS = {
 
 _LOSS = "env.loss"
 
+_ALWAYS = (_LOSS, "limits.name", "limits.enforced")
+"""What a label names wherever it is unusual: trials with it are not to be taken for others."""
+
 _NAMED = ("limits.bounds.", "limits.rates.")
 """Settings that have no default: each stands under a name of the system."""
 
@@ -76,7 +79,8 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
     """Return a label for each configuration that says only what differs among those of its env.
 
     The policy is named where several are shown. Of the settings that differ, usual values are left
-    out, unless the label would be empty or equal to that of another configuration.
+    out, unless the label would be empty or equal to that of another configuration. A loss
+    of its own and limits are always named, the bounds only where they differ.
     """
     flats = [flatten(completed(config)) for config in configs]
     titled = len({flat.get("policy.name") for flat in flats}) > 1
@@ -100,8 +104,9 @@ def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[
         words = _words(flat, [path for path in paths if _is_unusual(path, flat, own)])
         brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
         whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
-        if _LOSS in flat and _LOSS not in paths:  # never to be taken for another loss
-            brief, whole = ([*one, *_words(flat, [_LOSS])] for one in (brief, whole))
+        rest = [path for path in _paths([flat]) if path in _ALWAYS and path not in paths]
+        always = [path for path in rest if _is_unusual(path, flat, own)]
+        brief, whole = ([*one, *_words(flat, always)] for one in (brief, whole))
         rows.append((", ".join(brief), ", ".join(whole)))
     counts = Counter(brief for brief, _ in rows)
     return [brief if counts[brief] == 1 else whole for brief, whole in rows]
@@ -117,6 +122,13 @@ def _is_unusual(path: str, flat: Flat, usual: Flat) -> bool:
     """Whether a configuration has a setting other than the default, its versions apart."""
     hidden = path.endswith("_version")
     return not hidden and path in flat and (path not in usual or flat[path] != usual[path])
+
+
+def limits_label(config: Mapping[str, object]) -> str:
+    """Return the words for limits, such as ``limits, y=[-2, 2]``; empty without any."""
+    flat, usual = flatten(config), usual_values(config)
+    paths = [path for path in _paths([flat]) if path.startswith("limits.")]
+    return ", ".join(_words(flat, [path for path in paths if _is_unusual(path, flat, usual)]))
 
 
 def value_label(path: str, value: object) -> str:
@@ -192,9 +204,13 @@ def _title(flat: Flat) -> str:
 
 
 def _paths(flats: Sequence[Flat]) -> list[str]:
-    """Return all paths that a label can name, the model and the learner first."""
+    """Return all paths that a label can name, the model and the learner first.
+
+    The name of limits goes before what they are.
+    """
     paths = set().union(*flats) - set(_TITLED)
-    return [*(path for path in _FIRST if path in paths), *sorted(paths - set(_FIRST))]
+    rest = sorted(paths - set(_FIRST), key=lambda path: path.replace("limits.name", "limits."))
+    return [*(path for path in _FIRST if path in paths), *rest]
 
 
 def _words(flat: Flat, paths: Sequence[str], digits: int = 6) -> list[str]:

@@ -74,6 +74,9 @@ def _outcome(found: TrialReport) -> Text:
         for name in ("final_loss", "best_loss")
         if trial[name] is not None
     ]
+    words += [
+        f"{name} {value:.6g}" for name, value in found.beyond_limits.items() if value is not None
+    ]
     if trial["error_type"] is not None:
         words.append(f"{trial['error_type']}: {trial['error_message']}")
     return plain(" · ".join(words))

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from dopt.limits import VIOLATIONS, WORST
 from dopt.spec.added_fields import completed
 from orchestrate.redaction import without_password
 from orchestrate.store import ExplorationRow, Reader, explorations
@@ -22,6 +23,10 @@ WHERE a.trial_id = :trial_id
 ORDER BY a.attempt
 """
 _LOSS = "SELECT loss FROM step WHERE trial_id = :trial_id ORDER BY t"
+_BEYOND = f"""
+SELECT measure, value FROM assessment
+WHERE trial_id = :trial_id AND measure IN ('{VIOLATIONS}', '{WORST}') ORDER BY t, measure
+"""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,8 @@ class TrialReport:
         One for each claim, with its error if there was one.
     loss
         The loss curve, with None for values that are not finite; empty if there is none.
+    beyond_limits
+        ``violations`` and ``worst`` of a trial with limits (:data:`dopt.assessment.MEASURES`).
     exploration
         Steps of an exploration, and whether it goes on; None for another trial.
     """
@@ -49,6 +56,7 @@ class TrialReport:
     launches: Sequence[Mapping[str, Any]]
     attempts: Sequence[Mapping[str, Any]]
     loss: Sequence[float | None]
+    beyond_limits: Mapping[str, float | None]
     exploration: ExplorationRow | None = None
 
 
@@ -67,6 +75,7 @@ def report(reader: Reader, trial_id: int) -> TrialReport:
         ],
         attempts=attempts,
         loss=[row[0] for row in reader.rows(_LOSS, trial_id=trial_id)],
+        beyond_limits={row[0]: row[1] for row in reader.rows(_BEYOND, trial_id=trial_id)},
         exploration=next(
             (one for one in explorations(reader) if one.trial_key == trial["trial_key"]), None
         ),

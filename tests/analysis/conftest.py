@@ -12,6 +12,7 @@ from tests.analysis.synthetic import fill, make_grid
 
 SHORT = {"env": {"horizon": 60}}
 WIDTHS = (4, 8, 32, 64)
+RAIL = {"bounds": {"y": [-0.5, 0.5]}}
 WINDOWS = (10, 20, 40, 60)
 
 
@@ -31,6 +32,23 @@ def controlled(seeds: Iterable[int]) -> list[TrialSpec]:
     task = {"task": {"name": "control", "checkpoints": [20, 40]}}
     policies = ("d_optimal", "uniform", "random")
     return make_grid(("pendulum", "quadrotor"), policies, seeds, **SHORT, **task)
+
+
+def limited(
+    policies: Iterable[str], seeds: Iterable[int], **sections: Mapping[str, object]
+) -> list[TrialSpec]:
+    """Return trials in the cartpole with a rail of half a metre to each side.
+
+    Its bounds are counted only in half of them, and enforced in the others.
+    """
+    return [
+        spec
+        for enforced in (False, True)
+        for spec in make_grid(
+            ("cartpole",), policies, seeds, limits={**RAIL, "enforced": enforced},
+            **{**SHORT, **sections},
+        )
+    ]  # fmt: skip
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 import numpy.typing as npt
 
+from dopt.assessment import violations
 from dopt.errors import IncompatibleError
 from dopt.models import MLP
 from dopt.result import Assessment, TrialResult
@@ -103,6 +104,10 @@ def _result(
     if diverged_at is not None:
         for values in (*columns.values(), inputs, states[1:]):
             values[diverged_at:] = np.nan
+    assessments = _assessments(spec, rng) if spec.task else ()
+    if spec.limits:
+        last = system.horizon if diverged_at is None else diverged_at
+        assessments += violations(system, spec.limits, states[: last + 1])
     return TrialResult(
         **columns,
         states=states,
@@ -111,7 +116,7 @@ def _result(
         diverged_at=diverged_at,
         wall_seconds=0.1,
         cpu_seconds=0.1,
-        assessments=_assessments(spec, rng) if spec.task else (),
+        assessments=assessments,
     )
 
 

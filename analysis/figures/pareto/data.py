@@ -1,7 +1,7 @@
 """Figure 6 as numbers: final loss and time of a step of every configuration, and the Pareto front.
 
 A configuration is a policy, a model and a learner with all their settings. Environments are
-compared in one env section each, that of most trials.
+compared in one env section and under one section of limits each, those of most trials.
 """
 
 from __future__ import annotations
@@ -94,7 +94,8 @@ def pareto_part(selection: Selection) -> Selection:
         key=lambda one: one.config.env,
     ):
         finished = [one for one in group if one.finished and one.config.policy != APART]
-        own = one_each(one_world(finished), number_of_trials) if finished else []
+        world = one_world(one_world(finished), "limits") if finished else []
+        own = one_each(world, number_of_trials)
         kept += own if len(own) >= FEWEST else []
     entries = tuple(labelled(kept))
     return Selection(entries, notes=tuple(unfinished(entries)))
@@ -121,7 +122,7 @@ def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:
     They are the words of labels of configurations that differ in this section alone.
     """
     first = {section_text(entry, section): entry.config for entry in entries}
-    rest = entries[0].config.config
+    rest = {key: own for key, own in entries[0].config.config.items() if key != "limits"}
     alike = [
         replace(config, config={**rest, section: config.config[section]})
         for config in first.values()

@@ -73,6 +73,13 @@ def one_trial(url: str) -> None:
     fill(url, make_grid(("pendulum",), ("d_optimal",), range(1), **SHORT))
 
 
+def with_limits(url: str) -> None:
+    """Make a database of two trials in the cartpole on a rail, the second of which diverged."""
+    limits = {"bounds": {"y": [-0.1, 0.1], "φ̇": [None, 9.0]}, "enforced": False}
+    specs = make_grid(("cartpole",), ("d_optimal",), range(2), limits=limits, **SHORT)
+    fill(url, specs, diverged={specs[1].trial_key: 17})
+
+
 def all_diverged(url: str) -> None:
     """Make a database of which every trial diverged, one of them at once."""
     specs = make_grid(("pendulum",), ("d_optimal", "random"), range(3), **SHORT)

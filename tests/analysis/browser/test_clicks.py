@@ -56,6 +56,18 @@ def test_from_the_grid_to_a_trial(page: Page) -> None:
     expect(page.locator("tbody tr")).to_have_count(4)
 
 
+def test_states_with_bounds_have_a_chart(show: Callable[[str], Page], tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/limits.db"
+    grids.with_limits(url)
+    page = show(url)
+    page.goto("/trials")
+    page.locator("tbody").get_by_role("link").first.click()
+    page.wait_for_selector("#charts[data-drawn]")
+    expect(page.locator("#states canvas")).to_have_count(1)
+    expect(page.locator("#states-legend li")).to_have_count(2)
+    expect(page.locator("#charts canvas")).to_have_count(4)
+
+
 def test_curves_follow_the_controls(page: Page) -> None:
     page.goto("/curves")
     chart, rows = page.locator("#chart"), page.locator("#legend tbody tr")

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from orchestrate.store import Store
+from orchestrate.store import Reader, Store
 from tests.analysis.browser import grids
 from tests.analysis.synthetic import make_grid
 
@@ -98,6 +99,27 @@ def test_where_all_diverged_there_is_no_mean(url: str, visit: Visit) -> None:
         arrays = client.get(f"/api/trials/{row['trial_key']}/arrays").json()
         assert arrays["loss"][-1] is None
     assert client.get("/compare").status_code == 400
+
+
+def test_a_trial_with_limits_shows_bounds_and_what_is_beyond(url: str, visit: Visit) -> None:
+    grids.with_limits(url)
+    client = visit(url)
+    with Reader.open(url) as reader:
+        (config,) = reader.configs()
+        first, second = reader.trials(config.config_key)
+        states = reader.trajectory(config.config_key, first.seed).states[1:]
+    beyond = (np.abs(states[:, 0]) > 0.1) | (states[:, 3] > 9.0)
+    page = client.get(f"/trials/{first.trial_key}").text
+    assert f"<dd>{np.count_nonzero(beyond)} of 40</dd>" in page
+    assert "farthest beyond limits" in page
+    assert "counted only" in page
+    bounded = client.get(f"/api/trials/{first.trial_key}/arrays").json()["bounded"]
+    assert [one["label"] for one in bounded] == ["y [m]", "φ̇ [rad/s]"]
+    assert [one["bounds"] for one in bounded] == [[-0.1, 0.1], [None, 9.0]]
+    assert bounded[0]["values"] == states[:, 0].tolist()
+    arrays = client.get(f"/api/trials/{second.trial_key}/arrays").json()
+    assert arrays["bounded"][0]["values"][17:] == [None] * 23
+    assert " of 17</dd>" in client.get(f"/trials/{second.trial_key}").text
 
 
 def test_a_database_may_come_later_and_be_made_anew(tmp_path: Path, visit: Visit) -> None:

@@ -66,6 +66,31 @@ def test_a_task_is_no_departure_but_the_last_to_decide() -> None:
     assert choose([Candidate(assessed, 5), Candidate(plain, 5), Candidate(far, 5)]) == [plain]
 
 
+def test_policies_under_other_limits_are_never_mixed_in() -> None:
+    rail = {"bounds": {"y": [-2.0, 2.0]}}
+    kinds = {
+        "none": {},
+        "counted": {"limits": {**rail, "enforced": False}},
+        "enforced": {"limits": {**rail, "enforced": True}},
+    }
+    stored = {
+        (policy, kind): config("cartpole", policy, **limits)
+        for policy in ("d_optimal", "random", "oracle")
+        for kind, limits in kinds.items()
+    }
+
+    def chosen(**trials: int) -> set[str]:
+        pool = [Candidate(one, trials.get(kind, 0)) for (_, kind), one in stored.items()]
+        kept = {one.config_key for one in choose([one for one in pool if one.n_trials])}
+        return {kind for (_, kind), one in stored.items() if one.config_key in kept}
+
+    assert chosen(none=5, counted=5, enforced=5) == {"none"}
+    assert chosen(counted=5, enforced=5) == {"enforced"}
+    assert chosen(none=3, counted=5) == {"counted"}
+    reference, oracle = stored["d_optimal", "enforced"], stored["oracle", "none"]
+    assert choose([Candidate(reference, 5), Candidate(oracle, 9)]) == [reference]
+
+
 def test_of_learners_with_as_many_trials_that_of_a_launch_decides() -> None:
     learners = {name: {"learner": {"name": name}} for name in ("adam_window", "ekf", "adam_replay")}
     configs = {

@@ -24,6 +24,8 @@ from analysis.outputs.names import FIGURES, NAMES
 from analysis.outputs.registry import PLOTS, build
 from analysis.plot_options import PlotOptions
 from orchestrate.store import Reader
+from tests.analysis.conftest import limited
+from tests.analysis.synthetic import fill
 
 QUICK = ("figure2_spectrum", "comparison")
 
@@ -32,9 +34,11 @@ pytestmark = pytest.mark.xdist_group("figures")  # all outputs are drawn once fo
 
 @pytest.fixture(scope="module")
 def folder(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All outputs of the complete grid, made once."""
+    """All outputs of the complete grid and of trials with limits, made once."""
     target = tmp_path_factory.mktemp("figures")
-    with Reader.open(url) as reader:
+    whole = shutil.copy(url.removeprefix("sqlite:///"), tmp_path_factory.mktemp("whole"))
+    fill(f"sqlite:///{whole}", limited(("d_optimal",), range(5)))
+    with Reader.open(f"sqlite:///{whole}") as reader:
         outcomes = list(build(reader, select(reader, Filter()), PlotOptions(), target))
     assert [(outcome.name, outcome.state) for outcome in outcomes] == [
         (name, "written") for name in (*NAMES, "README.md")

@@ -38,7 +38,10 @@ WIDE = config("pendulum", "d_optimal", model={"width": 64})
 ORACLE = config("pendulum", "oracle")
 RANDOM = config("pendulum", "random")
 TASK = config("pendulum", "random", task={"name": "control"})
-ALL = (PLAIN, BOUND, REPLAY, WIDE, ORACLE, RANDOM, TASK)
+RAIL = {"bounds": {"φ": [-2.0, 2.0]}}
+ENFORCED = config("pendulum", "d_optimal", limits=RAIL)
+COUNTED = config("pendulum", "d_optimal", limits={**RAIL, "enforced": False})
+ALL = (PLAIN, BOUND, REPLAY, WIDE, ORACLE, RANDOM, TASK, ENFORCED, COUNTED)
 
 
 @pytest.mark.parametrize(
@@ -50,6 +53,8 @@ ALL = (PLAIN, BOUND, REPLAY, WIDE, ORACLE, RANDOM, TASK)
         (WIDE, "D-optimal, width 64"),
         (ORACLE, "oracle"),
         (TASK, "random, task control"),
+        (ENFORCED, "D-optimal, limits, φ=[-2, 2]"),
+        (COUNTED, "D-optimal, limits, φ=[-2, 2], enforced=False"),
     ],
 )
 def test_a_stored_label_says_what_is_not_the_default(one: Config, label: str) -> None:
@@ -66,6 +71,10 @@ def test_a_stored_label_says_what_is_not_the_default(one: Config, label: str) ->
         ([PLAIN, RANDOM], ["D-optimal", "random"]),
         ([PLAIN, RANDOM, BOUND], ["D-optimal", "random", "D-optimal, γ=3"]),
         ([RANDOM, TASK], ["random", "task control"]),
+        ([PLAIN, ENFORCED], ["D-optimal", "limits, φ=[-2, 2]"]),
+        ([ENFORCED], ["D-optimal, limits"]),
+        ([COUNTED], ["D-optimal, limits, enforced=False"]),
+        ([ENFORCED, COUNTED], ["enforced=True, limits", "enforced=False, limits"]),
         ([], []),
     ],
 )

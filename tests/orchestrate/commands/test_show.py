@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from dopt.result import Assessment
 from orchestrate.commands.sparkline import sparkline
 from orchestrate.store import Store
 from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, Answer, failure, run_now
@@ -72,6 +74,20 @@ def test_a_trial_that_has_not_begun(command: Run) -> None:
     assert (document["attempts"], document["launches"], document["loss"]) == ([], [], [])
     assert "pending" in command("show", waiting.trial_key).out
     assert "running" in command("show", RUNNING.trial_key).out
+
+
+def test_a_trial_with_limits_shows_what_was_beyond_them(
+    store: Store, command: Run, grid: int
+) -> None:
+    spec = Spec(9, policy="uniform")
+    store.register(grid, [spec])
+    (claim,) = store.claim(grid, [spec.trial_key])
+    beyond = Assessment(HORIZON, "violations", 3.0), Assessment(HORIZON, "worst", 0.1234567)
+    assert store.commit(claim, replace(result(9), assessments=beyond), run_now())
+    assert "· violations 3 · worst 0.123457\n" in command("show", spec.trial_key).out
+    document = command("show", spec.trial_key, "--json").document
+    assert document["beyond_limits"] == {"violations": 3.0, "worst": 0.1234567}
+    assert command("show", DONE[1].trial_key, "--json").document["beyond_limits"] == {}
 
 
 def test_names_instead_of_a_key(command: Run) -> None:

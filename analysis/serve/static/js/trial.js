@@ -1,4 +1,4 @@
-/** Trial page: charts of loss, inputs, spectrum and phase plane. */
+/** Trial page: charts of loss, inputs, bounded states, spectrum and phase plane. */
 
 import { hoverBox } from "./hover.js";
 import { swatch } from "./legend.js";
@@ -60,7 +60,7 @@ function drawLoss(found) {
 
 function drawInputs(found) {
   const times = found.t.map((t) => t * found.dt);
-  const series = [{}, ...found.inputs.map((_, index) => line(paint(found, index), { width: 1.2 }))];
+  const series = [{}, ...found.inputs.map((_, index) => line(paint(found, found.inputs, index), { width: 1.2 }))];
   const chart = drawn(
     part("inputs"),
     {
@@ -74,26 +74,50 @@ function drawInputs(found) {
   );
   hoverBox(part("inputs"), chart, (index) => ({
     title: `t = ${numeral(times[index])} s`,
-    rows: found.inputs.map((one, i) => ({ line: sample(paint(found, i)), label: one.label, value: numeral(one.values[index]) })),
+    rows: found.inputs.map((one, i) => ({ line: sample(paint(found, found.inputs, i)), label: one.label, value: numeral(one.values[index]) })),
   }));
-  nameInputs(found);
+  nameLines("inputs-legend", found.inputs, found);
   const names = found.inputs.length > 1 ? `Bound of the norm` : `Bound`;
   part("inputs-note").textContent = `${names}: γ = ${numeral(found.gamma, 3)}.`;
 }
 
-/** Write the legend of several inputs above their chart. */
-function nameInputs(found) {
-  const items = found.inputs.map((one, index) => {
+/** Write the legend of several lines above their chart. */
+function nameLines(place, lines, found) {
+  const items = lines.map((one, index) => {
     const item = document.createElement("li");
-    item.append(swatch(sample(paint(found, index))), one.label);
+    item.append(swatch(sample(paint(found, lines, index))), one.label);
     return item;
   });
-  part("inputs-legend").replaceChildren(...items);
-  part("inputs-legend").hidden = items.length < 2;
+  part(place).replaceChildren(...items);
+  part(place).hidden = items.length < 2;
 }
 
-function paint(found, index) {
-  return found.inputs.length === 1 ? found.legend_entry.colour : PAINTS[index % PAINTS.length];
+function paint(found, lines, index) {
+  return lines.length === 1 ? found.legend_entry.colour : PAINTS[index % PAINTS.length];
+}
+
+/** States that limits bound, each with dashed lines at its bounds. */
+function drawStates(found) {
+  const lines = found.bounded;
+  const times = found.t.map((t) => (t + 1) * found.dt);
+  const series = [{}];
+  const data = [times];
+  lines.forEach((one, index) => {
+    const colour = paint(found, lines, index);
+    series.push(line(colour, { width: 1.2 }));
+    data.push(one.values);
+    for (const bound of one.bounds.filter((value) => value !== null)) {
+      series.push(line(colour, { width: 1, dash: [5, 4] }));
+      data.push(times.map(() => bound));
+    }
+  });
+  const axes = [axis("time [s]", false, { size: 38 }), axis(lines.map((one) => one.label).join(", "), false, { size: 54 })];
+  const chart = drawn(part("states"), { series, scales: { x: { time: false } }, axes, cursor: SILENT }, data, HEIGHT);
+  hoverBox(part("states"), chart, (index) => ({
+    title: `t = ${numeral(times[index])} s`,
+    rows: lines.map((one, i) => ({ line: sample(paint(found, lines, i)), label: one.label, value: numeral(one.values[index]) })),
+  }));
+  nameLines("states-legend", lines, found);
 }
 
 function drawSpectrum(found) {
@@ -157,6 +181,7 @@ async function load() {
     if (!answer.ok) throw new Error(found.error);
     drawLoss(found);
     drawInputs(found);
+    if (part("states")) drawStates(found);
     drawSpectrum(found);
     if (found.phase && part("phase")) {
       drawPhase(part("phase"), found.phase, found.legend_entry.colour, `Path in the plane of ${found.phase.labels.join(" and ")}`);
