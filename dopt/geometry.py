@@ -14,7 +14,16 @@ from functools import singledispatch
 import numpy as np
 import numpy.typing as npt
 
-from dopt.systems import Arm, Cartpole, Chain, MassSpring, Pendulum, Quadrotor, System
+from dopt.systems import (
+    Arm,
+    Cartpole,
+    Chain,
+    MassSpring,
+    Pendulum,
+    Quadrotor,
+    System,
+    UnbalancedDisk,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -23,6 +32,10 @@ CART = (0.3, 0.12)
 
 BLOCK = 0.3
 """Half the side of a mass between springs that is drawn [m]; at rest they are 2 m apart."""
+
+
+RIM = 1.2
+"""Radius of the disk that is drawn [m]; its weight is 1 m from the centre."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +64,15 @@ def body(system: System, states: Array) -> Body | None:  # noqa: ARG001  # its v
 def _(system: Pendulum, states: Array) -> Body:
     tip = _hanging(states[:, 0], system.length)
     return Body((_polyline(np.zeros_like(tip), tip),), tip[:, None])
+
+
+@body.register
+def _(system: UnbalancedDisk, states: Array) -> Body:  # noqa: ARG001  # its class decides
+    weight = _hanging(states[:, 0], 1.0)
+    turn = np.linspace(0.0, 2.0 * np.pi, 25)
+    rim = RIM * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    spoke = _polyline(np.zeros_like(weight), weight)
+    return Body((np.broadcast_to(rim, (len(states), *rim.shape)), spoke), weight[:, None])
 
 
 @body.register

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.spec.added_fields import completed
 from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import ALL_PAIRS, trial
 
@@ -111,7 +112,8 @@ def test_canonical_json_is_sorted_compact_json_of_the_content() -> None:
     spec = trial("cartpole", "periodic", 5)
     content = json.loads(spec.canonical_json())
     assert content["seed"] == 5
-    assert {key: content[key] for key in spec.to_mapping()} == spec.to_mapping()
+    whole = completed(content)
+    assert {key: whole[key] for key in spec.to_mapping()} == spec.to_mapping()
     written = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     assert spec.canonical_json() == written
     del content["seed"]
