@@ -58,7 +58,7 @@ TIE_MARGIN = 1e-9
 """Values that differ by less than this relative margin are equal: rounding must not choose."""
 
 NEWEST_ERRORS = 25
-"""Number of newest samples over which limits take the mean of the model's squared error."""
+"""Samples over which limits take the exponential mean of the model's squared error."""
 
 INVARIANT = 1e-9
 """A Krylov direction shorter than this beside its origin is rounding: the space is invariant."""

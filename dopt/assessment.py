@@ -16,7 +16,7 @@ from dopt.control.prediction import Forecast
 from dopt.control.task import Control
 from dopt.coverage import Plane
 from dopt.forecasts import model_forecast, true_forecast
-from dopt.limits import VIOLATIONS, WORST, Limits
+from dopt.limits import VIOLATIONS, WORST
 from dopt.models.base import Model
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
@@ -113,13 +113,14 @@ def assessed(spec: TrialSpec, result: TrialResult) -> TrialResult:
     if spec.task is not None:
         rows += assess(spec, spec.task, result.checkpoints, result.states)
     if spec.limits is not None:
-        rows += violations(spec.system, spec.limits, result.states[: result.n_steps + 1])
+        reached = result.states[1:]
+        finite = np.isfinite(reached).all(axis=1)
+        rows += violations(spec.limits.excess(spec.system, reached[finite]))
     return dataclasses.replace(result, assessments=rows) if rows else result
 
 
-def violations(system: System, limits: Limits, states: Array) -> tuple[Assessment, ...]:
-    """Return the measures of limits over the states, (t + 1, d), of t steps."""
-    excess = limits.excess(system, states[1:])
+def violations(excess: Array) -> tuple[Assessment, ...]:
+    """Return the measures of limits after t steps, whose states are so far beyond bounds, (t,)."""
     t = len(excess)
     return (
         Assessment(t, VIOLATIONS, float(np.count_nonzero(excess))),

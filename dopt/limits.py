@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -58,6 +58,15 @@ class Limits(Validated):
     rates: tuple[tuple[str, float], ...] = unvalidated(())
     enforced: bool = unvalidated(True)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        bounds = tuple((str(name), *_interval(str(name), pair)) for name, *pair in self.bounds)
+        rates = tuple((str(name), _rate(str(name), rate)) for name, rate in self.rates)
+        object.__setattr__(self, "bounds", bounds)
+        object.__setattr__(self, "rates", rates)
+        if not isinstance(self.enforced, bool):
+            raise _unlike("enforced", self.enforced, "true or false")
+
     @classmethod
     def from_section(cls, section: Mapping[str, Any]) -> Limits:
         """Return the limits that a section of a configuration describes.
@@ -74,13 +83,9 @@ class Limits(Validated):
         for key in section:
             if key not in ("name", *keys):
                 raise unknown_name("limits field", key, keys)
-        given = {key: value for key, value in section.items() if key in ("steps", "margin")}
-        enforced = section.get("enforced", True)
-        if not isinstance(enforced, bool):
-            raise _unlike("enforced", enforced, "true or false")
-        bounds = tuple((name, *_interval(name, pair)) for name, pair in _named(section, "bounds"))
-        rates = tuple((name, _rate(name, rate)) for name, rate in _named(section, "rates"))
-        return cls(**given, bounds=bounds, rates=rates, enforced=enforced)
+        given = {key: value for key, value in section.items() if key != "name"}
+        bounds = tuple((name, *_pair(name, pair)) for name, pair in _named(section, "bounds"))
+        return cls(**given | {"bounds": bounds, "rates": tuple(_named(section, "rates"))})
 
     def to_section(self) -> dict[str, object]:
         """Return the section that :meth:`from_section` turns into these limits."""
@@ -96,6 +101,11 @@ class Limits(Validated):
     def check(self, system: System) -> None:
         """Refuse a name that a system does not have, and bounds that it cannot heed."""
         states, inputs = names_of(system.state_labels), names_of(system.input_labels)
+        if not self.rates and not any(map(math.isfinite, _ends(self.bounds))):
+            raise SpecificationError(
+                "limits have neither a bound nor a rate, but at least one is expected: set "
+                f"limits.bounds of {', '.join((*states, *inputs))}, or choose limits=none."
+            )
         for name, low, high in self.bounds:
             if name not in (*states, *inputs):
                 raise unknown_name("state or input in limits.bounds", name, (*states, *inputs))
@@ -158,33 +168,56 @@ def names_of(labels: Sequence[str]) -> list[str]:
     return [label.partition(" [")[0] for label in labels]
 
 
+def _ends(bounds: Iterable[tuple[str, float, float]]) -> Iterator[float]:
+    for _, low, high in bounds:
+        yield from (low, high)
+
+
 def _named(section: Mapping[str, Any], key: str) -> list[tuple[str, Any]]:
-    given = section.get(key) or {}
+    given = section.get(key)
+    if given is None:
+        return []
     if not isinstance(given, Mapping):
         raise _unlike(key, given, "a mapping of names")
     return [(str(name), value) for name, value in given.items()]
 
 
-def _interval(name: str, given: object) -> Interval:
-    what, expected = f"bounds.{name}", "a pair of numbers, the lower one first, or null for none"
-    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 2:
-        raise _unlike(what, given, expected)
-    low, high = given
-    low = -math.inf if low is None else low
-    high = math.inf if high is None else high
-    if not (_is_number(low) and _is_number(high) and low < high):
-        raise _unlike(what, given, expected)
-    return float(low), float(high)
+_PAIR = "a pair of numbers, the lower one first, or null for none"
+
+
+def _pair(name: str, given: object) -> tuple[object, object]:
+    if isinstance(given, str | Mapping) or not isinstance(given, Sequence | np.ndarray):
+        raise _unlike(f"bounds.{name}", given, _PAIR)
+    if len(given) != 2:
+        raise _unlike(f"bounds.{name}", given, _PAIR)
+    return given[0], given[1]
+
+
+def _interval(name: str, pair: Sequence[object]) -> Interval:
+    if len(pair) != 2:
+        raise _unlike(f"bounds.{name}", list(pair), _PAIR)
+    low = -math.inf if pair[0] is None else _number(pair[0])
+    high = math.inf if pair[1] is None else _number(pair[1])
+    if not low < high:  # also where one is NaN
+        raise _unlike(f"bounds.{name}", list(pair), _PAIR)
+    return low, high
 
 
 def _rate(name: str, given: object) -> float:
-    if not _is_number(given) or not 0.0 < float(given) < math.inf:  # type: ignore[arg-type]
+    rate = _number(given)
+    if not 0.0 < rate < math.inf:
         raise _unlike(f"rates.{name}", given, "a positive number")
-    return float(given)  # type: ignore[arg-type]
+    return rate
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+def _number(given: object) -> float:
+    """Return a number, NaN for what is none or is too large for one."""
+    if not isinstance(given, int | float | np.number) or isinstance(given, bool):
+        return math.nan
+    try:
+        return float(given)
+    except (OverflowError, TypeError):
+        return math.nan
 
 
 def _finite(bound: float) -> float | None:

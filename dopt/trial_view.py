@@ -25,8 +25,12 @@ class TrialView(ABC):
         x_0 ... x_t.
     inputs : (t, m)
         u_0 ... u_{t-1}.
+    sampled : (t, d)
+        States at which the accelerations were observed: x_0 ... x_{t-1}, and with
+        ``env.integrator=rk4`` the middle of each step.
     accelerations : (t, r)
-        Observed at x_0 ... x_{t-1}: (x_{s+1} - x_s)/dt less the known part, in the learned rows.
+        Observed there: (x_{s+1} - x_s)/dt less the known part, in the learned rows; with rk4 also
+        less what the model's own step differs from its acceleration there.
     parameters : (q,)
         Parameters θ of the model.
     """
@@ -35,6 +39,7 @@ class TrialView(ABC):
     t: int
     states: Array
     inputs: Array
+    sampled: Array
     accelerations: Array
     parameters: Array
 
@@ -55,7 +60,7 @@ class TrialView(ABC):
 
     @abstractmethod
     def following(self, state: Array, inputs: Array) -> Array:
-        """Return the predicted next states x + dt f_θ(x, u), (N, d), for inputs (N, m) at (d,)."""
+        """Return the predicted next states, (N, d), for inputs (N, m) at (d,)."""
 
     @abstractmethod
     def input_matrix(self, state: Array) -> Array:

@@ -44,8 +44,8 @@ class _Updater(Updater):
 
     def update(self, view: TrialView) -> Array:
         drawn = self._rng.choice(view.t, min(view.t, self._batch), replace=False)
-        errors = (view.accelerations[drawn] - view.predict(view.states[drawn])).ravel()
-        J = np.concatenate([view.jacobian(state) for state in view.states[drawn]])
+        errors = (view.accelerations[drawn] - view.predict(view.sampled[drawn])).ravel()
+        J = np.concatenate([view.jacobian(state) for state in view.sampled[drawn]])
         damped = J @ J.T + self._damping * np.eye(len(J))
         changed: Array = view.parameters + J.T @ np.linalg.solve(damped, errors)
         return changed

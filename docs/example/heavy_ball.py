@@ -9,6 +9,7 @@ import numpy as np
 
 from dopt.declare.validated_fields import parameter
 from dopt.kernel.information.update import model_rows
+from dopt.kernel.learners.samples import sampled_point
 from dopt.kernel.structs import Trial
 from dopt.learning.base import Array, CompiledLearner, CustomLearner, Updater
 from dopt.systems import System
@@ -38,7 +39,7 @@ class HeavyBall(CompiledLearner, CustomLearner):
         learning_rate, momentum = trial.algorithm.learner[0], trial.algorithm.learner[1]
         theta, velocity = trial.state.theta, trial.state.learner_memory
         value = np.empty(target.shape[0])
-        J = model_rows(trial.plant, trial.network, theta, trial.record.states[t], value)
+        J = model_rows(trial.plant, trial.network, theta, sampled_point(trial, t), value)
         for i in range(theta.shape[0]):
             slope = 0.0
             for k in range(target.shape[0]):
@@ -61,7 +62,7 @@ class _Updater(Updater):
         self._velocity: Array | float = 0.0
 
     def update(self, view: TrialView) -> Array:
-        x, y = view.states[-2], view.accelerations[-1]
+        x, y = view.sampled[-1], view.accelerations[-1]
         slope = 2.0 * (view.predict(x[None])[0] - y) @ view.jacobian(x)
         self._velocity = self._momentum * self._velocity - self._learning_rate * slope
         return view.parameters + self._velocity

@@ -20,6 +20,7 @@ from dopt.explorer.measured import measured
 from dopt.explorer.planner import PunctualPlanner
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import difference
+from dopt.spec.added_fields import completed
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import Plant
@@ -321,11 +322,11 @@ class Explorer(SavedExplored):
         if not journal.events:
             journal.write(about, durable=True)
             return
-        stored = journal.events[0]["trial"]
-        if stored != about["trial"]:
+        stored, given = completed(journal.events[0]["trial"]), completed(self.spec.to_mapping())
+        if stored != given:
             raise SpecificationError(
                 f"the journal {journal.path} is that of another exploration "
-                f"({difference(stored, about['trial'])}): give the same arguments as then, or "
+                f"({difference(stored, given)}): give the same arguments as then, or "
                 f"another file."
             )
         for event in journal.events[1:]:

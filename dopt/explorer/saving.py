@@ -86,7 +86,7 @@ class SavedExplored(Explored):
     def _result(self, test: Run | None) -> TrialResult:
         with self._lock:
             states, inputs, errors = self.states, self.inputs, self.errors
-            parameters = self.parameters.copy()
+            parameters, excess = self.parameters.copy(), self._state.excess[: self.n_steps].copy()
         at = _diverged_at(errors, parameters)
         n = len(errors) if at is None else at
         errors[n:] = np.nan
@@ -95,7 +95,7 @@ class SavedExplored(Explored):
         if test is not None:
             tested += (self._tested(test, n, parameters),)
         if self.spec.limits is not None:
-            tested += violations(self.spec.system, self.spec.limits, states[: n + 1])
+            tested += violations(excess[:n])
         return TrialResult(
             loss=errors,
             reachable_loss=unknown,

@@ -68,6 +68,8 @@ class ExplorerState:
         Input that was given for it.
     time : float or None
         When it was measured [s].
+    excess : (T,)
+        How far the state that each step led to is beyond the limits, 0 without limits.
     counts : Counter of str
         How often what happened (:class:`dopt.Explorer`).
     """
@@ -81,6 +83,7 @@ class ExplorerState:
         self._rows = list(spec.system.learned_rows)
         self._squares = np.zeros(spec.system.n_learned)
         self._told_of_plans = False
+        self.excess = np.zeros(spec.system.horizon)
 
     def do(self, event: Event) -> None:
         """Change by one event."""
@@ -128,6 +131,8 @@ class ExplorerState:
     def _learn(self, event: Event) -> None:
         t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
         self.steps.inputs[t], self.steps.states[t + 1] = u, x
+        if self.spec.limits is not None:
+            self.excess[t] = self.spec.limits.excess(self.spec.system, x[None])[0]
         self._watch_size(t, x, u, event["dt"])
         finite = self.steps.take_in(t, event["dt"])
         self.done += 1

@@ -259,8 +259,10 @@ def limits_of(config: TrialConfig) -> args.Limits:
 
 
 def _prediction_error(spec: TrialSpec) -> args.PredictionError:
-    r = spec.system.n_learned if limits_of(spec.config).enforced else 0
-    return args.PredictionError(np.zeros(r), np.zeros((2, r)))
+    r, m = spec.system.n_learned, spec.system.n_inputs
+    if not limits_of(spec.config).enforced:
+        r = m = 0
+    return args.PredictionError(np.zeros(r), np.zeros((2, r)), np.zeros(m))
 
 
 def _posterior(spec: TrialSpec) -> args.Posterior:

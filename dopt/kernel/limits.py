@@ -26,11 +26,33 @@ def limit_input(trial: Trial, t: int, u: Vector) -> None:
     limits, record = trial.limits, trial.record
     if not limits.enforced or not np.isfinite(u).all():
         return
-    before = record.inputs[t - 1] if t > 0 else np.zeros(u.shape[0])
+    before, x = input_before(trial), record.states[t]
     move_within(limits, before, u)
-    if limits.steps == 0:
-        return
-    x = record.states[t]
+    if limits.steps > 0:
+        keep_within_bounds(trial, x, before, u)
+    trial.state.prediction.last_input[:] = u
+
+
+@compiled
+def input_before(trial: Trial) -> Vector:
+    """Return the last input, (m,), moved into its box and the sphere ‖u‖ ≤ γ.
+
+    It is what was planned last, or what was applied in its place.
+    """
+    limits, before, norm = trial.limits, trial.state.prediction.last_input.copy(), 0.0
+    for j in range(before.shape[0]):
+        before[j] = min(max(before[j], limits.input_lower[j]), limits.input_upper[j])
+        norm += before[j] * before[j]
+    norm = np.sqrt(norm)
+    if norm > trial.plant.gamma:
+        before *= trial.plant.gamma / norm
+    return before
+
+
+@compiled
+def keep_within_bounds(trial: Trial, x: Vector, before: Vector, u: Vector) -> None:
+    """Replace an input that leads beyond the bounds of the states."""
+    limits = trial.limits
     backups = backup_inputs(trial.plant.gamma, u.shape[0])
     errors = error_bounds(trial, x)
     tried, best = np.empty(u.shape[0]), np.inf
@@ -78,8 +100,9 @@ def backup_inputs(gamma: float, m: int) -> Matrix:
 def error_bounds(trial: Trial, x: Vector) -> Vector:
     """Return the largest errors of predicted accelerations that are reckoned with, (r,).
 
-    They are the margin times √(s² (1 + h)): h = g M⁻¹ gᵀ at the predicted state is the model's own
-    uncertainty, 0 where no M is held, and s² is what it has proved to be worth so far.
+    Each acceleration is taken to be off alone, by the margin times √(s² (1 + h)): h = g M⁻¹ gᵀ at
+    the predicted state is the model's own uncertainty, 0 where no M is held or a search plans by
+    it, and s² is what it has proved to be worth so far.
     """
     plant, state, network = trial.plant, trial.state, trial.network
     error, r = state.prediction, plant.learned_rows.shape[0]
@@ -102,6 +125,7 @@ def note_error(trial: Trial, t: int, target: Vector) -> None:
     if not trial.limits.enforced:
         return
     error, value = trial.state.prediction, np.empty(target.shape[0])
+    error.last_input[:] = trial.record.inputs[t]
     point = sampled_point(trial, t)
     model_accelerations(trial.plant, trial.network, trial.state.theta, point, value)
     share = max(1.0 / (t + 1.0), 1.0 / NEWEST_ERRORS)

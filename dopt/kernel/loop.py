@@ -95,7 +95,7 @@ def take_in(trial: Trial, learn: Learn, t: int, dt: float) -> bool:
 
 @compiled
 def prediction_error(trial: Trial, t: int, dt: float) -> float:
-    """Return ‖y_t - a_θ(x_t, u_t)‖ of the accelerations observed from x_t to x_{t+1}.
+    """Return the error of the model at the accelerations observed from x_t to x_{t+1}.
 
     Of an ensemble the mean of the members is taken.
     """

@@ -218,10 +218,11 @@ class Members(NamedTuple):
 
 
 class PredictionError(NamedTuple):
-    """What the limits of a trial need to know of the model's error; empty in other trials."""
+    """What limits remember of the model's errors and of the inputs; empty in other trials."""
 
     scale: Vector  # (r,) mean of e²/(1 + h) over the newest samples
     variances: Matrix  # (2, r), h = g M⁻¹ gᵀ at the present and at the predicted state
+    last_input: Vector  # (m,) planned or applied
 
 
 class State(NamedTuple):

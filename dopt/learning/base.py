@@ -92,5 +92,5 @@ class CompiledLearner(Learner):
         t : int
             Number of the step that was just done, from 0.
         target : (r,)
-            Accelerations observed at x_t.
+            Accelerations observed in step t.
         """

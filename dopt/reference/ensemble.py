@@ -50,7 +50,7 @@ class EnsemblePlan:
         per_trial = len(self._others) // len(batch.theta)
         states, targets = (
             rows[:, : t + 1].repeat_interleave(per_trial, dim=0)
-            for rows in (batch.states, batch.targets)
+            for rows in (batch.sampled_states, batch.targets)
         )
         self._learner.learn(states, targets)
 

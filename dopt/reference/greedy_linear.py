@@ -33,6 +33,6 @@ class GreedyLinearPlan:
         return d_optimal_inputs(problem, batch.system.gamma, batch.ties[:, t])
 
     def inform(self, t: int) -> None:
-        """Count the state x_t."""
-        z = features(self._batch.system, self._batch.states[:, t])
+        """Count the state at which step t was observed."""
+        z = features(self._batch.system, self._batch.sampled_states[:, t])
         self._gram = self._gram + z.unsqueeze(-1) * z.unsqueeze(-2)

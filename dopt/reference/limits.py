@@ -32,6 +32,7 @@ class BatchLimits:
         signed = torch.stack([axes, -axes], dim=1).flatten(0, 1)
         self._backups = torch.cat([signed, torch.zeros_like(axes[:1])])
         self._scale = batch.theta.new_zeros(n, system.n_learned)
+        self._last_input, self._gamma = torch.zeros_like(batch.inputs[:, 0]), system.gamma
         self._variances = torch.zeros_like(self._scale), torch.zeros_like(self._scale)
         policy = batch.config.policy
         searches = isinstance(policy, (Search, ICEM))
@@ -39,12 +40,18 @@ class BatchLimits:
 
     def limited(self, t: int, u: Tensor) -> Tensor:
         """Return inputs, (n, m), that heed the limits in the place of u_t, (n, m)."""
-        batch = self._batch
-        before = batch.inputs[:, t - 1] if t > 0 else torch.zeros_like(u)
+        before = self._input_before()
         moved = self._within(before, u)
         if self._bounded:
             moved = self._kept(t, before, moved)
-        return torch.where(u.isfinite().all(dim=1, keepdim=True), moved, u)
+        self._last_input = torch.where(u.isfinite().all(dim=1, keepdim=True), moved, u)
+        return self._last_input
+
+    def _input_before(self) -> Tensor:
+        """Return the last inputs, (n, m), moved into their box and the sphere ‖u‖ ≤ γ."""
+        before = torch.clamp(self._last_input, self._input_lower, self._input_upper)
+        norm, gamma = torch.linalg.vector_norm(before, dim=1, keepdim=True), self._gamma
+        return torch.where(norm > gamma, before * (gamma / norm), before)
 
     def note_error(self, t: int, sampled: Tensor) -> None:
         """Take the errors of the accelerations observed at step t, before they are learned.
@@ -52,13 +59,14 @@ class BatchLimits:
         ``sampled``, (n, ·), are the points at which they were observed.
         """
         batch = self._batch
+        self._last_input = batch.inputs[:, t]
         value = vmap(batch.model)(batch.theta, sampled)
         square = (batch.targets[:, t] - value).square() / (1 + self._variances[0])
         self._scale += max(1 / (t + 1), 1 / NEWEST_ERRORS) * (square - self._scale)
 
     def _within(self, before: Tensor, u: Tensor) -> Tensor:
         """Move inputs, (..., m), into their box, and then towards those before them."""
-        u = torch.minimum(torch.maximum(u, self._input_lower), self._input_upper)
+        u = torch.clamp(u, self._input_lower, self._input_upper)
         change = (u - before).abs()
         share = torch.where(change > self._change, self._change / change, 1.0)
         share = share.amin(dim=-1, keepdim=True)

@@ -45,6 +45,8 @@ class BatchState:
         Parameters of the networks of an ensemble.
     states, inputs, targets : (n, T + 1, d), (n, T, m), (n, T, r) tensors
         Visited states, applied inputs and observed accelerations; NaN where no trial has come yet.
+    sampled_states : (n, T, d) tensor
+        States at which the accelerations were observed.
     information : (n, s, s) tensor or None
         M in the space to which ``project`` maps gradients, (..., q).
     held : Information or None
@@ -117,6 +119,7 @@ class BatchState:
             self.states[:, 0] = self.tensor(np.array(self.system.initial_state))
         self.inputs = self._unset(n, T, self.system.n_inputs)
         self.targets = self._unset(n, T, self.system.n_learned)
+        self.sampled_states = self._unset(n, T, self.system.n_states)
         self.diverged = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
 
     def _unset(self, *shape: int) -> Tensor:

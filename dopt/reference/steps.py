@@ -78,7 +78,10 @@ class BatchSteps(BatchState):
         With the integrator of Runge and Kutta, they are those of :func:`dopt.kernel.loop.observe`.
         """
         system, x, u = self.system, self.states[:, t], self.inputs[:, t]
-        rows, at = list(system.learned_rows), self._sampled_states(t)
+        rows, at = list(system.learned_rows), x
+        if system.integrator != "euler":
+            at = 0.5 * (x + self.states[:, t + 1])
+        self.sampled_states[:, t] = at
         known = known_flow(system, at, u)
         observed = ((self.states[:, t + 1] - x) / dt - known)[:, rows]
         if system.integrator != "euler":
@@ -121,14 +124,7 @@ class BatchSteps(BatchState):
 
     def sampled(self, steps: int | slice) -> Tensor:
         """Return the points at which the accelerations of some steps were observed, (n, ..., ·)."""
-        return self.points(self._sampled_states(steps), self.inputs[:, steps])
-
-    def _sampled_states(self, steps: int | slice) -> Tensor:
-        """Return x_t, or the middle of the step, (n, ..., d), for some steps."""
-        before, after = self.states[:, :-1], self.states[:, 1:]
-        if self.system.integrator == "euler":
-            return before[:, steps]
-        return 0.5 * (before[:, steps] + after[:, steps])
+        return self.points(self.sampled_states[:, steps], self.inputs[:, steps])
 
     def rows(self, t: int) -> Tensor:
         """Return J at (x_t, u_t) and the current parameters, (n, r, s), in the space of M."""

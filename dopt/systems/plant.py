@@ -78,7 +78,7 @@ class Plant:
         left out.
     integrator : {"euler", "rk4"}
         How the model's accelerations are compared with two states: as that at the first one, or
-        integrated over the step, which is exact to O(dt⁴).
+        integrated over the step by the method of Runge and Kutta.
 
     Raises
     ------

@@ -13,7 +13,7 @@ from orchestrate.store import ConfigRow
 
 NAMES = ("env", "policy", "width")
 DETAILS = tuple(name for name in COLUMNS if name not in NAMES)
-_TEXT_COLUMNS = ("env", "policy", "model", "learner", "task")
+_TEXT_COLUMNS = ("env", "policy", "model", "learner", "task", "limits")
 _STYLES = {
     "failed": "red",
     "diverged": "yellow",

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from dopt.spec.label import limits_label
 from orchestrate.store import ConfigRow
 
 COLUMNS = (
     *("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma", "task"),
+    "limits",
 )
 
 
 def column_text(config: ConfigRow, name: str) -> str:
     """Return the value of a column; "-" where the configuration has none."""
+    if name == "limits":
+        return limits_label(config.config) or "-"
     value = _task(config) if name == "task" else getattr(config, name)
     return "-" if value is None else str(value)
 

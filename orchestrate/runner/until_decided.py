@@ -124,16 +124,20 @@ class DecidedComparisons(SeedRule):
         return f"{decided:,} of {len(self._comparisons):,} comparisons decided"
 
 
+SHARED = ("env", "limits")
+"""Sections that a configuration and its reference have in common."""
+
+
 def _references(seeds: Seeds, policy: str) -> Iterator[tuple[str, str]]:
     """Yield each configuration with its reference, itself for a reference."""
     first = {key: trials[0] for key, trials in seeds.items()}
     found: dict[tuple[str, ...], str] = {}
     for key, trial in first.items():
         if trial.policy.name == policy:
-            found.setdefault(_part(trial, "env", "model"), key)
-            found.setdefault(_part(trial, "env"), key)
+            found.setdefault(_part(trial, *SHARED, "model"), key)
+            found.setdefault(_part(trial, *SHARED), key)
     for key, trial in first.items():
-        reference = found.get(_part(trial, "env", "model")) or found.get(_part(trial, "env"))
+        reference = found.get(_part(trial, *SHARED, "model")) or found.get(_part(trial, *SHARED))
         if reference is None:
             names = sorted({one.policy.name for one in first.values()})
             raise LaunchError(
@@ -146,7 +150,7 @@ def _references(seeds: Seeds, policy: str) -> Iterator[tuple[str, str]]:
 
 def _part(trial: TrialSpec, *sections: str) -> tuple[str, ...]:
     content = trial.to_mapping()
-    return tuple(json.dumps(content[section], sort_keys=True) for section in sections)
+    return tuple(json.dumps(content.get(section), sort_keys=True) for section in sections)
 
 
 def _pairs(own: list[TrialSpec], reference: list[TrialSpec]) -> list[tuple[int, str, str]]:

@@ -139,6 +139,58 @@ def test_an_explorer_fed_the_states_of_a_trial_chooses_its_inputs() -> None:
         explorer.tell(following)
 
 
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+def test_rates_are_counted_from_the_last_answer(path: str) -> None:
+    """Also where nothing was learned after it, and from an input that was applied instead."""
+    explorer = Explorer(limited("cartpole", None).system, limits={"rates": {"u": 50.0}}, path=path)
+    x, before = np.array([0.0, 0.0, np.pi, 0.0]), 0.0
+    for k in range(12):
+        u = explorer.ask(x + 0.01 * k)[0]  # each state is a jump
+        assert abs(u - before) <= 50.0 * 0.02 + 1e-12
+        before = u
+    explorer.tell(x, applied=[3.0])
+    assert abs(explorer.ask(x)[0] - 3.0) <= 50.0 * 0.02 + 1e-12
+
+
+@pytest.mark.parametrize("path", ["kernel", "reference"])
+def test_an_input_of_others_beyond_the_bounds_widens_none(path: str) -> None:
+    limits = {"bounds": {"u": [-1.0, 1.0]}, "rates": {"u": 1.0}}
+    explorer = Explorer(limited("cartpole", None).system, limits=limits, path=path)
+    x = np.array([0.0, 0.0, np.pi, 0.0])
+    explorer.ask(x)
+    explorer.tell(x + 1e-3, applied=[500.0])
+    assert abs(explorer.ask(x + 1e-3)[0]) <= 1.0
+
+
+def test_states_beyond_a_bound_count_after_a_reset() -> None:
+    explorer = Explorer(limited("cartpole", None).system, limits=RAIL)
+    x = np.array([0.0, 0.0, np.pi, 0.0])
+    explorer.ask(x)
+    explorer.tell(np.array([2.5, 0.0, np.pi, 0.0]))
+    explorer.reset()
+    explorer.ask(x)
+    explorer.tell(x)
+    rows = {row.measure: row.value for row in explorer._result(None).assessments}
+    assert rows == {"violations": 1.0, "worst": pytest.approx(0.5)}
+
+
+def test_violations_of_a_diverged_trial_are_those_before() -> None:
+    counted = RAIL | {"enforced": False, "bounds": {"ẏ": [-0.5, 0.5]}}
+    result = run_trial(limited("cartpole", counted, "random", state_limit=3.5, horizon=300))
+    assert result.diverged_at is not None
+    speeds = np.abs(result.states[1:, 1])
+    beyond = speeds[np.isfinite(speeds)] - 0.5
+    assert measures(result)["violations"] == np.count_nonzero(beyond > 0) > 0
+    assert measures(result)["worst"] == pytest.approx(beyond.max())
+
+
+def test_limits_are_checked_however_they_are_made() -> None:
+    assert Limits(bounds=(("y", -1, 1),)) == Limits.from_section({"bounds": {"y": (-1, 1)}})
+    assert Limits.from_section({"bounds": {"y": np.array([-1, 1])}}).bounds == (("y", -1.0, 1.0),)
+    with pytest.raises(SpecificationError, match=r"bounds\.y is \[2\.0, -2\.0\]"):
+        Limits(bounds=(("y", 2.0, -2.0),))
+
+
 def test_sections_describe_their_limits() -> None:
     spec = limited("cartpole", TIGHT | {"steps": 20})
     assert TrialSpec.from_mapping(spec.to_mapping()) == spec
@@ -153,7 +205,7 @@ def test_sections_describe_their_limits() -> None:
 
 def test_labels_name_the_bounds() -> None:
     label = config_label(limited("cartpole", RAIL).config.content())
-    assert label.endswith("y=[-2, 2], limits")
+    assert label.endswith("limits, y=[-2, 2]")
 
 
 WRONG = [
@@ -170,6 +222,11 @@ WRONG = [
     (RAIL | {"steps": 0}, r"limits\.steps is 0 steps, but it has to be"),
     (RAIL | {"margin": -1.0}, r"limits\.margin is -1\.0"),
     (RAIL | {"enforced": "no"}, r"limits\.enforced is 'no', but true or false"),
+    ({"bounds": {}}, "limits have neither a bound nor a rate, .* choose limits=none"),
+    ({"bounds": {"y": [None, None]}}, "limits have neither a bound nor a rate"),
+    ({"bounds": 0}, r"limits\.bounds is 0, but a mapping of names"),
+    ({"bounds": {"y": [-(10**400), 1]}}, r"limits\.bounds\.y is .* but a pair"),
+    ({"rates": {"u": 10**400}}, r"limits\.rates\.u is .* but a positive number"),
     ("rail", "configuration key 'limits' is 'rail', but a section"),
     ({"name": "sphere"}, "limits 'sphere' is unknown"),
 ]

@@ -32,7 +32,8 @@ _CONDITIONS = {
     "done trials that lack assessments": (
         f"r.status = 'done' AND c.config_json NOT LIKE '{PREQUENTIAL}' "
         "AND (coalesce(a.n, 0) <> coalesce(m.most, 0) "
-        """OR (c.config_json LIKE '%"task":{%' AND a.n IS NULL))"""
+        """OR (a.n IS NULL AND (c.config_json LIKE '%"task":{%' """
+        """OR c.config_json LIKE '%"limits":{%')))"""
     ),
     "unfinished trials with steps, a trajectory or assessments": (
         f"NOT {_FINISHED} AND (s.n > 0 OR p.trial_id IS NOT NULL OR a.n > 0)"

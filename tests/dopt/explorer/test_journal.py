@@ -18,6 +18,7 @@ import pytest
 from dopt import Explorer
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import Journal
+from dopt.systems import Pendulum
 from tests.dopt.explorer.plants import MOTOR, following
 from tests.dopt.explorer.test_explorer import explored
 from tests.paths import ROOT
@@ -129,6 +130,15 @@ def test_the_journal_of_another_exploration_is_refused(journal: Path) -> None:
     with pytest.raises(SpecificationError, match=r"seed was 0 and is 1.*another file"):
         Explorer(MOTOR, steps=5, journal=journal, seed=1)
     Explorer(MOTOR, steps=5, journal=journal).close()  # which is not locked by the refused one
+
+
+def test_a_journal_from_before_a_field_was_added_goes_on(journal: Path) -> None:
+    system = Pendulum(horizon=5)
+    Explorer(system, journal=journal).close()
+    text = journal.read_text()
+    assert '"integrator": "euler", ' in text
+    journal.write_text(text.replace('"integrator": "euler", ', ""))
+    Explorer(system, journal=journal).close()
 
 
 @pytest.mark.parametrize(

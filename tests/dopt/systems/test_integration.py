@@ -24,6 +24,7 @@ from dopt.systems import SYSTEMS, System
 from dopt.systems.integration import INTEGRATORS, next_state
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import LEARNERS, MODELS, SMALL_GRIDS, SMALL_SEARCHES
+from tests.paths import EXAMPLE
 
 
 def integrated(
@@ -150,6 +151,37 @@ def test_an_explorer_fed_the_states_of_a_trial_learns_what_it_learned() -> None:
         assert explorer.ask(x) == pytest.approx(u, abs=1e-12)
         explorer.tell(following)
     np.testing.assert_allclose(explorer.parameters, result.parameters, atol=1e-12)
+
+
+@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton"])
+def test_a_reset_changes_no_sample_before_it(learner: str) -> None:
+    """The state in which a plant starts anew takes the place of the one that was reached."""
+    spec = integrated("pendulum", "random", horizon=40)
+    explorers = [
+        Explorer(spec.system, policy="random", learner=learner, path=path)
+        for path in ("kernel", "reference")
+    ]
+    rng, x = np.random.default_rng(0), np.zeros(2)
+    for k in range(40):
+        x = rng.standard_normal(2) if k % 5 == 0 else x
+        for explorer in explorers:
+            if k % 5 == 0:
+                explorer.reset()
+            u = explorer.ask(x)
+        x = next_state("rk4", lambda z, u=u: spec.system.derivative(z, u), x, 0.02)
+        for explorer in explorers:
+            explorer.tell(x)
+    assert relative_gap(explorers[0].parameters, explorers[1].parameters) < 1e-7
+
+
+def test_the_view_of_a_plugin_has_the_sampled_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example's learner of the tutorial means the same on both paths."""
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    mapping = integrated("pendulum", "random").to_mapping()
+    own = {"_target_": "heavy_ball.HeavyBall"}
+    spec = TrialSpec.from_mapping({**mapping, "learner": own})
+    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
+    assert relative_gap(fast.parameters, plain.parameters) < 1e-10
 
 
 def test_keys_of_stored_trials_stay() -> None:
