@@ -107,7 +107,7 @@ def _result(
     assessments = _assessments(spec, rng) if spec.task else ()
     if spec.limits:
         last = system.horizon if diverged_at is None else diverged_at
-        assessments += violations(system, spec.limits, states[: last + 1])
+        assessments += violations(spec.limits.excess(system, states[1 : last + 1]))
     return TrialResult(
         **columns,
         states=states,

@@ -23,6 +23,7 @@ def transplant(trial: KernelTrial, parameters: np.ndarray | None = None) -> Lock
     twin.theta.copy_(torch.tensor(state.theta)[None])
     twin.states[0, : t + 1] = torch.tensor(record.states[: t + 1])
     twin.inputs[0, :t] = torch.tensor(record.inputs[:t])
+    twin.sampled_states[0, :t] = twin.states[0, :t]  # by the Euler map
     twin.targets[:, :t] = observed(twin, t)
     if twin.information is not None and parameters is not None:
         J = vmap(jacrev(twin.model))(torch.tensor(parameters), twin.states[0, :t]).flatten(0, 1)
