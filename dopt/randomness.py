@@ -36,6 +36,7 @@ _STREAMS = {
     "uniform_states": 11,
     "sampled_plans": 12,
     "sampled_parameters": 13,
+    "measurement_noise": 14,
 }
 
 
@@ -52,6 +53,8 @@ class Draws:
     ----------
     noise : (T, d)
         w_t, variance dt σ².
+    measurement_noise : (T, n)
+        v_{t+1} of the n measured states, in their units; (T, 0) where all are known.
     weights : (q,)
         Initial parameters.
     inputs : (T, m)
@@ -69,6 +72,7 @@ class Draws:
     """
 
     noise: Array
+    measurement_noise: Array
     weights: Array
     inputs: Array
     components: npt.NDArray[np.int64]
@@ -88,6 +92,7 @@ def draw(spec: TrialSpec) -> Draws:
         inputs = on_sphere(stream(seed, "inputs").standard_normal(sphere), system.gamma)
     return Draws(
         noise=process_noise(system, seed),
+        measurement_noise=measurement_noise(system, seed),
         weights=initial_weights(spec),
         inputs=np.ascontiguousarray(inputs),
         components=stream(seed, "components").integers(system.n_learned, size=system.horizon),
@@ -116,6 +121,13 @@ def process_noise(system: System, seed: int) -> Array:
     """Return w_t of equation 2, (T, d), variance dt σ²."""
     noise = stream(seed, "noise").standard_normal((system.horizon, system.n_states))
     scaled: Array = np.sqrt(system.dt) * system.noise * noise
+    return scaled
+
+
+def measurement_noise(system: System, seed: int) -> Array:
+    """Return v_{t+1} of y = C x + v, (T, n), for the measured states."""
+    noise = stream(seed, "measurement_noise").standard_normal((system.horizon, system.n_measured))
+    scaled: Array = np.array(system.measurement_noise) * noise
     return scaled
 
 

@@ -41,7 +41,7 @@ class TrialResult:
         Time spent on planning (with the update of the information matrix), on learning and on the
         evaluation [µs].
     states : (T + 1, d)
-        States x_0 ... x_T.
+        States x_0 ... x_T, of a simulation the true ones.
     inputs : (T, m)
         Inputs u_0 ... u_{T-1}.
     parameters : (q,)
@@ -51,6 +51,8 @@ class TrialResult:
         from there on are NaN.
     wall_seconds, cpu_seconds : float
         Duration of the exploration [s].
+    estimated_states : (T + 1, d) or None
+        What policy and learner took for the states, where these are measured with noise.
     checkpoints : mapping of int to (q,)
         Parameters of the model after the numbers of steps at which the trial is to be assessed, up
         to a divergence.
@@ -69,6 +71,7 @@ class TrialResult:
     diverged_at: int | None
     wall_seconds: float
     cpu_seconds: float
+    estimated_states: Array | None = None
     checkpoints: Mapping[int, Array] = field(default_factory=dict)
     assessments: tuple[Assessment, ...] = ()
 

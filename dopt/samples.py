@@ -65,7 +65,8 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
 
     The observed accelerations are those that its learner was given: (x_{t+1} - x_t)/dt less the
     known part at x_t and u_t, in the learned rows. With the integrator of Runge and Kutta they are
-    taken in the middle of the step, without what the learner's model adds to them.
+    taken in the middle of the step, without what the learner's model adds to them. Where states are
+    measured with noise they are those of the true states, which the learner was not given.
     """
     at = system.sampled_states(states)
     known = system.known(tuple(at.T), tuple(inputs.T), system.parameters)

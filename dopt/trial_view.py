@@ -22,9 +22,11 @@ class TrialView(ABC):
     t : int
         Number of steps done.
     states : (t + 1, d)
-        x_0 ... x_t.
+        x_0 ... x_t, or their estimates.
     inputs : (t, m)
         u_0 ... u_{t-1}.
+    sampled_inputs : (t, m)
+        Inputs that belong to ``accelerations``: the same, or filtered as estimates are.
     sampled : (t, d)
         States at which the accelerations were observed: x_0 ... x_{t-1}, and with
         ``env.integrator=rk4`` the middle of each step.
@@ -39,6 +41,7 @@ class TrialView(ABC):
     t: int
     states: Array
     inputs: Array
+    sampled_inputs: Array
     sampled: Array
     accelerations: Array
     parameters: Array

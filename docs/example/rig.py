@@ -174,6 +174,8 @@ def main() -> None:
             ended.set()
             saver.join()
         save(explorer, given.save)
+        if not len(latencies):
+            raise SystemExit(f"no measurement came within {given.seconds:g} s: start the motor.")
         median, high, longest = np.percentile(1e6 * latencies, [50, 99, 100])
         print(f"{len(latencies)} answers: {median:.0f} µs, p99 {high:.0f}, longest {longest:.0f}")
         print(explorer.counts)

@@ -59,6 +59,8 @@ class Explored:
     def states(self) -> Array:
         """States x_0 ... x_t from which steps were taken, and the last one, (t + 1, d).
 
+        Where states are measured with noise they are estimates.
+
         Where the exploration went on from another state, as after a gap, that one is here.
         """
         return self._state.steps.states[: self.n_steps + 1].copy()
@@ -70,7 +72,11 @@ class Explored:
 
     @property
     def errors(self) -> Array:
-        """Errors ‖y - a_θ(x, u)‖ of the accelerations, each before it was learned, (t,)."""
+        """Errors ‖y - a_θ(x, u)‖ of the accelerations, each before it was learned, (t,).
+
+        Where states are measured with noise, they are those of the predicted measurements, in
+        standard deviations of their noise.
+        """
         return self._state.steps.errors[: self.n_steps].copy()
 
     def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike | None = None) -> Array:

@@ -64,6 +64,11 @@ class Explorer(SavedExplored):
     ``missed``
         questions that were answered with the fallback, because the plan was not ready in time
 
+    Of a plant some of whose states are measured with noise (``Plant(measured=...)``), :meth:`ask`
+    and :meth:`tell` are given these states, (n,), in the order of all, in their place; the learner
+    'joint_ekf' estimates the others. Ask with what was told last: with another measurement the
+    states that are not measured are unknown again.
+
     Parameters
     ----------
     plant : Plant or System
@@ -123,8 +128,10 @@ class Explorer(SavedExplored):
         self._tolerance = within("tolerance", tolerance, 1.0)
         deadline = None if deadline is None else within("deadline", deadline, math.inf)
         self._fallback = safe_input(spec, fallback)
-        self._limits = np.full(system.n_states, system.state_limit)
-        self._limits[list(system.angle_indices)] = np.finfo(float).max
+        measured_states = system.measured_states or range(system.n_states)
+        self._angles = [i for i, row in enumerate(measured_states) if row in system.angle_indices]
+        self._limits = np.full(len(measured_states), system.state_limit)
+        self._limits[self._angles] = np.finfo(float).max
         super().__init__(spec)
         self._in_vain = 0  # states in a row that were not learned from
         self._journal = None if journal is None else Journal(Path(journal), fsync)
@@ -137,7 +144,7 @@ class Explorer(SavedExplored):
                 raise
 
     def ask(self, state: npt.ArrayLike, time: float | None = None) -> Array:
-        """Return the input u_t, (m,), for a state x_t, (d,).
+        """Return the input u_t, (m,), for a state x_t, (d,), or what was measured of it, (n,).
 
         Asked again for the same state, it gives the same input.
 
@@ -193,6 +200,8 @@ class Explorer(SavedExplored):
         self, state: npt.ArrayLike, applied: npt.ArrayLike | None = None, time: float | None = None
     ) -> bool:
         """Learn from the state x_{t+1}, (d,), that followed, and return whether that was possible.
+
+        Of a plant some of whose states are measured it is these, (n,).
 
         Parameters
         ----------
@@ -255,10 +264,10 @@ class Explorer(SavedExplored):
         return now - self._state.time
 
     def _measured(self, given: npt.ArrayLike) -> Array:
-        """Return a state, (d,), with its angles within half a turn of the present ones."""
-        x, present = numbers("state", given, self.spec.system.n_states), self._state.present
+        """Return what was measured, with its angles within half a turn of the present ones."""
+        x, present = numbers("state", given, len(self._limits)), self._state.present
         if present is not None:
-            for i in self.spec.system.angle_indices:
+            for i in self._angles:
                 turns = (present[i] - x[i]) / (2 * math.pi)
                 if abs(turns) > 0.5 and math.isfinite(turns):
                     x[i] += 2 * math.pi * np.round(turns)

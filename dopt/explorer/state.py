@@ -33,6 +33,9 @@ from dopt.types import Array
 SIZED_STEPS = 50
 """First steps over which the size of the accelerations is taken."""
 
+MANY_JUMPS = 10
+"""Jumps of a plant some of whose states are measured after which that is said."""
+
 _log = logging.getLogger("dopt.explorer")
 
 
@@ -48,6 +51,7 @@ class Steps(Protocol):
     @property
     def errors(self) -> Array: ...
     def plan_input(self, t: int) -> None: ...
+    def begin(self, t: int, state: Array) -> None: ...
     def take_in(self, t: int, dt: float) -> bool: ...
 
 
@@ -63,7 +67,7 @@ class ExplorerState:
     done : int
         Steps t that were learned from.
     present : (d,) or None
-        State x_t; None where it is unknown.
+        State x_t, or what was measured of it; None where it is unknown.
     answer : (m,) or None
         Input that was given for it.
     time : float or None
@@ -81,6 +85,7 @@ class ExplorerState:
         self.answer: Array | None = None
         self.time: float | None = None
         self._rows = list(spec.system.learned_rows)
+        self._measured = list(spec.system.measured_states or range(spec.system.n_states))
         self._squares = np.zeros(spec.system.n_learned)
         self._told_of_plans = False
         self.excess = np.zeros(spec.system.horizon)
@@ -97,9 +102,11 @@ class ExplorerState:
         elif "begin" in event:
             x = np.array(event["begin"])
             self.counts["jumps"] += self.present is not None and not np.array_equal(x, self.present)
+            self._warn_of_jumps()
             self._move(x, event["time"])
         elif "gap" in event:
             self.counts["gaps"] += 1
+            self.present = None  # a state after a gap is begun anew, whatever it is
             self._move(np.array(event["gap"]), event["time"])
         elif "lost" in event:
             self.counts[event["lost"]] += 1
@@ -125,19 +132,33 @@ class ExplorerState:
         return chosen
 
     def _move(self, x: Array, time: float | None) -> None:
+        same = self.present is not None and np.array_equal(x, self.present)
         self.present, self.time, self.answer = x, time, None
-        self.steps.states[self.done] = x
+        if not (same and self.spec.system.n_measured):  # then the estimate stays
+            state = np.zeros(self.spec.system.n_states)
+            state[self._measured] = x
+            self.steps.begin(self.done, state)
+
+    def _warn_of_jumps(self) -> None:
+        """Say so once if inputs are asked for other measurements than those told last."""
+        if self.spec.system.n_measured and self.counts["jumps"] == MANY_JUMPS:
+            _log.warning(
+                "%d times an input was asked for another measurement than the one told last, and "
+                "the states that are not measured were taken for 0: ask with the one told last",
+                MANY_JUMPS,
+            )
 
     def _learn(self, event: Event) -> None:
         t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
-        self.steps.inputs[t], self.steps.states[t + 1] = u, x
+        self.steps.inputs[t] = u
+        self.steps.states[t + 1, self._measured] = x
         if self.spec.limits is not None:
             self.excess[t] = self.spec.limits.excess(self.spec.system, x[None])[0]
         self._watch_size(t, x, u, event["dt"])
         finite = self.steps.take_in(t, event["dt"])
         self.done += 1
         self.counts["learned"] += 1
-        self.present, self.time = self.steps.states[t + 1].copy(), event["time"]
+        self.present, self.time = x, event["time"]
         self.answer = None
         if not finite:
             raise ExplorationError(
@@ -146,7 +167,12 @@ class ExplorerState:
             )
 
     def accelerations(self, following: Array, u: Array, dt: float) -> Array:
-        """Return the accelerations that are observed from x_t to the next state, (r,)."""
+        """Return the accelerations that are observed from x_t to the next state, (r,).
+
+        Where states are measured with noise they are not: 0 is returned.
+        """
+        if self.spec.system.n_measured:
+            return np.zeros(len(self._rows))
         system, x, rows = self.spec.system, self.steps.states[self.done], self._rows
         with np.errstate(all="ignore"):
             known = np.array(system.known(tuple(x), tuple(u), system.parameters), dtype=float)
@@ -155,7 +181,8 @@ class ExplorerState:
 
     def _watch_size(self, t: int, following: Array, u: Array, dt: float) -> None:
         """Warn once where the first accelerations are of another size than a network learns."""
-        if t < SIZED_STEPS and isinstance(self.spec.model, MLP):
+        measured = self.spec.system.n_measured
+        if t < SIZED_STEPS and isinstance(self.spec.model, MLP) and not measured:
             self._squares += self.accelerations(following, u, dt) ** 2
             if t == SIZED_STEPS - 1:
                 sizes = np.sqrt(self._squares / SIZED_STEPS)

@@ -35,6 +35,7 @@ from dopt.spec.information_form import Information, held_information, is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
+from dopt.systems.sensors import delay, differentiated
 from dopt.types import Matrix, Vector
 
 MODULES = {Form.PRIMAL: primal_network, Form.DUAL: dual, Form.SKETCH: sketch}
@@ -57,16 +58,18 @@ def trial_of(spec: TrialSpec, draws: Draws) -> args.Trial:
     """Return all that a trial works on, before its first step."""
     plant, network, algorithm = constants(spec.config)
     network = network_of_trial(spec, network, draws.weights)
+    record = empty_record(spec.system)
     return args.Trial(
         plant,
         network,
         algorithm,
         information_of(spec.config),
         limits_of(spec.config),
+        sensors_of(spec.config),
         randomness_of(spec, draws),
-        initial_state(spec, draws.weights),
+        initial_state(spec, draws.weights, record),
         empty_scratch(spec, network),
-        empty_record(spec.system),
+        record,
     )
 
 
@@ -163,7 +166,7 @@ def _held(config: TrialConfig) -> Information | None:
     return held_information(config.policy, config.learner, q, n_rows)
 
 
-def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
+def initial_state(spec: TrialSpec, weights: Vector, record: args.Record) -> args.State:
     """Return the state of a trial before its first step.
 
     ``weights`` are all initial parameters of the model; the state holds those that are learned.
@@ -180,6 +183,7 @@ def initial_state(spec: TrialSpec, weights: Vector) -> args.State:
         _visited(spec),
         _posterior(spec),
         _prediction_error(spec),
+        _estimate(spec, q, record.inputs),
         np.zeros((len(spec.model.features(system)), window)),
         np.zeros((system.n_learned, window)),
         *(np.zeros(part.memory_size(system, q)) for part in (spec.policy, spec.learner)),
@@ -265,6 +269,39 @@ def _prediction_error(spec: TrialSpec) -> args.PredictionError:
     return args.PredictionError(np.zeros(r), np.zeros((2, r)), np.zeros(m))
 
 
+def sensors_of(config: TrialConfig) -> args.Sensors:
+    """Return what is measured of the states of a configuration; nothing where all are known."""
+    system, estimates = config.system, config.learner.estimates_states
+    return args.Sensors(
+        np.array(system.measured_states, dtype=np.int64),
+        np.array(system.measurement_noise, dtype=float) ** 2,
+        np.array(differentiated(system) if system.n_measured else [], dtype=np.int64),
+        0.0 if estimates else system.velocity_cutoff,
+        delay(system) if system.n_measured and not estimates else 0.0,
+        np.zeros(system.n_states),  # the initial state of a simulation is known
+    )
+
+
+def _estimate(spec: TrialSpec, q: int, applied: Matrix) -> args.Estimate:
+    """Return what is remembered to estimate states, without room where they are known."""
+    system, estimates = spec.system, spec.learner.estimates_states
+    steps = system.horizon if system.n_measured else 0
+    d = system.n_states if system.n_measured and estimates else 0
+    starts = np.full((steps, system.n_states), np.nan)
+    if steps and not isinstance(system, BlackBox):
+        starts[0] = system.initial_state
+    return args.Estimate(
+        starts,
+        np.full((steps, system.n_measured), np.nan),
+        np.zeros(steps),
+        np.zeros_like(applied) if steps and not estimates else applied,
+        np.zeros((3, system.n_states)),
+        np.zeros(system.n_inputs),
+        np.zeros((d, d)),
+        np.zeros((d, q)),
+    )
+
+
 def _posterior(spec: TrialSpec) -> args.Posterior:
     """Return the room for the samples of a Gaussian process, none in other models."""
     T = spec.system.horizon if isinstance(spec.model, GaussianProcess) else 0
@@ -304,5 +341,6 @@ def empty_record(system: System) -> args.Record:
     states = np.full((steps + 1, system.n_states), np.nan)
     if not isinstance(system, BlackBox):  # which starts where it is measured
         states[0] = system.initial_state
+    true_states = states.copy() if system.n_measured else states
     rows = (np.full(steps, np.nan) for _ in range(5))
-    return args.Record(states, np.zeros((steps, system.n_inputs)), *rows)
+    return args.Record(states, true_states, np.zeros((steps, system.n_inputs)), *rows)

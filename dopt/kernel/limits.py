@@ -24,7 +24,7 @@ from dopt.types import Matrix, Vector
 def limit_input(trial: Trial, t: int, u: Vector) -> None:
     """Replace u_t by an input that is within the limits; one that is not finite stays."""
     limits, record = trial.limits, trial.record
-    if not limits.enforced or not np.isfinite(u).all():
+    if not np.isfinite(u).all():
         return
     before, x = input_before(trial), record.states[t]
     move_within(limits, before, u)
@@ -122,8 +122,6 @@ def error_bounds(trial: Trial, x: Vector) -> Vector:
 @compiled
 def note_error(trial: Trial, t: int, target: Vector) -> None:
     """Take the error of the accelerations observed at step t, (r,), before they are learned."""
-    if not trial.limits.enforced:
-        return
     error, value = trial.state.prediction, np.empty(target.shape[0])
     error.last_input[:] = trial.record.inputs[t]
     point = sampled_point(trial, t)

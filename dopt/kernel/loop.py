@@ -18,6 +18,12 @@ from dopt.kernel.limits import limit_input, note_error
 from dopt.kernel.members import learn_members, members_or_one
 from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import model_point, sampled_state
+from dopt.kernel.sensors import (
+    estimate_state,
+    has_sensors,
+    measure,
+    output_error,
+)
 from dopt.kernel.structs import Evaluation, Learn, Plan, Plant, Trial
 from dopt.types import Vector
 
@@ -33,7 +39,8 @@ def plan_input(trial: Trial, plan: Plan, t: int) -> None:
         plan(trial, t, u)
     else:
         u[:] = trial.randomness.inputs[0]
-    limit_input(trial, t, u)
+    if trial.limits.enforced:
+        limit_input(trial, t, u)
     trial.record.plan_us[t] = monotonic_microseconds() - start
 
 
@@ -54,7 +61,8 @@ def observe(trial: Trial, t: int, dt: float, target: Vector) -> None:
     model's own step differs from the acceleration that it has there: a model whose error at them is
     0 predicts x_{t+1}.
     """
-    plant, states, u = trial.plant, trial.record.states, trial.record.inputs[t]
+    plant, states = trial.plant, trial.record.states
+    u = trial.state.estimate.inputs[t]
     x, following = states[t], states[t + 1]
     at, flow = sampled_state(plant, states, t), np.empty(x.shape[0])
     plant.known(at, u, plant.parameters, flow)
@@ -76,12 +84,16 @@ def observe(trial: Trial, t: int, dt: float, target: Vector) -> None:
 def take_in(trial: Trial, learn: Learn, t: int, dt: float) -> bool:
     """Learn from x_t, u_t and x_{t+1}, dt seconds later, and add the rows at (x_t, u_t) to M.
 
-    Returns whether the parameters are finite: otherwise nothing is added.
+    Where states are measured with noise, an estimate takes the place of what was measured of
+    x_{t+1}. Returns whether the parameters are finite: otherwise nothing is added.
     """
     plant, state, record = trial.plant, trial.state, trial.record
+    if has_sensors(trial.sensors):
+        estimate_state(trial, t, dt)
     target = np.empty(plant.learned_rows.shape[0])
     observe(trial, t, dt, target)
-    note_error(trial, t, target)
+    if trial.limits.enforced:
+        note_error(trial, t, target)
     clock_0 = monotonic_microseconds()
     learn_members(trial, learn, t, target)
     clock_1 = monotonic_microseconds()
@@ -97,8 +109,11 @@ def take_in(trial: Trial, learn: Learn, t: int, dt: float) -> bool:
 def prediction_error(trial: Trial, t: int, dt: float) -> float:
     """Return the error of the model at the accelerations observed from x_t to x_{t+1}.
 
-    Of an ensemble the mean of the members is taken.
+    Of an ensemble the mean of the members is taken. Where states are measured with noise it is
+    :func:`dopt.kernel.sensors.output_error`.
     """
+    if has_sensors(trial.sensors):
+        return output_error(trial, t, dt)
     plant, thetas, r = trial.plant, members_or_one(trial.state), trial.plant.learned_rows.shape[0]
     target, value, mean = np.empty(r), np.empty(r), np.zeros(r)
     observe(trial, t, dt, target)
@@ -127,9 +142,12 @@ def advance(
     thetas = members_or_one(trial.state)
     buffers = evaluation_buffers(network, thetas, plant.learned_rows.shape[0])
     for t in range(first, last):
-        x, following = record.states[t], record.states[t + 1]
+        x, following = record.true_states[t], record.true_states[t + 1]
         plan_input(trial, plan, t)
         act(plant, x, record.inputs[t], trial.randomness.noise[t], t, following)
+        if has_sensors(trial.sensors):
+            noise = trial.randomness.measurement_noise[t]
+            measure(trial.sensors, noise, following, record.states[t + 1])
         if not within(following, plant.state_limit):
             return t
         if not take_in(trial, learn, t, plant.dt):

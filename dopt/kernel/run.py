@@ -51,8 +51,11 @@ class KernelState:
 
     @property
     def states(self) -> Array:
-        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
-        return self.record.states
+        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet.
+
+        Of a simulation they are the true ones.
+        """
+        return self.record.true_states
 
 
 class KernelTrial(KernelState):
@@ -121,8 +124,12 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     if end is not None:
         for rows in record:
             rows[end:] = np.nan
+    columns = record._asdict()
+    columns["states"] = columns.pop("true_states")
+    if spec.system.n_measured:
+        columns["estimated_states"] = record.states
     return TrialResult(
-        **record._asdict(),
+        **columns,
         parameters=trial.parameters,
         diverged_at=end,
         wall_seconds=time.perf_counter() - wall,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dopt.kernel.pointers import compiled_steps
 from dopt.kernel.run import KernelState
 from dopt.spec.trial import TrialSpec
+from dopt.systems.sensors import start_variances
 from dopt.types import Array
 
 
@@ -16,8 +17,15 @@ class KernelSteps(KernelState):
 
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
+        if spec.system.n_measured:
+            self.trial.sensors.start_variances[:] = start_variances(spec.system)
         self._code = compiled_steps(spec.policy, spec.learner, self.trial)
         self._held = self._code.hold(self.trial, self._code.plan, self._code.learn)
+
+    @property
+    def states(self) -> Array:
+        """States x_0 ... x_T, known or estimated, (T + 1, d)."""
+        return self.record.states
 
     @property
     def inputs(self) -> Array:
@@ -28,6 +36,12 @@ class KernelSteps(KernelState):
     def errors(self) -> Array:
         """Errors of the accelerations before they were learned, (T,)."""
         return self.record.loss
+
+    def begin(self, t: int, state: Array) -> None:
+        """Let step t begin at a state, (d,), whatever came before it."""
+        self.record.states[t] = state
+        if len(self.state.estimate.starts):
+            self.state.estimate.starts[t] = state
 
     def plan_input(self, t: int) -> None:
         """Write the input u_t that the policy chooses at x_t."""

@@ -110,10 +110,22 @@ class Limits(NamedTuple):
     margin: float  # of the error of a prediction, in its standard deviations
 
 
+class Sensors(NamedTuple):
+    """What is measured of the states (:mod:`dopt.kernel.sensors`); empty where all are known."""
+
+    measured: Integers  # (n,) indices of the measured states
+    variances: Vector  # (n,) of their noise
+    positions: Integers  # (d,) whose difference estimates a state; itself where it is measured
+    cutoff: float  # of the low-pass filter, in Hz; 0 where a learner estimates
+    delay: float  # steps by which differences come late
+    start_variances: Vector  # (d,) of a state from which an exploration goes on
+
+
 class Randomness(NamedTuple):
     """Numbers of :class:`dopt.randomness.Draws`."""
 
     noise: Matrix  # (T, d)
+    measurement_noise: Matrix  # (T, n) of the measured states
     inputs: Matrix  # (T, m)
     components: Integers  # (T,)
     ties: Matrix  # (T, m)
@@ -225,6 +237,19 @@ class PredictionError(NamedTuple):
     last_input: Vector  # (m,) planned or applied
 
 
+class Estimate(NamedTuple):
+    """What is remembered to estimate states; empty where they are known, but for the inputs."""
+
+    starts: Matrix  # (T, d) states from which steps begin anew; NaN where they follow one another
+    outputs: Matrix  # (T, n) measured after each step
+    durations: Vector  # (T,) of the steps
+    inputs: Matrix  # (T, m) that go with the accelerations: those applied, or these filtered
+    filtered: Matrix  # (3, d) measured states and their differences, filtered, and as measured last
+    filtered_input: Vector  # (m,)
+    covariance: Matrix  # (d, d) of the state, given the parameters
+    sensitivity: Matrix  # (d, q) of the estimated state to the parameters
+
+
 class State(NamedTuple):
     """Everything that changes from step to step; written in place."""
 
@@ -240,6 +265,7 @@ class State(NamedTuple):
     visited: Visited
     posterior: Posterior
     prediction: PredictionError
+    estimate: Estimate
     window_features: Matrix  # (p, window) newest samples, a ring
     window_targets: Matrix  # (r, window)
     policy_memory: Vector  # what a compiled policy of a user's own keeps
@@ -257,7 +283,8 @@ class Scratch(NamedTuple):
 class Record(NamedTuple):
     """What a trial leaves behind."""
 
-    states: Matrix  # (T + 1, d)
+    states: Matrix  # (T + 1, d) known, or estimated
+    true_states: Matrix  # (T + 1, d) of a simulation; the same array where all are known
     inputs: Matrix  # (T, m)
     loss: Vector  # (T,)
     reachable_loss: Vector  # (T,)
@@ -288,8 +315,8 @@ class Information(NamedTuple):
 class Trial(NamedTuple):
     """All that the policy and the learner of a trial work on.
 
-    At step t a policy finds the states x_0 ... x_t in ``record.states[: t + 1]`` and the inputs
-    u_0 ... u_{t-1} in ``record.inputs[:t]``.
+    At step t a policy finds the states x_0 ... x_t, or their estimates, in
+    ``record.states[: t + 1]`` and the inputs u_0 ... u_{t-1} in ``record.inputs[:t]``.
     """
 
     plant: Plant
@@ -297,6 +324,7 @@ class Trial(NamedTuple):
     algorithm: Algorithm
     information: Information
     limits: Limits
+    sensors: Sensors
     randomness: Randomness
     state: State
     scratch: Scratch

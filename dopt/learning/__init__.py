@@ -9,6 +9,7 @@ from dopt.learning.conditioning import Conditioning
 from dopt.learning.extended_kalman import ExtendedKalman
 from dopt.learning.gauss_newton import GaussNewton
 from dopt.learning.information_learner import InformationLearner
+from dopt.learning.joint_kalman import JointKalman
 from dopt.learning.recursive_least_squares import RecursiveLeastSquares
 
 LEARNERS: dict[str, type[Learner]] = {
@@ -20,6 +21,7 @@ LEARNERS: dict[str, type[Learner]] = {
         RecursiveLeastSquares,
         ExtendedKalman,
         GaussNewton,
+        JointKalman,
         Conditioning,
     )
 }
@@ -34,6 +36,7 @@ __all__ = [
     "ExtendedKalman",
     "GaussNewton",
     "InformationLearner",
+    "JointKalman",
     "Learner",
     "RecursiveLeastSquares",
 ]

@@ -22,7 +22,8 @@ class Learner(KernelPart):
 
     ``structure`` is that of the models which it teaches (:class:`dopt.models.Model`), and
     ``updates_information`` says whether its step also adds the sample to the information matrix.
-    ``reads_inputs`` says whether it teaches models that depend on the inputs.
+    ``reads_inputs`` says whether it teaches models that depend on the inputs, and
+    ``estimates_states`` whether it learns from measured states with noise by estimating all states.
     """
 
     section: ClassVar[str] = "learner"
@@ -30,6 +31,7 @@ class Learner(KernelPart):
     structure: ClassVar[str] = "gradient"
     updates_information: ClassVar[bool] = False
     reads_inputs: ClassVar[bool] = False
+    estimates_states: ClassVar[bool] = False
 
     def samples_kept(self, horizon: int) -> int:  # noqa: ARG002  # of most learners, none
         """Return how many of the newest samples the kernel keeps in a trial of so many steps."""

@@ -46,7 +46,7 @@ class Lockstep(BatchSteps):
 
     def act(self, t: int, u: Tensor) -> None:
         """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""
-        x = self.states[:, t]
+        x = self.true_states[:, t]
         if self.episodes:
             u, following = stepped(self.episodes, u)
         else:
@@ -56,7 +56,9 @@ class Lockstep(BatchSteps):
             )
             following = following + self.noise[:, t]
         self.inputs[:, t] = u
-        self.states[:, t + 1] = following
+        self.true_states[:, t + 1] = following
+        if self.sensors:
+            self.sensors.measure(t)
         self.observe(t, self.system.dt)
 
     def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
@@ -86,7 +88,7 @@ class Lockstep(BatchSteps):
         u = self.plan(t)
         clocks.append(self._clock())
         self.act(t, u)
-        inside = self.states[:, t + 1].abs() <= self.system.state_limit
+        inside = self.true_states[:, t + 1].abs() <= self.system.state_limit
         self.diverged |= ~inside.all(dim=1, keepdim=True)
         clocks.append(self._clock())
         self.learn(t)
@@ -135,7 +137,7 @@ def _result(
     batch: Lockstep, i: int, checkpoints: Mapping[int, Array], wall: float, cpu: float
 ) -> TrialResult:
     """Cut trial i out of the batch; its rows end where it diverged."""
-    states, inputs = batch.states[i].cpu().numpy(), batch.inputs[i].cpu().numpy()
+    states, inputs = batch.true_states[i].cpu().numpy(), batch.inputs[i].cpu().numpy()
     columns = {name: rows[i].copy() for name, rows in batch.columns.items()}
     inside = np.all(np.abs(states[1:]) <= batch.system.state_limit, axis=1)
     wrong = np.flatnonzero(~(inside & np.isfinite(columns["loss"])))
@@ -144,11 +146,15 @@ def _result(
         for rows in (*columns.values(), inputs):
             rows[end:] = np.nan
         states[end:] = np.nan
+    estimated = batch.states[i].cpu().numpy() if batch.sensors else None
+    if estimated is not None and end is not None:
+        estimated[end:] = np.nan
     return TrialResult(
         **columns,
         states=states,
         inputs=inputs,
         parameters=batch.parameters_of_model[i].cpu().numpy().copy(),
+        estimated_states=estimated,
         diverged_at=end,
         wall_seconds=wall,
         cpu_seconds=cpu,

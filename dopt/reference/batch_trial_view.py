@@ -27,6 +27,7 @@ class BatchTrialView(TrialView):
         self.model, self.theta = batch.model, batch.theta[index].clone()
         self.states = _array(batch.states[index, : t + 1])
         self.inputs = _array(batch.inputs[index, :t])
+        self.sampled_inputs = _array(batch.sampled_inputs(slice(0, t))[index])
         self.sampled = _array(batch.sampled_states[index, :t])
         self.accelerations = _array(batch.targets[index, :t])
         self.parameters = _array(self.theta)

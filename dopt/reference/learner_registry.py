@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from dopt.learning import ExtendedKalman, GaussNewton, RecursiveLeastSquares
+from dopt.learning import ExtendedKalman, GaussNewton, JointKalman, RecursiveLeastSquares
 from dopt.learning.base import CustomLearner
 from dopt.models import GaussianProcess
 from dopt.reference.custom_plugins import OwnLearner
 from dopt.reference.gaussian_process import Posterior
+from dopt.reference.joint_kalman import JointKalmanLearner
 from dopt.reference.learning import (
     BatchLearner,
     GaussNewtonLearner,
@@ -16,13 +17,17 @@ from dopt.reference.learning import (
     LeastSquaresLearner,
     learner_for,
 )
+from dopt.reference.sensors import BatchSensors
 from dopt.reference.state import BatchState
 
 
-def batch_learner(batch: BatchState, points: Tensor) -> BatchLearner | KalmanLearner:
+def batch_learner(
+    batch: BatchState, points: Tensor, sensors: BatchSensors | None
+) -> BatchLearner | KalmanLearner | JointKalmanLearner:
     """Return the learner of a batch; it writes into the parameters of the batch.
 
-    ``points``, (N, d), are the states at which the model is evaluated at each step.
+    ``points``, (N, d), are the states at which the model is evaluated at each step; ``sensors``
+    measure the states, unless all are known.
     """
     model, learner = batch.config.model, batch.config.learner
     if isinstance(model, GaussianProcess):
@@ -35,6 +40,10 @@ def batch_learner(batch: BatchState, points: Tensor) -> BatchLearner | KalmanLea
     if isinstance(learner, GaussNewton):
         assert batch.held is not None
         return GaussNewtonLearner(learner, batch.model, batch.theta, batch.held.regularization)
+    if isinstance(learner, JointKalman):
+        assert batch.held is not None
+        assert sensors is not None
+        return JointKalmanLearner(learner, batch, sensors, batch.held.regularization)
     if isinstance(learner, RecursiveLeastSquares):
         ridge = float(getattr(batch.config.policy, "regularization", learner.regularization))
         return LeastSquaresLearner(batch.model, batch.theta, ridge, batch.n_learned)

@@ -126,7 +126,7 @@ class KalmanLearner:
             L, noise = self._noise_factor(faded, J), 1.0
             J, e = (torch.linalg.solve_triangular(L, part, upper=False) for part in (J, e))
         information = faded + J.mT @ J / noise
-        self._theta.add_(_solved(information, J.mT @ e / noise))
+        self._theta.add_(solved(information, J.mT @ e / noise))
         return information
 
     def _noise_factor(self, information: Tensor, J: Tensor) -> Tensor:
@@ -174,7 +174,7 @@ class GaussNewtonLearner(KalmanLearner):
         e = (y - self._models(self._theta, x)).flatten(1).unsqueeze(-1)
         distance = (self.prior - self._theta).unsqueeze(-1)
         matrix: Tensor = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
-        step = _solved(matrix, J.mT @ e + self._ridge * distance)
+        step = solved(matrix, J.mT @ e + self._ridge * distance)
         before, share = self._theta.clone(), torch.ones_like(self._theta[:, :1])
         bound = self._objective(before, x, y) * NO_GROWTH
         while True:
@@ -192,7 +192,7 @@ class GaussNewtonLearner(KalmanLearner):
         return whole.unsqueeze(1)
 
 
-def _solved(matrix: Tensor, right: Tensor) -> Tensor:
+def solved(matrix: Tensor, right: Tensor) -> Tensor:
     """Return the solutions, (n, q), for matrices and columns, (n, q, 1).
 
     NaN where rounding has left a matrix indefinite.

@@ -43,8 +43,11 @@ class BatchState:
         each trial are learned.
     members : (n, E, q) tensor or None
         Parameters of the networks of an ensemble.
+    true_states : (n, T + 1, d) tensor
+        Visited states of a simulation; those of ``states`` where all are known.
     states, inputs, targets : (n, T + 1, d), (n, T, m), (n, T, r) tensors
-        Visited states, applied inputs and observed accelerations; NaN where no trial has come yet.
+        States, known or estimated, applied inputs and observed accelerations; NaN where no trial
+        has come yet.
     sampled_states : (n, T, d) tensor
         States at which the accelerations were observed.
     information : (n, s, s) tensor or None
@@ -53,7 +56,7 @@ class BatchState:
         Form and λ of M.
     diverged : (n, 1) tensor
         Whether a trial has ended.
-    noise, open_loop, ties, components, replay, plans, parameters : tensors
+    noise, measurement_noise, open_loop, ties, components, replay, plans, parameters : tensors
         Numbers of :class:`dopt.randomness.Draws` with the trials along the first axis.
 
     Raises
@@ -97,6 +100,10 @@ class BatchState:
         """Return what the model depends on at states (..., d) and inputs (..., m)."""
         return self.learned.points(states, inputs)
 
+    def sampled_inputs(self, steps: int | slice) -> Tensor:
+        """Return the inputs that belong to the accelerations of some steps, (n, ..., m)."""
+        return self.inputs[:, steps]
+
     def tensor(self, values: Array) -> Tensor:
         """Return real numbers as a tensor where the trials are."""
         return torch.tensor(values, dtype=torch.float64, device=self.device)
@@ -104,6 +111,7 @@ class BatchState:
     def _draw(self) -> None:
         draws = [draw(spec) for spec in self.specs]
         self.noise = self.tensor(np.stack([d.noise for d in draws]))
+        self.measurement_noise = self.tensor(np.stack([d.measurement_noise for d in draws]))
         self.open_loop = self.tensor(np.stack([d.inputs for d in draws]))
         self.ties = self.tensor(np.stack([d.ties for d in draws]))
         self.plans = self.tensor(np.stack([d.plans for d in draws]))
@@ -117,6 +125,7 @@ class BatchState:
         self.states = self._unset(n, T + 1, self.system.n_states)
         if not isinstance(self.system, BlackBox):  # which starts where its episodes do
             self.states[:, 0] = self.tensor(np.array(self.system.initial_state))
+        self.true_states = self.states.clone() if self.system.n_measured else self.states
         self.inputs = self._unset(n, T, self.system.n_inputs)
         self.targets = self._unset(n, T, self.system.n_learned)
         self.sampled_states = self._unset(n, T, self.system.n_states)

@@ -10,6 +10,7 @@ from dopt.errors import SpecificationError
 from dopt.reference.batch import Lockstep
 from dopt.reference.steps import BatchSteps
 from dopt.spec.trial import TrialSpec
+from dopt.systems.sensors import start_variances
 
 Array = npt.NDArray[np.float64]
 
@@ -60,8 +61,8 @@ class ReferenceTrial:
 
     @property
     def states(self) -> Array:
-        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
-        states: Array = self._batch.states[0].numpy()
+        """States x_0 ... x_T, (T + 1, d), the true ones; NaN where the trial has not come yet."""
+        states: Array = self._batch.true_states[0].numpy()
         return states
 
 
@@ -75,6 +76,9 @@ class ReferenceSteps:
     def __init__(self, spec: TrialSpec) -> None:
         self._batch = BatchSteps([spec])
         self._batch.prepare(self._batch.tensor(np.zeros((1, spec.system.n_states))))
+        if self._batch.sensors:
+            variances = start_variances(spec.system)
+            self._batch.sensors.start_variances = self._batch.tensor(variances)
         self.states: Array = self._batch.states[0].numpy()
         self.inputs: Array = self._batch.inputs[0].numpy()
         self.errors: Array = np.full(spec.system.horizon, np.nan)
@@ -84,6 +88,12 @@ class ReferenceSteps:
         """Parameters of the model, (q,)."""
         parameters: Array = self._batch.parameters_of_model[0].numpy().copy()
         return parameters
+
+    def begin(self, t: int, state: Array) -> None:
+        """Let step t begin at a state, (d,), whatever came before it."""
+        self.states[t] = state
+        if self._batch.sensors:
+            self._batch.sensors.starts[:, t] = self._batch.tensor(state)
 
     @torch.no_grad()
     def plan_input(self, t: int) -> None:
@@ -96,8 +106,11 @@ class ReferenceSteps:
 
         Returns whether the parameters are finite.
         """
+        if self._batch.sensors:
+            self.errors[t] = float(self._batch.sensors.output_errors(t, dt)[0])
         self._batch.observe(t, dt)
-        self.errors[t] = self._prediction_error(t)
+        if not self._batch.sensors:
+            self.errors[t] = self._prediction_error(t)
         self._batch.learn(t)
         self._batch.inform(t)
         return bool(self._batch.theta.isfinite().all())

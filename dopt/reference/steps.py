@@ -11,12 +11,14 @@ from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
 from dopt.policies.base import OpenLoop
 from dopt.reference.custom_plugins import observe, planned_inputs, planners_for
 from dopt.reference.dynamics import known_flow
+from dopt.reference.joint_kalman import JointKalmanLearner
 from dopt.reference.learner_registry import batch_learner
 from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.limits import BatchLimits
 from dopt.reference.planner_registry import plan_for
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
 from dopt.reference.search import searched_inputs
+from dopt.reference.sensors import BatchSensors
 from dopt.reference.state import BatchState
 from dopt.spec.information_form import is_fresh
 
@@ -30,7 +32,8 @@ class BatchSteps(BatchState):
     def prepare(self, points: Tensor) -> None:
         """Make plans and learners; ``points``, (N, d), are the states of the evaluation."""
         self.planners = planners_for(self.specs)
-        self.learner = batch_learner(self, points)
+        self.sensors = BatchSensors(self) if self.system.n_measured else None
+        self.learner = batch_learner(self, points, self.sensors)
         self.own_plan = plan_for(self, self.learner)
         self._rows = vmap(jacrev(self.model))
         limits = self.config.limits
@@ -75,9 +78,13 @@ class BatchSteps(BatchState):
     def observe(self, t: int, dt: float) -> None:
         """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later.
 
-        With the integrator of Runge and Kutta, they are those of :func:`dopt.kernel.loop.observe`.
+        Where states are measured with noise, an estimate first takes the place of what was measured
+        of x_{t+1}. With the integrator of Runge and Kutta, the accelerations are those of
+        :func:`dopt.kernel.loop.observe`.
         """
-        system, x, u = self.system, self.states[:, t], self.inputs[:, t]
+        if self.sensors:
+            self.sensors.estimate(t, dt)
+        system, x, u = self.system, self.states[:, t], self.sampled_inputs(t)
         rows, at = list(system.learned_rows), x
         if system.integrator != "euler":
             at = 0.5 * (x + self.states[:, t + 1])
@@ -109,6 +116,11 @@ class BatchSteps(BatchState):
 
     def _learn(self, t: int) -> None:
         before = self.theta.clone()
+        if isinstance(self.learner, JointKalmanLearner):
+            assert self.information is not None
+            self.information = self.learner.filtered(t, self.information)
+            self.theta.copy_(torch.where(self.diverged, before, self.theta))
+            return
         seen = (self.sampled(slice(0, t + 1)), self.targets[:, : t + 1])
         if isinstance(self.learner, KalmanLearner):
             assert self.information is not None
@@ -124,7 +136,11 @@ class BatchSteps(BatchState):
 
     def sampled(self, steps: int | slice) -> Tensor:
         """Return the points at which the accelerations of some steps were observed, (n, ..., ·)."""
-        return self.points(self.sampled_states[:, steps], self.inputs[:, steps])
+        return self.points(self.sampled_states[:, steps], self.sampled_inputs(steps))
+
+    def sampled_inputs(self, steps: int | slice) -> Tensor:
+        """Return the inputs that belong to the accelerations of some steps, (n, ..., m)."""
+        return self.sensors.sampled_inputs(steps) if self.sensors else super().sampled_inputs(steps)
 
     def rows(self, t: int) -> Tensor:
         """Return J at (x_t, u_t) and the current parameters, (n, r, s), in the space of M."""
@@ -137,7 +153,8 @@ class BatchSteps(BatchState):
         all states at these parameters instead.
         """
         observe(self, self.planners, t)
-        if self.information is not None and not isinstance(self.learner, KalmanLearner):
+        shared = isinstance(self.learner, KalmanLearner | JointKalmanLearner)
+        if self.information is not None and not shared:
             self.information = self._informed(self.information, t)
         if self.own_plan is not None:
             self.own_plan.inform(t)

@@ -5,7 +5,15 @@ from __future__ import annotations
 import functools
 
 from dopt.errors import IncompatibleError
-from dopt.learning import LEARNERS, Adam, ExtendedKalman, GaussNewton, InformationLearner, Learner
+from dopt.learning import (
+    LEARNERS,
+    Adam,
+    ExtendedKalman,
+    GaussNewton,
+    InformationLearner,
+    JointKalman,
+    Learner,
+)
 from dopt.models import (
     MODELS,
     AffineMLP,
@@ -22,8 +30,10 @@ from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.greedy_linear import GreedyLinear
 from dopt.spec.information_form import held_information, is_fresh
 from dopt.systems import System
+from dopt.systems.black_box import BlackBox
 from dopt.systems.input_effect import input_effect
 from dopt.systems.plant import ExploredPlant
+from dopt.systems.sensors import differentiated
 
 
 def check_together(system: System, policy: Policy, model: Model, learner: Learner) -> None:
@@ -37,6 +47,7 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
     if isinstance(policy, Disagreement) and not isinstance(learner, Adam):
         expected = "learner 'adam' or 'adam_window', which can learn for many networks"
         raise mismatch(f"policy '{policy.name}'", expected, f"learner '{learner.name}'")
+    _check_sensors(system, learner)
     _check_model(system, policy, model, learner)
     _check_inputs(system, policy, model, learner)
     if not _teaches(type(learner), type(model)):
@@ -52,12 +63,33 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
         raise mismatch(f"model '{model.name}'", "learner.refit_every 1", every)
 
 
+def _check_sensors(system: System, learner: Learner) -> None:
+    """Check that states which are measured with noise can be estimated, and only these are."""
+    given = f"env '{system.name}' with all states known"
+    if not system.n_measured:
+        if learner.estimates_states:
+            fields = "env.measured_states and env.measurement_noise, or Plant(measured=...)"
+            expected = f"states that are measured with noise ({fields})"
+            raise mismatch(f"learner '{learner.name}'", expected, given)
+        return
+    if isinstance(system, BlackBox) and not isinstance(system, ExploredPlant):
+        raise mismatch("env.measured_states", "a system with equations", f"env '{system.name}'")
+    unknown = [i for i, position in enumerate(differentiated(system)) if position < 0]
+    if unknown and not learner.estimates_states:
+        names = ", ".join(system.state_labels[i] for i in unknown)
+        expected = (
+            f"learner 'joint_ekf' where the known part does not say that a state is the rate of a "
+            f"measured one ({names})"
+        )
+        raise mismatch("a choice of measured states", expected, f"learner '{learner.name}'")
+
+
 def _teaches(learner: type[Learner], model: type[Model]) -> bool:
     """Tell whether a learner can learn a model's parameters.
 
     A filter also learns those of physics, and a learner that fits anew the networks of an ensemble.
     """
-    filtered = issubclass(learner, ExtendedKalman) and issubclass(model, Linear)
+    filtered = issubclass(learner, ExtendedKalman | JointKalman) and issubclass(model, Linear)
     fitted = issubclass(learner, GaussNewton) and issubclass(model, Ensemble)
     return filtered or fitted or learner.structure == model.structure
 

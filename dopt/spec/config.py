@@ -22,7 +22,7 @@ from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop
 from dopt.spec.compatibility import check_together, mismatch
 from dopt.spec.custom_system_check import check_system
 from dopt.spec.memory_estimate import memory_by_setting
-from dopt.spec.scale_check import warn_of_scale
+from dopt.spec.scale_check import warn_of_prior, warn_of_scale
 from dopt.systems import SYSTEMS, System
 from dopt.systems.black_box import BlackBox
 
@@ -78,6 +78,9 @@ class TrialConfig:
         self._check_runnable()
         if self.limits is not None:
             self.limits.check(self.system)
+            if self.system.n_measured and self.limits.enforced:
+                given = "env.measured_states"
+                raise mismatch("limits", "states that are known without noise", given)
         if type(self.system) not in SYSTEMS.values():
             check_system(self.system)
             warn_of_scale(self.system, self.model)
@@ -90,6 +93,7 @@ class TrialConfig:
                 f"time: set it to 0."
             )
         check_together(self.system, self.policy, self.model, self.learner)
+        warn_of_prior(self.policy, self.model, self.learner)
 
     def _check_runnable(self) -> None:
         """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""

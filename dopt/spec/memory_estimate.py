@@ -10,7 +10,7 @@ import math
 
 from dopt.control import Control
 from dopt.control.free_run import STARTS
-from dopt.learning import Adam, AdamReplay, GaussNewton, Learner
+from dopt.learning import Adam, AdamReplay, GaussNewton, JointKalman, Learner
 from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
     ICEM,
@@ -76,6 +76,12 @@ def memory_by_setting(
         pairs = kept * (2 * (max(w, p) + 1) ** 2 + (r + 3) * (L + 1) * (max(w, p) + 1))
         rows = 3 * kept * r * q if path == "reference" else 0  # J itself, and copies of it
         numbers[_size_of(model)] += pairs + rows + 4 * q**2
+    if isinstance(learner, JointKalman):
+        # true states, outputs, the rows and errors of all innovations, JᵀJ and its factor, and Ψ
+        n = system.n_measured
+        numbers["env.horizon"] += T * (2 * d + 3 * n)
+        rows = T * n * q * (2 if path == "reference" else 1)
+        numbers[_size_of(model)] += rows + 4 * q**2 + 3 * d * q
     kept = policy.memory_size(system, q) + learner.memory_size(system, q)
     numbers[_size_of(model)] += kept
     held = held_information(policy, learner, q, r * T)

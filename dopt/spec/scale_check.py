@@ -8,7 +8,9 @@ import warnings
 import numpy as np
 
 from dopt.errors import ScaleWarning
+from dopt.learning import Learner
 from dopt.models import MLP, Model
+from dopt.policies import Policy
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
 from dopt.types import Array
@@ -20,6 +22,9 @@ Those of the shipped systems are 2 to 60 in their units.
 """
 
 SMALLEST = 0.05
+
+WEAKEST = 0.1
+"""λ below which a filter over state and parameters does not learn."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -33,6 +38,25 @@ def warn_of_scale(system: System, model: Model) -> None:
         return
     values = system.learned(system.grid())
     warn_of_sizes(system, np.sqrt(np.mean(values**2, axis=0)), "over the evaluation grid")
+
+
+@functools.lru_cache(maxsize=64)
+def warn_of_prior(policy: Policy, model: Model, learner: Learner) -> None:
+    """Warn where a filter over state and parameters begins with weights that may be anything.
+
+    Its prediction is then as uncertain from the first step on, and its linearisation wrong.
+    """
+    regularization = getattr(policy, "regularization", None)
+    if not (learner.estimates_states and isinstance(model, MLP)) or regularization is None:
+        return
+    if regularization < WEAKEST:
+        warnings.warn(
+            f"policy.regularization is {regularization:g}, which gives each initial parameter the "
+            f"variance {1 / regularization:.3g}, but learner '{learner.name}' needs one of about "
+            f"1/3: set policy.regularization to 3.",
+            ScaleWarning,
+            stacklevel=2,
+        )
 
 
 def warn_of_sizes(system: System, sizes: Array, where: str) -> None:

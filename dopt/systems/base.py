@@ -48,6 +48,12 @@ class System(Validated):
     definition serves the simulator, the evaluation, automatic differentiation and the compiled
     kernel. ``compiled`` says whether the kernel runs it, and ``reads_inputs`` whether the learned
     accelerations depend on the inputs.
+
+    Where ``measured_states`` names states by their indices, policy and learner are given
+    y = C x + v in the place of x, these states with noise of the standard deviations
+    ``measurement_noise``, in their units. The states are then estimated: by a learner that does so
+    (:class:`dopt.learning.JointKalman`), or else by a low-pass filter of ``velocity_cutoff`` [Hz]
+    and differences (:mod:`dopt.systems.sensors`).
     """
 
     section: ClassVar[str] = "env"
@@ -75,6 +81,9 @@ class System(Validated):
     grid_points: tuple[int, ...] = parameter((), bound="positive")
     state_limit: float = parameter(1e4, bound="positive")
     integrator: str = parameter("euler", choices=INTEGRATORS, added=True)
+    measured_states: tuple[int, ...] = parameter((), bound="nonnegative", added=True)
+    measurement_noise: tuple[float, ...] = parameter((), bound="positive", added=True)
+    velocity_cutoff: float = parameter(2.0, "Hz", "positive", added=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,6 +91,7 @@ class System(Validated):
         self._check_size("initial_state", self.n_states)
         self._check_size("grid_half_widths", axes)
         self._check_size("grid_points", 1 if self.low_discrepancy else axes)
+        self._check_measured()
         if self.low_discrepancy:
             check_number(self.grid_points[0])
 
@@ -92,6 +102,17 @@ class System(Validated):
                 f"env.{field} has {len(given)} entries, but {self.name} needs {size}: "
                 f"give one for each of them."
             )
+
+    def _check_measured(self) -> None:
+        """Refuse measurements of states that there are not, and another number of noises."""
+        given = self.measured_states
+        if len(set(given)) < len(given) or any(index >= self.n_states for index in given):
+            raise SpecificationError(
+                f"env.measured_states is {list(given)}, but indices from 0 to {self.n_states - 1} "
+                f"are expected, none twice: the states of {self.name} are "
+                f"{', '.join(self.state_labels)}."
+            )
+        self._check_size("measurement_noise", len(given))
 
     @staticmethod
     @abstractmethod
@@ -115,6 +136,11 @@ class System(Validated):
     def n_inputs(self) -> int:
         """Input dimension m."""
         return len(self.input_labels)
+
+    @property
+    def n_measured(self) -> int:
+        """Number of states that are measured with noise; 0 where all are known without."""
+        return len(self.measured_states)
 
     @property
     def n_learned(self) -> int:

@@ -20,7 +20,7 @@ from dopt.types import Equation, Scalar
 NAME = "plant"
 """Name of every plant in configurations and in the results database."""
 
-_MAPPINGS = ("states", "inputs", "known", "box", "constants")
+_MAPPINGS = ("states", "inputs", "known", "box", "constants", "measured")
 
 _LISTS = ("learned", "angles")
 
@@ -73,6 +73,12 @@ class Plant:
         turn or over many: each is followed from one state to the next.
     constants : mapping of str to float
         Known numbers that the expressions name.
+    measured : mapping of str to float
+        Standard deviation of the noise of each state that is measured; without any, all states are
+        measured, and their noise is left to the learner.
+    velocity_cutoff : float
+        Cutoff of the filter of these states and their differences [Hz], with a learner that does
+        not estimate states.
     limit : float
         Largest magnitude of a state that can be a measurement, but for angles; what is beyond is
         left out.
@@ -97,6 +103,8 @@ class Plant:
     constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
     limit: float = 1e4
     integrator: str = "euler"
+    measured: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    velocity_cutoff: float = 2.0
 
     def __post_init__(self) -> None:
         self._check_types()
@@ -105,7 +113,7 @@ class Plant:
         for what in _LISTS:
             object.__setattr__(self, what, tuple(getattr(self, what)))
         check_names("a plant", [*self.states, *self.inputs, *self.constants])
-        for what in ("known", "learned", "box", "angles"):
+        for what in ("known", "learned", "box", "angles", "measured"):
             for name in getattr(self, what):
                 if name not in self.states:
                     raise unknown_name(f"state in '{what}' of a plant", name, self.states)
@@ -135,7 +143,10 @@ class Plant:
 
     def _check_numbers(self) -> None:
         positive = {"dt": self.dt, "gamma": self.gamma, "limit": self.limit}
-        positive |= {f"box['{name}']": width for name, width in self.box.items()}
+        positive["velocity_cutoff"] = self.velocity_cutoff
+        for what in ("box", "measured"):
+            named = getattr(self, what)
+            positive |= {f"{what}['{name}']": number for name, number in named.items()}
         for what, value in positive.items():
             if not _is_number(value) or value <= 0:
                 raise _unlike(what, value, "a positive number")
@@ -160,6 +171,9 @@ class Plant:
         section = {"name": NAME, **ordered, "known": self.known, **named, **lists, **numbers}
         if self.integrator != "euler":  # explorations were stored before there was another one
             section["integrator"] = self.integrator
+        if self.measured:
+            section["measured"] = {name: float(value) for name, value in self.measured.items()}
+            section["velocity_cutoff"] = float(self.velocity_cutoff)
         return section
 
     @classmethod
@@ -183,6 +197,11 @@ class Plant:
             horizon=horizon,
             state_limit=self.limit,
             integrator=self.integrator,
+            measured_states=tuple(i for i, name in enumerate(self.states) if name in self.measured),
+            measurement_noise=tuple(
+                float(self.measured[name]) for name in self.states if name in self.measured
+            ),
+            velocity_cutoff=self.velocity_cutoff,
             grid_half_widths=tuple(half_widths[name] for name in axes),
             grid_points=(GRID_POINTS,) * len(axes),
         )

@@ -10,6 +10,9 @@ import numpy as np
 from orchestrate.store.records import Array
 from orchestrate.store.serialization import unpack
 
+ROUNDING = 1e-6
+"""Difference of two states, relative to their size or 1, that counts as none."""
+
 Path = tuple[Array, Array]
 """States (T + 1, d) and inputs (T, m)."""
 
@@ -18,11 +21,13 @@ def steps_ahead(one: Path, other: Path) -> int | None:
     """Return how many steps the first path has more than the second; None for different paths.
 
     The last state of the shorter one is not compared: after a gap an exploration goes on from
-    another state.
+    another state. States may be estimates, which another processor computes with other rounding.
     """
     n = min(len(one[1]), len(other[1]))
-    same = all(
-        np.array_equal(a[:n], b[:n], equal_nan=True) for a, b in zip(one, other, strict=True)
+    states = (one[0][:n], other[0][:n])
+    same = np.array_equal(one[1][:n], other[1][:n], equal_nan=True) and (
+        states[0].shape == states[1].shape
+        and np.allclose(*states, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
     )
     return len(one[1]) - len(other[1]) if same else None
 

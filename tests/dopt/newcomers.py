@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.update import model_rows
 from dopt.kernel.structs import Trial
+from dopt.kernel.user_code import _OwnCode
 from dopt.learning.base import Array, CustomLearner, Updater
 from dopt.policies.base import CustomPolicy, Planner
 from dopt.systems import System
 from dopt.trial_view import TrialView
+
+F = TypeVar("F", bound=Callable[..., object])
+
+
+def kept(function: F) -> F:
+    """Compile a function as those of the package, and keep its machine code as that of a user's.
+
+    The cache keeps functions of the package and those of a user's classes; here it would be
+    compiled in every process, for seconds.
+    """
+    dispatcher = compiled(function)
+    dispatcher._cache = _OwnCode(function)  # type: ignore[attr-defined]
+    return dispatcher
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +53,7 @@ class _Planner(Planner):
         return self._u if view.t % 2 == 0 else -self._u
 
 
-@compiled
+@kept
 def plan(trial: Trial, t: int, u: Array) -> None:
     size = trial.algorithm.policy[0] * trial.plant.gamma
     u[:] = 0.0
@@ -69,7 +84,7 @@ class _Updater(Updater):
         return view.parameters - self._learning_rate * error @ view.jacobian(x)
 
 
-@compiled
+@kept
 def learn(trial: Trial, t: int, target: Array) -> None:
     value = np.empty(target.shape[0])
     J = model_rows(trial.plant, trial.network, trial.state.theta, trial.record.states[t], value)

@@ -23,6 +23,7 @@ from dopt.run import run_trial
 from dopt.samples import uniform_samples
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
+from tests.dopt.kernel.calls import call
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES
 
@@ -90,7 +91,7 @@ def test_values_and_rows_are_those_of_automatic_differentiation(model: str) -> N
     for point, value in zip(np.hstack([x, u]), values, strict=True):
         given = (torch.tensor(theta), torch.tensor(point))
         out, rows_value = np.empty(2), np.empty(2)
-        model_accelerations(kernel.plant, kernel.network, theta, point, out)
+        call(model_accelerations, kernel.plant, kernel.network, theta, point, out)
         rows = network_jacobian(kernel.network, theta, point, rows_value)
         assert out == pytest.approx(value, rel=1e-12)
         assert rows_value == pytest.approx(value, rel=1e-12)

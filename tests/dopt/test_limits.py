@@ -57,9 +57,9 @@ BOTH_PATHS = [
 def test_both_paths_choose_the_same_inputs(
     env: str, limits: dict[str, Any], policy: str, model: str | None, learner: str | None
 ) -> None:
-    spec = limited(env, limits | {"steps": 20}, policy, horizon=40, model=model, learner=learner)
+    spec = limited(env, limits | {"steps": 12}, policy, horizon=30, model=model, learner=learner)
     fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
-    free = run_trial(limited(env, None, policy, horizon=40, model=model, learner=learner))
+    free = run_trial(limited(env, None, policy, horizon=30, model=model, learner=learner))
     assert not np.array_equal(fast.inputs, free.inputs)
     assert relative_gap(fast.inputs, plain.inputs) < 1e-7
     assert relative_gap(fast.parameters, plain.parameters) < 1e-6

@@ -15,7 +15,7 @@ from dopt.types import Matrix, Vector
 def sampled_point(trial: Trial, t: int) -> Vector:
     """Return where the accelerations of step t were observed: a state, or a state and u_t."""
     state = sampled_state(trial.plant, trial.record.states, t)
-    return model_point(trial.network, state, trial.record.inputs[t])
+    return model_point(trial.network, state, trial.state.estimate.inputs[t])
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""What a notebook gets."""
+"""Frames that a notebook gets."""
 
 from __future__ import annotations
 

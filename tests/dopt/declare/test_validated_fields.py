@@ -44,12 +44,15 @@ POSITIVE = {
         "forgetting",
         "dry_rate",
         "motor_gain",
+        "measurement_noise",
+        "velocity_cutoff",
     ),
 }
 NONNEGATIVE = {
     *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
     "dry_friction",
+    "measured_states",
 }
 FRACTIONS = {"beta_1", "beta_2"}
 SHARES = {"forgetting", "band"}
@@ -84,6 +87,8 @@ def bad_values(field: dataclasses.Field[Any]) -> Iterator[tuple[Any, Any]]:
         return
     rest = field.default[1:]
     yield from (((number, *rest), number) for number in numbers)
+    if not field.default:  # of any size, which another field decides
+        return
     for value in (3.0,) if field.name in OF_ANY_SIZE else (3.0, rest, (*field.default, 1)):
         yield value, None
 

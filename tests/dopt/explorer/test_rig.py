@@ -57,7 +57,7 @@ def test_either_end_is_killed_and_the_exploration_goes_on(rig: object, tmp_path:
         wait_for_steps(journal, 100)
         running[0].send_signal(signal.SIGKILL)
         running.append(started(*motor))
-        wait_for_steps(journal, 100, after="resets")
+        wait_for_steps(journal, 101, after="resets")
         running[1].send_signal(signal.SIGKILL)
         running[1].communicate(timeout=10.0)
         with reopened(rig, journal) as after:

@@ -12,7 +12,7 @@ from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from tests.dopt.kernel.test_information import run
+from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.twin import relative_gap, transplant
 from tests.dopt.trials import LEARNERS, PAIRS, trial
 
@@ -45,7 +45,8 @@ def check_agreement(spec: TrialSpec) -> tuple[TrialResult, TrialResult]:
 
 @pytest.mark.parametrize(("env", "policy", "learner"), CASES)
 def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str, Any]) -> None:
-    spec = trial(env, policy, 3, env={"horizon": 9}, learner=learner)
+    horizon = 6 if learner == NEWEST else 9  # no window to fill
+    spec = trial(env, policy, 3, env={"horizon": horizon}, learner=learner)
     fast, plain = check_agreement(spec)
     if policy not in LEARNERS:  # least squares and a process are solved for, at a large condition
         assert relative_gap(fast.parameters, plain.parameters) < 1e-8

@@ -200,10 +200,13 @@ def test_it_needs_the_primal_form(form: str) -> None:
 )
 def test_a_learner_that_updates_the_matrix_decides_about_it(learner: str) -> None:
     model = {"name": "mlp" if LEARNERS[learner].structure == "gradient" else "linear"}
+    estimates = LEARNERS[learner].estimates_states
+    env = {"measured_states": [0], "measurement_noise": [0.1]} if estimates else {}
+    policy = FRESH | ({"regularization": 3.0} if estimates else {})
     with pytest.raises(
         IncompatibleError, match=r"^policy.information 'fresh' goes with .*: change"
     ):
-        trial("arm", "d_optimal", policy=FRESH, learner={"name": learner}, model=model)
+        trial("arm", "d_optimal", policy=policy, learner={"name": learner}, model=model, env=env)
 
 
 @pytest.mark.parametrize("model", ["linear", "linear_state", "rff"])

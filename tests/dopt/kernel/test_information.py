@@ -12,6 +12,7 @@ from dopt.kernel.run import KernelTrial
 from dopt.reference.models import model_function
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close
+from tests.dopt.kernel.steps import run
 from tests.dopt.trials import trial
 
 
@@ -19,15 +20,6 @@ def jacobians(spec: TrialSpec, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return J of n pairs of parameters, (n, q), and states, (n, d): (n, r, q)."""
     rows = vmap(jacrev(model_function(spec.system, spec.model)))
     return rows(torch.tensor(theta), torch.tensor(x)).numpy()
-
-
-def run(fast: KernelTrial, steps: int) -> np.ndarray:
-    """Take steps one by one; return the parameters after each, (steps, q)."""
-    parameters = np.empty((steps, len(fast.state.theta)))
-    for t in range(steps):
-        fast.advance(t + 1)
-        parameters[t] = fast.state.theta
-    return parameters
 
 
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])

@@ -21,8 +21,8 @@ from dopt.learning import ExtendedKalman
 from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.test_agreement import check_agreement
-from tests.dopt.kernel.test_information import run
 from tests.dopt.kernel.twin import observed, relative_gap, transplant
 from tests.dopt.trials import trial
 
@@ -80,7 +80,7 @@ def test_with_a_matrix_of_its_own_it_is_ridge_regression(regularization: float) 
 @pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "quadrotor", "drifting_pendulum"])
 def test_both_paths_run_the_same_filter(env: str, policy: str, learner: dict[str, Any]) -> None:
-    fast, plain = check_agreement(trial(env, policy, 3, env={"horizon": 15}, learner=learner))
+    fast, plain = check_agreement(trial(env, policy, 3, env={"horizon": 10}, learner=learner))
     assert relative_gap(fast.parameters, plain.parameters) < 1e-8
 
 

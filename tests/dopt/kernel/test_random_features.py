@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numba import float64
 
 from dopt.errors import IncompatibleError
 from dopt.forecasts import model_forecast
@@ -14,13 +13,13 @@ from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
 from dopt.kernel.information.primal import dense
 from dopt.kernel.model import rows_at
-from dopt.kernel.pointers import compiled_for, kind_of
 from dopt.kernel.random_features import write_row_along
 from dopt.kernel.run import KernelTrial
 from dopt.policies import POLICIES
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close
+from tests.dopt.kernel.calls import call
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
@@ -91,12 +90,10 @@ def test_change_of_the_rows_is_that_of_finite_differences(env: str) -> None:
     fast, rng = KernelTrial(features(env)), np.random.default_rng(0)
     plant, network, theta = fast.trial.plant, fast.trial.network, fast.state.theta
     given, d, h = (plant, network, theta), fast.spec.system.n_states, 1e-5
-    # Compiled once for all systems, whose functions are pointers to it.
-    rows: Any = compiled_for("rows_at", rows_at, (*map(kind_of, given), float64[:, ::1]))
     for _ in range(5):
         x, direction = rng.normal(size=d), rng.normal(size=d)
         ends = np.stack([x + h * direction, x - h * direction])
-        ahead, behind = np.split(rows(*given, ends), 2)
+        ahead, behind = np.split(call(rows_at, *given, ends), 2)
         differences = (ahead - behind) / (2.0 * h)
         for k, expected in enumerate(differences):
             change = np.empty(len(theta))

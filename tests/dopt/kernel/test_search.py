@@ -40,7 +40,7 @@ def test_kernel_and_reference_choose_the_same_plans_for_many_steps(
     env: str, candidates: int, policy: str, fields: dict[str, Any]
 ) -> None:
     given = fields | {"candidates": candidates}
-    spec = trial(env, policy, 3, env={"horizon": 60}, policy=given, model={"width": 8})
+    spec = trial(env, policy, 3, env={"horizon": 45}, policy=given, model={"width": 8})
     fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
     assert np.array_equal(fast.inputs, plain.inputs)
     assert relative_gap(fast.states, plain.states) < 1e-8

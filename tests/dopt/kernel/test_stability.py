@@ -8,6 +8,7 @@ import pytest
 from dopt.kernel.information.primal import dense, rank_update, restore
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.structs import Covariance
+from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.test_information import jacobians
 from tests.dopt.trials import trial
 
@@ -27,10 +28,7 @@ def test_ten_thousand_steps_at_a_tiny_regularization_drift_little() -> None:
     q = len(fast.state.theta)
     M = REGULARIZATION * np.eye(q)
     for start in range(0, STEPS, 1_000):
-        parameters = np.empty((1_000, q))
-        for t in range(1_000):
-            fast.advance(start + t + 1)
-            parameters[t] = fast.state.theta
+        parameters = run(fast, 1_000)
         J = jacobians(spec, parameters, fast.record.states[start : start + 1_000])
         rows = J.reshape(-1, q)
         M += rows.T @ rows

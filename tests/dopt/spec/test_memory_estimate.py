@@ -33,8 +33,8 @@ def held(spec: TrialSpec) -> int:
     """Return the bytes of what a trial is made of in the kernel, its evaluation aside."""
     draws = draw(spec)
     arrays = (draws.noise, draws.inputs, draws.components, draws.ties)
-    state = from_spec.initial_state(spec, draws.weights)
-    return size(arrays) + size(from_spec.empty_record(spec.system)) + size(state)
+    record = from_spec.empty_record(spec.system)
+    return size(arrays) + size(record) + size(from_spec.initial_state(spec, draws.weights, record))
 
 
 @pytest.mark.parametrize(("env", "policy"), PAIRS)

@@ -33,6 +33,8 @@ def other(value: Any, field: dataclasses.Field[Any], spec: TrialSpec) -> Any:
         return 1 if "int" in str(field.type) else 1.5
     if isinstance(value, str):
         return next(choice for choice in field.metadata["choices"] if choice != value)
+    if field.name.startswith("measure"):
+        return tuple(range(spec.system.n_states))
     if value == ():
         return spec.system.initial_state
     if field.name == "grid_points":
@@ -44,7 +46,11 @@ def other(value: Any, field: dataclasses.Field[Any], spec: TrialSpec) -> Any:
 
 def with_value(spec: TrialSpec, section: str, field: str, value: Any) -> TrialSpec:
     mapping: dict[str, Any] = spec.to_mapping()
-    needed = {"information": "fresh"} if field == "refresh_every" else {}
+    needed: dict[str, Any] = {"information": "fresh"} if field == "refresh_every" else {}
+    if field == "measured_states":
+        needed = {"measurement_noise": [0.1] * len(value)}
+    if field == "measurement_noise":
+        needed, value = {"measured_states": value}, [0.2] * len(value)
     return TrialSpec.from_mapping(mapping | {section: mapping[section] | needed | {field: value}})
 
 
@@ -215,8 +221,8 @@ def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
             "mlp",
             "recursive_least_squares",
             "learner 'recursive_least_squares' goes with model 'linear', 'linear_state' or 'rff' "
-            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf' or "
-            "'gauss_newton', but",
+            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf', "
+            "'gauss_newton' or 'joint_ekf', but",
         ),
     ],
 )

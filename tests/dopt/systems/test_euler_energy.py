@@ -1,4 +1,4 @@
-"""What Euler steps do to the energy of the shipped systems where no input acts."""
+"""Effect of Euler steps on the energy of the shipped systems where no input acts."""
 
 from __future__ import annotations
 

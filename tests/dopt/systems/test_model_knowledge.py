@@ -1,4 +1,4 @@
-"""What the learner is told of a system: its features, and the form that an oracle knows."""
+"""Knowledge of a system that a learner is given: features, and the form that an oracle knows."""
 
 from __future__ import annotations
 

@@ -1,0 +1,76 @@
+"""Kalman filter over state and parameters in compiled code (:mod:`dopt.learning.joint_kalman`).
+
+Its numbers are λ, ρ, ζ, the steps from one fit to the next and the Gauss-Newton steps of a fit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.kernel.compiler import compiled
+from dopt.kernel.information.primal import inner, quadratic_forms
+from dopt.kernel.information.update import filter_step, model_rows
+from dopt.kernel.learners.prediction_errors import fit
+from dopt.kernel.learners.samples import sampled_point
+from dopt.kernel.learners.state_filter import (
+    begin,
+    correct_covariance,
+    correct_sensitivity,
+    move_covariance,
+    move_sensitivity,
+    state_jacobian,
+)
+from dopt.kernel.structs import Trial
+from dopt.types import Vector
+
+
+@compiled
+def learn(trial: Trial, t: int, target: Vector) -> None:  # noqa: ARG001  # it learns from outputs
+    """Filter what was measured of x_{t+1}, and fit all that was measured every k steps."""
+    numbers = trial.algorithm.learner
+    refit_every, steps = int(numbers[3]), int(numbers[4])
+    predict(trial, t, numbers[1], numbers[2])
+    update(trial, t)
+    if (t + 1) % refit_every == 0:
+        fit(trial, t + 1, numbers[0], numbers[1], steps)
+
+
+@compiled
+def predict(trial: Trial, t: int, noise_variance: float, underweighting: float) -> None:
+    """Move P and Ψ from x_t to x_{t+1}, of which the estimate is the prediction already."""
+    plant, network, theta = trial.plant, trial.network, trial.state.theta
+    estimate, rows = trial.state.estimate, plant.learned_rows
+    r, dt = rows.shape[0], estimate.durations[t]
+    J = model_rows(plant, network, theta, sampled_point(trial, t), np.empty(r))
+    noise = np.zeros((r, r))
+    if underweighting > 0.0:
+        noise[:] = underweighting * quadratic_forms(trial.state.covariance, J, J)
+    for k in range(r):
+        noise[k, k] += noise_variance
+    x, u = trial.record.states[t], trial.record.inputs[t]
+    begin(trial, t, estimate.covariance, estimate.sensitivity)
+    A = state_jacobian(plant, network, theta, x, u, dt)
+    move_covariance(A, noise, rows, dt, estimate.covariance)
+    move_sensitivity(A, J, rows, dt, estimate.sensitivity)
+
+
+@compiled
+def update(trial: Trial, t: int) -> None:
+    """Correct x̂_{t+1} and θ, P, Ψ and M by what was measured, one state after the other."""
+    state, sensors = trial.state, trial.sensors
+    estimate, x = state.estimate, trial.record.states[t + 1]
+    P, sensitivity, q = estimate.covariance, estimate.sensitivity, state.theta.shape[0]
+    rows, residual, change = np.empty((1, q)), np.empty(1), np.empty(q)
+    for i in range(sensors.measured.shape[0]):
+        row = sensors.measured[i]
+        error, variance = estimate.outputs[t, i] - x[row], P[row, row] + sensors.variances[i]
+        scale = 1.0 / np.sqrt(variance)
+        rows[0] = scale * sensitivity[row]
+        residual[0] = scale * error
+        change[:] = -state.theta
+        filter_step(state.covariance, state.theta, rows, residual)
+        change += state.theta
+        gain = correct_covariance(P, row, variance)
+        correct_sensitivity(gain, row, sensitivity)
+        for j in range(x.shape[0]):
+            x[j] += gain[j] * error + inner(sensitivity[j], change)

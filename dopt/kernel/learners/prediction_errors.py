@@ -1,0 +1,124 @@
+"""Fit of the parameters to all that was measured, by the errors of predictions, in compiled code.
+
+The filter over the state alone, at parameters θ, leaves the innovations e, whose variances are s;
+their derivatives by θ, with the gains held, are -C Ψ. A fit takes damped Gauss-Newton steps to the
+minimum of Σ (e²/s + log s) + λ ‖θ - θ₀‖² (:mod:`dopt.learning.joint_kalman`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
+from dopt.kernel.compiler import compiled
+from dopt.kernel.information.cholesky import factorize, solve, write_inverse
+from dopt.kernel.information.update import model_rows
+from dopt.kernel.integration import next_model_state
+from dopt.kernel.learners.gauss_newton import squared_distance
+from dopt.kernel.learners.state_filter import (
+    begin,
+    correct_covariance,
+    correct_sensitivity,
+    learned_at,
+    move_covariance,
+    move_sensitivity,
+    state_jacobian,
+)
+from dopt.kernel.points import model_point
+from dopt.kernel.structs import Trial
+from dopt.types import Matrix, Vector
+
+
+@compiled
+def fit(trial: Trial, n: int, regularization: float, noise_variance: float, steps: int) -> None:
+    """Fit θ to what was measured in n steps, and write M⁻¹, x̂_n, P and Ψ anew.
+
+    θ is NaN afterwards, which ends the trial as diverged, where rounding has left M indefinite.
+    """
+    state = trial.state
+    theta, prior, q = state.theta, state.prior, state.theta.shape[0]
+    n_errors = n * trial.sensors.measured.shape[0]
+    rows, errors, step = np.empty((n_errors, q)), np.empty(n_errors), np.empty(q)
+    normal, definite = np.empty((q, q)), True
+    for turn in range(steps + 1):
+        before = run_filter(trial, n, noise_variance, rows, errors)
+        before += regularization * squared_distance(theta, prior)
+        normal[:] = np.dot(rows.T, rows)
+        for i in range(q):
+            normal[i, i] += regularization
+        definite = definite and factorize(normal)
+        if not definite:
+            break
+        if turn < steps:
+            step[:] = np.dot(errors, rows) + regularization * (prior - theta)
+            solve(normal, step)
+            _take_step(trial, n, regularization, noise_variance, before, step)
+    if not (definite and write_inverse(normal, state.covariance.upper)):
+        theta[:] = np.nan
+    state.covariance.n_pending[0] = 0
+
+
+@compiled
+def _take_step(
+    trial: Trial,
+    n: int,
+    regularization: float,
+    noise_variance: float,
+    before: float,
+    step: Vector,
+) -> None:
+    """Move θ along a step, (q,), as far as the objective does not grow from ``before``."""
+    theta, prior, share = trial.state.theta, trial.state.prior, 1.0
+    start, none = theta.copy(), np.empty((0, theta.shape[0]))
+    while share >= SMALLEST_SHARE:
+        theta[:] = start + share * step
+        after = run_filter(trial, n, noise_variance, none, np.empty(0))
+        after += regularization * squared_distance(theta, prior)
+        if after <= before + (NO_GROWTH - 1.0) * abs(before):
+            return
+        share *= 0.5
+    theta[:] = start
+
+
+@compiled
+def run_filter(trial: Trial, n: int, noise_variance: float, rows: Matrix, errors: Vector) -> float:
+    """Filter what was measured in n steps at the present θ; return Σ (e²/s + log s).
+
+    Writes C Ψ/√s, (n outputs, q), and e/√s, if there is room for them, and then also x̂_n, P and Ψ.
+    """
+    plant, network, theta = trial.plant, trial.network, trial.state.theta
+    sensors, estimate, with_rows = trial.sensors, trial.state.estimate, rows.shape[0] > 0
+    n_measured, r = sensors.measured.shape[0], plant.learned_rows.shape[0]
+    x = trial.record.states[0].copy()
+    d, noise, following = x.shape[0], noise_variance * np.eye(r), np.empty(x.shape[0])
+    P, sensitivity = np.zeros((d, d)), np.zeros((d, theta.shape[0]))
+    total = 0.0
+    for t in range(n):
+        u, dt = trial.record.inputs[t], estimate.durations[t]
+        if begin(trial, t, P, sensitivity):
+            x[:] = estimate.starts[t]
+        A = state_jacobian(plant, network, theta, x, u, dt)
+        next_model_state(plant, network, theta, x, u, dt, following)
+        if with_rows:
+            point = model_point(network, learned_at(plant, x, following), u)
+            J = model_rows(plant, network, theta, point, np.empty(r))
+            move_sensitivity(A, J, plant.learned_rows, dt, sensitivity)
+        move_covariance(A, noise, plant.learned_rows, dt, P)
+        x[:] = following
+        for i in range(n_measured):
+            row = sensors.measured[i]
+            error, variance = estimate.outputs[t, i] - x[row], P[row, row] + sensors.variances[i]
+            total += error * error / variance + np.log(variance)
+            gain = correct_covariance(P, row, variance)
+            if with_rows:
+                scale = 1.0 / np.sqrt(variance)
+                rows[t * n_measured + i] = scale * sensitivity[row]
+                errors[t * n_measured + i] = scale * error
+                correct_sensitivity(gain, row, sensitivity)
+            for j in range(d):
+                x[j] += gain[j] * error
+    if with_rows:
+        trial.record.states[n] = x
+        estimate.covariance[:] = P
+        estimate.sensitivity[:] = sensitivity
+    return total

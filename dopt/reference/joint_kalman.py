@@ -1,0 +1,136 @@
+"""Filter over state and parameters, and fits of all that was measured, for a batch of trials.
+
+Twin of :mod:`dopt.kernel.learners.joint_kalman`; M is summed, and solved afresh.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
+from dopt.learning import JointKalman
+from dopt.reference.learning import solved
+from dopt.reference.sensors import BatchSensors
+from dopt.reference.state import BatchState
+
+
+class JointKalmanLearner:
+    """The filter of n trials: P, (n, d, d), and Ψ, (n, d, q)."""
+
+    def __init__(
+        self, learner: JointKalman, batch: BatchState, sensors: BatchSensors, regularization: float
+    ) -> None:
+        self._learner, self._batch, self._sensors = learner, batch, sensors
+        self._ridge, self._prior = regularization, batch.theta.clone()
+        n, d, q = len(batch.specs), batch.system.n_states, batch.n_learned
+        self._P, self._psi = batch.theta.new_zeros(n, d, d), batch.theta.new_zeros(n, d, q)
+        self._E = batch.theta.new_zeros(d, batch.system.n_learned)
+        for column, row in enumerate(batch.system.learned_rows):
+            self._E[row, column] = 1.0
+        self._rows = vmap(jacrev(batch.model))
+
+    def filtered(self, t: int, information: Tensor) -> Tensor:
+        """Take in what was measured of x_{t+1}, of which the prediction stands there; return M."""
+        batch, learner = self._batch, self._learner
+        x, following, u = batch.states[:, t], batch.states[:, t + 1], batch.inputs[:, t]
+        theta, dt = batch.theta, self._sensors.durations[t]
+        J = self._rows(theta, batch.points(self._learned_at(x, following), u))
+        spread = J @ torch.linalg.solve(information, J.mT)
+        noise = learner.noise_variance * torch.eye(J.shape[1]).to(J)
+        noise = noise + learner.underweighting * spread
+        A = self._state_jacobian(theta, x, u, dt)
+        self._P, self._psi = self._begun(t, self._P, self._psi)
+        P = A @ self._P @ A.mT + dt**2 * self._E @ noise @ self._E.T
+        psi = A @ self._psi + dt * self._E @ J
+        for i, row in enumerate(self._sensors.rows):
+            error = self._sensors.outputs[:, t, i] - following[:, row]
+            variance = P[:, row, row] + self._sensors.variances[i]
+            h, K = psi[:, row], P[:, :, row] / variance[:, None]
+            information = information + h[:, :, None] * (h / variance[:, None])[:, None, :]
+            change = solved(information, (h * (error / variance)[:, None]).unsqueeze(-1))
+            P = P - variance[:, None, None] * K[:, :, None] * K[:, None, :]
+            psi = psi - K[:, :, None] * h[:, None, :]
+            theta.add_(change)
+            following.add_(K * error[:, None] + (psi @ change.unsqueeze(-1)).squeeze(-1))
+        self._P, self._psi = P, psi
+        if (t + 1) % learner.refit_every == 0:
+            return self._fitted(t + 1)
+        return information
+
+    def _begun(self, t: int, P: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
+        """Return P and Ψ before step t, those of a state of its own where it begins anew."""
+        anew = self._sensors.starts[:, t, :1].isfinite().unsqueeze(-1)
+        start = torch.diag(self._sensors.start_variances)
+        return torch.where(anew, start, P), torch.where(anew, 0.0, psi)
+
+    def _learned_at(self, x: Tensor, following: Tensor) -> Tensor:
+        euler = self._batch.system.integrator == "euler"
+        return x if euler else 0.5 * (x + following)
+
+    def _state_jacobian(self, theta: Tensor, x: Tensor, u: Tensor, dt: float) -> Tensor:
+        """Return ∂x_{t+1}/∂x_t of the model's step, (n, d, d)."""
+
+        def step(one: Tensor, at: Tensor, inputs: Tensor) -> Tensor:
+            given = one.unsqueeze(0), at.unsqueeze(0), inputs.unsqueeze(0)
+            return self._batch.learned.next_states(*given, dt).squeeze(0)
+
+        A: Tensor = vmap(jacrev(step, argnums=1))(theta, x, u)
+        return A
+
+    def _fitted(self, n: int) -> Tensor:
+        """Fit θ to what was measured in n steps; return M."""
+        theta = self._batch.theta
+        for _ in range(self._learner.steps):
+            before, J, e = self._run(n)
+            right = J.mT @ e.unsqueeze(-1) + self._ridge * (self._prior - theta).unsqueeze(-1)
+            step, start = solved(self._normal(J), right), theta.clone()
+            share = torch.ones_like(theta[:, :1])
+            bound = before + (NO_GROWTH - 1.0) * before.abs()
+            while True:
+                theta.copy_(start + share * step)
+                worse = ~(self._run(n)[0] <= bound).unsqueeze(1) & (share > 0)
+                if not worse.any():
+                    break
+                smaller = torch.where(share > SMALLEST_SHARE, share / 2, 0.0)
+                share = torch.where(worse, smaller, share)
+        _, J, _ = self._run(n, keep=True)
+        return self._normal(J)
+
+    def _normal(self, J: Tensor) -> Tensor:
+        total: Tensor = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
+        return total
+
+    def _run(self, n: int, *, keep: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """Filter n steps at the present θ.
+
+        Returns the objective, (n,), the whitened rows C Ψ/√s, (n, N, q), and errors, (n, N);
+        ``keep`` writes x̂_n, P and Ψ.
+        """
+        batch, sensors, theta = self._batch, self._sensors, self._batch.theta
+        x, P, psi = batch.states[:, 0], torch.zeros_like(self._P), torch.zeros_like(self._psi)
+        noise = self._learner.noise_variance * self._E @ self._E.T
+        total = self._ridge * (theta - self._prior).square().sum(dim=1)
+        rows, errors = [], []
+        for t in range(n):
+            u, dt = batch.inputs[:, t], sensors.durations[t]
+            P, psi = self._begun(t, P, psi)
+            x = torch.where(sensors.starts[:, t].isfinite(), sensors.starts[:, t], x)
+            following = batch.learned.next_states(theta, x, u, dt)
+            A = self._state_jacobian(theta, x, u, dt)
+            J = self._rows(theta, batch.points(self._learned_at(x, following), u))
+            P, psi, x = A @ P @ A.mT + dt**2 * noise, A @ psi + dt * self._E @ J, following
+            for i, row in enumerate(sensors.rows):
+                error = sensors.outputs[:, t, i] - x[:, row]
+                variance = P[:, row, row] + sensors.variances[i]
+                total = total + error**2 / variance + variance.log()
+                K, scale = P[:, :, row] / variance[:, None], variance.rsqrt()
+                rows.append(psi[:, row] * scale[:, None])
+                errors.append(error * scale)
+                P = P - variance[:, None, None] * K[:, :, None] * K[:, None, :]
+                psi = psi - K[:, :, None] * psi[:, None, row]
+                x = x + K * error[:, None]
+        if keep:
+            batch.states[:, n], self._P, self._psi = x, P, psi
+        return total, torch.stack(rows, dim=1), torch.stack(errors, dim=1)
