@@ -1,0 +1,66 @@
+"""The numbers on a pendulum whose angle alone is measured are those of their table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from tests.findings.report_columns import FINDINGS
+from tests.pages import DOCS
+
+TABLE = pd.read_csv(DOCS / "noisy_angle.csv")
+ROWS = [
+    ("state", "adam_window"),
+    ("state", "ekf"),
+    ("state", "gauss_newton"),
+    ("angle", "adam_window"),
+    ("angle", "gauss_newton"),
+    ("angle", "joint_ekf without fits"),
+    ("angle", "joint_ekf"),
+]
+
+
+def losses(known: str, learner: str) -> pd.DataFrame:
+    """Return the final losses by seed, one column for each policy."""
+    rows = TABLE[(TABLE.known == known) & (TABLE.learner == learner)]
+    return rows.pivot_table(index="seed", columns="policy", values="final_loss")
+
+
+def geometric_mean(values: pd.Series[float]) -> float:
+    return float(np.exp(np.log(values).mean()))
+
+
+@pytest.mark.parametrize(("known", "learner"), ROWS)
+def test_rows_are_those_of_the_table(known: str, learner: str) -> None:
+    found = losses(known, learner)
+    assert len(found) == 100
+    means = geometric_mean(found.d_optimal), geometric_mean(found.random)
+    cells = " | ".join(f"{value:.3g}" for value in (*means, means[0] / means[1]))
+    name, _, how = learner.partition(" ")
+    assert f"| {known} | `{name}`{' ' + how if how else ''} | {cells} |" in FINDINGS
+
+
+def test_d_optimal_inputs_are_below_random_ones() -> None:
+    for known, learner in ROWS:
+        found = losses(known, learner)
+        gaps = np.log(found.d_optimal / found.random)
+        assert gaps.mean() < 0
+        assert stats.ttest_1samp(gaps, 0.0).pvalue < 1e-40
+
+
+def test_it_is_beside_learners_that_know_the_state() -> None:
+    """Below the paper's learner and the filter, and above a fit of all samples."""
+    found = geometric_mean(losses("angle", "joint_ekf").d_optimal)
+    for learner, known in (("adam_window", "state"), ("ekf", "state"), ("gauss_newton", "state")):
+        ratio = found / geometric_mean(losses(known, learner).d_optimal)
+        assert f"{ratio:.3g} times that of `{learner}`" in FINDINGS.replace("\n", " ")
+    nearly = geometric_mean(losses("both", "joint_ekf").d_optimal)
+    assert f"it ends at {nearly:.3g}" in FINDINGS.replace("\n", " ")
+
+
+def test_filtered_differences_end_above_the_filter() -> None:
+    found = geometric_mean(losses("angle", "joint_ekf").d_optimal)
+    for learner in ("adam_window", "gauss_newton"):
+        assert geometric_mean(losses("angle", learner).d_optimal) > 3 * found
