@@ -6,9 +6,15 @@ Here too: one database for each test, of each kind.
 from __future__ import annotations
 
 import os
+import sys
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
+
+# Otherwise pytest rewrites every test anew, and each process that a test starts compiles the
+# sources of its libraries, for seconds.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 import gc  # noqa: E402  all of these after the threads are set
 import shutil  # noqa: E402

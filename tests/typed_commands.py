@@ -14,8 +14,10 @@ from orchestrate import __main__ as orchestrate
 from orchestrate.runner import launch
 from tests.paths import ROOT
 
-STEPS, STEPS_OF_TASK = "env.horizon=20", "env.horizon=100"
-"""Added to each launch: what a page shows does not depend on how long its trials are."""
+STEPS, STEPS_OF_TASK = ("env.horizon=20",), ("env.horizon=100", "+task.iterations=1")
+"""Added to each launch: what a page shows does not depend on how long its trials are, nor on how
+well its tasks are solved.
+"""
 
 
 def run_typed(
@@ -44,7 +46,7 @@ def _main(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     assert words[0] == "orchestrate/launch.py", words
     here = ["executor=inprocess" if word == "executor=local" else word for word in words[1:]]
     steps = STEPS_OF_TASK if any(word.startswith("task=") for word in here) else STEPS
-    monkeypatch.setattr(sys, "argv", ["launch.py", *here, steps])
+    monkeypatch.setattr(sys, "argv", ["launch.py", *here, *steps])
     return int(launch.main())
 
 

@@ -24,8 +24,10 @@ class Server:
 
     def __init__(self) -> None:
         self._bin = binaries()
-        # Not below pytest's folder, which only we may enter.
-        self.folder = Path(tempfile.mkdtemp(prefix="dopt-postgresql-"))
+        # Beside pytest's folder, which only we may enter: in memory, where each table is made in a
+        # quarter of the time.
+        place = os.environ.get("PYTEST_DEBUG_TEMPROOT")
+        self.folder = Path(tempfile.mkdtemp(prefix="dopt-postgresql-", dir=place))
         self.port = _free_port()
         if os.geteuid() == 0:
             shutil.chown(self.folder, ACCOUNT)

@@ -27,6 +27,11 @@ SPECS = [Spec(seed) for seed in range(4)]
 losses = pytest.mark.parametrize("lost", LOSSES, ids="-".join)
 
 
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("orchestrate.runner.retrying_store.FIRST_PAUSE_SECONDS", 0.01)
+
+
 @pytest.fixture
 def said() -> list[str]:
     return []
