@@ -14,7 +14,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
 from dopt.kernel.stored_code import stored
-from dopt.types import NumbaType
+from dopt.types import NumbaType, Vector
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -67,6 +67,13 @@ def compilable(function: F) -> F:
 def squared(x: float) -> float:
     """Return x², rounded by itself."""
     return x * x
+
+
+@compiled
+def copy_into(values: Vector, out: Vector) -> None:
+    """Write values, (n,), to others; ``out[:] = values`` takes Numba two seconds to compile."""
+    for i in range(values.shape[0]):
+        out[i] = values[i]
 
 
 @intrinsic

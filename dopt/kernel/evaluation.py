@@ -158,7 +158,7 @@ def add_sample(network: Network, points: Evaluation, x: Vector) -> None:
     """Write the kernel of a Gaussian process between a new sample, at a state, and all points."""
     phi, n = np.empty(network.sizes[0]), points.n_basis[0]
     features_at(network, x, phi)
-    for block in range(points.n_all):
+    for block in range(points.bounds[2]):
         features, out = points.features[block], points.basis[block, n]
         out[:] = 0.0
         for j in range(phi.shape[0]):
@@ -182,7 +182,7 @@ def follow_truth(plant: Plant, network: Network, points: Evaluation, t: int) -> 
                 points.targets[i, k] = value[k] - offset[k]
         return
     i = 0
-    for block in range(points.n_all):
+    for block in range(points.bounds[2]):
         for j in range(points.block_sizes[block]):
             plant.accelerations(points.states[i], plant.history[t], value)
             i += 1

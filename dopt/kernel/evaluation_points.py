@@ -35,10 +35,14 @@ def evaluation_points(system: System, model: Model, network: args.Network) -> ar
         np.zeros((0, 0, 0)),
         np.zeros((0, 0)),
         _followed(system, points),
-        len(sizes[0]),
-        len(sizes[0]) + len(sizes[1]),
+        _bounds(*map(len, sizes)),
         _size(system, points),
     )
+
+
+def _bounds(n_grid: int, n_reachable: int) -> Integers:
+    """Return where the grid begins and ends, and where the reachable set ends."""
+    return np.cumsum([0, n_grid, n_reachable], dtype=np.int64)
 
 
 def _followed(system: System, points: EvaluationSet) -> Array:
@@ -65,7 +69,7 @@ def points_of_trial(
         values *= network.waves.scale
         points = points._replace(basis=values, n_basis=np.array([values.shape[1]]))
     elif network.kind == ModelKind.GAUSSIAN_PROCESS:
-        room = np.zeros((points.n_all, horizon, BLOCK))
+        room = np.zeros((points.bounds[2], horizon, BLOCK))
         points = points._replace(basis=room, n_basis=np.zeros(1, dtype=np.int64))
     return points
 
@@ -101,8 +105,7 @@ def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation
         np.ascontiguousarray(regressors),
         np.ascontiguousarray(points.accelerations - offset),
         _followed(system, points),
-        points.n_grid,
-        len(points.states),
+        _bounds(points.n_grid, len(points.states) - points.n_grid),
         _size(system, points),
     )
 

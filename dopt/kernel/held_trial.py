@@ -1,17 +1,20 @@
-"""A trial with its policy and learner as one argument of compiled functions.
+"""A trial with the functions of its steps, held for compiled functions that read it by pointer.
 
 Numba takes the structures of a trial apart at each call from Python, for half a millisecond; here
-that is done once, and the functions below receive a pointer.
+that is done once.
 """
 
 from __future__ import annotations
 
 from numba import types
+from numba.core import cgutils
 from numba.experimental import structref
+from numba.extending import intrinsic
 
-from dopt.kernel import loop
-from dopt.kernel.compiler import called_from_python, compiled
-from dopt.kernel.structs import Learn, Plan, Trial
+from dopt.kernel.compiler import compiled
+from dopt.kernel.struct_pointers import pointer_to
+from dopt.kernel.structs import Steps, Trial
+from dopt.types import NumbaType
 
 
 @structref.register
@@ -20,33 +23,39 @@ class HeldTrialType(types.StructRef):  # type: ignore[misc]  # numba has no type
 
 
 class HeldTrial(structref.StructRefProxy):  # type: ignore[misc]
-    """A trial, the function of its policy and that of its learner."""
+    """A trial and the functions that its steps call."""
 
     trial: Trial
-    plan: Plan
-    learn: Learn
+    steps: Steps
 
 
-structref.define_proxy(HeldTrial, HeldTrialType, ["trial", "plan", "learn"])
+FIELDS = ("trial", "steps")
+
+structref.define_proxy(HeldTrial, HeldTrialType, FIELDS)
 
 
 @compiled
-def hold(trial: Trial, plan: Plan, learn: Learn) -> HeldTrial:
+def hold(trial: Trial, steps: Steps) -> HeldTrial:
     """Return a trial and its functions as one; it writes into the same arrays."""
-    return HeldTrial(trial, plan, learn)
+    return HeldTrial(trial, steps)
 
 
-@called_from_python
-def plan_input(held: HeldTrial, t: int) -> None:
-    """Write u_t (:func:`dopt.kernel.loop.plan_input`)."""
-    loop.plan_input(held.trial, held.plan, t)
+@intrinsic
+def trial_in(typing_context: NumbaType, held: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of Numba
+    """Return a pointer to the trial that is held."""
 
+    def generate(  # the signature is that of numba
+        context: NumbaType,
+        builder: NumbaType,
+        signature: NumbaType,  # noqa: ARG001
+        arguments: NumbaType,
+    ) -> NumbaType:
+        kept = context.make_helper(builder, held, value=arguments[0])
+        start = context.nrt.meminfo_data(builder, kept.meminfo)
+        fields = context.get_value_type(held.get_data_type())
+        place = [*held.field_dict].index("trial")
+        start = builder.bitcast(start, fields.as_pointer())
+        address = cgutils.gep_inbounds(builder, start, 0, place)
+        return builder.bitcast(address, cgutils.voidptr_t)
 
-@called_from_python
-def take_in(held: HeldTrial, t: int, dt: float) -> bool:
-    """Learn from the step from x_t to x_{t+1} (:func:`dopt.kernel.loop.take_in`).
-
-    The loss of the step is the error of the accelerations before they are learned.
-    """
-    held.trial.record.loss[t] = loop.prediction_error(held.trial, t, dt)
-    return loop.take_in(held.trial, held.learn, t, dt)
+    return pointer_to(held.field_dict["trial"])(held), generate

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import RUNGE_KUTTA_SHARES, RUNGE_KUTTA_WEIGHTS, Integrator
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import model_point, plant_point
 from dopt.kernel.structs import Network, Plant
@@ -59,7 +59,7 @@ def next_true_state(
     """Write the state that follows with the true accelerations."""
     rate, total = np.empty(x.shape[0]), np.empty(x.shape[0])
     accelerations = np.empty(plant.learned_rows.shape[0])
-    following[:] = x
+    copy_into(x, following)
     for stage in range(n_stages(plant)):
         plant.accelerations(plant_point(plant, following, u), parameters, accelerations)
         write_rate(plant, following, u, accelerations, rate)
@@ -79,7 +79,7 @@ def next_model_state(
     """Write the state that follows dt seconds later with the accelerations of the model."""
     rate, total = np.empty(x.shape[0]), np.empty(x.shape[0])
     accelerations = np.empty(plant.learned_rows.shape[0])
-    following[:] = x
+    copy_into(x, following)
     for stage in range(n_stages(plant)):
         model_accelerations(
             plant, network, theta, model_point(network, following, u), accelerations

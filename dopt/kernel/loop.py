@@ -8,39 +8,33 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import Integrator, ModelKind
+from dopt.algorithm import ModelKind
 from dopt.kernel.checks import within
-from dopt.kernel.compiler import called_from_python, compiled, monotonic_microseconds
+from dopt.kernel.compiler import called_from_python, compiled, copy_into, monotonic_microseconds
 from dopt.kernel.evaluation import add_sample, evaluation_buffers, follow_truth, model_error
-from dopt.kernel.integration import next_model_state, next_true_state
+from dopt.kernel.held_trial import HeldTrial, trial_in
+from dopt.kernel.integration import next_true_state
 from dopt.kernel.learners.samples import sampled_point
-from dopt.kernel.limits import limit_input, note_error
 from dopt.kernel.members import learn_members, members_or_one
 from dopt.kernel.model import model_accelerations
-from dopt.kernel.points import model_point, sampled_state
-from dopt.kernel.sensors import (
-    estimate_state,
-    has_sensors,
-    measure,
-    output_error,
-)
-from dopt.kernel.structs import Evaluation, Learn, Plan, Plant, Trial
+from dopt.kernel.points import sampled_state
+from dopt.kernel.sensors import has_sensors, measure, output_error
+from dopt.kernel.structs import Evaluation, Plant, Steps, Trial
 from dopt.types import Vector
 
 
 @compiled
-def plan_input(trial: Trial, plan: Plan, t: int) -> None:
+def plan_input(trial: Trial, steps: Steps, t: int) -> None:
     """Write u_t, the first of which was drawn before the trial, and the time that it took.
 
     It is what the policy chooses, unless the limits of the trial demand another one.
     """
     start, u = monotonic_microseconds(), trial.record.inputs[t]
     if t > 0:
-        plan(trial, t, u)
+        steps.plan(trial, t, u)
     else:
-        u[:] = trial.randomness.inputs[0]
-    if trial.limits.enforced:
-        limit_input(trial, t, u)
+        copy_into(trial.randomness.inputs[0], u)
+    steps.limit_input(trial, t, u)
     trial.record.plan_us[t] = monotonic_microseconds() - start
 
 
@@ -54,48 +48,19 @@ def act(plant: Plant, x: Vector, u: Vector, noise: Vector, t: int, following: Ve
 
 
 @compiled
-def observe(trial: Trial, t: int, dt: float, target: Vector) -> None:
-    """Write the accelerations observed from x_t to x_{t+1}, (r,), after dt seconds.
-
-    With the integrator of Runge and Kutta they are those in the middle of the step, plus what the
-    model's own step differs from the acceleration that it has there: a model whose error at them is
-    0 predicts x_{t+1}.
-    """
-    plant, states = trial.plant, trial.record.states
-    u = trial.state.estimate.inputs[t]
-    x, following = states[t], states[t + 1]
-    at, flow = sampled_state(plant, states, t), np.empty(x.shape[0])
-    plant.known(at, u, plant.parameters, flow)
-    for k in range(target.shape[0]):
-        row = plant.learned_rows[k]
-        target[k] = (following[row] - x[row]) / dt - flow[row]
-    if plant.integrator == Integrator.EULER:
-        return
-    network, theta = trial.network, trial.state.theta
-    value, end = np.empty(target.shape[0]), np.empty(x.shape[0])
-    model_accelerations(plant, network, theta, model_point(network, at, u), value)
-    next_model_state(plant, network, theta, x, u, dt, end)
-    for k in range(target.shape[0]):
-        row = plant.learned_rows[k]
-        target[k] -= (end[row] - x[row]) / dt - (flow[row] + value[k])
-
-
-@compiled
-def take_in(trial: Trial, learn: Learn, t: int, dt: float) -> bool:
+def take_in(trial: Trial, steps: Steps, t: int, dt: float) -> bool:
     """Learn from x_t, u_t and x_{t+1}, dt seconds later, and add the rows at (x_t, u_t) to M.
 
     Where states are measured with noise, an estimate takes the place of what was measured of
     x_{t+1}. Returns whether the parameters are finite: otherwise nothing is added.
     """
     plant, state, record = trial.plant, trial.state, trial.record
-    if has_sensors(trial.sensors):
-        estimate_state(trial, t, dt)
+    steps.estimate_state(trial, t, dt)
     target = np.empty(plant.learned_rows.shape[0])
-    observe(trial, t, dt, target)
-    if trial.limits.enforced:
-        note_error(trial, t, target)
+    steps.observe(trial, t, dt, target)
+    steps.note_error(trial, t, target)
     clock_0 = monotonic_microseconds()
-    learn_members(trial, learn, t, target)
+    learn_members(trial, steps.learn, t, target)
     clock_1 = monotonic_microseconds()
     if not within(state.theta, np.inf):
         return False
@@ -106,7 +71,7 @@ def take_in(trial: Trial, learn: Learn, t: int, dt: float) -> bool:
 
 
 @compiled
-def prediction_error(trial: Trial, t: int, dt: float) -> float:
+def prediction_error(trial: Trial, steps: Steps, t: int, dt: float) -> float:
     """Return the error of the model at the accelerations observed from x_t to x_{t+1}.
 
     Of an ensemble the mean of the members is taken. Where states are measured with noise it is
@@ -116,7 +81,7 @@ def prediction_error(trial: Trial, t: int, dt: float) -> float:
         return output_error(trial, t, dt)
     plant, thetas, r = trial.plant, members_or_one(trial.state), trial.plant.learned_rows.shape[0]
     target, value, mean = np.empty(r), np.empty(r), np.zeros(r)
-    observe(trial, t, dt, target)
+    steps.observe(trial, t, dt, target)
     point = sampled_point(trial, t)
     for member in range(thetas.shape[0]):
         model_accelerations(plant, trial.network, thetas[member], point, value)
@@ -129,39 +94,52 @@ def prediction_error(trial: Trial, t: int, dt: float) -> float:
 
 
 @called_from_python
-def advance(
-    trial: Trial, points: Evaluation, plan: Plan, learn: Learn, first: int, last: int
-) -> int:
+def plan_next(held: HeldTrial, t: int) -> None:
+    """Write u_t (:func:`plan_input`)."""
+    plan_input(trial_in(held), held.steps, t)
+
+
+@called_from_python
+def take_in_next(held: HeldTrial, t: int, dt: float) -> bool:
+    """Learn from the step from x_t to x_{t+1} (:func:`take_in`).
+
+    The loss of the step is the error of the accelerations before they are learned.
+    """
+    trial, steps = trial_in(held), held.steps
+    trial.record.loss[t] = prediction_error(trial, steps, t, dt)
+    return take_in(trial, steps, t, dt)
+
+
+@called_from_python
+def advance(held: HeldTrial, points: Evaluation, first: int, last: int) -> int:
     """Run the steps from ``first`` to ``last`` in place.
 
-    ``plan`` writes the input of a step, of which the first was drawn before the trial; ``learn``
-    updates the parameters with the accelerations that were observed in it. Returns the number of
-    steps done from the start of the trial: ``last``, or the step at which the trial diverged.
+    Returns the number of steps done from the start of the trial: ``last``, or the step at which the
+    trial diverged.
     """
+    trial, steps = trial_in(held), held.steps
     plant, network, record = trial.plant, trial.network, trial.record
-    thetas = members_or_one(trial.state)
+    thetas, bounds = members_or_one(trial.state), points.bounds
     buffers = evaluation_buffers(network, thetas, plant.learned_rows.shape[0])
     for t in range(first, last):
         x, following = record.true_states[t], record.true_states[t + 1]
-        plan_input(trial, plan, t)
+        plan_input(trial, steps, t)
         act(plant, x, record.inputs[t], trial.randomness.noise[t], t, following)
         if has_sensors(trial.sensors):
             noise = trial.randomness.measurement_noise[t]
             measure(trial.sensors, noise, following, record.states[t + 1])
         if not within(following, plant.state_limit):
             return t
-        if not take_in(trial, learn, t, plant.dt):
+        if not take_in(trial, steps, t, plant.dt):
             return t
         start = monotonic_microseconds()
         if network.kind == ModelKind.GAUSSIAN_PROCESS:
             add_sample(network, points, sampled_state(plant, record.states, t))
         if plant.history.shape[0] > 1:
             follow_truth(plant, network, points, t)
-        loss = model_error(network, thetas, points, 0, points.n_grid, buffers)
-        record.loss[t] = loss
-        record.reachable_loss[t] = model_error(
-            network, thetas, points, points.n_grid, points.n_all, buffers
-        )
+        loss = model_error(network, thetas, points, bounds[0], bounds[1], buffers)
+        reachable_loss = model_error(network, thetas, points, bounds[1], bounds[2], buffers)
+        record.loss[t], record.reachable_loss[t] = loss, reachable_loss
         record.evaluate_us[t] = monotonic_microseconds() - start
         if not np.isfinite(loss):
             return t

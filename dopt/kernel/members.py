@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.structs import Learn, State, Trial
 from dopt.types import Matrix, Vector
 
@@ -25,10 +25,12 @@ def learn_members(trial: Trial, learn: Learn, t: int, target: Vector) -> None:
     members, priors = state.members.parameters, state.members.priors
     if members.shape[0] > 0:
         turn = 1 + t % (members.shape[0] - 1)
-        state.theta[:], state.prior[:] = members[turn], priors[turn]
+        copy_into(members[turn], state.theta)
+        copy_into(priors[turn], state.prior)
         learn(trial, t, target)
-        members[turn] = state.theta
-        state.theta[:], state.prior[:] = members[0], priors[0]
+        copy_into(state.theta, members[turn])
+        copy_into(members[0], state.theta)
+        copy_into(priors[0], state.prior)
     learn(trial, t, target)
     if members.shape[0] > 0:
-        members[0] = state.theta
+        copy_into(state.theta, members[0])

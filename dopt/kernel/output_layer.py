@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.kernel.compiler import compiled, contracted
+from dopt.kernel.compiler import compiled, contracted, copy_into
 from dopt.kernel.structs import Network
 from dopt.types import Matrix, Real, Vector
 
@@ -78,7 +78,7 @@ def output_inputs_along(
         return hidden_dot
     first = phi.shape[0] - m
     out = np.empty((1 + m) * w + m)
-    out[:w] = hidden_dot
+    copy_into(hidden_dot, out[:w])
     for j in range(m):
         u, u_dot = phi[first + j], phi_dot[first + j]
         out[(1 + m) * w + j] = u_dot

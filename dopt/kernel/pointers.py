@@ -16,12 +16,15 @@ import numpy as np
 from numba import float64, int64, types
 from numba.core.errors import NumbaError
 
+from dopt.algorithm import Integrator
 from dopt.errors import SpecificationError
-from dopt.kernel import held_trial, loop
+from dopt.kernel import absent_steps, held_trial, limits, loop, observation, sensors
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compilation import compile_missing
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
-from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Trial
+from dopt.kernel.held_trial import HeldTrial
+from dopt.kernel.struct_pointers import pointer_to
+from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Steps, Trial
 from dopt.kernel.user_code import compiled_own
 from dopt.learning.base import CompiledLearner, Learner
 from dopt.policies.base import CompiledPolicy, Policy
@@ -31,27 +34,28 @@ from dopt.types import CompiledFunction, NumbaType
 class Compiled(NamedTuple):
     """Compiled code of a trial."""
 
+    hold: Callable[..., HeldTrial]
     advance: Callable[..., int]
-    plan: CompiledFunction
-    learn: CompiledFunction
+    steps: Steps
 
 
 class CompiledSteps(NamedTuple):
     """Compiled code of an exploration whose steps are taken one by one."""
 
-    hold: Callable[..., Any]  # returns a HeldTrial
+    hold: Callable[..., HeldTrial]
     plan_input: Callable[..., int]
     take_in: Callable[..., int]
-    plan: CompiledFunction
-    learn: CompiledFunction
+    steps: Steps
 
 
 def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evaluation) -> Compiled:
     """Compile the loop for a trial, with the functions of its policy and its learner."""
-    key = (layout_of(trial), layout_of(points), _source(policy), _source(learner))
+    kinds = layout_of((trial, points, *other_steps(trial).values()))
+    key = (kinds, _source(policy), _source(learner))
     if key not in _trials:
-        parts = _compiled_parts(policy, learner, trial, [loop.advance])
-        _trials[key] = Compiled(compiled_loop(trial, points), *parts)
+        steps = _compiled_parts(policy, learner, trial, [held_trial.hold, loop.advance])
+        hold, advance = compiled_step(trial, held_trial.hold), compiled_loop(trial, points)
+        _trials[key] = Compiled(hold, advance, steps)
     return _trials[key]
 
 
@@ -60,24 +64,46 @@ _trials: dict[Hashable, Compiled] = {}
 
 def compiled_steps(policy: Policy, learner: Learner, trial: Trial) -> CompiledSteps:
     """Compile the steps of a trial, with the functions of its policy and its learner."""
-    parts = _compiled_parts(policy, learner, trial, list(STEPS))
+    steps = _compiled_parts(policy, learner, trial, list(STEPS))
     hold, plan_input, take_in = (compiled_step(trial, step) for step in STEPS)
-    return CompiledSteps(hold, plan_input, take_in, *parts)
+    return CompiledSteps(hold, plan_input, take_in, steps)
 
 
-STEPS = (held_trial.hold, held_trial.plan_input, held_trial.take_in)
+STEPS = (held_trial.hold, loop.plan_next, loop.take_in_next)
 """Functions of an exploration, which do not depend on its policy and its learner."""
+
+
+OTHER_STEPS = {
+    "limit_input": (absent_steps.limit_input, limits.limit_input),
+    "note_error": (absent_steps.note_error, limits.note_error),
+    "estimate_state": (absent_steps.estimate_state, sensors.estimate_state),
+    "observe": (observation.observe_euler, observation.observe_runge_kutta),
+}
+"""Functions of a trial's steps but for its policy's and its learner's: the usual and the other."""
+
+
+def other_steps(trial: Trial) -> dict[str, CompiledFunction]:
+    """Return which of :data:`OTHER_STEPS` a trial calls."""
+    limited, measured = trial.limits.enforced, len(trial.sensors.measured) > 0
+    others = (limited, limited, measured, trial.plant.integrator != Integrator.EULER)
+    return {
+        name: choices[other]
+        for (name, choices), other in zip(OTHER_STEPS.items(), others, strict=True)
+    }
 
 
 def _compiled_parts(
     policy: Policy, learner: Learner, trial: Trial, callers: list[CompiledFunction]
-) -> tuple[CompiledFunction, CompiledFunction]:
-    """Compile what a trial needs but for the callers; return the plan and the learning step."""
-    compile_missing(_names(policy, learner, [*trial.information, *callers]))
-    plan, learn = signatures(trial)
+) -> Steps:
+    """Compile what a trial needs but for the callers."""
+    others, kinds = other_steps(trial), step_kinds(trial)
+    compile_missing(_names(policy, learner, [*trial.information, *others.values(), *callers]))
     for function in trial.information:
         compile_form(trial, function)
-    return function_of(policy, plan), function_of(learner, learn)
+    for name, function in others.items():
+        compiled_at(path_of(function), getattr(kinds, name))
+    plan, learn = function_of(policy, kinds.plan), function_of(learner, kinds.learn)
+    return Steps(plan, learn, **others)
 
 
 def layout_of(value: object) -> Hashable:
@@ -116,35 +142,49 @@ def path_of(function: CompiledFunction) -> str:
 
 def _information_signatures(plant: Plant, network: Network, state: State) -> dict[str, NumbaType]:
     """Return the types of the functions of a form of M, by their names."""
-    given = (*map(kind_of, (plant, network, state)), float64[::1])
+    structs = (pointer_to(kind_of(part)) for part in (plant, network, state))
+    given = (*structs, float64[::1])
     rows = types.void(*given)
     forms = float64[:, ::1](*given, float64[:, ::1], int64)
     return dict(zip(Information._fields, (rows, forms), strict=True))
 
 
-def signatures(trial: Trial) -> tuple[NumbaType, NumbaType]:
-    """Return the types of the functions of a policy and of a learner."""
-    plan = learn = types.void(kind_of(trial), int64, float64[::1])
-    return plan, learn
+def step_kinds(trial: Trial) -> Steps:
+    """Return the types of the functions of a trial's steps."""
+    whole, row = pointer_to(kind_of(trial)), float64[::1]
+    writes, takes_time = types.void(whole, int64, row), types.void(whole, int64, float64)
+    return Steps(
+        plan=writes,
+        learn=writes,
+        limit_input=writes,
+        note_error=writes,
+        estimate_state=takes_time,
+        observe=types.void(whole, int64, float64, row),
+    )
 
 
 def compiled_loop(trial: Trial, points: Evaluation) -> Callable[..., int]:
-    """Compile the loop for a trial, with pointers to the functions of its policy and learner."""
-    given = (kind_of(trial), kind_of(points), *map(pointer, signatures(trial)))
-    return compiled_for(path_of(loop.advance), loop.advance, (*given, int64, int64))
+    """Compile the loop for a trial."""
+    kinds = (held_kind(trial), kind_of(points), int64, int64)
+    return compiled_for(path_of(loop.advance), loop.advance, kinds)
 
 
 def compiled_step(trial: Trial, step: CompiledFunction) -> Callable[..., Any]:
     """Compile one of the functions of an exploration."""
-    whole = (kind_of(trial), *map(pointer, signatures(trial)))
-    fields = list(zip(("trial", "plan", "learn"), whole, strict=True))
-    held = held_trial.HeldTrialType(fields)
+    held = held_kind(trial)
     kinds = {
-        held_trial.hold: whole,
-        held_trial.plan_input: (held, int64),
-        held_trial.take_in: (held, int64, float64),
+        held_trial.hold: tuple(held.field_dict.values()),
+        loop.plan_next: (held, int64),
+        loop.take_in_next: (held, int64, float64),
     }
     return compiled_for(path_of(step), step, kinds[step])
+
+
+def held_kind(trial: Trial) -> NumbaType:
+    """Return the type of a trial that is held with pointers to its policy and learner."""
+    steps = types.NamedTuple([*map(pointer, step_kinds(trial))], Steps)
+    whole = (kind_of(trial), steps)
+    return held_trial.HeldTrialType(list(zip(held_trial.FIELDS, whole, strict=True)))
 
 
 def function_of(part: Policy | Learner, signature: NumbaType) -> CompiledFunction:

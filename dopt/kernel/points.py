@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import Integrator
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Vector
 
@@ -27,14 +27,20 @@ def model_point(network: Network, x: Vector, u: Vector) -> Vector:
 
 @compiled
 def sampled_state(plant: Plant, states: Matrix, t: int) -> Vector:
-    """Return where the accelerations of step t are observed: at x_t, or in the middle of the step.
+    """Return where the accelerations of step t are observed, given the states x_0 ... x_T."""
+    return state_between(plant, states[t], states[t + 1])
 
-    ``states`` are x_0 ... x_T (:meth:`dopt.systems.base.System.sampled_states`).
+
+@compiled
+def state_between(plant: Plant, x: Vector, following: Vector) -> Vector:
+    """Return where the accelerations of a step are observed: at its start, or in its middle.
+
+    See :meth:`dopt.systems.base.System.sampled_states`.
     """
-    state: Vector = states[t]
-    if plant.integrator != Integrator.EULER:
-        state = 0.5 * (state + states[t + 1])
-    return state
+    if plant.integrator == Integrator.EULER:
+        return x
+    middle: Vector = 0.5 * (x + following)
+    return middle
 
 
 @compiled
@@ -44,8 +50,8 @@ def joined(x: Vector, u: Vector, n_inputs_read: int) -> Vector:
         return x
     d = x.shape[0]
     point = np.empty(d + n_inputs_read)
-    point[:d] = x
-    point[d:] = u
+    copy_into(x, point[:d])
+    copy_into(u, point[d:])
     return point
 
 

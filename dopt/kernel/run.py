@@ -10,6 +10,7 @@ import numpy as np
 from dopt.errors import SpecificationError
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points, trial_of
+from dopt.kernel.held_trial import HeldTrial
 from dopt.kernel.pointers import Compiled, compiled_trial
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import draw
@@ -82,6 +83,11 @@ class KernelTrial(KernelState):
     def _code(self) -> Compiled:
         return compiled_trial(self.spec.policy, self.spec.learner, self.trial, self.points)
 
+    @functools.cached_property
+    def held(self) -> HeldTrial:
+        """The trial as compiled code holds it."""
+        return self._code.hold(self.trial, self._code.steps)
+
     def advance(self, last: int) -> None:
         """Run the steps up to ``last``, unless they are done or the trial has diverged.
 
@@ -97,8 +103,8 @@ class KernelTrial(KernelState):
             )
         if self.diverged_at is not None or last <= self.done:
             return
-        before, code = self.done, self._code
-        self.done = code.advance(self.trial, self.points, code.plan, code.learn, self.done, last)
+        before = self.done
+        self.done = self._code.advance(self.held, self.points, self.done, last)
         _check_inputs(self.spec, self.record.inputs, before, self.done)
         if self.done < last:
             self.diverged_at = self.done

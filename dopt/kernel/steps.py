@@ -20,7 +20,7 @@ class KernelSteps(KernelState):
         if spec.system.n_measured:
             self.trial.sensors.start_variances[:] = start_variances(spec.system)
         self._code = compiled_steps(spec.policy, spec.learner, self.trial)
-        self._held = self._code.hold(self.trial, self._code.plan, self._code.learn)
+        self._held = self._code.hold(self.trial, self._code.steps)
 
     @property
     def states(self) -> Array:

@@ -150,8 +150,7 @@ class Evaluation(NamedTuple):
     regressors: Stack  # (N, r, q) of the linear model
     targets: Matrix  # (N, r) less the offset, of the linear model
     states: Matrix  # (N, d) where the truth changes, or (N, d + m); otherwise empty
-    n_grid: int  # blocks of the grid, or its points for the linear model
-    n_all: int  # all blocks or points
+    bounds: Integers  # (3,) blocks, or points for the linear model: 0, the grid's, all
     target_size: float  # root mean square of the targets
 
 
@@ -336,3 +335,20 @@ Plan = Callable[[Trial, int, Vector], None]
 
 Learn = Callable[[Trial, int, Vector], None]
 """Learning step: trial, step t and the accelerations observed in it, (r,)."""
+
+EstimateState = Callable[[Trial, int, float], None]
+"""Estimate of x_{t+1}: trial, step t and its duration."""
+
+Observe = Callable[[Trial, int, float, Vector], None]
+"""Observation: trial, step t, its duration and the accelerations in it, (r,), which it writes."""
+
+
+class Steps(NamedTuple):
+    """Compiled functions that the steps of a trial call, by what the trial consists of."""
+
+    plan: Plan
+    learn: Learn
+    limit_input: Plan  # replaces the input
+    note_error: Learn  # before the accelerations are learned
+    estimate_state: EstimateState
+    observe: Observe

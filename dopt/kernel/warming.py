@@ -15,13 +15,14 @@ from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.loop import advance
 from dopt.kernel.pointers import (
+    OTHER_STEPS,
     STEPS,
     compile_form,
     compiled_at,
     compiled_loop,
     compiled_step,
     path_of,
-    signatures,
+    step_kinds,
 )
 from dopt.kernel.run import KernelTrial
 from dopt.learning import LEARNERS, Adam
@@ -53,19 +54,23 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
     """Return what compiles each part, by its name in the cache."""
     spec = TrialSpec.from_names({"name": "pendulum", "grid_points": [2, 2]}, "d_optimal")
     trial, chosen = KernelTrial(spec), choices(everything)
-    plan, learn = signatures(trial.trial)
+    kinds = step_kinds(trial.trial)
+    others = {
+        function: getattr(kinds, name)
+        for name, choices in OTHER_STEPS.items()
+        for function in choices[: 2 if everything else 1]
+    }
     systems = [system() for system in SYSTEMS.values()]
     forms = [one for form in chosen.forms for one in (form.add_rows, form.planning_forms)]
+    steps = STEPS if everything else STEPS[:1]
     return {
         path_of(advance): partial(compiled_loop, trial.trial, trial.points),
-        **{
-            path_of(step): partial(compiled_step, trial.trial, step)
-            for step in (STEPS if everything else ())
-        },
-        **{path: partial(compiled_at, path, learn) for path in chosen.learns},
+        **{path_of(step): partial(compiled_step, trial.trial, step) for step in steps},
+        **{path_of(one): partial(compiled_at, path_of(one), others[one]) for one in others},
+        **{path: partial(compiled_at, path, kinds.learn) for path in chosen.learns},
         **{name_of_equations(system): partial(compiled_equations, system) for system in systems},
         **{path_of(form): partial(compile_form, trial.trial, form) for form in forms},
-        **{path: partial(compiled_at, path, plan) for path in chosen.plans},
+        **{path: partial(compiled_at, path, kinds.plan) for path in chosen.plans},
     }
 
 

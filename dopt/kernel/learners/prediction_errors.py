@@ -19,12 +19,11 @@ from dopt.kernel.learners.state_filter import (
     begin,
     correct_covariance,
     correct_sensitivity,
-    learned_at,
     move_covariance,
     move_sensitivity,
     state_jacobian,
 )
-from dopt.kernel.points import model_point
+from dopt.kernel.points import model_point, state_between
 from dopt.kernel.structs import Trial
 from dopt.types import Matrix, Vector
 
@@ -100,7 +99,7 @@ def run_filter(trial: Trial, n: int, noise_variance: float, rows: Matrix, errors
         A = state_jacobian(plant, network, theta, x, u, dt)
         next_model_state(plant, network, theta, x, u, dt, following)
         if with_rows:
-            point = model_point(network, learned_at(plant, x, following), u)
+            point = model_point(network, state_between(plant, x, following), u)
             J = model_rows(plant, network, theta, point, np.empty(r))
             move_sensitivity(A, J, plant.learned_rows, dt, sensitivity)
         move_covariance(A, noise, plant.learned_rows, dt, P)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import Integrator
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.primal import add_multiple
 from dopt.kernel.integration import next_model_state
@@ -52,15 +51,6 @@ def begin(trial: Trial, t: int, P: Matrix, sensitivity: Matrix) -> bool:
     P[:] = np.diag(trial.sensors.start_variances)
     sensitivity[:] = 0.0
     return True
-
-
-@compiled
-def learned_at(plant: Plant, x: Vector, following: Vector) -> Vector:
-    """Return the state of a step at which its accelerations are learned."""
-    if plant.integrator == Integrator.EULER:
-        return x
-    middle: Vector = 0.5 * (x + following)
-    return middle
 
 
 @compiled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.integration import next_model_state
 from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import model_point
@@ -69,5 +69,6 @@ def point_columns(network: Network, columns: Matrix) -> Matrix:
     if network.n_inputs_read == 0:
         return columns
     out = np.zeros((m, d + m))
-    out[:, :d] = columns
+    for j in range(m):
+        copy_into(columns[j], out[j, :d])
     return out

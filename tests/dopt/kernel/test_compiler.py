@@ -125,6 +125,11 @@ def test_a_trial_asks_for_each_part_that_it_calls(monkeypatch: pytest.MonkeyPatc
     KernelTrial(TrialSpec.from_names("pendulum", "d_optimal")).advance(1)
     assert set(asked) == {
         "dopt.kernel.loop.advance",
+        "dopt.kernel.held_trial.hold",
+        "dopt.kernel.absent_steps.limit_input",
+        "dopt.kernel.absent_steps.note_error",
+        "dopt.kernel.absent_steps.estimate_state",
+        "dopt.kernel.observation.observe_euler",
         "dopt.kernel.policies.d_optimal.plan",
         "dopt.kernel.learners.adam.learn",
         "dopt.kernel.information.primal_network.add_rows",
