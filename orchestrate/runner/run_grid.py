@@ -34,7 +34,7 @@ POLL_OTHER_LAUNCHES_SECONDS = 1.0
 ANNOUNCE_AFTER_SECONDS = 1.0
 """Duration of a preparation after which a message explains the delay."""
 
-COMPILING = "compiling the kernel: this takes a minute or two, and later launches reuse it"
+COMPILING = "compiling the kernel: this takes up to a minute, and later launches reuse it"
 
 Say = Callable[[str], None]
 
