@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dopt.kernel.compiler import compiled, copy_into
-from dopt.kernel.structs import Learn, State, Trial
+from dopt.kernel.state_structs import State
+from dopt.kernel.structs import Learn, Trial
 from dopt.types import Matrix, Vector
 
 

@@ -15,7 +15,8 @@ from dopt.kernel import network as nn
 from dopt.kernel import network_tangents as tangents
 from dopt.kernel.compiler import compiled
 from dopt.kernel.points import model_point
-from dopt.kernel.structs import Linearization, Network, Plant
+from dopt.kernel.state_structs import Linearization
+from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
 
 STEP = 1e-30

@@ -7,6 +7,7 @@ import numpy as np
 from dopt.algorithm import FeatureKind, ModelKind
 from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
+from dopt.kernel.state_structs import Members
 from dopt.models import MLP, MODELS, RFF, AffineMLP, GaussianProcess, Linear
 from dopt.models.base import Model
 from dopt.spec.trial import TrialSpec
@@ -67,8 +68,8 @@ def network_of_trial(spec: TrialSpec, network: args.Network, weights: Vector) ->
     return network._replace(waves=waves)
 
 
-def members_of(model: Model, weights: Vector) -> args.Members:
+def members_of(model: Model, weights: Vector) -> Members:
     """Return the networks of an ensemble with the parameters that a trial has drawn for them."""
     count = model.n_members if model.n_members > 1 else 0
     drawn = weights.reshape(count, -1) if count else np.zeros((0, 0))
-    return args.Members(drawn.copy(), drawn.copy())
+    return Members(drawn.copy(), drawn.copy())

@@ -23,8 +23,9 @@ from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compilation import compile_missing
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
 from dopt.kernel.held_trial import HeldTrial
+from dopt.kernel.state_structs import State
 from dopt.kernel.struct_pointers import pointer_to
-from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Steps, Trial
+from dopt.kernel.structs import Evaluation, Information, Network, Plant, Steps, Trial
 from dopt.kernel.user_code import compiled_own
 from dopt.learning.base import CompiledLearner, Learner
 from dopt.policies.base import CompiledPolicy, Policy

@@ -1,4 +1,6 @@
-"""Structures that compiled functions receive: constants, mutable state and records, by name.
+"""Structures that compiled functions receive, by name: constants, and all that a trial works on.
+
+What they write into is in :mod:`dopt.kernel.state_structs`.
 
 Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
 w units in each hidden layer, L hidden layers, N evaluation points, D random features. A point is
@@ -11,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from dopt.kernel.state_structs import Record, Scratch, State
 from dopt.types import (
     Accelerations,
     ComplexAccelerations,
@@ -152,144 +155,6 @@ class Evaluation(NamedTuple):
     states: Matrix  # (N, d) where the truth changes, or (N, d + m); otherwise empty
     bounds: Integers  # (3,) blocks, or points for the linear model: 0, the grid's, all
     target_size: float  # root mean square of the targets
-
-
-class Covariance(NamedTuple):
-    """M⁻¹ = A - VᵀV (:mod:`dopt.kernel.information`); all empty where nothing needs it."""
-
-    upper: Matrix  # (q, q), A in the upper triangle
-    pending: Matrix  # (PENDING_ROWS, q), V in the first n_pending rows
-    n_pending: Integers  # (1,)
-
-
-class Dual(NamedTuple):
-    """Rows of the Gram matrix and its factor (:mod:`dopt.kernel.information.dual`).
-
-    Empty in other forms.
-    """
-
-    features: Matrix  # (T, p) at the states seen
-    hidden: Stack  # (L, T, w)
-    deltas: Stack  # (r, L, T, w)
-    factor: Matrix  # (r T, r T), C in the lower triangle
-    n_states: Integers  # (1,)
-    regularization: float  # λ of M₀ = λI
-
-
-class Sketch(NamedTuple):
-    """Random projection of the parameters (:mod:`dopt.kernel.information.sketch`).
-
-    Empty in other forms.
-    """
-
-    buckets: Integers  # (q,)
-    signs: Vector  # (q,)
-    size: int
-
-
-class Visited(NamedTuple):
-    """States visited, for fresh information (:mod:`dopt.kernel.information.fresh`).
-
-    Empty where information is accumulated.
-    """
-
-    features: Matrix  # (p, T) at the states, of which n_states are filled
-    n_states: Integers  # (1,)
-    refresh_every: int  # steps
-    regularization: float  # λ of M₀ = λI
-
-
-class Posterior(NamedTuple):
-    """Samples of a Gaussian process (:mod:`dopt.kernel.learners.conditioning`).
-
-    Empty in other models.
-    """
-
-    factor: Matrix  # (T, T), L in the lower triangle
-    solved: Matrix  # (T, r), z
-    n_samples: Integers  # (1,)
-
-
-class Linearization(NamedTuple):
-    """Passes of the network at one state for one component, and along m directions."""
-
-    phi: Vector  # (p,)
-    hidden: Matrix  # (L, w)
-    deltas: Matrix  # (L, w)
-    phi_dots: Matrix  # (m, p)
-    hidden_dots: Stack  # (m, L, w)
-    deltas_dots: Stack  # (m, L, w)
-
-
-class Members(NamedTuple):
-    """Networks of an ensemble (:mod:`dopt.kernel.members`); empty in other models."""
-
-    parameters: Matrix  # (E, q)
-    priors: Matrix  # (E, q) before the first step
-
-
-class PredictionError(NamedTuple):
-    """What limits remember of the model's errors and of the inputs; empty in other trials."""
-
-    scale: Vector  # (r,) mean of e²/(1 + h) over the newest samples
-    variances: Matrix  # (2, r), h = g M⁻¹ gᵀ at the present and at the predicted state
-    last_input: Vector  # (m,) planned or applied
-
-
-class Estimate(NamedTuple):
-    """What is remembered to estimate states; empty where they are known, but for the inputs."""
-
-    starts: Matrix  # (T, d) states from which steps begin anew; NaN where they follow one another
-    outputs: Matrix  # (T, n) measured after each step
-    durations: Vector  # (T,) of the steps
-    inputs: Matrix  # (T, m) that go with the accelerations: those applied, or these filtered
-    filtered: Matrix  # (3, d) measured states and their differences, filtered, and as measured last
-    filtered_input: Vector  # (m,)
-    covariance: Matrix  # (d, d) of the state, given the parameters
-    sensitivity: Matrix  # (d, q) of the estimated state to the parameters
-
-
-class State(NamedTuple):
-    """Everything that changes from step to step; written in place."""
-
-    theta: Vector  # (q,) parameters, of an ensemble those of its first member
-    prior: Vector  # (q,) parameters before the first step
-    members: Members
-    moment_1: Vector  # (q,) of Adam
-    moment_2: Vector  # (q,)
-    covariance: Covariance
-    factor: Matrix  # (q, q), the Cholesky factor of M of a learner that leaves it in place of M⁻¹
-    dual: Dual
-    sketch: Sketch
-    visited: Visited
-    posterior: Posterior
-    prediction: PredictionError
-    estimate: Estimate
-    window_features: Matrix  # (p, window) newest samples, a ring
-    window_targets: Matrix  # (r, window)
-    policy_memory: Vector  # what a compiled policy of a user's own keeps
-    learner_memory: Vector  # what a compiled learner of a user's own keeps
-
-
-class Scratch(NamedTuple):
-    """Memory that a learning step overwrites."""
-
-    hidden: Matrix  # (L, room) flat activations of a batch
-    deltas: Matrix  # (3, room) flat δ of a batch
-    gradient: Vector  # (q,)
-
-
-class Record(NamedTuple):
-    """What a trial leaves behind."""
-
-    states: Matrix  # (T + 1, d) known, or estimated
-    true_states: Matrix  # (T + 1, d) of a simulation; the same array where all are known
-    inputs: Matrix  # (T, m)
-    loss: Vector  # (T,)
-    reachable_loss: Vector  # (T,)
-    plan_us: Vector  # (T,)
-    learn_us: Vector  # (T,)
-    evaluate_us: Vector  # (T,)
 
 
 AddRows = Callable[[Plant, Network, State, Vector], None]

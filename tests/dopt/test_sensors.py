@@ -63,7 +63,7 @@ def test_both_paths_estimate_and_learn_the_same(
 ) -> None:
     policy = "oracle" if model == "linear" else "d_optimal"
     on_kernel, on_reference = (
-        run_trial(sensed(env, sensors, learner, policy, model=model, path=path))
+        run_trial(sensed(env, sensors, learner, policy, horizon=16, model=model, path=path))
         for path in ("kernel", "reference")
     )
     np.testing.assert_allclose(on_kernel.states, on_reference.states, atol=1e-8)
@@ -203,7 +203,8 @@ def test_a_trial_that_diverges_has_no_estimates_from_there_on() -> None:
     results: list[TrialResult] = []
     for path in ("kernel", "reference"):
         sensors = ANGLE | {"state_limit": 0.05}
-        results.append(run_trial(sensed("pendulum", sensors, horizon=60, path=path)))
+        spec = sensed("pendulum", sensors, horizon=60, path=path, refit_every=1000)
+        results.append(run_trial(spec))
     for result in results:
         assert result.diverged_at is not None
         assert result.estimated_states is not None

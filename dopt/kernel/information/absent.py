@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled
-from dopt.kernel.structs import Network, Plant, State
+from dopt.kernel.state_structs import State
+from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Vector
 
 

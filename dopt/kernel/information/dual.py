@@ -21,7 +21,8 @@ from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.information.cholesky import solve_lower
 from dopt.kernel.information.primal import inner
 from dopt.kernel.model import all_components, linearization_at
-from dopt.kernel.structs import Dual, Linearization, Network, Plant, State
+from dopt.kernel.state_structs import Dual, Linearization, State
+from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from dopt.kernel.compiler import vectorized
 from dopt.kernel.information.primal import add_multiple, append_row
-from dopt.kernel.structs import Covariance
+from dopt.kernel.state_structs import Covariance
 from dopt.types import Vector
 
 

@@ -10,7 +10,8 @@ from dopt.kernel.information.normal_equations import normal_matrix
 from dopt.kernel.information.primal_network import add_rows as add_newest_rows
 from dopt.kernel.information.primal_network import planning_forms
 from dopt.kernel.network import features_at
-from dopt.kernel.structs import Network, Plant, State
+from dopt.kernel.state_structs import State
+from dopt.kernel.structs import Network, Plant
 from dopt.types import Vector
 
 __all__ = ["add_rows", "planning_forms"]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import vectorized
-from dopt.kernel.structs import Covariance
+from dopt.kernel.state_structs import Covariance
 from dopt.types import Matrix, Vector
 
 PENDING_ROWS = 16

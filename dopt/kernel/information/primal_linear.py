@@ -7,7 +7,8 @@ import numpy as np
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.primal import quadratic_forms, rank_update
 from dopt.kernel.model import linear_gradients, regressors
-from dopt.kernel.structs import Network, Plant, State
+from dopt.kernel.state_structs import State
+from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Vector
 
 

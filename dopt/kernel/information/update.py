@@ -8,7 +8,8 @@ from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.primal import rank_update
 from dopt.kernel.model import add_linear, network_jacobian, regressors
-from dopt.kernel.structs import Covariance, Network, Plant
+from dopt.kernel.state_structs import Covariance
+from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Vector
 
 

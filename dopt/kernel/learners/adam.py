@@ -10,7 +10,8 @@ import numpy as np
 from dopt.kernel.compiler import compiled, contracted
 from dopt.kernel.learners.samples import sampled_point, store_sample
 from dopt.kernel.network import loss_gradient
-from dopt.kernel.structs import Network, Scratch, State, Trial
+from dopt.kernel.state_structs import Scratch, State
+from dopt.kernel.structs import Network, Trial
 from dopt.types import Matrix, Vector
 
 

@@ -19,7 +19,8 @@ from dopt.kernel.information.cholesky import solve_lower, solve_lower_transposed
 from dopt.kernel.information.primal import inner
 from dopt.kernel.network import features_at
 from dopt.kernel.points import sampled_state
-from dopt.kernel.structs import Network, Posterior, Trial
+from dopt.kernel.state_structs import Posterior
+from dopt.kernel.structs import Network, Trial
 from dopt.types import Vector
 
 

@@ -13,7 +13,8 @@ from dopt.kernel.information.cholesky import factorize, solve, write_inverse
 from dopt.kernel.information.normal_equations import errors_of, normal_equations
 from dopt.kernel.learners.kalman import filter_sample
 from dopt.kernel.learners.samples import sampled_point, store_sample
-from dopt.kernel.structs import Network, State, Trial
+from dopt.kernel.state_structs import State
+from dopt.kernel.structs import Network, Trial
 from dopt.types import Matrix, Vector
 
 

@@ -14,7 +14,8 @@ from dopt.kernel.information.forgetting import forget
 from dopt.kernel.information.primal import quadratic_forms
 from dopt.kernel.information.update import filter_step, model_rows
 from dopt.kernel.learners.samples import sampled_point
-from dopt.kernel.structs import Covariance, Trial
+from dopt.kernel.state_structs import Covariance
+from dopt.kernel.structs import Trial
 from dopt.types import Matrix, Vector
 
 

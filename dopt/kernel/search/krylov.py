@@ -7,7 +7,7 @@ import numpy as np
 from dopt.algorithm import INVARIANT
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.primal import add_multiple, inner, multiply_rows
-from dopt.kernel.structs import Covariance
+from dopt.kernel.state_structs import Covariance
 from dopt.types import Matrix
 
 

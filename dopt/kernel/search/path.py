@@ -16,7 +16,8 @@ from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.information.primal import add_multiple, inner, multiply_rows
 from dopt.kernel.model import add_linear, euler_step, model_accelerations, regressors, rows_at
 from dopt.kernel.points import model_point, n_next_points, next_points
-from dopt.kernel.structs import Covariance, Network, Plant, Search
+from dopt.kernel.state_structs import Covariance
+from dopt.kernel.structs import Network, Plant, Search
 from dopt.types import Matrix, Vector
 
 FEW_ROWS = 24

@@ -18,7 +18,8 @@ from dopt.kernel.search.path import (
     rows_of_state,
 )
 from dopt.kernel.search.scores import ScoreContext, score_context, score_of_path
-from dopt.kernel.structs import Covariance, Network, Plant, Search, Trial
+from dopt.kernel.state_structs import Covariance
+from dopt.kernel.structs import Network, Plant, Search, Trial
 from dopt.types import Booleans, Integers, Matrix, Vector
 
 

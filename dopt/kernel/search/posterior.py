@@ -23,7 +23,8 @@ from dopt.kernel.information.cholesky import (
 )
 from dopt.kernel.model import regressors, write_features
 from dopt.kernel.output_layer import output_inputs
-from dopt.kernel.structs import Covariance, Network, Plant, State
+from dopt.kernel.state_structs import Covariance, State
+from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
 
 

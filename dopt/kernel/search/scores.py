@@ -11,7 +11,8 @@ from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import inner
 from dopt.kernel.search.krylov import krylov_space, largest_eigenvalue
 from dopt.kernel.search.path import Path, model_and_jacobian, rows_of_state, whiten
-from dopt.kernel.structs import Covariance, Network, Plant, Search
+from dopt.kernel.state_structs import Covariance
+from dopt.kernel.structs import Network, Plant, Search
 from dopt.types import Matrix, Vector
 
 

@@ -16,7 +16,7 @@ from dopt.kernel.information.primal import PENDING_ROWS, dense
 from dopt.kernel.information.update import filter_step
 from dopt.kernel.learners.kalman import whiten
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.structs import Covariance
+from dopt.kernel.state_structs import Covariance
 from dopt.learning import ExtendedKalman
 from dopt.reference.models import model_function
 from dopt.run import run_trial

@@ -7,7 +7,7 @@ import pytest
 
 from dopt.kernel.information.primal import dense, rank_update, restore
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.structs import Covariance
+from dopt.kernel.state_structs import Covariance
 from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.test_information import jacobians
 from tests.dopt.trials import trial

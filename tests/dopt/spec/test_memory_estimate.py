@@ -13,7 +13,7 @@ from dopt.control.episode import run_episode
 from dopt.control.free_run import free_run_error
 from dopt.control.prediction import forecast_by_equations
 from dopt.errors import SpecificationError
-from dopt.kernel import from_spec
+from dopt.kernel.state_from_spec import empty_record, initial_state
 from dopt.policies import DOptimal
 from dopt.randomness import draw
 from dopt.spec.config import LARGEST_HORIZON
@@ -33,8 +33,8 @@ def held(spec: TrialSpec) -> int:
     """Return the bytes of what a trial is made of in the kernel, its evaluation aside."""
     draws = draw(spec)
     arrays = (draws.noise, draws.inputs, draws.components, draws.ties)
-    record = from_spec.empty_record(spec.system)
-    return size(arrays) + size(record) + size(from_spec.initial_state(spec, draws.weights, record))
+    record = empty_record(spec.system)
+    return size(arrays) + size(record) + size(initial_state(spec, draws.weights, record))
 
 
 @pytest.mark.parametrize(("env", "policy"), PAIRS)

@@ -1,0 +1,185 @@
+"""Translation of a trial's specification to what its steps write: first state, empty record."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.algorithm import Form
+from dopt.kernel import state_structs as args
+from dopt.kernel.information.primal import PENDING_ROWS, SMALL
+from dopt.kernel.model_from_spec import members_of
+from dopt.kernel.structs import Network
+from dopt.learning import GaussNewton, Learner
+from dopt.models import MLP, GaussianProcess
+from dopt.policies import ICEM, DOptimal, InformationPolicy
+from dopt.policies.d_optimal import count_sketch
+from dopt.spec.config import TrialConfig
+from dopt.spec.information_form import Information, held_information, is_fresh
+from dopt.spec.trial import TrialSpec
+from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
+from dopt.types import Matrix, Vector
+
+
+def initial_state(spec: TrialSpec, weights: Vector, record: args.Record) -> args.State:
+    """Return the state of a trial before its first step.
+
+    ``weights`` are all initial parameters of the model; the state holds those that are learned.
+    """
+    system, q = spec.system, n_learned_parameters(spec.config)
+    window = spec.learner.samples_kept(system.horizon)
+    return args.State(
+        weights[:q].copy(),
+        weights[:q].copy(),
+        members_of(spec.model, weights),
+        np.zeros(q),
+        np.zeros(q),
+        *_information(spec, q),
+        _visited(spec),
+        _posterior(spec),
+        _prediction_error(spec),
+        _estimate(spec, q, record.inputs),
+        np.zeros((len(spec.model.features(system)), window)),
+        np.zeros((system.n_learned, window)),
+        *(np.zeros(part.memory_size(system, q)) for part in (spec.policy, spec.learner)),
+    )
+
+
+def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, Matrix, args.Dual, args.Sketch]:
+    """Return the initial information in the chosen form; the other forms are empty."""
+    policy = spec.policy
+    form = form_of(spec.config)
+    size, rows, projection = 0, _empty_dual(spec, 0), count_sketch(0, 1)
+    factored = q if isinstance(policy, ICEM) and _is_fitted(spec.learner) else 0
+    if form == Form.PRIMAL and _needs_inverse(spec.config):
+        size = q
+    elif form == Form.DUAL:
+        rows = _empty_dual(spec, spec.system.horizon)
+    elif form == Form.SKETCH and isinstance(policy, DOptimal):
+        size = policy.sketch_size
+        projection = count_sketch(q, size)
+    covariance = args.Covariance(
+        np.eye(size) / regularization_of(spec.config),
+        np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
+        np.zeros(1, dtype=np.int64),
+    )
+    factor = np.eye(factored) * regularization_of(spec.config) ** 0.5
+    return covariance, factor, rows, args.Sketch(*projection, size)
+
+
+def _needs_inverse(config: TrialConfig) -> bool:
+    """Tell whether the policy or the learner reads M⁻¹: a learner that fits M anew may not."""
+    policy = config.policy
+    reads = isinstance(policy, InformationPolicy) and not isinstance(policy, ICEM)
+    return held_form(config) is not None and (reads or not _is_fitted(config.learner))
+
+
+def _is_fitted(learner: Learner) -> bool:
+    """Tell whether a learner makes M anew at each step."""
+    return isinstance(learner, GaussNewton) and learner.refit_every == 1
+
+
+def _visited(spec: TrialSpec) -> args.Visited:
+    """Return the empty store of states; it has no room where information is accumulated."""
+    places, refresh_every = 0, 1
+    if is_fresh(spec.policy):
+        places, refresh_every = spec.system.horizon, spec.policy.refresh_every
+    return args.Visited(
+        np.empty((len(spec.model.features(spec.system)), places)),
+        np.zeros(1, dtype=np.int64),
+        refresh_every,
+        regularization_of(spec.config),
+    )
+
+
+def _prediction_error(spec: TrialSpec) -> args.PredictionError:
+    r, m = spec.system.n_learned, spec.system.n_inputs
+    if spec.config.limits is None or not spec.config.limits.enforced:
+        r = m = 0
+    return args.PredictionError(np.zeros(r), np.zeros((2, r)), np.zeros(m))
+
+
+def _estimate(spec: TrialSpec, q: int, applied: Matrix) -> args.Estimate:
+    """Return what is remembered to estimate states, without room where they are known."""
+    system, estimates = spec.system, spec.learner.estimates_states
+    steps = system.horizon if system.n_measured else 0
+    d = system.n_states if system.n_measured and estimates else 0
+    starts = np.full((steps, system.n_states), np.nan)
+    if steps and not isinstance(system, BlackBox):
+        starts[0] = system.initial_state
+    return args.Estimate(
+        starts,
+        np.full((steps, system.n_measured), np.nan),
+        np.zeros(steps),
+        np.zeros_like(applied) if steps and not estimates else applied,
+        np.zeros((3, system.n_states)),
+        np.zeros(system.n_inputs),
+        np.zeros((d, d)),
+        np.zeros((d, q)),
+    )
+
+
+def _posterior(spec: TrialSpec) -> args.Posterior:
+    """Return the room for the samples of a Gaussian process, none in other models."""
+    T = spec.system.horizon if isinstance(spec.model, GaussianProcess) else 0
+    solved = np.zeros((T, spec.system.n_learned))
+    return args.Posterior(np.zeros((T, T)), solved, np.zeros(1, dtype=np.int64))
+
+
+def _empty_dual(spec: TrialSpec, states: int) -> args.Dual:
+    depth, width, r = 1, 1, spec.system.n_learned
+    if isinstance(spec.model, MLP):
+        depth, width = spec.model.depth, spec.model.width
+    return args.Dual(
+        np.empty((states, len(spec.model.features(spec.system)))),
+        np.empty((depth, states, width)),
+        np.empty((r, depth, states, width)),
+        np.empty((r * states, r * states)),
+        np.zeros(1, dtype=np.int64),
+        regularization_of(spec.config),
+    )
+
+
+def empty_scratch(spec: TrialSpec, network: Network) -> args.Scratch:
+    """Return the memory that a learning step overwrites, for the largest batch of the learner."""
+    room = int(max(network.sizes[1], spec.system.n_learned)) * spec.learner.largest_batch()
+    depth, q = len(network.offsets) - 1, n_learned_parameters(spec.config)
+    return args.Scratch(np.empty((depth, room)), np.empty((3, room)), np.empty(q))
+
+
+def empty_record(system: System) -> args.Record:
+    """Return the record of a trial before its first step."""
+    steps = system.horizon
+    states = np.full((steps + 1, system.n_states), np.nan)
+    if not isinstance(system, BlackBox):  # which starts where it is measured
+        states[0] = system.initial_state
+    true_states = states.copy() if system.n_measured else states
+    rows = (np.full(steps, np.nan) for _ in range(5))
+    return args.Record(states, true_states, np.zeros((steps, system.n_inputs)), *rows)
+
+
+def n_learned_parameters(config: TrialConfig) -> int:
+    """Return the number of parameters that are learned, the first ones."""
+    model, system = config.model, config.system
+    return model.n_member_parameters(system) - model.n_fixed_parameters(system)
+
+
+def regularization_of(config: TrialConfig) -> float:
+    """Return λ of M₀ = λI, 1 where there is no M."""
+    held = held_form(config)
+    return held.regularization if held else 1.0
+
+
+def held_form(config: TrialConfig) -> Information | None:
+    """Return the form in which M is held, None where there is no M."""
+    q, n_rows = (
+        config.model.n_member_parameters(config.system),
+        config.system.n_learned * config.system.horizon,
+    )
+    return held_information(config.policy, config.learner, q, n_rows)
+
+
+def form_of(config: TrialConfig) -> int:
+    """Return the form of the information matrix, PRIMAL where there is none."""
+    held = held_form(config)
+    return int(Form[held.form.upper()] if held else Form.PRIMAL)
