@@ -16,15 +16,15 @@ def test_a_fit_finds_parameters_at_which_all_that_was_measured_is_likelier() -> 
     """Its objective is that of the reference's pass over all steps."""
     objectives = {}
     for steps in (1, 8):
-        spec = sensed("pendulum", ANGLE, horizon=30, path="reference", refit_every=30, steps=steps)
+        spec = sensed("pendulum", ANGLE, horizon=60, path="reference", refit_every=60, steps=steps)
         batch = Lockstep([spec])
-        for t in range(30):
+        for t in range(60):
             batch.step(t)
         learner: Any = batch.learner
-        objectives[steps] = float(learner._run(30)[0])
+        objectives[steps] = float(learner._run(60)[0])
         if steps == 1:
             batch.theta.copy_(batch.tensor(draw(spec).weights)[None])
-            objectives[0] = float(learner._run(30)[0])
+            objectives[0] = float(learner._run(60)[0])
     assert objectives[8] <= objectives[1] < objectives[0]
 
 
