@@ -15,12 +15,7 @@ from dopt.types import Vector
 @compiled
 def observe_euler(trial: Trial, t: int, dt: float, target: Vector) -> None:
     """Write the accelerations observed from x_t to x_{t+1}, (r,), after dt seconds."""
-    plant, states = trial.plant, trial.record.states
-    x, following, flow = states[t], states[t + 1], np.empty(states.shape[1])
-    known_rate(trial, t, flow)
-    for k in range(target.shape[0]):
-        row = plant.learned_rows[k]
-        target[k] = (following[row] - x[row]) / dt - flow[row]
+    write_difference(trial, t, dt, np.empty(trial.record.states.shape[1]), target)
 
 
 @compiled
@@ -30,12 +25,11 @@ def observe_runge_kutta(trial: Trial, t: int, dt: float, target: Vector) -> None
     What the model's own step differs from the acceleration that it has there is added to them: a
     model whose error at them is 0 predicts x_{t+1}.
     """
-    observe_euler(trial, t, dt, target)
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     x, u = trial.record.states[t], trial.state.estimate.inputs[t]
-    at, flow = sampled_state(plant, trial.record.states, t), np.empty(x.shape[0])
-    known_rate(trial, t, flow)
-    value, end = np.empty(target.shape[0]), np.empty(x.shape[0])
+    value, flow, end = np.empty(target.shape[0]), np.empty(x.shape[0]), np.empty(x.shape[0])
+    write_difference(trial, t, dt, flow, target)
+    at = sampled_state(plant, trial.record.states, t)
     model_accelerations(plant, network, theta, model_point(network, at, u), value)
     next_model_state(plant, network, theta, x, u, dt, end)
     for k in range(target.shape[0]):
@@ -44,7 +38,12 @@ def observe_runge_kutta(trial: Trial, t: int, dt: float, target: Vector) -> None
 
 
 @compiled
-def known_rate(trial: Trial, t: int, flow: Vector) -> None:
-    """Write the known part of dx/dt, (d,), where the accelerations of step t are observed."""
-    at = sampled_state(trial.plant, trial.record.states, t)
-    trial.plant.known(at, trial.state.estimate.inputs[t], trial.plant.parameters, flow)
+def write_difference(trial: Trial, t: int, dt: float, flow: Vector, target: Vector) -> None:
+    """Write the known part of dx/dt at the sampled state, (d,), and what is observed beside it."""
+    plant, states = trial.plant, trial.record.states
+    x, following = states[t], states[t + 1]
+    at = sampled_state(plant, states, t)
+    plant.known(at, trial.state.estimate.inputs[t], plant.parameters, flow)
+    for k in range(target.shape[0]):
+        row = plant.learned_rows[k]
+        target[k] = (following[row] - x[row]) / dt - flow[row]
