@@ -68,7 +68,7 @@ def linearisation_gaps(
     given = candidates(batch, search)
     found: list[tuple[Tensor, Tensor]] = []
     for t in range(batch.system.horizon):
-        covariance = torch.linalg.inv(batch.information)
+        covariance = batch.information.covariance()
         now = Situation(batch.theta.clone(), covariance, batch.states[:, t], batch.components[:, t])
         batch.step(t)
         if t > 0:

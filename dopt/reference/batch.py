@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.func import vmap
 
 from dopt.evaluation import evaluation_set
 from dopt.reference.black_box import episodes_for, initial_states, stepped
@@ -73,14 +72,11 @@ class Lockstep(BatchSteps):
         """Return the modelled accelerations at the evaluation points, (n, N, r)."""
         if isinstance(self.learner, Posterior):
             return self.learner.predict_points()
-        over_points = vmap(self.model, in_dims=(None, 0))
-        over_trials = vmap(over_points, in_dims=(0, None))
-        if self.members is not None:
-            members = self.members.unbind(1)
-            each = [over_trials(theta, self.evaluated) for theta in members]
-            return torch.stack(each).mean(dim=0)
-        predicted: Tensor = over_trials(self.theta, self.evaluated)
-        return predicted
+        points = self.evaluated.unsqueeze(0)
+        if self.members is None:
+            return self.model(self.theta, points)
+        each = [self.model(theta, points) for theta in self.members.unbind(1)]
+        return torch.stack(each).mean(dim=0)
 
     def step(self, t: int) -> None:
         """Take step t of every trial and record it."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, jvp, vmap
 
+from dopt.reference.derivatives import gradients_and_changes
 from dopt.reference.dynamics import input_matrix, next_states
 from dopt.reference.state import BatchState
 from dopt.trial_view import Array, TrialView
@@ -16,15 +16,13 @@ class BatchTrialView(TrialView):
 
     Attributes
     ----------
-    model : callable
-        a_θ(x) over tensors: parameters (q,) and state (d,) to accelerations (r,).
     theta : (q,) tensor
         Parameters, for plans that are written in torch.
     """
 
     def __init__(self, batch: BatchState, index: int, t: int) -> None:
         self.system, self.t = batch.system, t
-        self.model, self.theta = batch.model, batch.theta[index].clone()
+        self._learned, self.theta = batch.learned, batch.theta[index].clone()
         self.states = _array(batch.states[index, : t + 1])
         self.inputs = _array(batch.inputs[index, :t])
         self.sampled_inputs = _array(batch.sampled_inputs(slice(0, t))[index])
@@ -32,29 +30,41 @@ class BatchTrialView(TrialView):
         self.accelerations = _array(batch.targets[index, :t])
         self.parameters = _array(self.theta)
 
+    def model(self, theta: Tensor, state: Tensor) -> Tensor:
+        """Return a_θ(x), (r,), for parameters (q,) and a state (d,), differentiable by torch."""
+        return self._learned.model(theta[None], state[None, None])[0, 0]
+
     def predict(self, states: Array) -> Array:
-        return _array(vmap(self.model, in_dims=(None, 0))(self.theta, self.tensor(states)))
+        return _array(self._learned.model(self.theta[None], self.tensor(states)[None])[0])
 
     def jacobian(self, state: Array) -> Array:
-        return _array(jacrev(self.model)(self.theta, self.tensor(state)))
+        return _array(
+            self._learned.jacobian(self.theta[None], self.tensor(state)[None, None])[0, 0]
+        )
 
     def jacobian_change(self, state: Array, directions: Array) -> Array:
-        def rows(x: Tensor) -> Tensor:
-            J: Tensor = jacrev(self.model)(self.theta, x)
-            return J
-
-        x = self.tensor(state)
-        return _array(vmap(lambda along: jvp(rows, (x,), (along,))[1])(self.tensor(directions)))
+        along, r = self.tensor(directions), self.system.n_learned
+        items = len(along) * r
+        _, changes = gradients_and_changes(
+            self._learned.model,
+            self.theta.expand(items, -1),
+            self.tensor(state).expand(items, -1),
+            torch.arange(r, device=along.device).repeat(len(along)),
+            along.repeat_interleave(r, dim=0),
+        )
+        return _array(changes.view(len(along), r, -1))
 
     def following(self, state: Array, inputs: Array) -> Array:
-        x, u = self.tensor(state), self.tensor(inputs)
-        x = x.expand(len(u), -1)
-        modelled = vmap(self.model, in_dims=(None, 0))
-        system = self.system
-        return _array(next_states(system, x, u, lambda z: modelled(self.theta, z), system.dt))
+        system, u = self.system, self.tensor(inputs)
+        x = self.tensor(state).expand(len(u), -1)
+
+        def accelerations(z: Tensor) -> Tensor:
+            return self._learned.model(self.theta[None], z[None])[0]
+
+        return _array(next_states(system, x, u, accelerations, system.dt))
 
     def input_matrix(self, state: Array) -> Array:
-        return _array(input_matrix(self.system, self.tensor(state)))
+        return _array(input_matrix(self.system, self.tensor(state)[None])[0])
 
     def tensor(self, values: Array) -> Tensor:
         """Return values as a tensor where the model is."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
 
-from dopt.reference.models import Accelerations, stack
+from dopt.reference.derivatives import rows as model_rows
+from dopt.reference.models import BatchModel, stack
 from dopt.systems.base import System
 from dopt.systems.integration import next_state
 
@@ -48,13 +48,16 @@ def next_states(
 
 
 def input_matrix(system: System, x: Tensor) -> Tensor:
-    """Return B = dt ∂known/∂u, (d, m), at one state (d,)."""
-
-    def by_input(u: Tensor) -> Tensor:
-        return known_flow(system, x, u)
-
-    zero = torch.zeros(system.n_inputs, dtype=x.dtype, device=x.device)
-    columns: Tensor = torch.func.jacfwd(by_input)(zero)
+    """Return B = dt ∂known/∂u, (n, d, m), at states (n, d)."""
+    n, d = x.shape
+    with torch.enable_grad():
+        u = x.new_zeros(n, d, system.n_inputs).requires_grad_()
+        known = known_flow(system, x.unsqueeze(1).expand(-1, d, -1), u)
+        # The i-th of d copies of the input is what the i-th state is differentiated by.
+        total = known.diagonal(dim1=1, dim2=2).sum()
+        if not total.requires_grad:
+            return torch.zeros_like(u)
+        (columns,) = torch.autograd.grad(total, u)
     return system.dt * columns
 
 
@@ -67,13 +70,13 @@ class LearnedDynamics:
     system : System
         Known part, γ and dt.
     model : callable
-        a_θ: parameters (q,) and a point to accelerations (r,).
+        a_θ of a batch of trials.
     n_inputs_read : int
         m where a point is a state and an input, (d + m,); 0 where it is a state, (d,).
     """
 
     system: System
-    model: Accelerations
+    model: BatchModel
     n_inputs_read: int = 0
 
     def points(self, x: Tensor, u: Tensor) -> Tensor:
@@ -93,28 +96,41 @@ class LearnedDynamics:
         states = x.unsqueeze(-2).expand(*x.shape[:-1], len(both), -1)
         return torch.cat([states, both.expand(*x.shape[:-1], -1, -1)], dim=-1)
 
+    def jacobian(self, theta: Tensor, points: Tensor, *, differentiable: bool = False) -> Tensor:
+        """Return J, (n, N, r, q), for parameters (n, q) at points (n, N, ·)."""
+        r = self.system.n_learned
+        return model_rows(self.model, r, theta, points, differentiable=differentiable)
+
     def rows_at(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return rows, (N, n r, q), whose JᵀJ is the mean over :meth:`next_points` of (N, d)."""
+        """Return rows, (n, N, k r, q), whose JᵀJ is the mean over :meth:`next_points`.
+
+        Given are parameters (n, q) and states (n, N, d).
+        """
         points = self.next_points(x)
-        J = vmap(vmap(jacrev(self.model), (None, 0)), (None, 0))(theta, points)
-        rows: Tensor = J.flatten(1, 2) * points.shape[-2] ** -0.5
+        k = points.shape[-2]
+        J = self.jacobian(theta, points.flatten(1, 2)).unflatten(1, (-1, k))
+        rows: Tensor = J.flatten(2, 3) * k**-0.5
         return rows
 
     def following(self, theta: Tensor, x: Tensor, u: Tensor) -> Tensor:
-        """Return x + dt f_θ(x, u), (n, d), for parameters (q,), states (n, d), inputs (n, m).
+        """Return x + dt f_θ(x, u), (n, N, d), for parameters (n, q), states and inputs (n, N, ·).
 
         Searches plan by this Euler map, whatever the integrator.
         """
-        accelerations = vmap(self.model, (None, 0))(theta, self.points(x, u))
+        accelerations = self.model(theta, self.points(x, u))
         return x + self.system.dt * flow(self.system, x, u, accelerations)
 
     def next_states(self, theta: Tensor, x: Tensor, u: Tensor, dt: float) -> Tensor:
         """Return the states dt seconds later, (n, d), for (n, q), (n, d) and (n, m)."""
-        modelled = vmap(self.model)
-        return next_states(self.system, x, u, lambda z: modelled(theta, self.points(z, u)), dt)
+
+        def accelerations(z: Tensor) -> Tensor:
+            values: Tensor = self.model(theta, self.points(z, u).unsqueeze(1)).squeeze(1)
+            return values
+
+        return next_states(self.system, x, u, accelerations, dt)
 
     def input_matrix(self, theta: Tensor, x: Tensor) -> Tensor:
-        """Return B = dt ∂f_θ/∂u, (d, m), at one state (d,).
+        """Return B = dt ∂f_θ/∂u, (n, d, m), for parameters (n, q) at states (n, d).
 
         What a model has learned of the inputs is taken as its secant between -γ and γ along each
         axis, exact for one that is affine in them.
@@ -122,10 +138,7 @@ class LearnedDynamics:
         columns = input_matrix(self.system, x)
         if not self.n_inputs_read:
             return columns
-        gamma = self.system.gamma
-        axes = gamma * torch.eye(self.n_inputs_read).to(x)
-        both = torch.cat([axes, -axes])
-        values = vmap(self.model, (None, 0))(theta, self.points(x.expand(len(both), -1), both))
-        slopes = (values[: len(axes)] - values[len(axes) :]).mT / (2.0 * gamma)
-        rows = torch.tensor(self.system.learned_rows, device=x.device)
-        return columns.index_add(0, rows, self.system.dt * slopes)
+        values = self.model(theta, self.next_points(x))
+        slopes = (values[:, ::2] - values[:, 1::2]).mT / (2.0 * self.system.gamma)
+        learned = torch.tensor(self.system.learned_rows, device=x.device)
+        return torch.index_add(columns, 1, learned, self.system.dt * slopes)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import vmap
 
 from dopt.policies.disagreement import Disagreement
 from dopt.randomness import stream
 from dopt.reference.dynamics import flow
 from dopt.reference.learning import learner_for
-from dopt.reference.models import Accelerations
+from dopt.reference.models import BatchModel
 from dopt.reference.state import BatchState
 from dopt.systems.base import System
 
@@ -57,7 +56,7 @@ class EnsemblePlan:
 
 def disagreements(
     system: System,
-    model: Accelerations,
+    model: BatchModel,
     members: Tensor,
     x: Tensor,
     inputs: Tensor,
@@ -74,13 +73,20 @@ def disagreements(
     inputs : (C, m)
         Candidates, each held over the ``lookahead`` steps.
     """
-    predict = vmap(vmap(model, in_dims=(0, None)))
+    n, K, q = members.shape
+
+    def predict(z: Tensor) -> Tensor:
+        """Return the accelerations of each network, (n, K, C, r), at states (n, C, d)."""
+        states = z.unsqueeze(1).expand(n, K, *z.shape[1:]).flatten(0, 1)
+        values: Tensor = model(members.reshape(n * K, q), states).unflatten(0, (n, K))
+        return values
+
     z = x.unsqueeze(1).expand(-1, len(inputs), -1)
     values = torch.zeros(z.shape[:2]).to(x)
-    predicted = predict(members, z)
+    predicted = predict(z)
     for _ in range(lookahead):
         z = z + system.dt * flow(system, z, inputs.expand(*z.shape[:2], -1), predicted.mean(dim=1))
-        predicted = predict(members, z)
+        predicted = predict(z)
         values = values + predicted.var(dim=1, correction=0).sum(dim=-1)
     return values
 

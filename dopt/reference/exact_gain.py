@@ -19,10 +19,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.func import grad_and_value, jacrev, vmap
 
 from dopt.policies.gradient import GradientDOptimal
-from dopt.reference.dynamics import flow
 from dopt.reference.state import BatchState
 
 WIDENING = 4.0
@@ -42,36 +40,39 @@ class Situation(NamedTuple):
 
 
 def log_det_gain(rows: Tensor, covariance: Tensor) -> Tensor:
-    """Return log det(I + J M⁻¹ Jᵀ) for J (r, s) and M⁻¹ (s, s)."""
+    """Return log det(I + J M⁻¹ Jᵀ), (...), for J (..., r, s) and M⁻¹ (..., s, s)."""
     S = rows @ covariance @ rows.mT
-    if len(S) == 1:
-        alone: Tensor = S[0, 0].log1p()
-        return alone
-    factor, _ = torch.linalg.cholesky_ex(S + torch.eye(len(S)).to(S))
-    total: Tensor = torch.diagonal(factor).square().log().sum()
-    return total
+    if S.shape[-1] == 1:
+        return S[..., 0, 0].log1p()
+    factor, _ = torch.linalg.cholesky_ex(S + torch.eye(S.shape[-1]).to(S))
+    return torch.diagonal(factor, dim1=-2, dim2=-1).square().log().sum(dim=-1)
 
 
 class ExactGain:
     """G_D(u) - log det M of Definition 1 for a batch: of all learned components, or of one."""
 
     def __init__(self, batch: BatchState, *, single: bool = False) -> None:
-        system, model, project = batch.system, batch.model, batch.project
-        scale = batch.held.noise_variance**-0.5 if batch.held else 1.0
-
-        def gain(u: Tensor, theta: Tensor, covariance: Tensor, x: Tensor, k: Tensor) -> Tensor:
-            following = x + system.dt * flow(system, x, u, model(theta, x))
-            rows = scale * project(jacrev(model)(theta, following))
-            return log_det_gain(rows.index_select(0, k.view(1)) if single else rows, covariance)
-
-        over_inputs = (0, None, None, None, None)
-        self._values = vmap(vmap(gain, in_dims=over_inputs))
-        self._slopes = vmap(vmap(grad_and_value(gain), in_dims=over_inputs))
+        self._learned, self._project, self._single = batch.learned, batch.project, single
+        self._scale = batch.held.noise_variance**-0.5 if batch.held else 1.0
 
     def values(self, u: Tensor, now: Situation) -> Tensor:
         """Return the gains, (n, C), of inputs (n, C, m)."""
-        gains: Tensor = self._values(u, *now)
-        return gains
+        theta, covariance, x, component = now
+        x = x.unsqueeze(1).expand(-1, u.shape[1], -1)
+        following = self._learned.following(theta, x, u)
+        J = self._learned.jacobian(theta, following, differentiable=u.requires_grad)
+        rows = self._scale * self._project(J)
+        if self._single:
+            rows = rows[torch.arange(len(rows)), :, component].unsqueeze(2)
+        return log_det_gain(rows, covariance.unsqueeze(1))
+
+    def slopes(self, u: Tensor, now: Situation) -> tuple[Tensor, Tensor]:
+        """Return the slopes, (n, C, m), and the gains, (n, C), of inputs (n, C, m)."""
+        with torch.enable_grad():
+            u = u.detach().requires_grad_()
+            gains = self.values(u, now)
+            (slopes,) = torch.autograd.grad(gains.sum(), u)
+        return slopes, gains.detach()
 
     def optimum(self, starts: Tensor, now: Situation, search: GradientDOptimal) -> Tensor:
         """Return the best inputs, (n, m), found from inputs (n, C, m) on the sphere."""
@@ -82,7 +83,7 @@ class ExactGain:
         values = values.gather(1, chosen)
         if starts.shape[2] > 1:
             angle = math.pi / starts.shape[1]
-            u, values = ascend(lambda v: self._slopes(v, *now), u, angle, search.iterations)
+            u, values = ascend(lambda v: self.slopes(v, now), u, angle, search.iterations)
         return u[torch.arange(len(u)), values.argmax(dim=1)]
 
 
@@ -139,7 +140,7 @@ class GradientPlan:
         """Return the inputs u_t, (n, m)."""
         batch = self._batch
         assert batch.information is not None
-        covariance = torch.linalg.inv_ex(batch.information)[0]
+        covariance = batch.information.covariance()
         now = Situation(batch.theta, covariance, batch.states[:, t], batch.components[:, t])
         return self._gain.optimum(self._candidates, now, self._policy)
 

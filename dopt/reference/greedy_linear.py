@@ -19,7 +19,7 @@ class GreedyLinearPlan:
         self._batch = batch
         prior = policy.regularization * torch.eye(batch.system.n_states).to(batch.theta)
         self._gram = prior.repeat(len(batch.theta), 1, 1)
-        columns = input_matrix(batch.system, batch.states[0, 0])
+        columns = input_matrix(batch.system, batch.states[:1, 0])[0]
         self._B = features(batch.system, columns.mT).mT
 
     def plan(self, t: int) -> Tensor:

@@ -1,17 +1,17 @@
 """Filter over state and parameters, and fits of all that was measured, for a batch of trials.
 
-Twin of :mod:`dopt.kernel.learners.joint_kalman`; M is summed, and solved afresh.
+Twin of :mod:`dopt.kernel.learners.joint_kalman`.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
 
 from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
 from dopt.learning import JointKalman
-from dopt.reference.learning import solved
+from dopt.reference.derivatives import jacobian
+from dopt.reference.information import BatchInformation
 from dopt.reference.sensors import BatchSensors
 from dopt.reference.state import BatchState
 
@@ -29,15 +29,19 @@ class JointKalmanLearner:
         self._E = batch.theta.new_zeros(d, batch.system.n_learned)
         for column, row in enumerate(batch.system.learned_rows):
             self._E[row, column] = 1.0
-        self._rows = vmap(jacrev(batch.model))
 
-    def filtered(self, t: int, information: Tensor) -> Tensor:
-        """Take in what was measured of x_{t+1}, of which the prediction stands there; return M."""
-        batch, learner = self._batch, self._learner
+    @property
+    def _information(self) -> BatchInformation:
+        assert self._batch.information is not None
+        return self._batch.information
+
+    def filter(self, t: int) -> None:
+        """Take in what was measured of x_{t+1}, of which the prediction stands there."""
+        batch, learner, information = self._batch, self._learner, self._information
         x, following, u = batch.states[:, t], batch.states[:, t + 1], batch.inputs[:, t]
         theta, dt = batch.theta, self._sensors.durations[t]
         J = self._rows(theta, batch.points(self._learned_at(x, following), u))
-        spread = J @ torch.linalg.solve(information, J.mT)
+        spread = J @ information.solve(J.mT)
         noise = learner.noise_variance * torch.eye(J.shape[1]).to(J)
         noise = noise + learner.underweighting * spread
         A = self._state_jacobian(theta, x, u, dt)
@@ -48,16 +52,19 @@ class JointKalmanLearner:
             error = self._sensors.outputs[:, t, i] - following[:, row]
             variance = P[:, row, row] + self._sensors.variances[i]
             h, K = psi[:, row], P[:, :, row] / variance[:, None]
-            information = information + h[:, :, None] * (h / variance[:, None])[:, None, :]
-            change = solved(information, (h * (error / variance)[:, None]).unsqueeze(-1))
+            information.add((h * variance.rsqrt()[:, None]).unsqueeze(1))
+            change = information.solve((h * (error / variance)[:, None]).unsqueeze(-1))
             P = P - variance[:, None, None] * K[:, :, None] * K[:, None, :]
             psi = psi - K[:, :, None] * h[:, None, :]
-            theta.add_(change)
-            following.add_(K * error[:, None] + (psi @ change.unsqueeze(-1)).squeeze(-1))
+            theta.add_(change.squeeze(-1))
+            following.add_(K * error[:, None] + (psi @ change).squeeze(-1))
         self._P, self._psi = P, psi
         if (t + 1) % learner.refit_every == 0:
-            return self._fitted(t + 1)
-        return information
+            self._fit(t + 1)
+
+    def _rows(self, theta: Tensor, points: Tensor) -> Tensor:
+        """Return J, (n, r, q), at points (n, ·)."""
+        return self._batch.learned.jacobian(theta, points.unsqueeze(1)).squeeze(1)
 
     def _begun(self, t: int, P: Tensor, psi: Tensor) -> tuple[Tensor, Tensor]:
         """Return P and Ψ before step t, those of a state of its own where it begins anew."""
@@ -71,21 +78,16 @@ class JointKalmanLearner:
 
     def _state_jacobian(self, theta: Tensor, x: Tensor, u: Tensor, dt: float) -> Tensor:
         """Return ∂x_{t+1}/∂x_t of the model's step, (n, d, d)."""
+        return jacobian(lambda at: self._batch.learned.next_states(theta, at, u, dt), x)
 
-        def step(one: Tensor, at: Tensor, inputs: Tensor) -> Tensor:
-            given = one.unsqueeze(0), at.unsqueeze(0), inputs.unsqueeze(0)
-            return self._batch.learned.next_states(*given, dt).squeeze(0)
-
-        A: Tensor = vmap(jacrev(step, argnums=1))(theta, x, u)
-        return A
-
-    def _fitted(self, n: int) -> Tensor:
-        """Fit θ to what was measured in n steps; return M."""
+    def _fit(self, n: int) -> None:
+        """Fit θ to what was measured in n steps; M is that of the fit."""
         theta = self._batch.theta
         for _ in range(self._learner.steps):
             before, J, e = self._run(n)
             right = J.mT @ e.unsqueeze(-1) + self._ridge * (self._prior - theta).unsqueeze(-1)
-            step, start = solved(self._normal(J), right), theta.clone()
+            self._information.replace(self._normal(J))
+            step, start = self._information.solve(right).squeeze(-1), theta.clone()
             share = torch.ones_like(theta[:, :1])
             bound = before + (NO_GROWTH - 1.0) * before.abs()
             while True:
@@ -96,7 +98,7 @@ class JointKalmanLearner:
                 smaller = torch.where(share > SMALLEST_SHARE, share / 2, 0.0)
                 share = torch.where(worse, smaller, share)
         _, J, _ = self._run(n, keep=True)
-        return self._normal(J)
+        self._information.replace(self._normal(J))
 
     def _normal(self, J: Tensor) -> Tensor:
         total: Tensor = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)

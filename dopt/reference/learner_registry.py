@@ -23,7 +23,7 @@ from dopt.reference.state import BatchState
 
 def batch_learner(
     batch: BatchState, points: Tensor, sensors: BatchSensors | None
-) -> BatchLearner | KalmanLearner | JointKalmanLearner:
+) -> BatchLearner | JointKalmanLearner:
     """Return the learner of a batch; it writes into the parameters of the batch.
 
     ``points``, (N, d), are the states at which the model is evaluated at each step; ``sensors``
@@ -34,17 +34,18 @@ def batch_learner(
         return Posterior(batch.system, model, batch.theta, points)
     if isinstance(learner, CustomLearner):
         return OwnLearner(learner, batch)
-    if isinstance(learner, ExtendedKalman):
+    if isinstance(learner, ExtendedKalman | GaussNewton):
         assert batch.held is not None
-        return KalmanLearner(learner, batch.model, batch.theta, batch.held.regularization)
-    if isinstance(learner, GaussNewton):
-        assert batch.held is not None
-        return GaussNewtonLearner(learner, batch.model, batch.theta, batch.held.regularization)
+        assert batch.information is not None
+        shared = batch.learned, batch.theta, batch.information, batch.held.regularization
+        if isinstance(learner, GaussNewton):
+            return GaussNewtonLearner(learner, *shared)
+        return KalmanLearner(learner, *shared)
     if isinstance(learner, JointKalman):
         assert batch.held is not None
         assert sensors is not None
         return JointKalmanLearner(learner, batch, sensors, batch.held.regularization)
     if isinstance(learner, RecursiveLeastSquares):
         ridge = float(getattr(batch.config.policy, "regularization", learner.regularization))
-        return LeastSquaresLearner(batch.model, batch.theta, ridge, batch.n_learned)
+        return LeastSquaresLearner(batch.learned, batch.theta, ridge, batch.n_learned)
     return learner_for(learner, batch.model, batch.theta, batch.replay)

@@ -6,12 +6,13 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.func import grad, jacrev, vmap
 
 from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
 from dopt.errors import SpecificationError
 from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, GaussNewton, Learner
-from dopt.reference.models import Accelerations
+from dopt.reference.dynamics import LearnedDynamics
+from dopt.reference.information import BatchInformation
+from dopt.reference.models import BatchModel
 
 
 class BatchLearner(Protocol):
@@ -25,7 +26,7 @@ class AdamLearner:
     """Adam on the newest samples; one optimiser for the whole batch, as Adam is elementwise."""
 
     def __init__(
-        self, learner: AdamRule, model: Accelerations, theta: Tensor, window: int = 1
+        self, learner: AdamRule, model: BatchModel, theta: Tensor, window: int = 1
     ) -> None:
         self.window = window
         self.optimizer = torch.optim.Adam(
@@ -35,12 +36,7 @@ class AdamLearner:
             eps=learner.epsilon,
         )
         self._theta = theta
-
-        def loss(parameters: Tensor, x: Tensor, targets: Tensor) -> Tensor:
-            errors = vmap(model, in_dims=(None, 0))(parameters, x) - targets
-            return errors.square().sum(dim=-1).mean()
-
-        self._gradient = vmap(grad(loss))
+        self._model = model
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Take one step on states (n, t + 1, d) and observed accelerations (n, t + 1, r)."""
@@ -48,7 +44,11 @@ class AdamLearner:
         self._step(states[:, newest], targets[:, newest])
 
     def _step(self, states: Tensor, targets: Tensor) -> None:
-        self._theta.grad = self._gradient(self._theta, states, targets)
+        with torch.enable_grad():
+            theta = self._theta.detach().requires_grad_()
+            squares = (self._model(theta, states) - targets).square().sum(dim=-1)
+            # The gradient of a sum over trials holds that of each.
+            (self._theta.grad,) = torch.autograd.grad(squares.mean(dim=1).sum(), theta)
         self.optimizer.step()
 
 
@@ -56,7 +56,7 @@ class ReplayLearner(AdamLearner):
     """Adam on the samples that were last put into the drawn places of a buffer, (n, T, S, B)."""
 
     def __init__(
-        self, learner: AdamReplay, model: Accelerations, theta: Tensor, places: Tensor
+        self, learner: AdamReplay, model: BatchModel, theta: Tensor, places: Tensor
     ) -> None:
         super().__init__(learner, model, theta)
         self._capacity, self._places = learner.capacity, places
@@ -79,132 +79,130 @@ class LeastSquaresLearner:
     """
 
     def __init__(
-        self, model: Accelerations, theta: Tensor, regularization: float, n_learned: int
+        self, learned: LearnedDynamics, theta: Tensor, regularization: float, n_learned: int
     ) -> None:
-        self._theta = theta[:, :n_learned]
-        self._fixed = theta[:, n_learned:]
-        self._normal = regularization * torch.eye(n_learned).to(theta).repeat(len(theta), 1, 1)
+        self._learned, self._whole, self._theta = learned, theta, theta[:, :n_learned]
+        prior = regularization * torch.eye(n_learned).to(theta)
+        self._normal = prior.repeat(len(theta), 1, 1)
         self._moment = torch.zeros_like(self._theta)
-
-        def whole(learned: Tensor, fixed: Tensor, x: Tensor) -> Tensor:
-            return model(torch.cat([learned, fixed]), x)
-
-        self._model = vmap(whole)
-        self._rows = vmap(jacrev(whole))
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Absorb the newest of the states (n, t + 1, d) and targets (n, t + 1, r)."""
-        x, y = states[:, -1], targets[:, -1]
-        J = self._rows(self._theta, self._fixed, x)
-        offset = self._model(torch.zeros_like(self._theta), self._fixed, x)
+        x, y = states[:, -1:], targets[:, -1]
+        n_learned = self._theta.shape[1]
+        J = self._learned.jacobian(self._whole, x)[:, 0, :, :n_learned]
+        nothing = torch.cat([torch.zeros_like(self._theta), self._whole[:, n_learned:]], dim=1)
+        offset = self._learned.model(nothing, x).squeeze(1)
         self._normal = self._normal + J.mT @ J
         self._moment = self._moment + (J.mT @ (y - offset).unsqueeze(-1)).squeeze(-1)
         self._theta.copy_(torch.linalg.solve(self._normal, self._moment))
 
 
 class KalmanLearner:
-    """The extended Kalman filter in information form: M is summed, and solved afresh.
+    """The extended Kalman filter in information form.
 
     M_{t+1} = f M_t + D_t + JᵀJ/ρ and θ += M_{t+1}⁻¹ Jᵀ e/ρ. Underweighted, R takes the place of ρ.
     """
 
     def __init__(
-        self, learner: ExtendedKalman, model: Accelerations, theta: Tensor, regularization: float
+        self,
+        learner: ExtendedKalman,
+        learned: LearnedDynamics,
+        theta: Tensor,
+        information: BatchInformation,
+        regularization: float,
     ) -> None:
-        self._learner, self._theta = learner, theta
-        self._model, self._rows = vmap(model), vmap(jacrev(model))
+        self._learner, self._learned, self._theta = learner, learned, theta
+        self._information = information
         self._renewal = learner.renewal(theta.shape[1], regularization)
 
-    def filtered(self, states: Tensor, targets: Tensor, information: Tensor) -> Tensor:
-        """Absorb the newest of the states (n, t + 1, d) and targets (n, t + 1, r); return M."""
-        x, y = states[:, -1], targets[:, -1]
-        J, e = self._rows(self._theta, x), (y - self._model(self._theta, x)).unsqueeze(-1)
-        given_back = torch.diag(self._given_back(states.shape[1] - 1))
-        faded = self._learner.forgetting * information + given_back
+    def learn(self, states: Tensor, targets: Tensor) -> None:
+        """Absorb the newest of the states (n, t + 1, d) and targets (n, t + 1, r)."""
+        x, y = states[:, -1:], targets[:, -1]
+        J = self._learned.jacobian(self._theta, x).squeeze(1)
+        e = (y - self._learned.model(self._theta, x).squeeze(1)).unsqueeze(-1)
+        self._information.scale(self._learner.forgetting)
+        self._information.add(self._given_back(states.shape[1] - 1))
         noise = self._learner.noise_variance
         if self._learner.underweighting > 0.0:
-            L, noise = self._noise_factor(faded, J), 1.0
+            L, noise = self._noise_factor(J), 1.0
             J, e = (torch.linalg.solve_triangular(L, part, upper=False) for part in (J, e))
-        information = faded + J.mT @ J / noise
-        self._theta.add_(solved(information, J.mT @ e / noise))
-        return information
+        self._information.add(J * noise**-0.5)
+        self._theta.add_(self._information.solve(J.mT @ e / noise).squeeze(-1))
 
-    def _noise_factor(self, information: Tensor, J: Tensor) -> Tensor:
+    def _noise_factor(self, J: Tensor) -> Tensor:
         """Return the Cholesky factor of R = ρI + ζ J M⁻¹ Jᵀ, (n, r, r); NaN where there is none."""
-        predicted = J @ torch.cholesky_solve(J.mT, torch.linalg.cholesky_ex(information)[0])
+        predicted = J @ self._information.solve(J.mT)
         noise = self._learner.noise_variance * torch.eye(J.shape[1]).to(J)
         factor, failed = torch.linalg.cholesky_ex(noise + self._learner.underweighting * predicted)
         return torch.where(failed[:, None, None] > 0, torch.nan, factor)
 
     def _given_back(self, t: int) -> Tensor:
-        """Return the diagonal of D_t, (q,)."""
-        diagonal = torch.zeros_like(self._theta[0])
+        """Return rows, (n, k, q), the sum of whose squares is the diagonal D_t."""
+        n, q = self._theta.shape
         k, weight = self._renewal
-        turn = torch.arange(t * k, (t + 1) * k, device=diagonal.device)
-        diagonal[turn % len(diagonal)] = weight
-        return diagonal
+        turn = torch.arange(t * k, (t + 1) * k, device=self._theta.device) % q
+        rows = self._theta.new_zeros(k, q)
+        rows[torch.arange(k), turn] = weight**0.5
+        return rows.expand(n, k, q)
 
 
 class GaussNewtonLearner(KalmanLearner):
     """Gauss-Newton on the samples of the buffer, and the Kalman filter between two fits."""
 
     def __init__(
-        self, learner: GaussNewton, model: Accelerations, theta: Tensor, regularization: float
+        self,
+        learner: GaussNewton,
+        learned: LearnedDynamics,
+        theta: Tensor,
+        information: BatchInformation,
+        regularization: float,
     ) -> None:
         between = ExtendedKalman(noise_variance=learner.noise_variance)
-        super().__init__(between, model, theta, regularization)
+        super().__init__(between, learned, theta, information, regularization)
         self._fit, self.prior = learner, theta.clone()
+        self._regularization = regularization
         self._ridge = regularization * learner.noise_variance
-        self._models = vmap(vmap(model, in_dims=(None, 0)))
-        self._all_rows = vmap(vmap(jacrev(model), in_dims=(None, 0)))
 
-    def filtered(self, states: Tensor, targets: Tensor, information: Tensor) -> Tensor:
-        """Learn from the states (n, t + 1, d) and targets (n, t + 1, r); return M."""
+    def learn(self, states: Tensor, targets: Tensor) -> None:
+        """Learn from the states (n, t + 1, d) and targets (n, t + 1, r)."""
         if (states.shape[1] - 1) % self._fit.refit_every:
-            return super().filtered(states, targets, information)
+            super().learn(states, targets)
+            return
         newest = slice(-self._fit.capacity, None)
         for _ in range(self._fit.steps):
-            information = self._stepped(states[:, newest], targets[:, newest])
-        scaled: Tensor = information / self._fit.noise_variance
-        return scaled
+            self._step(states[:, newest], targets[:, newest])
 
-    def _stepped(self, x: Tensor, y: Tensor) -> Tensor:
-        """Take one damped step on (n, N, d) and (n, N, r); return ρM before it."""
-        J = self._all_rows(self._theta, x).flatten(1, 2)
-        e = (y - self._models(self._theta, x)).flatten(1).unsqueeze(-1)
+    def _step(self, x: Tensor, y: Tensor) -> None:
+        """Take one damped step on (n, N, d) and (n, N, r); M is that before it."""
+        J = self._learned.jacobian(self._theta, x).flatten(1, 2)
+        e = (y - self._learned.model(self._theta, x)).flatten(1).unsqueeze(-1)
         distance = (self.prior - self._theta).unsqueeze(-1)
-        matrix: Tensor = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
-        step = solved(matrix, J.mT @ e + self._ridge * distance)
+        noise = self._fit.noise_variance
+        prior = self._regularization * torch.eye(J.shape[-1]).to(J)
+        self._information.replace(J.mT @ J / noise + prior)
+        step = self._information.solve(J.mT @ e / noise + self._regularization * distance)
+        step = step.squeeze(-1)
         before, share = self._theta.clone(), torch.ones_like(self._theta[:, :1])
         bound = self._objective(before, x, y) * NO_GROWTH
         while True:
             self._theta.copy_(before + share * step)
             worse = ~(self._objective(self._theta, x, y) <= bound) & (share > 0)
             if not worse.any():
-                return matrix
+                return
             smaller = torch.where(share > SMALLEST_SHARE, share / 2, 0.0)
             share = torch.where(worse, smaller, share)
 
     def _objective(self, theta: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """Return ‖e‖² + λρ ‖θ - θ₀‖², (n, 1)."""
-        squares = (y - self._models(theta, x)).square().sum(dim=(1, 2))
+        squares = (y - self._learned.model(theta, x)).square().sum(dim=(1, 2))
         whole = squares + self._ridge * (theta - self.prior).square().sum(dim=1)
         return whole.unsqueeze(1)
 
 
-def solved(matrix: Tensor, right: Tensor) -> Tensor:
-    """Return the solutions, (n, q), for matrices and columns, (n, q, 1).
-
-    NaN where rounding has left a matrix indefinite.
-    """
-    factor, failed = torch.linalg.cholesky_ex(matrix)
-    solution = torch.cholesky_solve(right, factor).squeeze(-1)
-    return torch.where(failed.unsqueeze(-1) > 0, torch.nan, solution)
-
-
 def learner_for(
     learner: Learner,
-    model: Accelerations,
+    model: BatchModel,
     theta: Tensor,
     replay: Tensor | None = None,
 ) -> BatchLearner:

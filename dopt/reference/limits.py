@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
 
 from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
 from dopt.limits import Limits
@@ -60,7 +59,7 @@ class BatchLimits:
         """
         batch = self._batch
         self._last_input = batch.inputs[:, t]
-        value = vmap(batch.model)(batch.theta, sampled)
+        value = batch.model(batch.theta, sampled.unsqueeze(1)).squeeze(1)
         square = (batch.targets[:, t] - value).square() / (1 + self._variances[0])
         self._scale += max(1 / (t + 1), 1 / NEWEST_ERRORS) * (square - self._scale)
 
@@ -101,11 +100,9 @@ class BatchLimits:
         assert batch.information is not None
         bar = predicted_states(batch.learned, batch.theta, batch.states[:, t])
         zero = torch.zeros_like(batch.inputs[:, t])
-        rows = batch.project(vmap(jacrev(batch.model))(batch.theta, batch.points(bar, zero)))
-        factor, failed = torch.linalg.cholesky_ex(batch.information)
-        solved = torch.cholesky_solve(rows.mT, factor).mT
-        h: Tensor = (rows * solved).sum(dim=-1)
-        return torch.where((failed == 0).unsqueeze(1), h, torch.nan)
+        points = batch.points(bar, zero).unsqueeze(1)
+        rows = batch.project(batch.learned.jacobian(batch.theta, points).squeeze(1))
+        return (rows * batch.information.solve(rows.mT).mT).sum(dim=-1)
 
     def _excess(self, x: Tensor, tried: Tensor, errors: Tensor) -> Tensor:
         """Return how far beyond the bounds each input leads, (n, C), for inputs (n, C, m)."""
@@ -130,10 +127,9 @@ class BatchLimits:
     def _next_states(self, x: Tensor, u: Tensor, off: Tensor) -> Tensor:
         """Return the states after (n, ..., d) under the model, with errors of accelerations."""
         batch = self._batch
-        over_points = vmap(vmap(batch.model, in_dims=(None, 0)))
 
         def accelerations(z: Tensor) -> Tensor:
-            values: Tensor = over_points(batch.theta, batch.points(z, u).flatten(1, -2))
+            values = batch.model(batch.theta, batch.points(z, u).flatten(1, -2))
             return values.view(off.shape) + off
 
         return next_states(batch.system, x, u, accelerations, batch.system.dt)

@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from torch import nn
-from torch.func import vmap
 from torch.nn.utils import parameters_to_vector
 
 from dopt.declare.registry import SOURCE, TARGET, check_source, imported, source_digest
@@ -103,8 +102,9 @@ class Module(Model):
 
     def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
         function = network_function(system, self.module(system))
-        over_states = vmap(function, in_dims=(None, 0))
-        return _array(over_states(torch.as_tensor(parameters), torch.as_tensor(points)))
+        theta, states = torch.as_tensor(parameters), torch.as_tensor(points)
+        with torch.no_grad():
+            return _array(function(theta[None], states[None])[0])
 
 
 def _canonical(given: Mapping[str, object]) -> str:

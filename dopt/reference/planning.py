@@ -18,10 +18,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.func import grad, jvp, vmap
 
 from dopt.algorithm import TIE_MARGIN
+from dopt.reference.derivatives import gradients_and_changes
 from dopt.reference.dynamics import LearnedDynamics
+from dopt.reference.information import BatchInformation
 from dopt.reference.sphere import maximize_on_spheres
 
 
@@ -42,63 +43,48 @@ def predicted_states(learned: LearnedDynamics, theta: Tensor, x: Tensor) -> Tens
 def quadratic_problem(
     learned: LearnedDynamics,
     theta: Tensor,
-    information: Tensor,
+    information: BatchInformation,
     x: Tensor,
     components: Tensor,
     next_inputs: Tensor,
     project: Callable[[Tensor], Tensor],
 ) -> QuadraticProblem:
-    """Return Q and v for parameters (n, q), M (n, s, s), states (n, d), components k (n,).
+    """Return the sum of Q and of v over components k, (n, c).
 
-    ``next_inputs`` (n, m) are those of the next sample, for a model that reads inputs.
-    ``project`` maps gradients, (..., q), to the space of M, (..., s): the identity, or a sketch.
+    Given are parameters (n, q), M of s dimensions and states (n, d). ``next_inputs`` (n, m) are
+    those of the next sample, for a model that reads inputs. ``project`` maps gradients, (..., q),
+    to the space of M, (..., s): the identity, or a sketch.
     """
-    bar = predicted_states(learned, theta, x)
-    g, DB = vmap(lambda p, z, v, k: _gradient_and_changes(learned, p, z, v, k))(
-        theta, bar, next_inputs, components
-    )
-    columns = project(torch.cat([g.unsqueeze(-1), DB], dim=-1).mT).mT
-    solved = torch.cholesky_solve(columns, _factor(information))
-    Q = columns[..., 1:].mT @ solved[..., 1:]
-    v = -(columns[..., 1:].mT @ solved[..., :1]).squeeze(-1)
+    g, DB = gradient_and_changes(learned, theta, x, components, next_inputs)
+    columns = project(torch.cat([g.unsqueeze(2), DB], dim=2))  # (n, c, 1 + m, s)
+    solved = information.solve(columns.flatten(1, 2).mT).mT.view_as(columns)
+    Q = (columns[:, :, 1:] @ solved[:, :, 1:].mT).sum(dim=1)
+    v = -(columns[:, :, 1:] @ solved[:, :, :1].mT).sum(dim=1).squeeze(-1)
     return QuadraticProblem(Q, v)
 
 
-def summed(problems: list[QuadraticProblem]) -> QuadraticProblem:
-    """Return the problem whose objective is the sum of all."""
-    return QuadraticProblem(
-        torch.stack([problem.Q for problem in problems]).sum(dim=0),
-        torch.stack([problem.v for problem in problems]).sum(dim=0),
-    )
-
-
-def _factor(information: Tensor) -> Tensor:
-    """Return the Cholesky factors of M; NaN where M is not positive definite, or NaN itself."""
-    factor, failed = torch.linalg.cholesky_ex(information)
-    return torch.where((failed == 0)[:, None, None], factor, torch.nan)
-
-
-def _gradient_and_changes(
-    learned: LearnedDynamics, theta: Tensor, bar: Tensor, next_input: Tensor, component: Tensor
+def gradient_and_changes(
+    learned: LearnedDynamics, theta: Tensor, x: Tensor, components: Tensor, next_inputs: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return g, (q,), and D B, (q, m), by forward over reverse differentiation.
+    """Return g, (n, c, q), and D B, (n, c, m, q), for components (n, c).
 
     They are those at the predicted state; a model that reads inputs is given the next one, which
     does not change with the input that is planned.
     """
-
-    def chosen(parameters: Tensor, z: Tensor) -> Tensor:
-        return learned.model(parameters, z).gather(-1, component.view(1)).squeeze(-1)
-
-    def gradient(z: Tensor) -> Tensor:
-        g: Tensor = grad(chosen)(theta, z)
-        return g
-
-    columns = learned.input_matrix(theta, bar)
-    point = learned.points(bar, next_input)
-    columns = learned.points(columns.mT, columns.new_zeros(columns.shape[1], columns.shape[1])).mT
-    change = vmap(lambda column: jvp(gradient, (point,), (column,))[1], in_dims=1, out_dims=1)
-    return gradient(point), change(columns)
+    bar = predicted_states(learned, theta, x)
+    B = learned.input_matrix(theta, bar)
+    n, c, m = len(x), components.shape[1], B.shape[2]
+    point = learned.points(bar, next_inputs)
+    columns = learned.points(B.mT, B.new_zeros(n, m, m))
+    shape = n, c, m
+    g, DB = gradients_and_changes(
+        learned.model,
+        theta[:, None, None].expand(*shape, -1).flatten(0, 2),
+        point[:, None, None].expand(*shape, -1).flatten(0, 2),
+        components.unsqueeze(2).expand(shape).flatten(),
+        columns.unsqueeze(1).expand(*shape, -1).flatten(0, 2),
+    )
+    return g.view(*shape, -1)[:, :, 0], DB.view(*shape, -1)
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:
@@ -123,23 +109,23 @@ def uniform_inputs(learned: LearnedDynamics, theta: Tensor, states: Tensor, step
     Gradient ascent on the sphere from ±γ along every input axis, by automatic differentiation.
     """
     system, x = learned.system, states[:, -1]
-    center = predicted_states(learned, theta, x)
-    B = vmap(learned.input_matrix)(theta, x)
+    center = predicted_states(learned, theta, x).unsqueeze(1)
+    B = learned.input_matrix(theta, x)
     axes = torch.eye(system.n_inputs, dtype=x.dtype, device=x.device)
     starts = system.gamma * torch.stack([axes, -axes], dim=1).flatten(0, 1)
 
-    def distance(u: Tensor, c: Tensor, columns: Tensor, seen: Tensor) -> Tensor:
-        total: Tensor = torch.linalg.vector_norm(c + columns @ u - seen, dim=-1).sum()
-        return total
+    def distances(u: Tensor) -> Tensor:
+        reached = (center + u @ B.mT).unsqueeze(2)
+        apart: Tensor = torch.linalg.vector_norm(reached - states.unsqueeze(1), dim=-1)
+        return apart.sum(dim=-1)
 
-    def ascent(u: Tensor, c: Tensor, columns: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        for _ in range(steps if system.n_inputs > 1 else 0):
-            slope = grad(distance)(u, c, columns, seen)
-            u = system.gamma * slope / torch.linalg.vector_norm(slope)
-        return u, distance(u, c, columns, seen)
-
-    over_starts = vmap(ascent, in_dims=(0, None, None, None))
-    u, value = vmap(over_starts, in_dims=(None, 0, 0, 0))(starts, center, B, states)
+    u = starts.expand(len(x), -1, -1)
+    for _ in range(steps if system.n_inputs > 1 else 0):
+        with torch.enable_grad():
+            u = u.detach().requires_grad_()
+            (slope,) = torch.autograd.grad(distances(u).sum(), u)
+        u = system.gamma * slope / torch.linalg.vector_norm(slope, dim=-1, keepdim=True)
+    value = distances(u)
     best, best_value = u[:, 0], value[:, 0]
     for i in range(1, len(starts)):
         better = value[:, i] > best_value * (1 + TIE_MARGIN)

@@ -22,7 +22,6 @@ from torch.func import vmap
 from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, Score
 from dopt.policies import ICEM
 from dopt.policies.task_states import box_states, domain_box
-from dopt.reference.dynamics import flow
 from dopt.reference.state import BatchState
 
 
@@ -35,7 +34,7 @@ class SampledPlan:
         self._normals = batch.plans.view(n, -1, policy.iterations, policy.plans, K, m)
         self._mean = torch.zeros(n, K, m).to(batch.theta)
         self._elites = torch.zeros(n, policy.elites, K, m).to(batch.theta)
-        self._rows = vmap(batch.learned.rows_at)
+        self._rows = batch.learned.rows_at
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m)."""
@@ -72,11 +71,8 @@ class SampledPlan:
         """Return W and R; W is NaN where rounding has left M indefinite."""
         batch, count = self._batch, self._policy.task_count
         assert batch.information is not None
-        factor, failed = torch.linalg.cholesky_ex(batch.information)
-        q = factor.shape[-1]
-        eye = torch.eye(q).to(factor).expand_as(factor)
-        U = torch.linalg.solve_triangular(factor.mT, eye, upper=True)
-        U = torch.where((failed == 0)[:, None, None], U, torch.nan)
+        U = batch.information.upper_root()
+        q = U.shape[-1]
         random = batch.parameters[:, :q] / self._policy.samples**0.5
         if count == 0:
             return U @ random, U[:, :0, :0]
@@ -111,14 +107,12 @@ class SampledPlan:
     def _paths(self, t: int, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Return the states that count, (n, P, ·, d), and which paths stay in bounds, (n, P)."""
         batch, policy = self._batch, self._policy
-        predict = vmap(vmap(batch.model, (None, 0)))
         x = batch.states[:, t].unsqueeze(1).expand(-1, inputs.shape[1], -1)
         inside = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
         kept = []
         for i in range(policy.lookahead // policy.stride * policy.stride):
             u = inputs[:, :, (t + i) // policy.hold - t // policy.hold]
-            accelerations = predict(batch.theta, batch.points(x, u))
-            x = x + batch.system.dt * flow(batch.system, x, u, accelerations)
+            x = batch.learned.following(batch.theta, x, u)
             inside = inside & (x.abs() <= batch.system.state_limit).all(dim=-1)
             if (i + 1) % policy.stride == 0:
                 kept.append(x)

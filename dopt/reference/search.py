@@ -23,6 +23,7 @@ from dopt.policies import EOptimal, Lookahead, Search, TaskOptimal
 from dopt.policies.search import score_code
 from dopt.policies.task_states import task_states
 from dopt.reference.dynamics import LearnedDynamics
+from dopt.reference.information import BatchInformation
 from dopt.systems.base import System
 
 
@@ -30,29 +31,32 @@ def searched_inputs(
     policy: Search,
     learned: LearnedDynamics,
     theta: Tensor,
-    information: Tensor,
+    information: BatchInformation,
     x: Tensor,
     ties: Tensor,
     noise_variance: float = 1.0,
 ) -> Tensor:
     """Return the first inputs of the best plans, (n, m).
 
-    Given are parameters (n, q), M (n, q, q), states (n, d) and tie-breaking directions (n, m). A
+    Given are parameters (n, q), M, states (n, d) and tie-breaking directions (n, m). A
     sample adds JᵀJ/ρ to M, with ρ the ``noise_variance``.
     """
     system = learned.system
     candidates = torch.tensor(policy.compared_inputs(system)).to(x)
     pairs = plans(policy, system, len(candidates))
     inputs = candidates[torch.tensor(pairs)]
-    states = vmap(lambda p, z: paths(policy, learned, p, z, inputs))(theta, x)
+    states = paths(policy, learned, theta, x, inputs)
     stride = policy.stride_of(system) if isinstance(policy, Lookahead) else 1
     seen = states[:, :, stride - 1 :: stride]
-    rows = vmap(vmap(learned.rows_at, (None, 0)))(theta, seen)
-    rows = rows[..., : information.shape[1]] * noise_variance**-0.5
+    rows = learned.rows_at(theta, seen.flatten(1, 2)).unflatten(1, seen.shape[1:3])
+    rows = rows[..., : information.size] * noise_variance**-0.5
     if score_code(policy) == Score.JOINT:
         rows = rows * stride**0.5
-    score = score_function(policy, learned)
-    values = vmap(vmap(score, (0, None, None)))(rows, theta, torch.linalg.inv_ex(information)[0])
+    score, G = score_function(policy, learned.system), rows[:, 0, 0, :0]
+    if isinstance(policy, TaskOptimal):
+        wanted = torch.tensor(task_states(system, policy)).to(theta).expand(len(theta), -1, -1)
+        G = learned.rows_at(theta, wanted).flatten(1, 2)[..., : information.size]
+    values = vmap(vmap(score, (0, None, None)))(rows, G, information.covariance())
     inside = (states.abs() <= system.state_limit).flatten(2).all(dim=2)
     values = torch.where(inside & values.isfinite(), values, -torch.inf)
     return chosen(values, inputs[:, 0], ties)
@@ -68,49 +72,46 @@ def plans(policy: Search, system: System, count: int) -> list[tuple[int, int]]:
 def paths(
     policy: Search, learned: LearnedDynamics, theta: Tensor, x: Tensor, inputs: Tensor
 ) -> Tensor:
-    """Return the states predicted from one state (d,) under inputs (plans, 2, m): (plans, H, d)."""
+    """Return the states predicted from (n, d) under inputs (plans, 2, m): (n, plans, H, d)."""
     steps = policy.steps(learned.system)
-    states = [x.expand(len(inputs), -1)]
+    inputs = inputs.expand(len(x), *inputs.shape)
+    states = [x.unsqueeze(1).expand(-1, inputs.shape[1], -1)]
     for i in range(steps):
-        u = inputs[:, 0 if i < switch_step(steps) else 1]
+        u = inputs[:, :, 0 if i < switch_step(steps) else 1]
         states.append(learned.following(theta, states[-1], u))
-    return torch.stack(states[1:], dim=1)
+    return torch.stack(states[1:], dim=2)
 
 
 PathScore = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-def score_function(policy: Search, learned: LearnedDynamics) -> PathScore:
-    """Return the score of one path from its rows, (B, r, q), the parameters (q,) and M⁻¹ (q, q)."""
-    system = learned.system
+def score_function(policy: Search, system: System) -> PathScore:
+    """Return the score of one path from its rows, (B, r, q), task rows G (g, q) and M⁻¹ (q, q)."""
 
-    def joint(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+    def joint(rows: Tensor, G: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
         return _log_determinant(rows.flatten(0, 1), inverse)
 
-    def separate(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+    def separate(rows: Tensor, G: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
         total: Tensor = vmap(_log_determinant, (0, None))(rows, inverse).sum()
         return total
 
-    def trace(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+    def trace(rows: Tensor, G: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
         J = rows.flatten(0, 1)
         total: Tensor = ((J @ inverse) * J).sum()
         return total
 
-    def average(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
+    def average(rows: Tensor, G: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
         total: Tensor = decrease(rows, inverse).diagonal().sum()
         return total
 
-    def eigenvalue(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
+    def eigenvalue(rows: Tensor, G: Tensor, inverse: Tensor) -> Tensor:  # noqa: ARG001  # one signature
         assert isinstance(policy, EOptimal)
-        starts = torch.tensor(policy.starts(len(inverse), system.n_learned)).to(theta)
+        starts = torch.tensor(policy.starts(len(inverse), system.n_learned)).to(inverse)
         Q = krylov_basis(inverse, starts, policy.subspace)
         values: Tensor = torch.linalg.eigvalsh(Q @ (inverse - decrease(rows, inverse)) @ Q.mT)
         return -values[-1]
 
-    def task(rows: Tensor, theta: Tensor, inverse: Tensor) -> Tensor:
-        assert isinstance(policy, TaskOptimal)
-        states = torch.tensor(task_states(system, policy)).to(theta)
-        G = learned.rows_at(theta, states).flatten(0, 1)[:, : len(inverse)]
+    def task(rows: Tensor, G: Tensor, inverse: Tensor) -> Tensor:
         total: Tensor = ((G @ decrease(rows, inverse)) * G).sum()
         return total
 

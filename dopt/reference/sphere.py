@@ -1,6 +1,7 @@
 """The quadratic problem on a sphere for a batch, in torch: see :mod:`dopt.math.sphere`.
 
-The same mathematics in another form: bisection of the secular equation for all problems at once.
+The same mathematics in another form: the root of the secular equation is enclosed for all problems
+at once, in intervals of which each is a part of the one before.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-BISECTIONS = 200
+PARTS = 64
+DIVISIONS = 11
 TINY = 1e-150
 ROUNDING = 4e-16
 
@@ -71,13 +73,16 @@ def _direction(vectors: Tensor, axis: int) -> Tensor:
 
 
 def _secular_root(w: Tensor, gaps: Tensor, top: Tensor) -> Tensor:
-    """Return s ≥ 0 with ‖w / (gaps + s)‖ = 1, (n, 1), by bisection of its logarithm."""
+    """Return s ≥ 0 with ‖w / (gaps + s)‖ = 1, (n, 1), by division of its logarithm's range."""
     low = torch.where(top, w, torch.zeros_like(w)).square().sum(1, keepdim=True).sqrt()
     low = low.clamp_min(TINY).log()
     high = torch.linalg.vector_norm(w, dim=1, keepdim=True).clamp_min(TINY).log()
     high = torch.maximum(low, high)
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        outside = (w / (gaps + middle.exp())).square().sum(1, keepdim=True) >= 1
-        low, high = torch.where(outside, middle, low), torch.where(outside, high, middle)
+    shares = torch.linspace(0.0, 1.0, PARTS + 1).to(w)
+    for _ in range(DIVISIONS):
+        tried = low + (high - low) * shares
+        squares = (w.unsqueeze(2) / (gaps.unsqueeze(2) + tried.exp().unsqueeze(1))).square()
+        outside = (squares.sum(1) >= 1).sum(1, keepdim=True)
+        part = (outside - 1).clamp(0, PARTS - 1)
+        low, high = tried.gather(1, part), tried.gather(1, part + 1)
     return (0.5 * (low + high)).exp()

@@ -14,6 +14,7 @@ from dopt.policies import DOptimal, InformationPolicy
 from dopt.policies.d_optimal import count_sketch
 from dopt.randomness import draw
 from dopt.reference.dynamics import LearnedDynamics
+from dopt.reference.information import BatchInformation
 from dopt.reference.models import model_function, network_function
 from dopt.spec.information_form import held_information
 from dopt.spec.trial import TrialSpec
@@ -37,7 +38,7 @@ class BatchState:
     Attributes
     ----------
     model : callable
-        a_θ: parameters (q,) and a point, (d,) or (d + m,), to accelerations (r,).
+        a_θ of the batch (:data:`dopt.reference.models.BatchModel`).
     theta : (n, q) tensor
         Parameters, of an ensemble those of its first member; the first ``n_learned`` of
         each trial are learned.
@@ -50,7 +51,7 @@ class BatchState:
         has come yet.
     sampled_states : (n, T, d) tensor
         States at which the accelerations were observed.
-    information : (n, s, s) tensor or None
+    information : BatchInformation or None
         M in the space to which ``project`` maps gradients, (..., q).
     held : Information or None
         Form and λ of M.
@@ -138,12 +139,12 @@ class BatchState:
         q, n_rows = self.theta.shape[1], self.system.n_learned * self.system.horizon
         self.held = held_information(self.config.policy, self.config.learner, q, n_rows)
         self.project: Callable[[Tensor], Tensor] = lambda rows: rows[..., : self.n_learned]
-        self.information: Tensor | None = None
+        self.information: BatchInformation | None = None
         if self.held and self._reads_information():
             self._choose_form(self.held.form)
             size = self.project(self.theta).shape[1]
             prior = self.held.regularization * torch.eye(size).to(self.theta)
-            self.information = prior.repeat(len(self.specs), 1, 1)
+            self.information = BatchInformation(prior.repeat(len(self.specs), 1, 1))
 
     def _reads_information(self) -> bool:
         """Tell whether a policy or a filter reads M; least squares sum their own here."""

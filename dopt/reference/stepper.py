@@ -119,5 +119,5 @@ class ReferenceSteps:
         """Return ‖y_t - a_θ(x_t, u_t)‖ before it is learned."""
         batch = self._batch
         members = batch.theta if batch.members is None else batch.members[0]
-        predicted = torch.stack([batch.model(theta, batch.sampled(t)[0]) for theta in members])
-        return float(torch.linalg.vector_norm(batch.targets[0, t] - predicted.mean(dim=0)))
+        predicted = batch.model(members, batch.sampled(t).expand(len(members), 1, -1))
+        return float(torch.linalg.vector_norm(batch.targets[0, t] - predicted.mean(dim=0)[0]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
 
 from dopt.errors import SpecificationError
 from dopt.policies import DOptimal, Search, TraceLinearized, Uniform
@@ -16,7 +15,7 @@ from dopt.reference.learner_registry import batch_learner
 from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.limits import BatchLimits
 from dopt.reference.planner_registry import plan_for
-from dopt.reference.planning import d_optimal_inputs, quadratic_problem, summed, uniform_inputs
+from dopt.reference.planning import d_optimal_inputs, quadratic_problem, uniform_inputs
 from dopt.reference.search import searched_inputs
 from dopt.reference.sensors import BatchSensors
 from dopt.reference.state import BatchState
@@ -35,7 +34,6 @@ class BatchSteps(BatchState):
         self.sensors = BatchSensors(self) if self.system.n_measured else None
         self.learner = batch_learner(self, points, self.sensors)
         self.own_plan = plan_for(self, self.learner)
-        self._rows = vmap(jacrev(self.model))
         limits = self.config.limits
         self.limits = BatchLimits(self, limits) if limits and limits.enforced else None
 
@@ -72,8 +70,8 @@ class BatchSteps(BatchState):
             components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)
         ties = self.ties[:, t]
         v = ties * (self.system.gamma / torch.linalg.vector_norm(ties, dim=1, keepdim=True))
-        problems = [quadratic_problem(*given, k, v, self.project) for k in components.unbind(1)]
-        return d_optimal_inputs(summed(problems), self.system.gamma, self.ties[:, t])
+        problem = quadratic_problem(*given, components, v, self.project)
+        return d_optimal_inputs(problem, self.system.gamma, self.ties[:, t])
 
     def observe(self, t: int, dt: float) -> None:
         """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later.
@@ -93,7 +91,7 @@ class BatchSteps(BatchState):
         observed = ((self.states[:, t + 1] - x) / dt - known)[:, rows]
         if system.integrator != "euler":
             end = self.learned.next_states(self.theta, x, u, dt)
-            value = vmap(self.model)(self.theta, self.points(at, u))
+            value = self.model(self.theta, self.points(at, u).unsqueeze(1)).squeeze(1)
             observed = observed - (((end - x) / dt - known)[:, rows] - value)
         self.targets[:, t] = observed
 
@@ -117,16 +115,9 @@ class BatchSteps(BatchState):
     def _learn(self, t: int) -> None:
         before = self.theta.clone()
         if isinstance(self.learner, JointKalmanLearner):
-            assert self.information is not None
-            self.information = self.learner.filtered(t, self.information)
-            self.theta.copy_(torch.where(self.diverged, before, self.theta))
-            return
-        seen = (self.sampled(slice(0, t + 1)), self.targets[:, : t + 1])
-        if isinstance(self.learner, KalmanLearner):
-            assert self.information is not None
-            self.information = self.learner.filtered(*seen, self.information)
+            self.learner.filter(t)
         else:
-            self.learner.learn(*seen)
+            self.learner.learn(self.sampled(slice(0, t + 1)), self.targets[:, : t + 1])
         self.theta.copy_(torch.where(self.diverged, before, self.theta))
 
     @property
@@ -142,9 +133,12 @@ class BatchSteps(BatchState):
         """Return the inputs that belong to the accelerations of some steps, (n, ..., m)."""
         return self.sensors.sampled_inputs(steps) if self.sensors else super().sampled_inputs(steps)
 
-    def rows(self, t: int) -> Tensor:
-        """Return J at (x_t, u_t) and the current parameters, (n, r, s), in the space of M."""
-        return self.project(self._rows(self.theta, self.sampled(t)))
+    def rows(self, steps: slice) -> Tensor:
+        """Return J at the samples of some steps and the current parameters, (n, N, r, s).
+
+        They are those in the space of M.
+        """
+        return self.project(self.learned.jacobian(self.theta, self.sampled(steps)))
 
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t.
@@ -155,30 +149,24 @@ class BatchSteps(BatchState):
         observe(self, self.planners, t)
         shared = isinstance(self.learner, KalmanLearner | JointKalmanLearner)
         if self.information is not None and not shared:
-            self.information = self._informed(self.information, t)
+            policy = self.config.policy
+            if is_fresh(policy) and (t + 1) % policy.refresh_every == 0:
+                self._sum_anew(t)
+            else:
+                self.information.add(self.rows(slice(t, t + 1)).squeeze(1))
         if self.own_plan is not None:
             self.own_plan.inform(t)
 
-    def _informed(self, information: Tensor, t: int) -> Tensor:
-        """Return M after step t: with the rows at x_t, or fresh, with those of all states."""
-        policy = self.config.policy
-        if is_fresh(policy) and (t + 1) % policy.refresh_every == 0:
-            return self._summed_anew(t)
-        J = self.rows(t)
-        return information + J.mT @ J
-
-    def _summed_anew(self, t: int) -> Tensor:
-        """Return λI + Σ JᵀJ over x_0 ... x_t at the current parameters.
+    def _sum_anew(self, t: int) -> None:
+        """Make M = λI + Σ JᵀJ over x_0 ... x_t at the current parameters.
 
         θ is NaN afterwards, which ends the trial as diverged, where rounding has left the sum
         indefinite or its inverse is not finite.
         """
         assert self.held is not None
-        over_states = vmap(self._rows, in_dims=(None, 1), out_dims=1)
-        J = self.project(over_states(self.theta, self.sampled(slice(0, t + 1)))).flatten(1, 2)
-        total: Tensor = self.held.regularization * torch.eye(J.shape[-1]).to(J) + J.mT @ J
-        factor, failed = torch.linalg.cholesky_ex(total)
-        root = torch.linalg.solve_triangular(factor, torch.eye(J.shape[-1]).to(J), upper=False)
-        lost = (failed > 0) | ~root.square().sum(dim=1).isfinite().all(dim=1)
+        assert self.information is not None
+        J = self.rows(slice(0, t + 1)).flatten(1, 2)
+        prior = self.held.regularization * torch.eye(J.shape[-1]).to(J)
+        self.information.replace(prior + J.mT @ J)
+        lost = ~self.information.covariance().diagonal(dim1=1, dim2=2).isfinite().all(dim=1)
         self.theta.masked_fill_(lost.unsqueeze(1) & ~self.diverged, torch.nan)
-        return total

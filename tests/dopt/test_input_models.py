@@ -16,7 +16,7 @@ from dopt.kernel.run import KernelTrial
 from dopt.models import MODELS
 from dopt.offline_fit import fit_offline
 from dopt.randomness import draw
-from dopt.reference.models import model_function
+from dopt.reference.information import BatchInformation
 from dopt.reference.planning import predicted_states, quadratic_problem
 from dopt.reference.state import BatchState
 from dopt.run import run_trial
@@ -25,6 +25,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.kernel.calls import call
 from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.torch_models import for_one, model_of_one
 from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES
 
 READERS = ("affine", "black_box")
@@ -83,7 +84,7 @@ def test_forms_of_the_information_agree(model: str, policy: dict[str, Any]) -> N
 @pytest.mark.parametrize("model", READERS)
 def test_values_and_rows_are_those_of_automatic_differentiation(model: str) -> None:
     spec = small("arm", model)
-    kernel, function = KernelTrial(spec).trial, model_function(spec.system, spec.model)
+    kernel, function = KernelTrial(spec).trial, model_of_one(spec.system, spec.model)
     rng = np.random.default_rng(1)
     theta = draw(spec).weights + 0.1 * rng.standard_normal(len(draw(spec).weights))
     x, u = rng.standard_normal((5, 4)), 3.0 * rng.standard_normal((5, 2))
@@ -122,14 +123,16 @@ def test_the_plan_is_for_the_change_of_the_gradient_with_the_state(model: str) -
     q, gamma = theta.shape[1], spec.system.gamma
     root = torch.tensor(rng.standard_normal((q, q)))
     M = (torch.eye(q) + root @ root.mT / q)[None]
+    information = BatchInformation(M)
     v, learned = torch.tensor([[-gamma]], dtype=torch.float64), batch.learned
-    problem = quadratic_problem(learned, theta, M, x, torch.tensor([1]), v, lambda rows: rows)
+    given = learned, theta, information, x, torch.tensor([[1]]), v
+    problem = quadratic_problem(*given, lambda rows: rows)
     bar = predicted_states(learned, theta, x)[0]
-    B = learned.input_matrix(theta[0], bar)[:, 0]
+    B = learned.input_matrix(theta, bar[None])[0, :, 0]
 
     def gradient(share: float) -> torch.Tensor:
         point = torch.cat([bar + share * B, v[0]])
-        return jacrev(learned.model)(theta[0], point)[1]
+        return jacrev(for_one(learned.model))(theta[0], point)[1]
 
     change = (gradient(1e-5) - gradient(-1e-5)) / 2e-5
     solved = torch.linalg.solve(M[0], change)
@@ -141,10 +144,10 @@ def test_the_effect_of_inputs_is_that_of_the_model_and_the_known_part() -> None:
     """B by differences of the predicted next state."""
     spec = small("cartpole_unknown_gain")
     batch, rng = BatchState([spec]), np.random.default_rng(4)
-    theta, x = batch.theta[0], torch.tensor(rng.standard_normal(4))
+    theta, x = batch.theta, torch.tensor(rng.standard_normal((1, 4)))
     both = torch.tensor([[0.5], [-0.5]], dtype=torch.float64)
-    ahead, behind = batch.learned.following(theta, x.expand(2, -1), both)
-    B = batch.learned.input_matrix(theta, x)
+    ahead, behind = batch.learned.following(theta, x.expand(1, 2, -1), both[None])[0]
+    B = batch.learned.input_matrix(theta, x)[0]
     np.testing.assert_allclose(B[:, 0], ahead - behind, rtol=1e-9, atol=1e-14)
 
 

@@ -13,13 +13,13 @@ import dopt
 from dopt.errors import SpecificationError
 from dopt.offline_fit import RIDGE, fit_offline, grid_loss
 from dopt.randomness import draw, initial_weights
-from dopt.reference.models import model_function
 from dopt.rerun import rerun
 from dopt.samples import Samples, recorded_samples, uniform_samples
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.close import assert_close
 from tests.dopt.kernel.twin import observed, transplant
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
 SMALL = {"width": 4, "depth": 2}
@@ -38,7 +38,7 @@ def taught(spec: TrialSpec, states: Array) -> tuple[Array, Array]:
 
 def jacobian(spec: TrialSpec, theta: Array, states: Array) -> Array:
     """Return ∂a_θ(x)/∂θ, (N r, q), by automatic differentiation."""
-    model = model_function(spec.system, spec.model)
+    model = model_of_one(spec.system, spec.model)
     rows = vmap(jacrev(model), in_dims=(None, 0))(torch.tensor(theta), torch.tensor(states))
     return rows.flatten(0, 1).numpy()
 

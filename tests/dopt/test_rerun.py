@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from dopt.errors import SpecificationError
-from dopt.reference.models import model_function
 from dopt.rerun import rerun
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import KNOWN_EFFECT
 
 
@@ -71,7 +71,7 @@ def test_prediction_is_that_of_the_reference(env: str, model: dict[str, object] 
     rng = np.random.default_rng(1)
     theta = rng.normal(size=spec.model.n_parameters(spec.system))
     states = rng.normal(size=(6, spec.system.n_states))
-    reference = model_function(spec.system, spec.model)
+    reference = model_of_one(spec.system, spec.model)
     expected = [reference(torch.tensor(theta), torch.tensor(x)).numpy() for x in states]
     predicted = spec.model.predict(spec.system, theta, states)
     np.testing.assert_allclose(predicted, expected, rtol=1e-10, atol=1e-12)

@@ -8,14 +8,14 @@ import torch
 
 from dopt.evaluation import evaluation_set
 from dopt.kernel.run import KernelTrial
-from dopt.reference.models import model_function
 from dopt.spec.trial import TrialSpec
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import PAIRS, trial
 
 
 def losses(spec: TrialSpec, theta: np.ndarray, step: int = 0) -> tuple[float, float]:
     """Return the L2 errors over the grid and over the reachable states, point by point."""
-    points, model = evaluation_set(spec.system), model_function(spec.system, spec.model)
+    points, model = evaluation_set(spec.system), model_of_one(spec.system, spec.model)
     found = np.stack([model(torch.tensor(theta), x).numpy() for x in torch.tensor(points.states)])
     squares = ((found - spec.system.learned(points.states, step)) ** 2).sum(axis=1)
     means = squares[: points.n_grid].mean(), squares[points.n_grid :].mean()

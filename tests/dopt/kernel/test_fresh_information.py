@@ -17,12 +17,12 @@ from dopt.learning import LEARNERS
 from dopt.policies import POLICIES, InformationPolicy
 from dopt.policies.base import CompiledPolicy
 from dopt.reference.batch import Lockstep, run_trials
-from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.close import assert_close
 from tests.dopt.kernel.test_agreement import check_agreement
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
 FRESH = {"information": "fresh"}
@@ -55,7 +55,7 @@ class Numbered(CompiledPolicy, InformationPolicy):
 
 def rows(spec: TrialSpec, theta: Array, states: Array) -> Array:
     """Return J of all states, (n r, q)."""
-    model = model_function(spec.system, spec.model)
+    model = model_of_one(spec.system, spec.model)
     over_states = vmap(jacrev(model), in_dims=(None, 0))
     J: Array = over_states(torch.tensor(theta), torch.tensor(states)).flatten(0, 1).numpy()
     return J
@@ -145,7 +145,7 @@ def test_the_reference_holds_the_dense_sum_for_every_trial_of_a_batch(refresh_ev
         for t in range(9):
             batch.step(t)
     assert batch.information is not None
-    for M, theta, states in zip(batch.information, batch.theta, batch.states, strict=True):
+    for M, theta, states in zip(batch.information.matrix(), batch.theta, batch.states, strict=True):
         J = rows(first, theta.numpy(), states[:9].numpy())
         assert M.numpy() == pytest.approx(1e-3 * np.eye(len(M)) + J.T @ J, rel=1e-9, abs=1e-12)
 

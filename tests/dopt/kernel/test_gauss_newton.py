@@ -14,12 +14,12 @@ from dopt.kernel.information.cholesky import BLOCK
 from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
 from dopt.policies import InformationPolicy
-from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.types import Array
 from tests.close import assert_close
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import observed, relative_gap, transplant
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
 GAUSS_NEWTON = {"name": "gauss_newton"}
@@ -45,7 +45,7 @@ def advanced(
 
 def linearized(fast: KernelTrial, theta: Array, first: int = 0) -> tuple[Array, Array]:
     """Return J, (n r, q), and e, (n r,), of the samples from ``first`` on."""
-    model = model_function(fast.spec.system, fast.spec.model)
+    model = model_of_one(fast.spec.system, fast.spec.model)
     states = torch.tensor(fast.record.states[first : fast.done])
     targets = observed(transplant(fast), fast.done)[0, first:]
     J = vmap(jacrev(model), in_dims=(None, 0))(torch.tensor(theta), states).flatten(0, 1)

@@ -9,16 +9,16 @@ from torch.func import jacrev, vmap
 
 from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
-from dopt.reference.models import model_function
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close
 from tests.dopt.kernel.steps import run
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
 
 def jacobians(spec: TrialSpec, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return J of n pairs of parameters, (n, q), and states, (n, d): (n, r, q)."""
-    rows = vmap(jacrev(model_function(spec.system, spec.model)))
+    rows = vmap(jacrev(model_of_one(spec.system, spec.model)))
     return rows(torch.tensor(theta), torch.tensor(x)).numpy()
 
 

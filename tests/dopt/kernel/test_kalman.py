@@ -18,12 +18,12 @@ from dopt.kernel.learners.kalman import whiten
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.state_structs import Covariance
 from dopt.learning import ExtendedKalman
-from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import observed, relative_gap, transplant
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
 EKF = {"name": "ekf"}
@@ -33,7 +33,7 @@ FADING = {"name": "ekf", "forgetting": 0.95, "noise_variance": 3.0, "regularizat
 
 def jacobians(spec: TrialSpec, before: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return J at each state and the parameters before its learning step, (t, r, q)."""
-    model = model_function(spec.system, spec.model)
+    model = model_of_one(spec.system, spec.model)
     rows = [
         jacrev(model)(torch.tensor(p), torch.tensor(x)) for p, x in zip(before, states, strict=True)
     ]
@@ -161,11 +161,11 @@ def test_the_planner_plans_by_the_matrix_of_the_filter() -> None:
     longer = KernelTrial(spec)
     longer.advance(25)
     plain = transplant(longer)
-    plain.information = torch.linalg.inv(torch.tensor(dense(longer.state.covariance)))[None]
+    plain.information.replace(torch.linalg.inv(torch.tensor(dense(longer.state.covariance)))[None])
     longer.advance(26)
     planned = plain.plan(25)[0].numpy()
     assert planned == pytest.approx(longer.record.inputs[25], abs=1e-6 * spec.system.gamma)
-    plain.information = torch.eye(len(longer.state.theta), dtype=torch.float64)[None]
+    plain.information.replace(torch.eye(len(longer.state.theta), dtype=torch.float64)[None])
     assert np.abs(plain.plan(25)[0].numpy() - planned).max() > 1e-3 * spec.system.gamma
 
 

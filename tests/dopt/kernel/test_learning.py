@@ -8,8 +8,8 @@ import torch
 from torch.func import grad, vmap
 
 from dopt.kernel.run import KernelTrial
-from dopt.reference.models import model_function
 from tests.dopt.kernel.twin import observed, transplant
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
 
@@ -21,7 +21,7 @@ def test_the_gradient_is_that_of_the_mean_square_over_the_newest_samples(
 ) -> None:
     learner = {"name": "adam", "beta_1": 0.0, "window": window}
     spec = trial(env, "random", 1, env={"horizon": 9}, learner=learner, model={"depth": depth})
-    fast, model = KernelTrial(spec), model_function(spec.system, spec.model)
+    fast, model = KernelTrial(spec), model_of_one(spec.system, spec.model)
 
     def loss(theta: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         return (vmap(model, in_dims=(None, 0))(theta, x) - y).square().sum(-1).mean()

@@ -11,9 +11,9 @@ from torch.func import grad, vmap
 
 from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
-from dopt.reference.models import model_function
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import observed, relative_gap, transplant
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
 REPLAY: dict[str, Any] = {"name": "adam_replay", "batch": 5, "steps": 3, "capacity": 7}
@@ -56,7 +56,7 @@ def test_a_step_follows_the_gradient_over_the_newest_samples_in_the_drawn_places
     spec = trial("quadrotor", "random", 1, env={"horizon": 20}, learner=learner)
     fast, model, places = (
         KernelTrial(spec),
-        model_function(spec.system, spec.model),
+        model_of_one(spec.system, spec.model),
         draw(spec).replay,
     )
 

@@ -16,6 +16,7 @@ from dopt.policies import Search
 from dopt.reference import search
 from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.exact_gain import ExactGain, Situation
+from dopt.reference.information import BatchInformation
 from dopt.reference.models import model_function
 from dopt.reference.search import paths
 from dopt.run import run_trial
@@ -24,6 +25,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import transplant
+from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
 SEARCHES = ["exact", "trace", "a_optimal", "e_optimal", "task", "lookahead"]
@@ -44,8 +46,8 @@ def candidate_rows(fast: KernelTrial) -> Array:
     theta, x = torch.tensor(fast.state.theta), torch.tensor(fast.record.states[fast.done])
     inputs = torch.tensor(policy.compared_inputs(system))
     held = torch.stack([inputs, inputs], 1)
-    states = paths(policy, LearnedDynamics(system, model), theta, x, held)[:, 0]
-    rows: Array = vmap(jacrev(model), (None, 0))(theta, states).numpy()
+    states = paths(policy, LearnedDynamics(system, model), theta[None], x[None], held)[0, :, 0]
+    rows: Array = vmap(jacrev(for_one(model)), (None, 0))(theta, states).numpy()
     return rows
 
 
@@ -106,7 +108,7 @@ def test_the_scores_of_the_reference_are_the_growth_of_the_determinant(
     batch, values = transplant_of(spec, spec), []
     monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
     batch.plan(12)
-    C = np.linalg.inv(batch.information[0].numpy())
+    C = batch.information.covariance()[0].numpy()
     expected = growth(candidate_rows(fast), C, 0.05)
     assert values[0][0].numpy() == pytest.approx(expected, rel=1e-5, abs=1e-7)
 
@@ -121,12 +123,12 @@ def test_the_exact_gain_is_that_of_the_matrix() -> None:
     spec = noisy("gradient", 0.05)
     batch = transplant_of(noisy("exact", 0.05), spec)
     assert batch.information is not None
-    covariance = torch.linalg.inv(batch.information)
+    covariance = batch.information.covariance()
     now = Situation(batch.theta, covariance, batch.states[:, 12], batch.components[:, 12])
     fast = KernelTrial(noisy("exact", 0.05))
     fast.advance(12)
     u = torch.tensor(fast.spec.policy.compared_inputs(spec.system))  # type: ignore[attr-defined]
-    C = np.linalg.inv(batch.information[0].numpy())
+    C = batch.information.covariance()[0].numpy()
     expected = growth(candidate_rows(fast), C, 0.05)
     found = ExactGain(batch).values(u[None], now)[0].numpy()
     assert found == pytest.approx(expected, rel=1e-5, abs=1e-7)
@@ -140,7 +142,9 @@ def transplant_of(run: TrialSpec, other: TrialSpec) -> Any:
     batch = type(twin)([other])
     batch.theta.copy_(twin.theta)
     batch.states.copy_(twin.states)
-    batch.information = torch.linalg.inv(torch.tensor(dense(fast.state.covariance)))[None]
+    batch.information = BatchInformation(
+        torch.linalg.inv(torch.tensor(dense(fast.state.covariance)))[None]
+    )
     return batch
 
 

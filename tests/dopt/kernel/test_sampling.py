@@ -22,6 +22,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from dopt.types import Array
 from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
 SMALL = {"lookahead": 7, "hold": 3, "stride": 2, "plans": 9, "iterations": 2, "elites": 3}
@@ -96,7 +97,7 @@ def planned(spec: TrialSpec, steps: int) -> tuple[Lockstep, SampledPlan]:
 
 def rows_at(batch: Lockstep, states: Array) -> torch.Tensor:
     """Return J at states, (N, d), as a matrix, (N r, q)."""
-    rows = vmap(jacrev(batch.model), (None, 0))(batch.theta[0], torch.tensor(states))
+    rows = vmap(jacrev(for_one(batch.model)), (None, 0))(batch.theta[0], torch.tensor(states))
     return rows.flatten(0, 1).detach()
 
 
@@ -107,7 +108,7 @@ def test_products_with_the_rows_at_task_states_are_exact_and_all_others_unbiased
     W, R = (part[0] for part in plan._directions(12))
     states = box_states(batch.system)
     task, other = rows_at(batch, states[36:39]), rows_at(batch, states[500:510])
-    M = batch.information[0]
+    M = batch.information.matrix()[0]
     exact = task @ torch.linalg.solve(M, other.mT)
     through_basis = R.mT @ (other @ W[:, : len(R)]).mT
     assert relative_gap(through_basis.numpy(), exact.numpy()) < 1e-8
@@ -125,7 +126,7 @@ def test_scores_are_those_of_dense_matrices(criterion: str) -> None:
     inputs = plan._elites
     values = plan._values(4, inputs, *plan._directions(4))[0]
     states = plan._paths(4, inputs)[0][0]
-    M, r = batch.information[0], batch.system.n_learned
+    M, r = batch.information.matrix()[0], batch.system.n_learned
     G = rows_at(batch, box_states(batch.system)[12:15])
     for path, value in zip(states, values, strict=True):
         J = rows_at(batch, path.numpy()) * (2**0.5 if criterion in ("joint", "task") else 1.0)

@@ -20,6 +20,7 @@ from dopt.reference.search import paths, plans, score_function
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
 SEARCHES: list[tuple[str, dict[str, Any]]] = [
@@ -72,7 +73,9 @@ def rows_of_candidates(fast: KernelTrial) -> tuple[np.ndarray, np.ndarray]:
 def jacobian(fast: KernelTrial, states: np.ndarray) -> np.ndarray:
     """Return J at states, (N, r, q), by automatic differentiation."""
     model = model_function(fast.spec.system, fast.spec.model)
-    rows = vmap(jacrev(model), (None, 0))(torch.tensor(fast.state.theta), torch.tensor(states))
+    rows = vmap(jacrev(for_one(model)), (None, 0))(
+        torch.tensor(fast.state.theta), torch.tensor(states)
+    )
     return np.asarray(rows)
 
 
@@ -208,8 +211,8 @@ class TestBudget:
         candidates = torch.tensor(policy.compared_inputs(system))
         pairs = plans(policy, system, len(candidates))
         learned = LearnedDynamics(system, model)
-        states = paths(policy, learned, theta, x, candidates[torch.tensor(pairs)])
-        score = score_function(policy, learned)
+        states = paths(policy, learned, theta[None], x[None], candidates[torch.tensor(pairs)])[0]
+        score = score_function(policy, system)
         inverse = torch.tensor(dense(fast.state.covariance))
-        rows = vmap(vmap(jacrev(model), (None, 0)), (None, 0))(theta, states)
-        return pairs, [float(score(J, theta, inverse)) for J in rows]
+        rows = vmap(vmap(jacrev(for_one(model)), (None, 0)), (None, 0))(theta, states)
+        return pairs, [float(score(J, theta[None], inverse)) for J in rows]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch.func import jacrev, vmap
 
 from dopt.kernel.run import KernelTrial
 from dopt.reference.batch import Lockstep
@@ -26,8 +25,8 @@ def transplant(trial: KernelTrial, parameters: np.ndarray | None = None) -> Lock
     twin.sampled_states[0, :t] = twin.states[0, :t]  # by the Euler map
     twin.targets[:, :t] = observed(twin, t)
     if twin.information is not None and parameters is not None:
-        J = vmap(jacrev(twin.model))(torch.tensor(parameters), twin.states[0, :t]).flatten(0, 1)
-        twin.information = twin.information + J.mT @ J
+        J = twin.learned.jacobian(torch.tensor(parameters), twin.states[0, :t].unsqueeze(1))
+        twin.information.add(J.flatten(0, 2)[None])
     if isinstance(twin.learner, AdamLearner):
         twin.learner.optimizer.state[twin.theta] = {
             "step": torch.tensor(float(t)),

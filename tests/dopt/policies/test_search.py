@@ -19,11 +19,13 @@ from dopt.policies.task_states import goal_weights, task_states
 from dopt.randomness import draw
 from dopt.reference import search
 from dopt.reference.dynamics import LearnedDynamics
+from dopt.reference.information import BatchInformation
 from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig
 from dopt.systems import SYSTEMS
 from dopt.systems.equilibrium import eigenmode
+from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
 
@@ -175,12 +177,12 @@ def test_a_state_counts_stride_times_in_the_joint_determinant_alone(
 
     monkeypatch.setattr(search, "score_function", scored)
     learned = LearnedDynamics(spec.system, model)
-    information = torch.eye(theta.shape[1], dtype=torch.float64)[None]
+    information = BatchInformation(torch.eye(theta.shape[1], dtype=torch.float64)[None])
     ties = torch.ones(1, 1, dtype=torch.float64)
     values: list[torch.Tensor] = []
     monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
     search.searched_inputs(spec.policy, learned, theta, information, x, ties)
     inputs = torch.tensor(spec.policy.compared_inputs(spec.system))[[0, 0]][None]
-    path = search.paths(spec.policy, learned, theta[0], x[0], inputs)[0, 2::3]
-    rows = vmap(jacrev(model), (None, 0))(theta[0], path)
+    path = search.paths(spec.policy, learned, theta[:1], x[:1], inputs)[0, 0, 2::3]
+    rows = vmap(jacrev(for_one(model)), (None, 0))(theta[0], path)
     assert float(values[0][0, 0]) == pytest.approx(weight * float((rows**2).sum()))

@@ -10,14 +10,15 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from dopt.randomness import draw
-from dopt.reference.models import Accelerations, model_function
+from dopt.reference.models import BatchModel, model_function
 from dopt.spec.trial import TrialSpec
+from tests.dopt.torch_models import for_one
 
 
 class Situation(NamedTuple):
     """What a plan is made from, for one trial."""
 
-    model: Accelerations
+    model: BatchModel
     theta: Tensor  # (q,)
     state: Tensor  # (d,)
     information: Tensor  # (q, q)
@@ -38,7 +39,7 @@ def situation(
     states = widths * (2 * torch.rand(seen + 1, system.n_states, generator=rng).double() - 1)
     M = regularization * torch.eye(len(theta), dtype=torch.float64)
     if seen:
-        J = vmap(jacrev(model), (None, 0))(theta, states[1:]).flatten(0, 1)
+        J = vmap(jacrev(for_one(model)), (None, 0))(theta, states[1:]).flatten(0, 1)
         M = M + J.mT @ J
     return Situation(model, theta, states[0], M)
 
@@ -51,7 +52,7 @@ def step_from(spec: TrialSpec, now: Situation, u: Tensor) -> Tensor:
     rows = torch.zeros(system.n_states, system.n_learned, dtype=torch.float64)
     for k, row in enumerate(system.learned_rows):
         rows[row, k] = 1.0
-    return now.state + system.dt * (flow + rows @ now.model(now.theta, now.state))
+    return now.state + system.dt * (flow + rows @ for_one(now.model)(now.theta, now.state))
 
 
 def circle(radius: float, points: int) -> Tensor:

@@ -12,10 +12,12 @@ from torch.func import jacrev, vmap
 
 from dopt.math.sphere import maximize_on_sphere
 from dopt.reference.dynamics import LearnedDynamics
+from dopt.reference.information import BatchInformation
 from dopt.reference.planning import d_optimal_inputs, quadratic_problem
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from tests.dopt.reference.batch import Situation, situation, sphere, step_from
+from tests.dopt.torch_models import for_one
 from tests.dopt.trials import PAIRS, trial
 
 CASES = [(env, policy) for env, policy in PAIRS if policy in ("d_optimal", "oracle")]
@@ -23,7 +25,7 @@ CASES = [(env, policy) for env, policy in PAIRS if policy in ("d_optimal", "orac
 
 def gradients(now: Situation, x: Tensor) -> Tensor:
     """Return J = ∂a/∂θ at n states, (n, r, q)."""
-    return vmap(jacrev(now.model), (None, 0))(now.theta, x)
+    return vmap(jacrev(for_one(now.model)), (None, 0))(now.theta, x)
 
 
 @functools.cache
@@ -56,9 +58,9 @@ def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tens
     problem = quadratic_problem(
         LearnedDynamics(spec.system, now.model),
         now.theta[None],
-        now.information[None],
+        BatchInformation(now.information[None]),
         now.state[None],
-        torch.tensor([component]),
+        torch.tensor([[component]]),
         torch.zeros(1, spec.system.n_inputs, dtype=torch.float64),
         whole,
     )
@@ -141,9 +143,9 @@ def test_each_trial_of_a_batch_has_its_own_problem() -> None:
     problem = quadratic_problem(
         LearnedDynamics(spec.system, several[0].model),
         torch.stack([now.theta for now in several]),
-        torch.stack([now.information for now in several]),
+        BatchInformation(torch.stack([now.information for now in several])),
         torch.stack([now.state for now in several]),
-        torch.tensor([0, 1, 1]),
+        torch.tensor([[0], [1], [1]]),
         torch.zeros(3, 2, dtype=torch.float64),
         whole,
     )

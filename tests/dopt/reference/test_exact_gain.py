@@ -23,6 +23,7 @@ from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close
 from tests.dopt.reference.batch import circle, situation, step_from
+from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
 SHORT = {"horizon": 7}
@@ -33,7 +34,7 @@ ENVS = ["pendulum", "cartpole", "arm", "quadrotor"]
 def definition(spec: TrialSpec, seed: int, u: Tensor) -> float:
     """Return log det[M + J(x(u))ᵀ J(x(u))] - log det M, both q × q."""
     now = situation(spec, seed)
-    J = jacrev(now.model)(now.theta, step_from(spec, now, u))
+    J = jacrev(for_one(now.model))(now.theta, step_from(spec, now, u))
     return float(torch.logdet(now.information + J.mT @ J) - torch.logdet(now.information))
 
 
@@ -133,9 +134,9 @@ def test_the_plan_goes_by_the_information_of_all_steps(
                 assert_close((seen[-1] @ M).numpy(), np.eye(len(M)), abs=1e-7)
             assert batch.information is not None
             if learner == "ekf":
-                M = batch.information[0].clone()
+                M = batch.information.matrix()[0]
             else:
-                J = batch.rows(t)[0]
+                J = batch.rows(slice(t, t + 1))[0, 0]
                 M = M + J.mT @ J
     assert len(seen) == 7
 

@@ -12,6 +12,7 @@ from torch.func import jacrev, vmap
 from dopt.reference.batch import Lockstep, run_trials
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from tests.dopt.torch_models import for_one
 
 NETWORK = "tests.dopt.custom_networks.Stack"
 POINT = "tests.dopt.custom_environments.Point"
@@ -36,7 +37,7 @@ def check_sum(spec: TrialSpec, summed_at: int = STEPS) -> None:
     """See that M after some steps is the dense sum, with the newest rows since ``summed_at``."""
     batch = Lockstep([spec, spec.with_seed(7)])
     expected: list[torch.Tensor] = []
-    rows = vmap(jacrev(batch.model), in_dims=(None, 0))
+    rows = vmap(jacrev(for_one(batch.model)), in_dims=(None, 0))
     with torch.no_grad():
         for t in range(STEPS):
             batch.step(t)
@@ -47,7 +48,7 @@ def check_sum(spec: TrialSpec, summed_at: int = STEPS) -> None:
                 expected.append(torch.stack([one.T @ one for one in J]))
     assert batch.information is not None
     M = 1e-3 * torch.eye(expected[0].shape[-1]).double() + sum(expected)
-    assert batch.information.numpy() == pytest.approx(M.numpy(), rel=1e-9, abs=1e-12)
+    assert batch.information.matrix().numpy() == pytest.approx(M.numpy(), rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("policy", ["d_optimal", "exact", "gradient"])

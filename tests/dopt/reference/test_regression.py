@@ -12,8 +12,9 @@ from dopt.models import RFF, GaussianProcess
 from dopt.randomness import draw
 from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.gaussian_process import Posterior
-from dopt.reference.models import features, model_function
+from dopt.reference.models import features
 from dopt.spec.trial import TrialSpec
+from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import KNOWN_EFFECT, trial
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
@@ -51,7 +52,7 @@ def test_prediction_is_that_of_the_reference(env: str, model: str) -> None:
     rng = np.random.default_rng(1)
     theta = rng.normal(size=spec.model.n_parameters(spec.system))
     states = rng.normal(size=(6, spec.system.n_states))
-    reference = model_function(spec.system, spec.model)
+    reference = model_of_one(spec.system, spec.model)
     expected = [reference(torch.tensor(theta), torch.tensor(x)).numpy() for x in states]
     predicted = spec.model.predict(spec.system, theta, states)
     np.testing.assert_allclose(predicted, expected, rtol=1e-10, atol=1e-10)
@@ -126,7 +127,7 @@ def test_information_of_random_features_is_about_the_learned_parameters_alone() 
     spec = regression("arm", "rff", "d_optimal", model={"n_features": 20}, env={"horizon": 4})
     batch = run(spec)
     assert batch.information is not None
-    assert batch.information.shape == (1, 40, 40)
+    assert batch.information.size == 40
 
 
 @pytest.mark.parametrize("env", ["pendulum", "arm"])
