@@ -68,7 +68,7 @@ def linearisation_gaps(
     given = candidates(batch, search)
     found: list[tuple[Tensor, Tensor]] = []
     for t in range(batch.system.horizon):
-        covariance = batch.information.covariance()
+        covariance = batch.information.covariance().clone()
         now = Situation(batch.theta.clone(), covariance, batch.states[:, t], batch.components[:, t])
         batch.step(t)
         if t > 0:

@@ -39,6 +39,8 @@ class BatchInformation:
 
     def __init__(self, matrix: Tensor) -> None:
         self.replace(matrix)
+        if matrix.shape[1] > SMALL:
+            self._subtract_roots()  # rows come next: products with P take less than with L
 
     @property
     def size(self) -> int:
@@ -84,7 +86,7 @@ class BatchInformation:
         return torch.baddbmm(solved, roots, roots.mT @ columns, alpha=-1)
 
     def covariance(self) -> Tensor:
-        """Return M⁻¹, (n, s, s); it is not the caller's to change."""
+        """Return M⁻¹, (n, s, s), which the next rows change in place."""
         self.solve(self._waiting.mT[..., :0])
         return self._subtract_roots()
 
@@ -116,8 +118,7 @@ class BatchInformation:
             assert self._factor is not None
             self._inverse, self._factor = torch.cholesky_inverse(self._factor), None
         if self._roots.shape[2]:
-            # A new tensor: what was returned before stays as it is.
-            self._inverse = torch.baddbmm(self._inverse, self._roots, self._roots.mT, alpha=-1)
+            torch.baddbmm(self._inverse, self._roots, self._roots.mT, alpha=-1, out=self._inverse)
             self._roots = self._roots[..., :0]
         return self._inverse
 
