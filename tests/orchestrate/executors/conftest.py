@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tests.orchestrate.executors.names import WORKERS
+from tests.orchestrate.lean_ray import leave_services_out
 
 
 @pytest.fixture
@@ -24,6 +25,7 @@ def shared_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def start_once(address: str, **options: Any) -> None:
         if not ray.is_initialized():
+            leave_services_out()
             start(address, **{**options, "num_cpus": WORKERS})
 
     def disconnect(_: OwnRay, *, lost: bool) -> None:

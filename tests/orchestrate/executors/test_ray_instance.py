@@ -14,6 +14,7 @@ from orchestrate.executors.base import WorkerLost
 from orchestrate.executors.ray.executor import RayExecutor
 from tests.orchestrate.executors.names import ON_RAY, WORKERS
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
+from tests.orchestrate.lean_ray import leave_services_out
 from tests.orchestrate.standins import BROKEN_SEED, slow
 from tests.orchestrate.unruly import hanging
 
@@ -39,6 +40,7 @@ def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
 ) -> None:
     monkeypatch.setenv("RAY_memory_usage_threshold", "0.0001")
     monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
+    leave_services_out()
     with RayExecutor(hanging, 1) as executor:
         executor.submit(tasks([BROKEN_SEED, 3]))
         [lost] = drain(executor)

@@ -27,6 +27,7 @@ from orchestrate.runner.run_grid import Work
 from orchestrate.store import Store
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
+from tests.orchestrate import lean_ray
 from tests.orchestrate.faults.trials import Standin, grid_of, rest
 
 
@@ -85,6 +86,8 @@ def _start_anew(order: Order, output: Path) -> None:
 
 
 def _launch(order: Order) -> int:
+    if order.executor == "ray":
+        lean_ray.leave_services_out()
     launch.WORK = Work(Standin(order.seconds, order.trouble), prepare=lambda: None)
     chosen = {"workers": 2, "chunk_seconds": 0.2, **order.settings}
     settings = LaunchSettings(order.executor, order.url, **chosen)

@@ -79,4 +79,4 @@ def test_a_disk_that_is_read_only_is_left_alone(laboratory: Laboratory, disk: Di
     assert "Read-only file system" in launched.errors
     assert "Traceback" not in launched.errors
     disk.mount("-o", "remount,rw")
-    laboratory.complete(seconds=0.0)
+    laboratory.complete()

@@ -42,7 +42,7 @@ def test_a_torn_log_costs_the_last_trials_only(file_laboratory: Laboratory) -> N
 
 def test_a_damaged_file_ends_the_launch_and_stays_as_it_is(file_laboratory: Laboratory) -> None:
     laboratory = file_laboratory
-    laboratory.complete(executor="inprocess", seconds=0.0)
+    laboratory.complete(executor="inprocess")
     path = file_of(laboratory)
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
