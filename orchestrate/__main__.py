@@ -51,7 +51,7 @@ def _run(name: str, words: Sequence[str]) -> int:
     if name not in commands:
         raise unknown_name("command", name, commands)
     command = commands[name]
-    return command.run(command.parser().read(words))
+    return command.run(command.parser().read(words, mixed=True))
 
 
 def _refuse(error: DoptError, code: ExitCode) -> ExitCode:

@@ -31,6 +31,8 @@ ONLY_IN = {
     "torch": ("dopt/reference/", "orchestrate/executors/lockstep.py"),
     "numba": ("dopt/kernel/",),
     "gymnasium": ("dopt/gymnasium/",),
+    "mlflow": ("orchestrate/export/trackers/",),
+    "wandb": ("orchestrate/export/trackers/",),
     "matplotlib": (
         "analysis/figures/",
         "analysis/outputs/",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
+from orchestrate import __main__ as orchestrate
 from orchestrate.store import Reader
 from orchestrate.store.schema import SCHEMA_VERSION, metadata
 from orchestrate.store.views import VIEWS
@@ -68,6 +70,18 @@ def test_every_query_answers_and_mixes_no_configurations(small: str) -> None:
         if "t" in columns and "config_key" not in columns:
             steps = [row[columns.index("t")] for row in rows]
             assert len(set(steps)) == len(steps), question
+
+
+def test_every_query_has_the_same_answer_in_duckdb_on_a_bundle(small: str, tmp_path: Path) -> None:
+    duckdb = pytest.importorskip("duckdb", reason="needs the extra: pip install dopt[bundle]")
+    folder = tmp_path / "bundle"
+    assert orchestrate.main(["export", "bundle", str(folder), "--db", small]) == 0
+    with duckdb.connect() as connection:
+        connection.execute(f"SET file_search_path = '{folder}'")
+        connection.execute((folder / "views.sql").read_text())
+        found = {question: connection.execute(query).fetchall() for question, query in QUERIES}
+    for question, (_, rows) in _answers(small).items():
+        assert [tuple(map(_rounded, row)) for row in found[question]] == rows, question
 
 
 def test_the_page_counts_its_queries() -> None:

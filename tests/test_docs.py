@@ -31,6 +31,7 @@ pytestmark = pytest.mark.xdist_group("docs")  # one database for all of them
 TUTORIAL = "docs/tutorial.md"
 STRUCTURE = "docs/structure.md"
 PLUGINS = "docs/compiled_plugins.md"
+SHARING = "docs/sharing.md"  # tests/test_sharing_page.py
 SHORT = {"env": {"horizon": 40}}
 TASK = {"task": {"name": "control", "checkpoints": [20]}}
 
@@ -174,7 +175,9 @@ def typed(
 
 def _on_results(*programs: str) -> list[Command]:
     """Return the commands outside the pages that are run as a whole; each of them once."""
-    found = [c for c in commands(*programs) if c.page not in (TUTORIAL, PLUGINS, *GENERATED)]
+    found = [
+        c for c in commands(*programs) if c.page not in (TUTORIAL, PLUGINS, SHARING, *GENERATED)
+    ]
     return list({c.words: c for c in found if c.words and c.words[0] != "COMMAND"}.values())
 
 

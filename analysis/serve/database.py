@@ -17,15 +17,12 @@ class Database:
         parsed = parse(url)
         self.safe_url = safe(parsed)
         self._url = url
+        self.is_file = parsed.get_backend_name() != "postgresql"
+        """Whether the database is a SQLite file or a bundle, and not on a server."""
         self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
         self._lock = threading.Lock()
         self._reader: Reader | None = None
         self._identity: Identity = None
-
-    @property
-    def is_file(self) -> bool:
-        """Whether the database is a SQLite file."""
-        return self._path is not None
 
     def reader(self) -> Reader:
         """Return a reader; raise ``StoreError`` for a missing database or another schema."""

@@ -1,51 +1,121 @@
-"""Command ``export``: results as a file for other programs, with a manifest of their origin."""
+"""Command ``export``: results as a file or a folder for other programs, with their origin."""
 
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
+from typing import Any
 
 from orchestrate.cli_parser import UsageError
 from orchestrate.commands.command import Command
 from orchestrate.commands.filtering import add_filters, chosen
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.export.wanted import FORMATS, KINDS, Export
+from orchestrate.export.wanted import FOLDERS, FORMATS, KINDS, Export, FolderExport
 from orchestrate.store import Reader
+
+_NO_LICENSE = "unknown"
+_LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]*")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "kind",
-        choices=KINDS,
-        help="curves (a row for each step), trials (a row for each trial) or trajectories (states "
-        "and inputs; with npz also the final parameters)",
+        choices=(*KINDS, *FOLDERS),
+        help="a file: curves (a row for each step), trials (a row for each trial), trajectories "
+        "(states and inputs; with npz also the final parameters) or assessments; a folder: bundle "
+        "(all tables as Parquet, which commands and figures read as they do a database), mlflow "
+        "(a tracking store of MLflow) or wandb (offline runs of Weights & Biases)",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="file to write")
+    parser.add_argument(
+        "path", nargs="?", type=Path, metavar="PATH", help="file or folder to write"
+    )
+    parser.add_argument("--out", type=Path, metavar="PATH", help="the same, as an option")
     parser.add_argument(
         "--format", choices=FORMATS, help="csv, parquet or npz (as the name of the file ends)"
+    )
+    parser.add_argument(
+        "--license",
+        metavar="ID",
+        help="licence of the data for the card of a bundle, such as cc-by-4.0 (default: "
+        f"{_NO_LICENSE})",
     )
     add_filters(parser)
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Write the file and its manifest."""
-    from orchestrate.export.exporting import export  # its libraries would slow every command
-
-    wanted = Export(
-        kind=arguments.kind,
-        format=arguments.format or _format_of(arguments.out),
-        out=arguments.out,
-        filters={"env": arguments.env, "policy": arguments.policy},
-    )
-    with Reader.open(arguments.db) as reader, reader.moment() as moment:
-        document = export(moment, chosen(moment, arguments), wanted)
+    """Write the file and its manifest, or the folder."""
+    out = _target(arguments)
+    document = _to_folder(arguments, out) if arguments.kind in FOLDERS else _to_file(arguments, out)
     if arguments.json:
         say_json(document)
     else:
-        size = f"{document['rows']:,} rows" if "rows" in document else "matrices"
-        say(f"{wanted.out}: {size}, {document['bytes']:,} bytes; from where: {wanted.manifest}")
+        say(_line(arguments.kind, out, document))
     return ExitCode.DONE
+
+
+def _target(arguments: argparse.Namespace) -> Path:
+    given = [path for path in (arguments.path, arguments.out) if path is not None]
+    if len(given) != 1:
+        raise UsageError(
+            f"{'Two paths are' if given else 'No path is'} given to write to, one is expected: "
+            f"write export {arguments.kind} PATH."
+        )
+    path: Path = given[0]
+    return path
+
+
+def _to_file(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
+    from orchestrate.export.exporting import export  # its libraries would slow every command
+
+    if arguments.license is not None:
+        raise UsageError("--license is for the card of a bundle, not for a file: leave it out.")
+    wanted = Export(
+        kind=arguments.kind,
+        format=arguments.format or _format_of(out),
+        out=out,
+        filters={"env": arguments.env, "policy": arguments.policy},
+    )
+    with Reader.open(arguments.db) as reader, reader.moment() as moment:
+        return export(moment, chosen(moment, arguments), wanted)
+
+
+def _to_folder(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
+    from orchestrate.export.folders import export_folder
+
+    if arguments.format is not None:
+        raise UsageError(f"--format is for files, but {arguments.kind} is a folder: leave it out.")
+    wanted = FolderExport(
+        kind=arguments.kind,
+        out=out,
+        filters={"env": arguments.env, "policy": arguments.policy},
+        license=_license(arguments),
+    )
+    with Reader.open(arguments.db) as reader, reader.moment() as moment:
+        return export_folder(moment, chosen(moment, arguments), wanted)
+
+
+def _license(arguments: argparse.Namespace) -> str:
+    given = arguments.license
+    if given is not None and arguments.kind != "bundle":
+        raise UsageError(
+            f"--license is for the card of a bundle, not for {arguments.kind}: leave it out."
+        )
+    if given is not None and not _LICENSE.fullmatch(given):
+        raise UsageError(
+            f"--license is {given!r}, an identifier in lower case is expected: give one such as "
+            f"cc-by-4.0 or mit."
+        )
+    return given or _NO_LICENSE
+
+
+def _line(kind: str, out: Path, document: dict[str, Any]) -> str:
+    if kind in FOLDERS:
+        return f"{out}: {document['n_trials']:,} trials, {document['bytes']:,} bytes"
+    size = f"{document['rows']:,} rows" if "rows" in document else "matrices"
+    manifest = out.with_name(f"{out.name}.manifest.json")
+    return f"{out}: {size}, {document['bytes']:,} bytes; from where: {manifest}"
 
 
 def _format_of(path: Path) -> str:
@@ -58,4 +128,6 @@ def _format_of(path: Path) -> str:
     return ending
 
 
-COMMAND = Command("export", "write curves, trials or trajectories to a file", add_arguments, run)
+COMMAND = Command(
+    "export", "write results to a file, a bundle, MLflow or Weights & Biases", add_arguments, run
+)

@@ -17,7 +17,9 @@ MAX_LISTED = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("other", metavar="OTHER", help="file or URL of the other database")
+    parser.add_argument(
+        "other", metavar="OTHER", help="file or URL of the other database, or folder of a bundle"
+    )
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
@@ -31,7 +33,10 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 
 
 def _url(text: str) -> str:
-    return text if "://" in text else f"sqlite:///{Path(text).absolute()}"
+    if "://" in text:
+        return text
+    kind = "bundle" if Path(text).is_dir() else "sqlite"
+    return f"{kind}:///{Path(text).absolute()}"
 
 
 def _plain(merged: Merged) -> dict[str, object]:

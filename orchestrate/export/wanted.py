@@ -9,6 +9,11 @@ from pathlib import Path
 from dopt.errors import DoptError
 
 KINDS = ("curves", "trials", "trajectories", "assessments")
+"""Exports that are one file."""
+
+FOLDERS = ("bundle", "mlflow", "wandb")
+"""Exports that are a folder."""
+
 FORMATS = ("csv", "parquet", "npz")
 
 
@@ -28,3 +33,16 @@ class Export:
     @property
     def manifest(self) -> Path:
         return self.out.with_name(f"{self.out.name}.manifest.json")
+
+
+@dataclass(frozen=True)
+class FolderExport:
+    """Request of an export: one of ``FOLDERS``, with filters.
+
+    ``license`` is the identifier of the licence of the data, written into the card of a bundle.
+    """
+
+    kind: str
+    out: Path
+    filters: Mapping[str, Sequence[str]]
+    license: str

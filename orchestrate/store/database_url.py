@@ -16,9 +16,17 @@ DEFAULT_URL = "sqlite:///results/results.db"
 URL_VARIABLE = "DOPT_DB"
 """Environment variable that names another default database; an empty one counts as unset."""
 
-_EXAMPLES = "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name"
+BUNDLE = "bundle"
+"""Kind of URL that names the folder of a bundle, which is only read."""
+
+_EXAMPLES = (
+    "sqlite:///results/results.db, postgresql+psycopg://user@host:5432/name or bundle:///FOLDER"
+)
 _SQLITE_FILE = re.compile(r"[\w./-]+\.(db|sqlite3?)")
 """Path of a file in place of a URL; a text that may hold a password does not match."""
+
+_NAMES = {"sqlite": "SQLite", BUNDLE: "a bundle"}
+_DEFAULT_NAMES = {"sqlite": "results.db", BUNDLE: "results"}
 
 _SECRETS = ("password", "sslpassword", "passfile")
 
@@ -31,11 +39,14 @@ def default_url() -> str:
 def parse(url: str) -> URL:
     """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
 
+    The path of a folder is taken for a bundle in it.
     The message says whether the URL came from ``DOPT_DB``. It repeats no text other than the path
     of a SQLite file, because a mistyped URL may hold a password.
     """
     source = f" in the environment variable {URL_VARIABLE}"
     where = source if url == os.environ.get(URL_VARIABLE) else ""
+    if "://" not in url and Path(url).is_dir():
+        return URL.create(BUNDLE, database=url)
     try:
         parsed = make_url(url)
     except (ArgumentError, ValueError):  # the latter for a port that is no number
@@ -44,16 +55,27 @@ def parse(url: str) -> URL:
     backend = parsed.get_backend_name()
     if backend == "postgresql":
         return parsed.set(drivername="postgresql+psycopg")
-    if backend != "sqlite":
+    if backend not in ("sqlite", BUNDLE):
         raise StoreError(
             f"A database of kind '{parsed.drivername}'{where} is not supported: give {_EXAMPLES}."
         )
     if parsed.host is not None:
         raise StoreError(
-            f"The database URL sqlite://{parsed.host}/...{where} names a host, but SQLite has "
-            f"none: write three slashes, sqlite:///{parsed.host}/{parsed.database or 'results.db'}."
+            f"The database URL {backend}://{parsed.host}/...{where} names a host, but "
+            f"{_NAMES[backend]} has none: write three slashes, {backend}:///{parsed.host}/"
+            f"{parsed.database or _DEFAULT_NAMES[backend]}."
         )
-    return parsed.set(drivername="sqlite")
+    return parsed.set(drivername=backend)
+
+
+def bundle_path(url: URL) -> Path:
+    """Return the absolute path of the folder of a bundle; raise ``StoreError`` without one."""
+    if not url.database:
+        raise StoreError(
+            "The URL of a bundle names no folder: write bundle:///FOLDER, or bundle:////FOLDER for "
+            "an absolute path."
+        )
+    return Path(url.database).resolve()
 
 
 def safe(url: URL) -> str:

@@ -45,6 +45,21 @@ def write_engine(path: Path) -> Engine:
     return _engine(lambda: _writer(path), "BEGIN IMMEDIATE")
 
 
+def filling_engine(path: Path) -> Engine:
+    """Return an engine for a new file that no other process reads, without a log and without syncs.
+
+    A file that is not complete after a crash must be deleted.
+    """
+
+    def connect() -> sqlite3.Connection:
+        connection = _connect(path, "mode=rwc")
+        connection.execute("PRAGMA journal_mode = OFF")
+        connection.execute("PRAGMA synchronous = OFF")
+        return connection
+
+    return _engine(connect, "BEGIN")
+
+
 def _engine(connect: Any, begin: str) -> Engine:
     engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
 

@@ -16,7 +16,7 @@ from sqlalchemy import URL, Connection, CursorResult, Engine, select, text
 from dopt.errors import suggestion
 from dopt.spec.added_fields import completed
 from orchestrate.store import database_url, schema_version
-from orchestrate.store.backends import postgresql, sqlite
+from orchestrate.store.backends import bundle, postgresql, sqlite
 from orchestrate.store.backends.driver_errors import translated, translated_query
 from orchestrate.store.errors import QueryError, StoreUnavailableError
 from orchestrate.store.read import liveness
@@ -241,8 +241,11 @@ class Reader:
                 yield connection
 
 
+_KINDS = {"sqlite": sqlite, "postgresql": postgresql, database_url.BUNDLE: bundle}
+
+
 def _kind(url: URL) -> ModuleType:
-    return sqlite if url.get_backend_name() == "sqlite" else postgresql
+    return _KINDS[url.get_backend_name()]
 
 
 def _config_row(*values: Any) -> ConfigRow:

@@ -1,0 +1,364 @@
+"""``export bundle``: the whole database as files, bit for bit, and read in its place."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from orchestrate.__main__ import main
+from orchestrate.export.bundle.descriptions import COLUMNS, TABLE_TITLES
+from orchestrate.redaction import without_password
+from orchestrate.store import Claim, NoDatabaseError, Reader, SchemaVersionError, Store, StoreError
+from orchestrate.store.bundles import cached, checksums
+from orchestrate.store.bundles.tables import TABLES, arrow_schema, primary_key
+from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, run_now
+from tests.orchestrate.store.everything import everything
+from tests.orchestrate.store.fakes import HORIZON, Spec, assessed, diverged, result
+
+Run = Callable[..., Answer]
+FILES = [*(f"{name}.parquet" for name in TABLES), "README.md", "provenance.json", "views.sql"]
+ODD = np.array([-0.0, 5e-324, np.nextafter(1, 2), -1.7976931348623157e308])
+"""Numbers that a conversion to text or to another type would change."""
+
+
+@pytest.fixture(autouse=True)
+def copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep the SQLite copies of bundles in a folder of the test."""
+    folder = tmp_path / "copies"
+    folder.mkdir()
+    monkeypatch.setattr(cached, "copies_folder", lambda: folder)
+    return folder
+
+
+@pytest.fixture
+def bundle(grid: int, store: Store, command: Run, tmp_path: Path) -> Path:
+    """Return a bundle of the grid with every status, of assessments and of odd numbers."""
+    odd = result(20)
+    odd.states[:4, 0] = ODD
+    odd.inputs[:4, 1] = ODD
+    odd.loss[:3] = ODD[1:]  # SQLite itself stores -0.0 in a column of numbers as 0.0
+    odd.parameters[:4] = ODD
+    lost = diverged(3, seed=21)
+    lost.states[4:] = np.nan
+    specs = [Spec(20), Spec(21), Spec(22, width=8)]
+    claims = store.claim(grid, store.register(grid, specs).todo)
+    found = [replace(odd, best_loss=float(odd.loss.min())), lost, assessed(22)]
+    for claim, one in zip(claims, found, strict=True):
+        assert store.commit(claim, one, run_now())
+    out = tmp_path / "bundle"
+    answer = command("export", "bundle", str(out))
+    assert (answer.code, answer.err) == (0, "")
+    return out
+
+
+def rows(reader: Reader, table: str) -> list[list[object]]:
+    names, order = ", ".join(arrow_schema(table).names), ", ".join(primary_key(table))
+    found = reader.rows(f"SELECT {names} FROM {table} ORDER BY {order}")
+    return [[bytes(x) if isinstance(x, memoryview) else x for x in row] for row in found]
+
+
+class TestRoundTrip:
+    def test_every_row_of_every_table_is_the_same(self, bundle: Path, url: str) -> None:
+        with Reader.open(url) as there, Reader.open(f"bundle:///{bundle}") as here:
+            for table in TABLES:
+                expected = rows(there, table)
+                if table == "launch":  # its command line held a password
+                    expected = [
+                        [without_password(x) if isinstance(x, str) else x for x in row]
+                        for row in expected
+                    ]
+                assert repr(rows(here, table)) == repr(expected), table
+
+    def test_every_number_has_the_same_bits(self, bundle: Path, url: str) -> None:
+        with Reader.open(url) as there, Reader.open(f"bundle:///{bundle}") as here:
+            assert here.configs() == there.configs()
+            for config in there.configs():
+                key = config.config_key
+                for column in ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us"):
+                    one, other = (reader.curves(key, column) for reader in (there, here))
+                    assert one.values.tobytes() == other.values.tobytes()
+                assert there.trials(key) == here.trials(key)
+                for trial in there.trials(key):
+                    if trial.status in ("done", "diverged"):
+                        one, other = (
+                            reader.trajectory(key, trial.seed) for reader in (there, here)
+                        )
+                        for name in ("states", "inputs", "parameters"):
+                            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+
+    def test_the_odd_numbers_are_in_it(self, bundle: Path) -> None:
+        with Reader.open(str(bundle)) as reader:
+            found = reader.trajectory(Spec(20).config_key, 20)
+        np.testing.assert_array_equal(found.states[:4, 0], ODD)
+        assert np.signbit(found.states[0, 0])
+
+    def test_a_bundle_of_a_bundle_is_the_same(self, bundle: Path, tmp_path: Path) -> None:
+        again = tmp_path / "again"
+        assert main(["export", "bundle", str(again), "--db", str(bundle)]) == 0
+        for table in TABLES:
+            name = f"{table}.parquet"
+            assert (again / name).read_bytes() == (bundle / name).read_bytes()
+
+    def test_its_results_can_be_merged_into_a_database(
+        self, bundle: Path, url: str, tmp_path: Path
+    ) -> None:
+        copies = [f"sqlite:///{tmp_path}/{name}.db" for name in ("of_bundle", "of_database")]
+        for target, other in zip(copies, (str(bundle), url), strict=True):
+            assert main(["merge", other, "--db", target]) == 0
+        one, other = map(everything, copies)
+        assert one[0] == other[0]
+        assert one[1:4] == other[1:4]
+
+
+class TestFiles:
+    def test_sha256sum_accepts_all_of_them(self, bundle: Path) -> None:
+        done = subprocess.run(
+            ["sha256sum", "--check", "--strict", "SHA256SUMS"],
+            cwd=bundle,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert sorted(done.stdout.split(": OK\n")[:-1]) == sorted(FILES)
+        assert {path.name for path in bundle.iterdir()} == {*FILES, "SHA256SUMS"}
+
+    def test_pandas_reads_states_as_lists(self, bundle: Path) -> None:
+        trials = pd.read_parquet(bundle / "trial.parquet")
+        paths = pd.read_parquet(bundle / "trajectory.parquet").set_index("trial_id")
+        assert len(paths) == 7
+        for spec in DONE:
+            (number,) = trials[trials.trial_key == spec.trial_key].trial_id
+            np.testing.assert_array_equal(np.stack(paths.states[number]), result(spec.seed).states)
+
+    def test_the_card_has_a_header_and_every_column(self, bundle: Path, command: Run) -> None:
+        assert command("export", "bundle", str(bundle), "--license", "cc-by-4.0").code == 0
+        _, header, text = (bundle / "README.md").read_text().split("---\n", 2)
+        facts = yaml.safe_load(header)
+        assert facts["license"] == "cc-by-4.0"
+        assert facts["size_categories"] == ["n<1K"]
+        assert {one["config_name"] for one in facts["configs"]} == set(TABLES)
+        assert "12 trials (5 done, " in text
+        assert "commit 000000000000 with changes" in text
+        for table in TABLES:
+            for name in arrow_schema(table).names:
+                assert f"| `{name}` |" in text
+
+    def test_the_provenance_says_what_was_run(self, bundle: Path, grid: int) -> None:
+        facts = json.loads((bundle / "provenance.json").read_text())
+        (launch,) = facts["launches"]
+        assert (launch["launch_id"], launch["git_commit"]) == (grid, "0" * 40)
+        assert launch["git_dirty"] is True
+        assert launch["versions"] == {"numpy": np.__version__}
+        assert facts["filters"] == {"env": [], "policy": []}
+        assert facts["rows"]["step"] == 7 * HORIZON
+        assert {"command", "written", "program", "schema_version", "versions"} <= facts.keys()
+
+    def test_passwords_appear_nowhere(self, bundle: Path, copies: Path) -> None:
+        Reader.open(str(bundle)).close()
+        for path in [*bundle.iterdir(), *copies.iterdir()]:
+            assert SECRET.encode() not in path.read_bytes()
+
+    def test_filters_leave_the_rest_out(self, bundle: Path, command: Run, tmp_path: Path) -> None:
+        out = tmp_path / "part"
+        words = ("export", "bundle", "--env", "pendulum", "--policy", "d_optimal", "--json")
+        document = command(*words, "--out", str(out)).document
+        assert document["filters"] == {"env": ["pendulum"], "policy": ["d_optimal"]}
+        assert document["rows"]["trial"] == 3
+        assert document["rows"]["error"] == 2
+        assert document["bytes"] == sum(path.stat().st_size for path in out.iterdir())
+        with Reader.open(str(out)) as reader, Reader.open(str(bundle)) as whole:
+            assert [config.policy for config in reader.configs()] == ["d_optimal"]
+            key = BAD.config_key
+            assert reader.trials(key) == whole.trials(key)
+        assert main(["export", "bundle", str(out / "more"), "--env", "no", "--db", str(out)]) == 2
+
+
+def test_every_column_of_the_schema_is_described() -> None:
+    assert set(TABLE_TITLES) == set(TABLES)
+    for table in TABLES:
+        assert list(COLUMNS[table]) == arrow_schema(table).names
+
+
+class TestOpening:
+    def test_every_form_of_its_name(self, bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(bundle.parent)
+        for name in (f"bundle:///{bundle}", "bundle:///bundle", str(bundle), "bundle"):
+            with Reader.open(name) as reader:
+                assert reader.safe_url.startswith("bundle:///")
+                assert len(reader.configs()) == 5
+
+    @pytest.mark.parametrize("name", FILES)
+    def test_a_damaged_file_is_named(self, bundle: Path, name: str, copies: Path) -> None:
+        Reader.open(str(bundle)).close()  # a copy is no reason to leave the check out
+        assert len(list(copies.glob("*.db"))) == 1
+        content = bytearray((bundle / name).read_bytes())
+        content[len(content) // 2] ^= 1
+        (bundle / name).write_bytes(content)
+        with pytest.raises(StoreError, match=f"{name} of the bundle is damaged.*SHA-256"):
+            Reader.open(str(bundle))
+        (bundle / name).unlink()
+        with pytest.raises(StoreError, match=f"{name} of the bundle.*is missing"):
+            Reader.open(str(bundle))
+
+    def test_a_damaged_list_of_checksums_is_refused(self, bundle: Path) -> None:
+        listed = bundle / checksums.CHECKSUMS
+        listed.write_text(listed.read_text()[10:])
+        with pytest.raises(StoreError, match="SHA256SUMS is damaged"):
+            Reader.open(str(bundle))
+
+    def test_a_table_that_is_not_listed_is_refused(self, bundle: Path) -> None:
+        listed = bundle / checksums.CHECKSUMS
+        lines = [line for line in listed.read_text().splitlines() if "step" not in line]
+        listed.write_text("\n".join(lines))
+        with pytest.raises(StoreError, match=r"step\.parquet"):
+            Reader.open(str(bundle))
+
+    def test_a_file_with_other_columns_is_refused(self, bundle: Path) -> None:
+        shutil.copy(bundle / "error.parquet", bundle / "step.parquet")
+        checksums.write(bundle)
+        with pytest.raises(StoreError, match=r"columns of .*step\.parquet"):
+            Reader.open(str(bundle))
+        (bundle / "step.parquet").write_text("no Parquet")
+        checksums.write(bundle)
+        with pytest.raises(StoreError, match=r"step\.parquet of the bundle is no Parquet file"):
+            Reader.open(str(bundle))
+
+    def test_another_schema_is_refused(self, bundle: Path) -> None:
+        path = bundle / "provenance.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"schema_version": "3"}))
+        checksums.write(bundle)
+        with pytest.raises(SchemaVersionError, match="has schema 3, this program reads schema 4"):
+            Reader.open(str(bundle))
+
+    def test_what_is_no_bundle_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(NoDatabaseError, match="There is no folder"):
+            Reader.open(f"bundle:///{tmp_path}/nothing")
+        with pytest.raises(StoreError, match="is no bundle, because it has no file SHA256SUMS"):
+            Reader.open(str(tmp_path))
+        with pytest.raises(StoreError, match="names no folder"):
+            Reader.open("bundle://")
+        with pytest.raises(StoreError, match=r"has none: write three slashes, bundle:///here/x\."):
+            Reader.open("bundle://here/x")
+
+    def test_it_is_imported_once(self, bundle: Path, copies: Path) -> None:
+        for _ in range(2):
+            Reader.open(str(bundle)).close()
+        (copy,) = copies.glob("*.db")
+        made = copy.stat().st_ino
+        old = copies / "old.db"
+        old.touch()
+        os.utime(old, times=(0, time.time() - 86_400 * (cached.DAYS_KEPT + 1)))
+        Reader.open(str(bundle)).close()
+        assert (copy.stat().st_ino, old.exists()) == (made, True)
+        copy.unlink()
+        Reader.open(str(bundle)).close()
+        assert sorted(path.name for path in copies.iterdir()) == sorted([copy.name, "lock"])
+
+
+class TestWriting:
+    def test_it_is_refused_with_what_to_do(self, bundle: Path) -> None:
+        with pytest.raises(StoreError, match=r"only read.*orchestrate merge bundle:///"):
+            Store.open(f"bundle:///{bundle}")
+
+    @pytest.mark.parametrize("words", [("retry", "failed"), ("upgrade",), ("merge", "other")])
+    def test_every_command_that_writes_refuses_it(
+        self, bundle: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        given = [str(bundle) if word == "other" else word for word in words]
+        files = {path.name: path.read_bytes() for path in bundle.iterdir()}
+        other = shutil.copytree(bundle, bundle.parent / "second")
+        assert main([*given, "--db", str(other)]) == 2
+        assert "is a bundle, which is only read" in capsys.readouterr().err
+        assert files == {path.name: path.read_bytes() for path in other.iterdir()}
+
+    def test_a_query_cannot_write(self, bundle: Path) -> None:
+        with Reader.open(str(bundle)) as reader, pytest.raises(StoreError, match="only a SELECT"):
+            reader.query("DELETE FROM trial")
+
+
+class TestWholeOrNotAtAll:
+    def test_an_earlier_bundle_is_replaced(self, bundle: Path, command: Run) -> None:
+        assert command("export", "bundle", str(bundle), "--env", "cartpole").code == 0
+        with Reader.open(str(bundle)) as reader:
+            assert {config.env for config in reader.configs()} == {"cartpole"}
+        assert [path.name for path in bundle.parent.glob(".*")] == []
+
+    def test_another_folder_is_not(self, bundle: Path, command: Run, tmp_path: Path) -> None:
+        other = tmp_path / "mine"
+        other.mkdir()
+        (other / "notes.txt").write_text("keep")
+        for out in (other, other / "notes.txt"):
+            answer = command("export", "bundle", str(out))
+            assert answer.code == 2
+            assert "is there already and is no earlier export of this kind" in answer.err
+        assert (other / "notes.txt").read_text() == "keep"
+        assert bundle.exists()
+
+    @pytest.mark.usefixtures("grid")
+    def test_an_error_leaves_nothing(
+        self, command: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(_: Path) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(checksums, "write", full)
+        before = sorted(tmp_path.iterdir())
+        answer = command("export", "bundle", str(tmp_path / "out"))
+        assert answer.code == 2
+        assert "cannot be written (No space left on device)" in answer.err
+        assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.usefixtures("grid")
+class TestWords:
+    @pytest.mark.parametrize(
+        ("words", "said"),
+        [
+            (("bundle",), "No path is given to write to"),
+            (("bundle", "a", "--out", "b"), "Two paths are given to write to"),
+            (("bundle", "a", "--format", "csv"), "--format is for files"),
+            (("curves", "a.csv", "--license", "mit"), "--license is for the card of a bundle"),
+            (("bundle", "a", "--license", "My own"), "an identifier in lower case is expected"),
+            (("bundel", "a"), "did you mean 'bundle'"),
+        ],
+    )
+    def test_a_mistake_is_one_sentence(
+        self, command: Run, words: tuple[str, ...], said: str
+    ) -> None:
+        answer = command("export", *words)
+        assert (answer.code, answer.err.count("\n")) == (2, 1)
+        assert said in answer.err
+
+    def test_a_file_may_be_named_without_an_option(self, command: Run, tmp_path: Path) -> None:
+        out = tmp_path / "curves.csv"
+        assert command("export", "curves", str(out)).code == 0
+        assert out.exists()
+
+
+def test_an_empty_database_has_no_bundle(store: Store, command: Run, tmp_path: Path) -> None:
+    assert store.safe_url
+    answer = command("export", "bundle", str(tmp_path / "out"))
+    assert answer.code == 2
+    assert "holds no trials yet" in answer.err
+
+
+def test_trials_without_results_are_kept(
+    take: Callable[..., list[Claim]], command: Run, tmp_path: Path
+) -> None:
+    take(Spec(0))
+    out = tmp_path / "out"
+    assert command("export", "bundle", str(out)).code == 0
+    with Reader.open(str(out)) as reader:
+        assert [trial.status for trial in reader.trials(Spec(0).config_key)] == ["running"]
+        assert [launch.alive for launch in reader.launches()] == [False]
