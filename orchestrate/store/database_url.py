@@ -20,7 +20,8 @@ BUNDLE = "bundle"
 """Kind of URL that names the folder of a bundle, which is only read."""
 
 _EXAMPLES = (
-    "sqlite:///results/results.db, postgresql+psycopg://user@host:5432/name or bundle:///FOLDER"
+    "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name, "
+    "or bundle:///FOLDER to read a bundle"
 )
 _SQLITE_FILE = re.compile(r"[\w./-]+\.(db|sqlite3?)")
 """Path of a file in place of a URL; a text that may hold a password does not match."""
