@@ -40,9 +40,9 @@ def default_url() -> str:
 def parse(url: str) -> URL:
     """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
 
-    The path of a folder is taken for a bundle in it.
-    The message says whether the URL came from ``DOPT_DB``. It repeats no text other than the path
-    of a SQLite file, because a mistyped URL may hold a password.
+    The path of a folder is taken for a bundle in it. The message says whether the URL came from
+    ``DOPT_DB``. It repeats no text other than the path of a SQLite file, because a mistyped URL may
+    hold a password.
     """
     source = f" in the environment variable {URL_VARIABLE}"
     where = source if url == os.environ.get(URL_VARIABLE) else ""

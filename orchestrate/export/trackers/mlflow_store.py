@@ -57,15 +57,12 @@ def _client(database: Path) -> Iterator[MlflowClient]:
         from mlflow import MlflowClient
     except ImportError as error:
         raise runs.missing_library("mlflow", _PACKAGE) from error
-    loggers = [logging.getLogger(name) for name in ("mlflow", "alembic")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.WARNING)
+    before = logging.root.manager.disable
+    logging.disable(logging.INFO)  # not the levels of its loggers, which its migrations set anew
     try:
         yield MlflowClient(tracking_uri=f"sqlite:///{database}")
     finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
 
 
 def _log(client: MlflowClient, experiment: str, run: TrackedRun) -> None:
