@@ -29,6 +29,7 @@ from analysis.stats.tolerance import BandKind
 from analysis.stats.trial_scores import Measure
 from analysis.tables.registry import TABLES, TableKind, comparison
 from analysis.tables.rendering import TextTable, gaps_table
+from analysis.yardsticks import command as yardsticks
 from dopt.errors import DoptError
 from orchestrate.cli_parser import Parser
 from orchestrate.store import DEFAULT_URL, Reader, default_url
@@ -119,6 +120,9 @@ def parser() -> Parser:
     )
     report.add_arguments(compared)
     compared.set_defaults(alone=lambda options: report.run(options, _filter(options)))
+    published = _command(commands, "yardsticks", None, yardsticks.HELP, diverged=False)
+    yardsticks.add_arguments(published)
+    published.set_defaults(alone=lambda options: yardsticks.run(options, _filter(options)))
     animate = commands.add_parser("animate", help=film.HELP, description=film.HELP)
     animate.set_defaults(alone=film.run)
     _add_database(animate)

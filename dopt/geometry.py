@@ -18,6 +18,7 @@ from dopt.systems import (
     Arm,
     Cartpole,
     Chain,
+    CoupledPendulums,
     MassSpring,
     Pendulum,
     Quadrotor,
@@ -95,6 +96,16 @@ def _(system: Chain, states: Array) -> Body:
     links = [_hanging(states[:, i], system.length) for i in system.angle_indices]
     masses = np.cumsum(links, axis=0)
     return Body((_polyline(np.zeros_like(masses[0]), *masses),), np.moveaxis(masses, 0, 1))
+
+
+@body.register
+def _(system: CoupledPendulums, states: Array) -> Body:
+    tips, pivots = [], []
+    for column, index in enumerate(system.angle_indices):
+        pivots.append(np.broadcast_to([2.0 * column, 0.0], (len(states), 2)))
+        tips.append(pivots[-1] + _hanging(states[:, index], 1.0))
+    rods = tuple(_polyline(pivot, tip) for pivot, tip in zip(pivots, tips, strict=True))
+    return Body(rods, np.stack(tips, axis=1))
 
 
 @body.register

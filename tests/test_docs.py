@@ -22,6 +22,7 @@ from orchestrate import __main__ as orchestrate
 from orchestrate import launch
 from orchestrate.commands import COMMANDS
 from tests.analysis.synthetic import fill, make_grid
+from tests.analysis.yardsticks.small_grid import fill_small_grid
 from tests.pages import GENERATED, PAGES, Command, anchors, blocks, commands, links
 from tests.paths import EXAMPLE, ROOT
 from tests.typed_commands import empty_folder, run_typed
@@ -226,11 +227,16 @@ def test_every_command_of_the_analysis_works(
     typed: Callable[[Command], str],
     narrow_database: str,
     monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     extra = {"animate": ("--frames", "2"), "floor": ()}
-    extra |= {"summary": (), "compare": (), "aggregate": (), "report": ()}
+    extra |= dict.fromkeys(("summary", "compare", "aggregate", "report", "yardsticks"), ())
     if command.words[0] == "floor":
         monkeypatch.setenv("DOPT_DB", narrow_database)
+    if command.words[0] == "yardsticks":
+        address = f"sqlite:///{tmp_path}/pendulums.db"
+        fill_small_grid(address)
+        monkeypatch.setenv("DOPT_DB", address)
     if command.words[0] == "serve":  # which does not end; its own tests start it
         assert cli.parser().read(command.words)
     else:

@@ -10,6 +10,7 @@ from dopt.systems.arm import Arm
 from dopt.systems.base import System
 from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
 from dopt.systems.chain import Chain
+from dopt.systems.coupled_pendulums import CoupledPendulums
 from dopt.systems.drifting_pendulum import DriftingPendulum
 from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
@@ -30,6 +31,7 @@ SYSTEMS: dict[str, type[System]] = {
         PendulumUnknownGain,
         CartpoleUnknownGain,
         UnbalancedDisk,
+        CoupledPendulums,
     )
 }
 
@@ -47,6 +49,7 @@ __all__ = [
     "Cartpole",
     "CartpoleUnknownGain",
     "Chain",
+    "CoupledPendulums",
     "DriftingPendulum",
     "Feature",
     "MassSpring",

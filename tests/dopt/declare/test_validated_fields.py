@@ -32,6 +32,7 @@ POSITIVE = {
     *("subspace", "count", "radius", "stride", "plans", "elites", "samples"),
     *(
         "n_links",
+        "n_pendulums",
         "time_constant",
         "capacity",
         "refit_every",
@@ -51,7 +52,7 @@ POSITIVE = {
 NONNEGATIVE = {
     *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
-    "dry_friction",
+    *("dry_friction", "coupling"),
     "measured_states",
 }
 FRACTIONS = {"beta_1", "beta_2"}

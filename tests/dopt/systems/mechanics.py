@@ -20,6 +20,7 @@ from dopt.systems import (
     Cartpole,
     CartpoleUnknownGain,
     Chain,
+    CoupledPendulums,
     DriftingPendulum,
     MassSpring,
     Pendulum,
@@ -189,6 +190,30 @@ class ChainMechanics(Mechanics):
         return -self.system.friction * rates
 
 
+class CoupledPendulumsMechanics(Mechanics):
+    """Unit masses at the ends of rods of 1 m, with torsion springs between neighbours."""
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        self.coordinates = system.angle_indices
+
+    def masses(self) -> list[float]:
+        return [1.0] * self.system.n_pendulums
+
+    def positions(self, q: Tensor) -> Tensor:
+        return torch.stack([q.sin(), -q.cos()], dim=-1)
+
+    def potential(self, q: Tensor) -> Tensor:
+        twists = torch.diff(q)
+        return super().potential(q) + 0.5 * self.system.coupling * twists.square().sum()
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:  # noqa: ARG002
+        return torch.cat([u, torch.zeros_like(q[1:])])
+
+    def friction(self, rates: Tensor) -> Tensor:
+        return -self.system.friction * rates
+
+
 class QuadrotorMechanics(Mechanics):
     coordinates = (0, 2, 4)
 
@@ -267,6 +292,7 @@ MECHANICS: dict[type[System], type[Mechanics]] = {
     PendulumUnknownGain: PendulumUnknownGainMechanics,
     CartpoleUnknownGain: CartpoleUnknownGainMechanics,
     UnbalancedDisk: UnbalancedDiskMechanics,
+    CoupledPendulums: CoupledPendulumsMechanics,
 }
 
 FRICTION = {
@@ -280,4 +306,5 @@ FRICTION = {
     "pendulum_unknown_gain": ("friction",),
     "cartpole_unknown_gain": ("pivot_friction", "cart_friction"),
     "unbalanced_disk": ("friction", "dry_friction"),
+    "coupled_pendulums": ("friction",),
 }

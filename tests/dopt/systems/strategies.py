@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,9 @@ NAMES = sorted(SYSTEMS)
 def systems(draw: st.DrawFn, name: str, **fixed: Any) -> System:
     """Draw a system with physical parameters between 0.2 and 5, but the fixed ones."""
     cls = SYSTEMS[name]
-    drawn = {field: draw(st.floats(0.2, 5.0)) for field in cls.physical if field not in fixed}
+    names = {field.name for field in dataclasses.fields(cls)}
+    named = [field for field in cls.physical if field in names]
+    drawn = {field: draw(st.floats(0.2, 5.0)) for field in named if field not in fixed}
     return cls(**drawn, **fixed)
 
 

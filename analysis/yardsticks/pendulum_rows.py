@@ -1,0 +1,195 @@
+"""Samples until the frictions of coupled pendulums are known: Table 3 of FLEX, run here."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from analysis.data.config_matching import Filter
+from analysis.data.curves import read_curves
+from analysis.data.trial_selection import Entry, newest, policy_rank
+from analysis.errors import AnalysisError
+from analysis.formatting import steps_text, within
+from analysis.stats.trial_scores import last_passage
+from analysis.tables.comparisons import against_reference
+from analysis.tables.rendering import TextTable
+from analysis.yardsticks.growth import Interval, exponent, median, slopes
+from analysis.yardsticks.published import FLEX_LONGEST, FLEX_SAMPLES, FLEX_SIZES
+from dopt.parameter_error import loss_by_parameter_error
+from dopt.spec.prequential import system_of
+from dopt.systems import CoupledPendulums
+from orchestrate.store import ConfigRow, Reader
+
+ERROR = 1e-2
+"""Euclidean norm of the error of the frictions [1/s] that is to be reached."""
+
+REFERENCE = "random"
+_SEED = 20_230_426
+
+
+def entries(reader: Reader, wanted: Filter) -> list[Entry]:
+    """Return the configurations with coupled pendulums and the linear model, and their trials.
+
+    Raises
+    ------
+    AnalysisError
+        If there is none, or two of them have the same policy and number of pendulums.
+    """
+    found = [one for one in reader.configs() if _is_asked_for(one, wanted)]
+    if not found:
+        raise AnalysisError(
+            f"{reader.safe_url} holds no trials of coupled pendulums with the linear model: run "
+            f"orchestrate/launch.py -m experiment=flex_table3 first."
+        )
+    kept = [Entry(one, tuple(reader.trials(one.config_key))) for one in newest(found)]
+    kept.sort(key=lambda one: (policy_rank(one.config.policy), _size(one)))
+    for one, other in itertools.pairwise(kept):
+        if (one.config.policy, _size(one)) == (other.config.policy, _size(other)):
+            raise AnalysisError(
+                f"Two configurations with {_size(one)} pendulums have the policy "
+                f"'{one.config.policy}', but one is expected: choose by --where, such as "
+                f"--where env.horizon=1000."
+            )
+    return kept
+
+
+def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
+    fits = config.env == CoupledPendulums.name and config.model == "linear"
+    return fits and wanted.accepts(config)
+
+
+def _size(entry: Entry) -> int:
+    return int(entry.config.config["env"]["n_pendulums"])
+
+
+def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
+    """Return one row for each finished trial: samples to the error, and the error at the end.
+
+    ``samples`` is the number of inputs after which the parameter error stays at most
+    :data:`ERROR`, inf where it does not or the trial diverged.
+    """
+    rows: list[dict[str, object]] = []
+    for entry in found:
+        curves = read_curves(reader, entry, "loss")
+        errors = curves.values / loss_by_parameter_error(system_of(entry.config.config))
+        samples = last_passage(errors, ERROR)
+        facts = {
+            "n_pendulums": _size(entry),
+            "policy": entry.config.policy,
+            "horizon": entry.config.horizon,
+        }
+        rows += [
+            facts | {"seed": int(seed), "samples": float(count), "final_error": float(error)}
+            for seed, count, error in zip(curves.seeds, samples, errors[:, -1], strict=True)
+        ]
+    return pd.DataFrame(rows)
+
+
+def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
+    """Return medians, exponents and ratios to random inputs with their intervals of 95 %.
+
+    One row for each policy and number of pendulums. ``ratio`` is the geometric mean of the samples
+    by those of random inputs of the same seed, ``exponent`` that of the policy over all numbers.
+    """
+    rows = []
+    for policy, own in trials.groupby("policy", sort=False):
+        by_size = {
+            int(str(size)): part.samples.to_numpy(float)
+            for size, part in own.groupby("n_pendulums")
+        }
+        growth = exponent(by_size, np.random.default_rng(_SEED))
+        for size, values in by_size.items():
+            row: dict[str, object] = {"policy": policy, "n_pendulums": size, "n": len(values)}
+            row["horizon"] = int(own[own.n_pendulums == size].horizon.iloc[0])
+            row["reached"] = int(np.isfinite(values).sum())
+            row |= _columns("median", median(values, np.random.default_rng(_SEED)))
+            row |= _columns("ratio", _ratio(trials, str(policy), size))
+            rows.append(row | _columns("exponent", growth))
+    return pd.DataFrame(rows)
+
+
+def _columns(name: str, interval: Interval) -> dict[str, float]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
+
+
+def _ratio(trials: pd.DataFrame, policy: str, size: int) -> Interval:
+    of_size = trials[trials.n_pendulums == size]
+    own, reference = (
+        dict(zip(part.seed, part.samples, strict=True))
+        for part in (of_size[of_size.policy == policy], of_size[of_size.policy == REFERENCE])
+    )
+    if policy == REFERENCE or not reference:
+        return np.nan, np.nan, np.nan
+    found = against_reference(own, reference, f"coupled_pendulums/{size}", policy, "samples")
+    return found.ratio, found.low, found.high
+
+
+def samples_table(table: pd.DataFrame) -> TextTable:
+    """Return the medians of all policies beside the published rows, and the exponents."""
+    sizes = sorted(set(table.n_pendulums))
+    rows = [
+        [policy, *(_cell(own, size, _median_text) for size in sizes), _exponent_text(own)]
+        for policy, own in table.groupby("policy", sort=False)
+    ]
+    for policy, samples in FLEX_SAMPLES.items():
+        printed = dict(zip(FLEX_SIZES, samples, strict=True))
+        texts = [
+            steps_text(printed[size], FLEX_LONGEST) if size in printed else "–" for size in sizes
+        ]
+        rows.append([f"published: {policy}", *texts, f"{published_exponent(policy):.2f}"])
+    note = (
+        f"Samples until the error of the frictions stays at most {ERROR:g} / s: median over the "
+        f"trials [interval of 95 %]. Exponent a of samples ∝ N^a, from the medians."
+    )
+    return TextTable(["policy", *(f"N = {size}" for size in sizes), "a"], rows, note)
+
+
+def ratio_table(table: pd.DataFrame) -> TextTable:
+    """Return the samples by those of random inputs, beside the published ratios."""
+    sizes = sorted(set(table.n_pendulums))
+    rows = [
+        [policy, *(_cell(own, size, _ratio_text) for size in sizes)]
+        for policy, own in table.groupby("policy", sort=False)
+        if policy != REFERENCE
+    ]
+    pairs = zip(FLEX_SAMPLES["FLEX"], FLEX_SAMPLES["random"], strict=True)
+    texts = [f"{a / b:.2f}" if b < np.inf else f"< {a / FLEX_LONGEST:.2f}" for a, b in pairs]
+    printed = dict(zip(FLEX_SIZES, texts, strict=True))
+    rows.append(["published: FLEX", *(printed.get(size, "–") for size in sizes)])
+    note = "Samples by those of random inputs: paired geometric mean [interval of 95 %]."
+    return TextTable(["policy", *(f"N = {size}" for size in sizes)], rows, note)
+
+
+def published_exponent(policy: str) -> float:
+    """Return the exponent of the published samples of a policy, over the numbers it reached."""
+    kept = [
+        (size, samples)
+        for size, samples in zip(FLEX_SIZES, FLEX_SAMPLES[policy], strict=True)
+        if np.isfinite(samples)
+    ]
+    sizes, reached = zip(*kept, strict=True)
+    return float(slopes(sizes, np.array([reached]))[0])
+
+
+def _cell(own: pd.DataFrame, size: int, text: Callable[[Mapping[Hashable, Any]], str]) -> str:
+    rows = own[own.n_pendulums == size].to_dict("records")
+    return text(rows[0]) if rows else "–"
+
+
+def _median_text(row: Mapping[Hashable, Any]) -> str:
+    names = ("median", "median_low", "median_high")
+    texts = [steps_text(row[name], int(row["horizon"])) for name in names]
+    return f"{texts[0]} [{texts[1]}, {texts[2]}]"
+
+
+def _ratio_text(row: Mapping[Hashable, Any]) -> str:
+    return within(row["ratio"], row["ratio_low"], row["ratio_high"])
+
+
+def _exponent_text(own: pd.DataFrame) -> str:
+    first = own.iloc[0]
+    return within(first.exponent, first.exponent_low, first.exponent_high)

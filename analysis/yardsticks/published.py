@@ -1,0 +1,22 @@
+"""Numbers that other authors printed, as the tables here show them beside their own.
+
+Table 3 of M. Blanke and M. Lelarge, "FLEX: an adaptive exploration algorithm for nonlinear systems"
+(ICML 2023): samples until the frictions of N coupled pendulums are known to 1e-2. A number that is
+not reached is printed there as "> 1,000"; here it is infinite.
+"""
+
+from __future__ import annotations
+
+import math
+
+FLEX_SIZES = (2, 5, 10, 20, 50)
+"""Numbers N of pendulums."""
+
+FLEX_SAMPLES = {
+    "random": (20.0, 100.0, 200.0, 500.0, math.inf),
+    "FLEX": (10.0, 50.0, 100.0, 200.0, 500.0),
+}
+"""Samples for each N, by policy."""
+
+FLEX_LONGEST = 1000
+"""Samples of the longest run in the table."""
