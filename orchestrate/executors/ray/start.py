@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -51,7 +52,7 @@ def _long_start() -> Iterator[None]:
             try:
                 return query(*arguments, **options)  # type: ignore[no-untyped-call]
             except RuntimeError:
-                if time.monotonic() > end:
+                if time.monotonic() > end or not _raylet_lives():
                     raise
 
     services.get_node = patient
@@ -65,6 +66,17 @@ def _children() -> set[int]:
     """Return the process ids of the children of this process."""
     lists = Path("/proc/self/task").glob("*/children")
     return {int(number) for one in lists for number in one.read_text().split()}
+
+
+def _raylet_lives() -> bool:
+    """Tell whether a raylet that this process has started has not ended."""
+    for process in _children():
+        with suppress(OSError):  # it may end at this moment
+            status = Path(f"/proc/{process}/status").read_text()
+            name, state = re.findall(r"^(?:Name|State):\s+(\S+)", status, re.MULTILINE)
+            if name == "raylet" and state not in "ZX":
+                return True
+    return False
 
 
 def _kill(processes: set[int]) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ from ray._private import services
 
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import WorkerLost
+from orchestrate.executors.ray import start as ray_start
 from orchestrate.executors.ray.executor import RayExecutor
 from orchestrate.executors.ray.start import start
 from tests.orchestrate.executors.names import ON_RAY, WORKERS
@@ -60,10 +63,31 @@ def test_a_slow_start_of_ray_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> N
         return answer
 
     monkeypatch.setattr(services, "get_node", slow_query)
+    monkeypatch.setattr(ray_start, "_raylet_lives", lambda: True)
     found = []
     start(lambda: found.append(services.get_node()))
     assert found == [{"node": 1}]
     assert services.get_node.__name__ == "slow_query"
+
+
+def test_a_raylet_that_has_ended_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    raylet = tmp_path / "raylet"
+    shutil.copy("/bin/sleep", raylet)
+    with subprocess.Popen([raylet, "600"]) as process:
+        monkeypatch.setattr(ray_start, "_children", lambda: {process.pid})
+        assert ray_start._raylet_lives()
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert not ray_start._raylet_lives()  # although nobody has asked for its status
+
+        def no_node() -> None:
+            raise RuntimeError("no node")
+
+        monkeypatch.setattr(services, "get_node", no_node)
+        with pytest.raises(RuntimeError, match="no node"):
+            start(services.get_node)
 
 
 def test_a_failed_start_of_ray_is_ended_and_tried_once_more() -> None:
