@@ -12,6 +12,7 @@ from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.ray.chunk import run_chunk
 from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection
+from orchestrate.executors.ray.start import start
 from orchestrate.executors.worker_environment import ONE_THREAD, module_path
 
 OBJECT_STORE_BYTES = 256 * 2**20
@@ -28,15 +29,18 @@ class OwnRay(Connection):
         # Workers inherit this environment, which is seconds faster than a runtime environment.
         os.environ.update({**ONE_THREAD, **module_path()})
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        start(self._start)
+        self._task = ray.remote(**TASK_OPTIONS)(run_chunk)
+        resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        self._cores = int(resources.get("CPU", 1.0))
+
+    def _start(self) -> None:
         self._init(
             "local",
             num_cpus=self._workers,
             object_store_memory=OBJECT_STORE_BYTES,
             include_dashboard=False,
         )
-        self._task = ray.remote(**TASK_OPTIONS)(run_chunk)
-        resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-        self._cores = int(resources.get("CPU", 1.0))
 
     @property
     def slots(self) -> int:

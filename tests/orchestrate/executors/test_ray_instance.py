@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 import ray
+from ray._private import services
 
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import WorkerLost
+from orchestrate.executors.ray import start as ray_start
 from orchestrate.executors.ray.executor import RayExecutor
+from orchestrate.executors.ray.start import start
 from tests.orchestrate.executors.names import ON_RAY, WORKERS
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.lean_ray import leave_services_out
@@ -33,6 +40,77 @@ def test_the_end_of_ray_itself_is_no_fault_of_a_trial(monkeypatch: pytest.Monkey
     monkeypatch.undo()
     executor.stop()
     assert not ray.is_initialized()
+
+
+def test_a_launch_without_a_parent_outlives_its_raylet() -> None:
+    command = f"{sys.executable} -m tests.orchestrate.orphaned_driver $$ &"
+    # The driver holds the pipe too: this returns when both have ended.
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines()[1:] == [
+        "Ray's raylet has ended: run the same command again to continue.",
+        "processes of Ray: 0",
+        "exit",
+    ], done.stderr
+
+
+def test_a_slow_start_of_ray_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = iter([RuntimeError("not yet"), RuntimeError("not yet"), {"node": 1}])
+
+    def slow_query() -> dict[str, int]:
+        answer = next(answers)
+        if isinstance(answer, RuntimeError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(services, "get_node", slow_query)
+    monkeypatch.setattr(ray_start, "_raylet_lives", lambda: True)
+    found = []
+    start(lambda: found.append(services.get_node()))
+    assert found == [{"node": 1}]
+    assert services.get_node.__name__ == "slow_query"
+
+
+def test_a_raylet_that_has_ended_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    raylet = tmp_path / "raylet"
+    shutil.copy("/bin/sleep", raylet)
+    with subprocess.Popen([raylet, "600"]) as process:
+        monkeypatch.setattr(ray_start, "_children", lambda: {process.pid})
+        assert ray_start._raylet_lives()
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert not ray_start._raylet_lives()  # although nobody has asked for its status
+
+        def no_node() -> None:
+            raise RuntimeError("no node")
+
+        monkeypatch.setattr(services, "get_node", no_node)
+        with pytest.raises(RuntimeError, match="no node"):
+            start(services.get_node)
+
+
+def test_a_failed_start_of_ray_is_ended_and_tried_once_more() -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    def fail() -> None:
+        started.append(subprocess.Popen(["sleep", "600"]))
+        raise InfrastructureError("Ray timed out.")
+
+    with pytest.raises(
+        InfrastructureError, match=r"Ray timed out\. It was tried 2 times; the load"
+    ):
+        start(fail)
+    assert [process.wait(10) for process in started] == [-signal.SIGKILL, -signal.SIGKILL]
+
+
+def test_a_worker_is_given_the_number_of_its_raylet() -> None:
+    leave_services_out()
+    with RayExecutor(slow, 1):
+        node: Any = ray._private.worker._global_node
+        raylet = node.all_processes["raylet"][0].process.pid
+        ask = ray.remote(num_cpus=1)(lambda: os.environ["RAY_RAYLET_PID"])
+        assert ray.get(ask.remote()) == str(raylet)
 
 
 def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
