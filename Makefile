@@ -21,9 +21,9 @@ export MKL_NUM_THREADS := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-# One worker for each of two cores: tests with limits of seconds fail where more processes compete.
+# Three workers on two cores: many tests wait for processes, servers and leases.
 # tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
-ALL := --numprocesses 2 --dist loadgroup --no-loadscope-reorder -m 'not soak and not machines and not image'
+ALL := --numprocesses 3 --dist loadgroup --no-loadscope-reorder -m 'not soak and not machines and not image'
 # Tests of pure functions, of the configuration and of the architecture: no trial, no database server,
 # no cluster and no browser. Two files compile, or compose many grids, and are left to `make test`.
 FAST := tests/test_architecture.py tests/test_release.py tests/dopt/declare tests/dopt/math \
