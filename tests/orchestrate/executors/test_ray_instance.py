@@ -77,8 +77,11 @@ def test_a_raylet_that_has_ended_is_not_waited_for(
     shutil.copy("/bin/sleep", raylet)
     with subprocess.Popen([raylet, "600"]) as process:
         monkeypatch.setattr(ray_start, "_children", lambda: {process.pid})
-        assert ray_start._raylet_lives()
-        process.kill()
+        try:
+            while not ray_start._raylet_lives():  # until the process has its name
+                assert process.poll() is None
+        finally:
+            process.kill()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         assert not ray_start._raylet_lives()  # although nobody has asked for its status
 
