@@ -121,13 +121,22 @@ def reachable_points(system: System) -> tuple[Array, Array]:
     The sample is drawn without replacement from all states visited, with a fixed seed.
     """
     rng = np.random.default_rng(_SEED)
+    states, inputs = visited_points(system, rng)
+    found = rng.choice(len(states), min(REACHABLE_POINTS, len(states)), replace=False)
+    chosen = np.sort(found)
+    return states[chosen], inputs[chosen]
+
+
+def visited_points(system: System, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return all states of :func:`reachable_points` within the limit, (n, d), and inputs, (n, m).
+
+    Runs with the same first input share their first states, which are then there several times.
+    """
     inputs = np.stack(_held(system, rng) + _waves(system), axis=1)
     visited = simulate(system, inputs).reshape(-1, system.n_states)
     applied = np.concatenate([inputs, np.zeros_like(inputs[:1])]).reshape(-1, system.n_inputs)
-    inside = np.flatnonzero(np.all(np.abs(visited) <= system.state_limit, axis=1))
-    found = rng.choice(len(inside), min(REACHABLE_POINTS, len(inside)), replace=False)
-    chosen = inside[np.sort(found)]
-    return visited[chosen], applied[chosen]
+    inside = np.all(np.abs(visited) <= system.state_limit, axis=1)
+    return visited[inside], applied[inside]
 
 
 def simulate(system: System, inputs: Array) -> Array:

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from dopt.errors import SpecificationError
-from dopt.kernel.equations import compiled_equations
 from dopt.systems import Arm, Chain, Feature
 from dopt.systems.equilibrium import jacobians
+from tests.dopt.systems.compiled import assert_compiled_equations_agree
 from tests.dopt.systems.mechanics import ChainMechanics
 
 CONSTANTS = {"mass": 0.7, "length": 0.6, "friction": 0.3}
@@ -56,12 +56,7 @@ def test_a_hanging_chain_swings_at_the_zeros_of_a_laguerre_polynomial(n_links: i
 @pytest.mark.parametrize("n_links", [1, 3, 5])
 def test_compiled_equations_are_those_of_a_chain_of_that_length(n_links: int) -> None:
     chain = Chain(n_links=n_links, **CONSTANTS)
-    (x, u), equations = point(chain, 1), compiled_equations(chain)
-    p, flow, learned = np.array(chain.parameters), np.empty(2 * n_links), np.empty(n_links)
-    equations.known(x, u, p, flow)
-    equations.accelerations(x, p, learned)
-    flow[1::2] += learned
-    assert flow == pytest.approx(chain.derivative(x, u), rel=1e-11, abs=1e-12)
+    assert_compiled_equations_agree(chain, *point(chain, 1))
 
 
 def test_what_depends_on_the_number_of_links_follows_it() -> None:

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from dopt.errors import SpecificationError
-from dopt.kernel.equations import compiled_equations
 from dopt.systems import CoupledPendulums
 from dopt.systems.coupled_pendulums import LARGEST_ROW
 from dopt.systems.equilibrium import jacobians
+from tests.dopt.systems.compiled import assert_compiled_equations_agree
 from tests.dopt.systems.mechanics import CoupledPendulumsMechanics
 
 
@@ -52,12 +52,7 @@ def test_the_input_turns_the_first_pendulum_alone() -> None:
 @pytest.mark.parametrize("n", [1, 3])
 def test_compiled_equations_are_those_of_a_row_of_that_length(n: int) -> None:
     row, rng = CoupledPendulums(n_pendulums=n), np.random.default_rng(n)
-    (x, u), equations = (rng.normal(size=2 * n), rng.normal(size=1)), compiled_equations(row)
-    p, flow, learned = np.array(row.parameters), np.empty(2 * n), np.empty(n)
-    equations.known(x, u, p, flow)
-    equations.accelerations(x, p, learned)
-    flow[1::2] += learned
-    assert flow == pytest.approx(row.derivative(x, u), rel=1e-11, abs=1e-12)
+    assert_compiled_equations_agree(row, rng.normal(size=2 * n), rng.normal(size=1))
 
 
 def test_what_depends_on_the_number_of_pendulums_follows_it() -> None:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dopt.parameter_error import true_parameters
 from dopt.systems import SYSTEMS, System
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems, vectors
 
@@ -32,6 +33,9 @@ def test_accelerations_are_affine_in_the_linear_parameters(name: str, data: st.D
     point = (*x, *u) if system.reads_inputs else tuple(x)
     expected = np.array(system.accelerations(point, tuple(values.values())))
     assert (offset + psi @ theta) / scale == pytest.approx(expected / scale, abs=1e-12)
+    assert offset + psi @ true_parameters(system) == pytest.approx(
+        system.learned(x[None], inputs=u[None])[0], rel=1e-12, abs=1e-12 * scale.max()
+    )
 
 
 def test_the_linear_parameters_can_be_told_apart_on_the_grid(name: str) -> None:
