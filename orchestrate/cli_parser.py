@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn
 
@@ -69,5 +70,25 @@ def positive(option: str, number: type[int] | type[float]) -> Callable[[str], fl
             kind = "whole number" if number is int else "number"
             raise UsageError(f"{option} is {given!r}, a {kind} above 0 is expected: give one.")
         return value
+
+    return read
+
+
+_TIME = re.compile(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
+
+
+def length_of_time(option: str) -> Callable[[str], float]:
+    """Return the argument type for a time in seconds, such as ``1h30m``, ``55m`` or ``90``."""
+
+    def read(given: str) -> float:
+        found = _TIME.fullmatch(given)
+        hours, minutes, seconds = (
+            (float(part or 0) for part in found.groups()) if found else 3 * [0]
+        )
+        if not (whole := 3600 * hours + 60 * minutes + seconds):
+            raise UsageError(
+                f"{option} is {given!r}, a time such as 55m, 1h30m or 90s is expected: give one."
+            )
+        return whole
 
     return read

@@ -13,6 +13,7 @@ class ExitCode(enum.IntEnum):
     DONE = 0
     SOME_FAILED = 1
     BAD_REQUEST = 2
+    UNFINISHED = 3  # trials are left, for which another worker may be started
     DEFECT = 70  # a bug of the program, with a traceback
     INFRASTRUCTURE = 75
     INTERRUPTED = 130

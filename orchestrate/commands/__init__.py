@@ -5,10 +5,21 @@ A new command is a file with a ``COMMAND`` and a line in ``COMMANDS``.
 
 from __future__ import annotations
 
-from orchestrate.commands import doctor, export, merge, query, retry, show, status, upgrade
+from orchestrate.commands import (
+    doctor,
+    export,
+    merge,
+    query,
+    retry,
+    show,
+    status,
+    upgrade,
+    work,
+)
 from orchestrate.commands.command import Command
 
 COMMANDS: tuple[Command, ...] = (
+    work.COMMAND,
     status.COMMAND,
     show.COMMAND,
     retry.COMMAND,

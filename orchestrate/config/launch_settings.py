@@ -25,6 +25,8 @@ class LaunchSettings:
         Name in :data:`orchestrate.executors.registry.EXECUTORS`.
     store_url
         SQLAlchemy URL of the results database.
+    detach
+        Register the grid and leave; workers run it.
     retry
         Finished trials of the grid that are run again.
     until
@@ -52,6 +54,7 @@ class LaunchSettings:
     executor: str
     store_url: str
     dry_run: bool = False
+    detach: bool = False
     fail_fast: bool = False
     retry: Retry | None = None
     until: Until | None = None
@@ -83,6 +86,7 @@ class LaunchSettings:
             executor=text("executor.name", executor["name"]),
             store_url=text("store.url", section("store", given["store"])["url"]),
             dry_run=flag("launch.dry_run", launch["dry_run"]),
+            detach=flag("launch.detach", launch["detach"]),
             fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
             retry=cast("Retry | None", retry),
             until=until(launch["until"]),

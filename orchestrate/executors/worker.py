@@ -20,10 +20,14 @@ from orchestrate.executors.limits import Limits, die_with_parent, ended_after, l
 from orchestrate.executors.task import run_task
 from orchestrate.executors.worker_environment import pin_threads
 
+HANDLED_BY_DRIVER = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+"""Ctrl-C, and warnings before a preemption, which some batch systems send to every process."""
+
 
 def main(descriptor: int, crash_report: int) -> None:
     """Run chunks until the driver closes the socket."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the driver
+    for number in HANDLED_BY_DRIVER:
+        signal.signal(number, signal.SIG_IGN)
     faulthandler.enable(crash_report)
     die_with_parent()
     pin_threads()

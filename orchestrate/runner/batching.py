@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 
 from dopt.spec.trial import TrialSpec
@@ -27,6 +27,13 @@ class Chunks:
         finish together.
     batch
         Chunk size in trials of one configuration; None cuts by cost.
+
+    Attributes
+    ----------
+    pending
+        Number of chunks that the workers hold; the scheduler keeps it up to date.
+    lone_losses
+        Losses of a whole machine while it ran one trial and the launch no other, by trial.
     """
 
     def __init__(
@@ -35,13 +42,25 @@ class Chunks:
         self._batch = batch
         self._waiting: deque[TrialSpec] = deque()
         self._alone: deque[TrialSpec] = deque()
+        self._exclusive: deque[TrialSpec] = deque()
+        self._exclusive_runs = False
+        self.pending = 0
+        self.lone_losses: Counter[str] = Counter()
         self.add(trials)
         self._seconds = seconds
         self.slots = slots
         self._costs: dict[str, float] = {}
 
     def __len__(self) -> int:
-        return len(self._waiting) + len(self._alone)
+        if self.pending and self._exclusive_runs:
+            return 0
+        return len(self._waiting) + len(self._alone) or (
+            0 if self.pending else len(self._exclusive)
+        )
+
+    def add_exclusive(self, trials: Iterable[TrialSpec]) -> None:
+        """Append trials that run last, and each while no other trial of the launch runs."""
+        self._exclusive.extend(trials)
 
     def add(self, trials: Iterable[TrialSpec], *, alone: bool = False) -> None:
         """Append trials to the queue, each as a chunk of its own if ``alone``."""
@@ -59,9 +78,11 @@ class Chunks:
 
     def next(self) -> list[Task]:
         """Return the next chunk; one trial while the cost of its configuration is unknown."""
-        if self._alone:
-            trial = self._alone.popleft()
-            return [Task(trial.trial_key, trial)]
+        self._exclusive_runs = not (self._alone or self._waiting)
+        for queue in (self._alone, self._exclusive if self._exclusive_runs else ()):
+            if queue:
+                trial = queue.popleft()
+                return [Task(trial.trial_key, trial)]
         if self._batch:
             return self._next_batch(self._batch)
         limit = min(MAX_CHUNK_TRIALS, max(1, len(self._waiting) // (2 * self.slots)))

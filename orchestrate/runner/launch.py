@@ -60,14 +60,30 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
     path = executor_factory(settings).path
     if path != "kernel":
         grid = grid.on_path(path)
-    check_memory(grid, settings)
-    if settings.until and request.single:
+    if not settings.detach:  # workers may run on other machines
+        check_memory(grid, settings)
+    _check_kind(settings, single=request.single)
+    SeedPlan(grid, settings)  # refuses a rule that does not apply to the grid
+    return grid, settings
+
+
+def _check_kind(settings: LaunchSettings, *, single: bool) -> None:
+    """Refuse settings that do not go together, or that only a grid can have."""
+    if settings.until and single:
         raise LaunchError(
             "launch.until chooses among the seeds of a grid, but a single trial is asked for: add "
             "-m and a range such as 'seed=range(100)', or leave launch.until out."
         )
-    SeedPlan(grid, settings)  # refuses a rule that does not apply to the grid
-    return grid, settings
+    if settings.detach and single:
+        raise LaunchError(
+            "launch.detach registers a grid for workers, but a single trial is asked for: add -m, "
+            "or leave launch.detach out."
+        )
+    if settings.detach and settings.until:
+        raise LaunchError(
+            "launch.until looks at results before it asks for more seeds, but launch.detach leaves "
+            "before there are any: leave one of the two out."
+        )
 
 
 def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:

@@ -10,6 +10,8 @@ from orchestrate.records import Failure, RunRecord
 from orchestrate.runner.signals import undisturbed
 from orchestrate.store import (
     Claim,
+    OpenConfig,
+    OpenTrial,
     Registrable,
     Registration,
     Result,
@@ -63,6 +65,18 @@ class RetryingStore:
     def final_losses(self, trial_keys: Sequence[str]) -> dict[str, float]:
         """Return the final loss of those of the trials that are done and did not diverge."""
         return self._persist(lambda: self._store.final_losses(trial_keys))
+
+    def open_configs(self) -> list[OpenConfig]:
+        """Return the configurations that have trials without an outcome."""
+        return self._persist(self._store.open_configs)
+
+    def open_trials(self, config_id: int, size: int, losses: int) -> list[OpenTrial]:
+        """Return some pending trials of a configuration that lost fewer launches."""
+        return self._persist(lambda: self._store.open_trials(config_id, size, losses))
+
+    def suspects(self, losses: int) -> list[OpenTrial]:
+        """Return the pending trials whose launch was lost that often."""
+        return self._persist(lambda: self._store.suspects(losses))
 
     def claim(self, trial_keys: Sequence[str]) -> list[Claim]:
         """Claim the pending ones of the trials, none of which the launch holds."""

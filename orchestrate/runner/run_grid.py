@@ -25,7 +25,7 @@ from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.runner.scheduler import Scheduler
 from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.runner.signals import Interrupt
-from orchestrate.runner.summary import closing, opening
+from orchestrate.runner.summary import closing, opening, registered
 from orchestrate.store import LaunchRecord, Registration, Store, StoreUnavailableError
 
 POLL_OTHER_LAUNCHES_SECONDS = 1.0
@@ -89,14 +89,38 @@ def launch_grid(
     StoreError, InfrastructureError
         If the database or the workers fail; nothing that was committed is lost.
     """
-    executor_factory(settings).check(settings)
     announce = warn or say
+    if settings.detach:
+        return recorded_launch(
+            settings, record, say, announce, lambda store: _leave(store, grid, settings, say)
+        )
+    executor_factory(settings).check(settings)
+    output = Output(say, announce, stream)
+    return recorded_launch(
+        settings, record, say, announce, lambda store: _run(store, grid, settings, work, output)
+    )
+
+
+def recorded_launch(
+    settings: LaunchSettings,
+    record: LaunchRecord,
+    say: Say,
+    warn: Say,
+    body: Callable[[RetryingStore], ExitCode],
+) -> ExitCode:
+    """Run ``body`` as a launch that the database records, alive until it ends.
+
+    Raises
+    ------
+    StoreError, InfrastructureError
+        If the database or the workers fail; claims are released if that is possible.
+    """
     with Store.open(settings.store_url, lease_seconds=settings.lease) as store:
         launch = store.begin_launch(record)
         try:
             with Heartbeat(store, launch, settings.lease):
-                patient = RetryingStore(store, launch, settings.patience, announce)
-                code = _interruptible(patient, grid, settings, work, Output(say, announce, stream))
+                patient = RetryingStore(store, launch, settings.patience, warn)
+                code = _interruptible(patient, body, say)
                 patient.end(_STATES.get(code, "failed"), code)
         except BaseException as error:
             # Try once more to release the claims; the error itself is reported by the caller.
@@ -106,7 +130,11 @@ def launch_grid(
     return code
 
 
-_STATES = {ExitCode.DONE: "done", ExitCode.INTERRUPTED: "interrupted"}
+_STATES = {
+    ExitCode.DONE: "done",
+    ExitCode.INTERRUPTED: "interrupted",
+    ExitCode.UNFINISHED: "interrupted",
+}
 
 
 def _code_of(error: BaseException) -> ExitCode | None:
@@ -119,16 +147,12 @@ def _code_of(error: BaseException) -> ExitCode | None:
 
 
 def _interruptible(
-    store: RetryingStore,
-    grid: Grid,
-    settings: LaunchSettings,
-    work: Work,
-    output: Output,
+    store: RetryingStore, body: Callable[[RetryingStore], ExitCode], say: Say
 ) -> ExitCode:
     try:
-        return _run(store, grid, settings, work, output)
+        return body(store)
     except KeyboardInterrupt:
-        output.say("stopped: committed trials are kept; run the same command again to continue")
+        say("stopped: committed trials are kept; run the same command again to continue")
         return ExitCode.INTERRUPTED
 
 
@@ -139,9 +163,7 @@ def _run(
     work: Work,
     output: Output,
 ) -> ExitCode:
-    store.recover()
-    if settings.retry:
-        store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
+    _free(store, grid, settings)
     plan, tally = SeedPlan(grid, settings), Tally(0)
     stages = _open_stages(store, plan, tally, settings, output.say)
     first = next(stages, None)
@@ -152,6 +174,20 @@ def _run(
     if plan.adaptive and not tally.left:
         output.say(plan.report())
     return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
+
+
+def _leave(store: RetryingStore, grid: Grid, settings: LaunchSettings, say: Say) -> ExitCode:
+    """Register the grid for workers."""
+    _free(store, grid, settings)
+    say(registered(grid, store.register(grid.trials), store.safe_url))
+    return ExitCode.DONE
+
+
+def _free(store: RetryingStore, grid: Grid, settings: LaunchSettings) -> None:
+    """Put the trials of dead launches, and those to be run again, back to pending."""
+    store.recover()
+    if settings.retry:
+        store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
 
 
 def _open_stages(
@@ -180,8 +216,7 @@ def _run_stages(
     compiled = any(trial.config.path == "kernel" for trial in grid.trials)
     prepare = work.prepare if compiled else None
     if prepare:
-        with _announced_if_slow(COMPILING, output.warn):
-            prepare()
+        prepare_workers(prepare, output.warn)
     start = time.monotonic()
     with make_executor(settings, work.run, prepare) as executor, Interrupt() as stop:
         chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
@@ -195,6 +230,12 @@ def _run_stages(
                 break
     output.say(closing(tally, scheduler.failures, stop.stop_requested, time.monotonic() - start))
     return stop.stop_requested and tally.left > 0
+
+
+def prepare_workers(prepare: Prepare, warn: Say) -> None:
+    """Compile the kernel, or load it."""
+    with _announced_if_slow(COMPILING, warn):
+        prepare()
 
 
 @contextmanager

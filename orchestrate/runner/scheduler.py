@@ -18,12 +18,20 @@ from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.store import Claim, InvalidResultError
 
 POLL_SECONDS = 0.2
+NODE_LOST = "node lost"
 
 MAX_WORKER_LOSSES = 2
 """Worker deaths while a trial runs alone after which the trial fails."""
 
-MAX_NODE_LOSSES = 5
-"""Losses of a whole node after which a trial that ran there fails."""
+SUSPECT_LOSSES = 3
+"""Losses of a whole machine, or of a launch, after which a trial runs while no other one does.
+
+A preemption takes all trials of a machine, and which trial it finds there is chance: its losses
+never count. A trial that takes its machine down is the only one left when nothing runs beside it.
+"""
+
+MAX_LONE_LOSSES = 10
+"""Losses of a whole machine that ran only this trial after which the trial fails."""
 
 
 class Stop(Protocol):
@@ -76,14 +84,17 @@ class Scheduler:
 
     def _fill(self) -> None:
         self.chunks.slots = self.executor.slots
-        while not self.ending and len(self.chunks) and self.executor.pending < self._window:
-            tasks = self.chunks.next()
+        while not self.ending and self.executor.pending < self._window:
+            self.chunks.pending = self.executor.pending
+            tasks = self.chunks.next() if len(self.chunks) else []
+            if not tasks:
+                return
             claims = self.store.claim([task.key for task in tasks])
             held = {claim.trial_key: claim for claim in claims}
             self.owned_by_others += len(tasks) - len(held)
             mine = [task for task in tasks if task.key in held]
             self._running |= {task.key: (held[task.key], task.spec) for task in mine}
-            self.executor.submit(mine)
+            self.executor.submit([task for task in mine if not self._give_up(task.key)])
 
     @property
     def _window(self) -> int:
@@ -125,37 +136,50 @@ class Scheduler:
             self.owned_by_others += 1
 
     def _recover(self, lost: WorkerLost) -> None:
-        """Queue lost trials again, each alone; fail those that were lost too often."""
-        counts = self._node_losses if lost.node_lost else self._crash_counts
-        if lost.node_lost or len(lost.keys) == 1:
-            counts.update(lost.keys)
-        limit = _max_losses(lost)
-        again = [key for key in lost.keys if counts[key] < limit]
-        held = {key: self._running.pop(key) for key in lost.keys}
-        if again:
-            self.store.release(again, _cause(lost))
-            self.chunks.add((held[key][1] for key in again), alone=not lost.node_lost)
-        for key in held.keys() - again:
-            self._fail(held[key][0], _loss_failure(lost, limit), _last_run(lost))
+        """Queue the trials of a process that died, each alone; fail those that killed it twice."""
+        if lost.node_lost:
+            self._recover_node(lost)
+            return
+        if len(lost.keys) == 1 and not self.stop.stop_requested:  # a kill may belong to the stop
+            self._crash_counts.update(lost.keys)
+        limit = 1 if lost.cause == "timeout" else MAX_WORKER_LOSSES
+        again = [key for key in lost.keys if self._crash_counts[key] < limit]
+        self.chunks.add(self._release(again, lost.cause), alone=True)
+        for key in set(lost.keys) - set(again):
+            self._fail(self._running.pop(key)[0], _loss_failure(lost, limit), _last_run(lost))
 
+    def _recover_node(self, lost: WorkerLost) -> None:
+        """Queue the trials of a lost machine; fail one that was alone there too often."""
+        self._node_losses.update(lost.keys)
+        if len(self._running) == 1:
+            self.chunks.lone_losses.update(lost.keys)
+        again = [key for key in lost.keys if not self._give_up(key, lost)]
+        suspects = [key for key in again if self._node_losses[key] >= SUSPECT_LOSSES]
+        self.chunks.add(self._release([key for key in again if key not in suspects], NODE_LOST))
+        self.chunks.add_exclusive(self._release(suspects, NODE_LOST))
 
-def _max_losses(lost: WorkerLost) -> int:
-    """Return the number of losses of this kind after which a trial fails."""
-    if lost.node_lost:
-        return MAX_NODE_LOSSES
-    return 1 if lost.cause == "timeout" else MAX_WORKER_LOSSES
+    def _release(self, keys: Sequence[str], cause: str) -> list[TrialSpec]:
+        if keys:
+            self.store.release(keys, cause)
+        return [self._running.pop(key)[1] for key in keys]
 
-
-def _cause(lost: WorkerLost) -> str:
-    return "node lost" if lost.node_lost else lost.cause
+    def _give_up(self, key: str, lost: WorkerLost | None = None) -> bool:
+        """Fail a trial that took its machine down too often; return whether it did."""
+        if self.chunks.lone_losses[key] < MAX_LONE_LOSSES:
+            return False
+        lost = lost or WorkerLost((key,), "no sign of life", node_lost=True)
+        failure = _loss_failure(lost, self.chunks.lone_losses[key])
+        self._fail(self._running.pop(key)[0], failure, _last_run(lost))
+        return True
 
 
 def _loss_failure(lost: WorkerLost, times: int) -> Failure:
     if lost.cause == "timeout":
         return Failure("TrialTimeoutError", lost.reason, lost.traceback, lost.cause)
-    lost_part = "node was lost" if lost.node_lost else "worker died"
-    message = f"{lost_part} {_times(times)} while running this trial (last: {lost.reason})"
-    return Failure("WorkerLost", message, lost.traceback, _cause(lost))
+    lost_part, only = ("node was lost", " only") if lost.node_lost else ("worker died", "")
+    message = f"{lost_part} {_times(times)} while running{only} this trial (last: {lost.reason})"
+    cause = NODE_LOST if lost.node_lost else lost.cause
+    return Failure("WorkerLost", message, lost.traceback, cause)
 
 
 def _times(count: int) -> str:

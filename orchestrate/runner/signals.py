@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+FINISHING = "\nCtrl-C: finishing running trials; press again to stop immediately\n"
 
 MAX_HELD_SIGNALS = 3
 """Signals during one undisturbed block after which it is interrupted."""
@@ -25,12 +26,16 @@ class Interrupt:
         At the second signal.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self, signals: Sequence[signal.Signals] = SIGNALS, notice: str = FINISHING
+    ) -> None:
         self.stop_requested = False
+        self._signals = signals
+        self._notice = notice
         self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
-        self._before = {number: signal.signal(number, self._handle) for number in SIGNALS}
+        self._before = {number: signal.signal(number, self._handle) for number in self._signals}
         return self
 
     def __exit__(
@@ -44,9 +49,7 @@ class Interrupt:
             raise KeyboardInterrupt
         self.stop_requested = True
         with suppress(RuntimeError):  # the signal arrived while this stream was being written
-            sys.stderr.write(
-                "\nCtrl-C: finishing running trials; press again to stop immediately\n"
-            )
+            sys.stderr.write(self._notice)
 
 
 @contextmanager
@@ -70,7 +73,9 @@ def undisturbed() -> Iterator[None]:
         if len(held) == MAX_HELD_SIGNALS:
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, hold) for number in SIGNALS}
+    # SIGUSR1 belongs to whoever uses it, but for a handler that is set as ours are.
+    used = [signal.SIGUSR1] if callable(signal.getsignal(signal.SIGUSR1)) else []
+    before = {number: signal.signal(number, hold) for number in (*SIGNALS, *used)}
     try:
         yield
     finally:

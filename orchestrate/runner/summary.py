@@ -13,13 +13,31 @@ MAX_LISTED_CAUSES = 3
 """Causes of failure that the summary lists."""
 
 
+def registered(grid: Grid, state: Registration, url: str) -> str:
+    """Return the counts of a grid that was registered for workers, and the command of a worker."""
+    lines = [*left_out(grid), f"{state.done + state.diverged:,} of {state.total:,} already done"]
+    if state.failed:
+        lines[-1] += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
+    if state.running_elsewhere:
+        lines[-1] += f", {state.running_elsewhere:,} running"
+    lines[-1] += f", {len(state.todo):,} registered; start workers with "
+    lines[-1] += f"python -m orchestrate work --db {url}"
+    return "\n".join(lines)
+
+
+def left_out(grid: Grid) -> list[str]:
+    """Return a line for each reason to leave out trials, and one for repeated jobs."""
+    lines = [f"left out {count:,} trials: {reason}" for reason, count in grid.left_out.items()]
+    if grid.repeats:
+        lines.append(f"{grid.repeats:,} of {grid.n_jobs:,} jobs name a trial of the grid again")
+    return lines
+
+
 def opening(
     grid: Grid, state: Registration, settings: LaunchSettings, url: str, heading: str = ""
 ) -> str:
     """Return the counts of trials to run, done, failed and left out, after the stage's heading."""
-    lines = [f"left out {count:,} trials: {reason}" for reason, count in grid.left_out.items()]
-    if grid.repeats:
-        lines.append(f"{grid.repeats:,} of {grid.n_jobs:,} jobs name a trial of the grid again")
+    lines = left_out(grid)
     counted = f"{state.done + state.diverged:,} of {state.total:,} already done"
     if state.failed:
         counted += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
@@ -41,4 +59,15 @@ def closing(tally: Tally, failures: Counter[str], stop_requested: bool, seconds:
     if tally.left:
         why = "interrupted" if stop_requested else "stopped at the first failure"
         lines.append(f"{why}, {tally.left:,} left: run the same command again to continue")
+    return "\n".join(lines)
+
+
+def worked(tally: Tally, failures: Counter[str], left: int, seconds: float) -> str:
+    """Return the counts of outcomes of a worker, and the number of trials left to others."""
+    lines = [
+        f"{tally.done + tally.diverged:,} trials done, {tally.diverged:,} of them diverged, "
+        f"{tally.failed:,} failed, in {duration(seconds)}; {left:,} left"
+    ]
+    for cause, count in failures.most_common(MAX_LISTED_CAUSES):
+        lines.append(f"{count:,} failed: {cause}")
     return "\n".join(lines)

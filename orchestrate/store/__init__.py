@@ -23,6 +23,7 @@ from orchestrate.store.errors import (
 from orchestrate.store.merging.merge import Merged, TrialName, merge
 from orchestrate.store.migrations.upgrade import Upgrade, upgrade
 from orchestrate.store.read.explorations import ExplorationRow, explorations
+from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.read.rows import (
     Assessments,
@@ -64,6 +65,8 @@ __all__ = [
     "LaunchRow",
     "Merged",
     "NoDatabaseError",
+    "OpenConfig",
+    "OpenTrial",
     "QueryError",
     "Reader",
     "Registrable",

@@ -9,7 +9,9 @@ from orchestrate.records import Failure, RunRecord
 from orchestrate.store import database_url, schema_version
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, make_backend
+from orchestrate.store.read import open_trials
 from orchestrate.store.read.final_losses import final_losses
+from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
 from orchestrate.store.records import (
     Claim,
     LaunchRecord,
@@ -92,6 +94,24 @@ class Store:
         """Return the final loss of those of the trials that are done and did not diverge."""
         with self._backend.transaction() as connection:
             return final_losses(connection, self._backend, trial_keys)
+
+    def open_configs(self) -> list[OpenConfig]:
+        """Return the configurations that have trials without an outcome."""
+        with self._backend.transaction() as connection:
+            return open_trials.open_configs(connection)
+
+    def open_trials(self, config_id: int, size: int, losses: int) -> list[OpenTrial]:
+        """Return some pending trials of a configuration that lost fewer launches than ``losses``.
+
+        They come in a random order, so that workers rarely choose the same ones.
+        """
+        with self._backend.transaction() as connection:
+            return open_trials.open_trials(connection, config_id, size, losses)
+
+    def suspects(self, losses: int) -> list[OpenTrial]:
+        """Return the pending trials whose launch was lost at least ``losses`` times."""
+        with self._backend.transaction() as connection:
+            return open_trials.suspects(connection, losses)
 
     def claim(self, launch: int, trial_keys: Sequence[str]) -> list[Claim]:
         """Claim those of the trials that are pending, in the given order."""

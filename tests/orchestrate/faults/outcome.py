@@ -47,6 +47,10 @@ _FLAWS = {
     "has an earlier attempt without an end": f"SELECT r.seed FROM {_WITH_ATTEMPTS} "
     "WHERE a.attempt < r.attempt AND (a.outcome IS NULL OR a.ended IS NULL "
     "OR a.outcome NOT IN ('lost', 'released', 'failed'))",
+    "was claimed before its earlier attempt ended": "SELECT r.seed FROM trial r "
+    "JOIN attempt a ON a.trial_id = r.trial_id "
+    "JOIN attempt b ON b.trial_id = a.trial_id AND b.attempt = a.attempt + 1 "
+    "WHERE b.claimed < a.ended",
     "is owned though it does not run": "SELECT r.seed FROM trial r "
     "WHERE (r.status = 'running') <> (r.owner IS NOT NULL)",
 }

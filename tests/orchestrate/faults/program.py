@@ -23,7 +23,8 @@ import psycopg
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.runner import launch
-from orchestrate.runner.run_grid import Work
+from orchestrate.runner.run_grid import Output, Work
+from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
@@ -46,6 +47,8 @@ class Order:
         on PostgreSQL in the middle of what it sends: the steps of a trial, or a claim.
     settings
         Further settings of the launch.
+    worker
+        Settings of a worker, which runs trials that are registered, in place of a launch.
     environment
         Variables of the environment that must be there before the program starts.
     """
@@ -57,6 +60,7 @@ class Order:
     trouble: str = ""
     pause: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    worker: Mapping[str, Any] | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -88,12 +92,23 @@ def _start_anew(order: Order, output: Path) -> None:
 def _launch(order: Order) -> int:
     if order.executor == "ray":
         lean_ray.leave_services_out()
-    launch.WORK = Work(Standin(order.seconds, order.trouble), prepare=lambda: None)
+    work = Work(Standin(order.seconds, order.trouble), prepare=lambda: None)
+    if order.worker is not None:
+        return _pull(order, work)
+    launch.WORK = work
     chosen = {"workers": 2, "chunk_seconds": 0.2, **order.settings}
     settings = LaunchSettings(order.executor, order.url, **chosen)
     request = launch.Request((), {}, (), single=False)
     try:
         return launch.run(request, grid_of(order.trials), settings)
+    except KeyboardInterrupt:
+        return ExitCode.INTERRUPTED
+
+
+def _pull(order: Order, work: Work) -> int:
+    settings = WorkerSettings(order.url, **{"processes": 2, **dict(order.worker or {})})
+    try:
+        return run_worker(settings, Output(launch.say, launch.say, sys.stderr), work)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
 

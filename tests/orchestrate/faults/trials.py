@@ -27,7 +27,8 @@ MEBIBYTE = 2**20
 class Standin:
     """A run of ``seconds``; ``trouble`` is what the trial with the broken seed does besides.
 
-    "kill" ends its worker, "hang" never returns, "memory" takes more and more memory.
+    "kill" ends its process, "kill worker" the one that started it, "hang" never returns, "memory"
+    takes more and more memory.
     """
 
     seconds: float
@@ -63,6 +64,11 @@ def _kill() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def _kill_worker() -> None:
+    os.kill(os.getppid(), signal.SIGKILL)
+    rest(3600)
+
+
 def _hang() -> None:
     rest(3600)
 
@@ -75,4 +81,4 @@ def _take_memory() -> None:
         rest(0.01)
 
 
-_TROUBLES = {"kill": _kill, "hang": _hang, "memory": _take_memory}
+_TROUBLES = {"kill": _kill, "kill worker": _kill_worker, "hang": _hang, "memory": _take_memory}

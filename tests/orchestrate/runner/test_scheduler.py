@@ -11,7 +11,7 @@ import pytest
 from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Event, Executor, Task, WorkerLost
 from orchestrate.executors.task import run_task
-from orchestrate.runner.scheduler import MAX_NODE_LOSSES, MAX_WORKER_LOSSES
+from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
 from orchestrate.store import Claim, Store, StoreUnavailableError
 from tests.orchestrate.conftest import Launches
 from tests.orchestrate.losses import lose
@@ -85,8 +85,11 @@ Launch = Callable[..., tuple[ExitCode, Scripted]]
 def test_a_trial_whose_node_is_lost_runs_again_free_of_charge(
     scripted: Launch, launches: Launches
 ) -> None:
+    losses = MAX_LONE_LOSSES - 1
+    assert losses > SUSPECT_LOSSES
+
     def fate(chunk: Sequence[Task], time: int) -> list[Event]:
-        if has_broken(chunk) and time < MAX_NODE_LOSSES:
+        if has_broken(chunk) and time <= losses:
             return [WorkerLost(keys(chunk), "lost its power", node_lost=True)]
         return finish(chunk)
 
@@ -96,10 +99,10 @@ def test_a_trial_whose_node_is_lost_runs_again_free_of_charge(
         "SELECT outcome, count(*) FROM attempt JOIN trial USING (trial_id) "
         f"WHERE seed = {BROKEN_SEED} GROUP BY outcome ORDER BY outcome"
     )
-    assert outcomes == [("done", 1), ("released", MAX_NODE_LOSSES - 1)]
+    assert outcomes == [("done", 1), ("released", losses)]
 
 
-def test_a_trial_that_is_lost_with_every_node_is_given_up(
+def test_a_trial_that_takes_every_node_down_runs_last_and_is_given_up(
     scripted: Launch, launches: Launches
 ) -> None:
     def fate(chunk: Sequence[Task], _: int) -> list[Event]:
@@ -107,14 +110,17 @@ def test_a_trial_that_is_lost_with_every_node_is_given_up(
             return [WorkerLost(keys(chunk), "lost its power", node_lost=True)]
         return finish(chunk)
 
-    assert scripted(fate)[0] == ExitCode.SOME_FAILED
+    code, executor = scripted(fate)
+    assert code == ExitCode.SOME_FAILED
     statuses = launches.statuses()
     assert statuses.pop(BROKEN_SEED) == "failed"
     assert set(statuses.values()) == {"done"}
-    [(cause, message, attempt)] = launches.query("SELECT cause, message, attempt FROM v_failures")
-    assert (cause, attempt) == ("node lost", MAX_NODE_LOSSES)
+    assert executor.given[-MAX_LONE_LOSSES + 1 :] == (MAX_LONE_LOSSES - 1) * [[BROKEN_SEED]]
+    [(cause, message)] = launches.query("SELECT cause, message FROM v_failures")
+    assert cause == "node lost"
     assert message == (
-        f"node was lost {MAX_NODE_LOSSES} times while running this trial (last: lost its power)"
+        f"node was lost {MAX_LONE_LOSSES} times while running only this trial "
+        "(last: lost its power)"
     )
 
 
@@ -122,7 +128,7 @@ def test_the_loss_of_nodes_does_not_count_against_the_attempts(
     scripted: Launch, launches: Launches
 ) -> None:
     def fate(chunk: Sequence[Task], time: int) -> list[Event]:
-        if has_broken(chunk) and time <= MAX_NODE_LOSSES:
+        if has_broken(chunk) and time <= MAX_LONE_LOSSES:
             return [WorkerLost(keys(chunk), "gone", node_lost=time != 2)]
         return finish(chunk)
 

@@ -1,0 +1,111 @@
+"""Workers that pull: whatever happens to them, each trial is run once, and none fails by it."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import pytest
+
+from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES
+from tests.orchestrate.faults.laboratory import Laboratory
+from tests.orchestrate.faults.preemptions import OPEN, preempt
+from tests.orchestrate.faults.trials import BROKEN_SEED
+
+At = Callable[..., Laboratory]
+
+DETACHED = {"settings": {"detach": True}}
+
+
+def register(laboratory: Laboratory) -> None:
+    with laboratory.launched(**DETACHED) as launched:
+        assert launched.end() == 0, launched.errors
+    assert f"{laboratory.order.trials:,} registered; start workers" in launched.said
+    assert laboratory.count("status = 'pending'") == laboratory.order.trials
+
+
+def test_workers_share_a_grid_and_run_nothing_twice(laboratory: Laboratory) -> None:
+    register(laboratory)
+    with ExitStack() as stack:
+        workers = [stack.enter_context(laboratory.launched(worker={})) for _ in range(3)]
+        codes = [worker.end() for worker in workers]
+    assert codes == [0, 0, 0], [worker.errors for worker in workers]
+    laboratory.check()
+    assert laboratory.count("attempt > 1") == 0
+
+
+def test_preempted_workers_lose_and_double_nothing(url: str, laboratory_at: At) -> None:
+    laboratory = laboratory_at(url, 300, seconds=0.05)
+    register(laboratory)
+    sent = preempt(laboratory, workers=3, pause=1.0, chance=random.Random(1), lease=2.0)
+    assert sent.total() >= 2
+    laboratory.check()
+    assert laboratory.count("status = 'failed'") == 0
+
+
+@pytest.mark.parametrize(
+    ("database", "number"), [("sqlite", signal.SIGTERM), ("postgresql", signal.SIGUSR1)]
+)
+def test_a_warned_worker_hands_back_within_five_seconds(
+    request: pytest.FixtureRequest, laboratory_at: At, database: str, number: signal.Signals
+) -> None:
+    laboratory = laboratory_at(request.getfixturevalue(f"{database}_url"))
+    register(laboratory)
+    with laboratory.launched(worker={}, seconds=600.0) as worker:
+        worker.until(lambda: laboratory.count("status = 'running'") > 0)
+        worker.send(number)
+        start = time.monotonic()
+        assert worker.end() == 130, worker.errors
+        assert time.monotonic() - start < 5.0
+    assert laboratory.count("status = 'pending'") == laboratory.order.trials
+    assert laboratory.query("SELECT DISTINCT outcome, cause FROM attempt") == [("released", None)]
+    assert "Traceback" not in worker.errors
+
+
+def test_a_worker_holds_nothing_at_the_end_of_its_time(sqlite_url: str, laboratory_at: At) -> None:
+    laboratory = laboratory_at(sqlite_url, 2000, seconds=0.05)
+    register(laboratory)
+    start = time.monotonic()
+    with laboratory.launched(worker={"seconds": 4.0}) as worker:
+        assert worker.end() == 3, worker.errors
+    assert time.monotonic() - start < 10.0
+    assert laboratory.count() > 0
+    assert laboratory.count("status = 'running'") == 0
+    assert laboratory.query("SELECT outcome FROM attempt WHERE outcome = 'released'") == []
+    laboratory.check_whole()
+
+
+def test_a_trial_that_kills_its_process_fails_and_stops_no_other(
+    sqlite_url: str, laboratory_at: At
+) -> None:
+    laboratory = laboratory_at(sqlite_url, 20, seconds=0.01, trouble="kill")
+    register(laboratory)
+    with laboratory.launched(worker={}) as worker:
+        assert worker.end() == 1, worker.errors
+    [(seed, attempt, cause)] = laboratory.query("SELECT seed, attempt, cause FROM v_failures")
+    assert (seed, cause) == (BROKEN_SEED, "killed")
+    assert attempt >= MAX_WORKER_LOSSES
+    laboratory.check_whole()
+
+
+def test_a_trial_that_kills_its_worker_runs_alone_and_stops_in_the_end(
+    sqlite_url: str, laboratory_at: At
+) -> None:
+    """As where a limit of memory ends all processes of a job together."""
+    laboratory = laboratory_at(sqlite_url, 20, seconds=0.01, trouble="kill worker")
+    register(laboratory)
+    codes = []
+    while laboratory.count(OPEN):
+        with laboratory.launched(worker={}) as worker:
+            codes.append(worker.end())
+        assert len(codes) <= 2 * MAX_LONE_LOSSES, worker.said + worker.errors
+    assert codes[:-1] == [-signal.SIGKILL] * (len(codes) - 1)
+    assert codes[-1] == 1
+    assert len(codes) > MAX_LONE_LOSSES
+    [(seed, cause, message)] = laboratory.query("SELECT seed, cause, message FROM v_failures")
+    assert (seed, cause) == (BROKEN_SEED, "node lost")
+    assert f"node was lost {MAX_LONE_LOSSES} times while running only this trial" in message
+    assert laboratory.count() == 19
