@@ -17,6 +17,7 @@ from orchestrate.redaction import without_password
 from orchestrate.runner.progress import duration
 from orchestrate.store import ExplorationRow, LaunchRow
 
+WORK = "python -m orchestrate work"
 _NAMES = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
 _CONFIG = ("config_key", *_NAMES, "n", *(f"n_{state}" for state in STATES))
 _LAUNCH = ("launch_id", "alive", "host", "pid", "started", "argv")
@@ -51,11 +52,14 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
         yield from map(_failure, status.failures[:_MAX_KINDS])
         if len(status.failures) > _MAX_KINDS:
             yield Text(f"  and {len(status.failures) - _MAX_KINDS:,} other kinds")
-    if status.launches:
+    detached = status.detached if status.left else ()
+    if status.launches or detached:
         yield Text("\nLaunches", style="bold")
+        yield from map(_detached, detached)
         yield from map(_launch, status.launches)
-    elif status.left:
-        yield Text("\nNo launch is running: run the same launch command again to continue.")
+    if status.left and not status.launches:
+        again = f"start workers with {WORK}" if detached else "run the same launch command again"
+        yield Text(f"\nNo {'worker' if detached else 'launch'} is running: {again} to continue.")
 
 
 def _exploration(one: ExplorationRow) -> Text:
@@ -75,17 +79,22 @@ def _failure(kind: FailureKind) -> Text:
     return text
 
 
+def _detached(launch: LaunchRow) -> Text:
+    since = f"{launch.started[:19]}Z"
+    return Text(f"  {launch.launch_id} on {launch.host}, {since}: registered a grid for workers")
+
+
 def _launch(launch: LaunchRow) -> Text:
     age = duration(max(0.0, seconds_since(launch.started, datetime.now(UTC))))
     since = f"{launch.started[:19]}Z"
     where = f"  {launch.launch_id} on {launch.host}, process {launch.pid}, since {since}"
+    worker = "work" in launch.argv[1:2]
     if launch.alive:
-        return Text(f"{where}: alive for {age}")
-    return (
-        Text(f"{where}: ")
-        .append("dead", style="red")
-        .append("; run the same launch command again to continue")
-    )
+        return Text(f"{where}: {'worker, ' if worker else ''}alive for {age}")
+    hint = "run the same launch command again to continue"
+    if worker:
+        hint = "other workers take its trials"
+    return Text(f"{where}: ").append("dead", style="red").append(f"; {hint}")
 
 
 def document(status: Status, database: str) -> dict[str, Any]:
@@ -105,6 +114,7 @@ def document(status: Status, database: str) -> dict[str, Any]:
             for kind in status.failures
         ],
         "launches": launches,
+        "detached": [one.launch_id for one in status.detached],
         "explorations": [asdict(one) for one in status.explorations],
     }
 

@@ -18,6 +18,8 @@ RATE_WINDOW_SECONDS = 300.0
 STATES = ("done", "diverged", "failed", "cancelled", "running", "pending")
 """Statuses of a trial in the order of display."""
 
+DETACHED = "launch.detach=true"
+
 _FAILURES = """
 SELECT c.config_key, a.cause, a.error_id, e.type, e.message, count(*) AS attempts,
        sum(CASE WHEN r.status = 'failed' AND r.attempt = a.attempt THEN 1 ELSE 0 END) AS trials
@@ -87,6 +89,8 @@ class Status:
         Launches recorded as running, including dead ones.
     rate
         Trials per second of the living launches over the last minutes.
+    detached
+        Launches that registered a grid for workers and left.
     explorations
         Explorations that were saved; they count as done or diverged.
     """
@@ -96,6 +100,7 @@ class Status:
     launches: Sequence[LaunchRow]
     rate: float
     explorations: Sequence[ExplorationRow] = ()
+    detached: Sequence[LaunchRow] = ()
 
     @property
     def counts(self) -> Counter[str]:
@@ -130,13 +135,15 @@ def gather(reader: Reader, configs: Sequence[ConfigRow], kinds: int = 10) -> Sta
     ``reader`` is the snapshot from which ``configs`` were read.
     """
     by_key = {config.config_key: config for config in configs}
-    running = [launch for launch in reader.launches() if launch.state == "running"]
+    launches = reader.launches()
+    running = [launch for launch in launches if launch.state == "running"]
+    detached = [launch for launch in launches if DETACHED in launch.overrides]
     failures = _failures(reader, by_key)
     for kind in failures[:kinds]:
         if kind.error_id is not None:
             kind.traceback = str(reader.rows(_TRACEBACK, error_id=kind.error_id)[0][0])
     explored = [one for one in explorations(reader) if one.config_key in by_key]
-    return Status(configs, failures, running, _rate(reader, by_key, running), explored)
+    return Status(configs, failures, running, _rate(reader, by_key, running), explored, detached)
 
 
 def _failures(reader: Reader, by_key: dict[str, ConfigRow]) -> list[FailureKind]:

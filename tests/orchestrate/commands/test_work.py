@@ -1,0 +1,111 @@
+"""``work``: the command line of a worker, and a launch that leaves its grid to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dopt.spec.trial import TrialSpec
+from orchestrate.__main__ import main
+from orchestrate.cli_parser import UsageError, length_of_time
+from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.runner import worker
+from orchestrate.runner.run_grid import Work
+from tests.orchestrate.standins import raising
+
+GRID = ("-m", "env=pendulum", "policy=random,uniform", "seed=range(3)", "env.horizon=5")
+LEAVE = "launch.detach=true"
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def pull(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Run:
+    """Return a function that runs commands, and trials of stand-ins in this process."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DOPT_DB", raising=False)
+    monkeypatch.setattr(worker, "WORK", Work(raising, prepare=lambda: None))
+    monkeypatch.setattr(worker, "make_executor", lambda _, run: InProcessExecutor(run))
+
+    def run(*words: str) -> tuple[int, str, str]:
+        code = main(words)
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return run
+
+
+def test_a_launch_leaves_its_grid_to_workers(command_line: Run, pull: Run) -> None:
+    code, said, _ = command_line(*GRID, LEAVE)
+    assert code == 0
+    assert "0 of 6 already done, 6 registered; start workers with" in said
+    _, out, _ = pull("status")
+    assert "registered a grid for workers" in out
+    assert "No worker is running: start workers with python -m orchestrate work" in out
+    code, out, _ = pull("work", "--until", "5m")
+    assert (code, out.splitlines()[0].split(",")[0]) == (1, "6 trials wait")
+    assert "4 trials done, 0 of them diverged, 2 failed" in out
+    assert "2 failed: ZeroDivisionError" in out
+    assert pull("work")[0] == 0
+    assert "registered a grid for workers" not in pull("status")[1]
+
+
+def test_a_launch_that_left_and_is_repeated_says_what_is_done(command_line: Run, pull: Run) -> None:
+    command_line(*GRID, LEAVE)
+    pull("work")
+    _, said, _ = command_line(*GRID, LEAVE, "launch.retry=failed")
+    assert "4 of 6 already done, 2 registered" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("env=pendulum", LEAVE), "launch.detach registers a grid"),
+        ((*GRID, LEAVE, "launch.until=ci<5%"), "leave one of the two out"),
+    ],
+)
+def test_what_does_not_go_with_leaving_is_refused(
+    command_line: Run, words: tuple[str, ...], named: str
+) -> None:
+    code, _, err = command_line(*words)
+    assert code == 2
+    assert named in err
+
+
+def test_a_worker_makes_no_database(pull: Run, tmp_path: Path) -> None:
+    code, _, err = pull("work")
+    assert code == 2
+    assert "error: " in err
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "seconds"), [("55m", 3300.0), ("1h30m", 5400.0), ("90", 90.0), ("0.5s", 0.5)]
+)
+def test_a_length_of_time(given: str, seconds: float) -> None:
+    assert length_of_time("--until")(given) == seconds
+
+
+@pytest.mark.parametrize("given", ["", "m", "5x", "-3m", "0"])
+def test_a_wrong_length_of_time_is_refused(given: str) -> None:
+    with pytest.raises(UsageError, match="such as 55m"):
+        length_of_time("--until")(given)
+
+
+def test_every_trial_is_rebuilt_as_it_was_registered(command_line: Run, pull: Run) -> None:
+    ran: list[TrialSpec] = []
+
+    def run(spec: TrialSpec) -> object:
+        ran.append(spec)
+        return raising(spec)
+
+    worker.WORK = Work(run, prepare=lambda: None)  # type: ignore[arg-type]
+    command_line(*GRID, LEAVE)
+    pull("work")
+    assert len({spec.trial_key for spec in ran}) == 6
+    _, out, _ = pull("query", "SELECT trial_key FROM trial", "--json")
+    assert all(spec.trial_key in out for spec in ran)
