@@ -79,14 +79,14 @@ def merge(url: str, other_url: str) -> Merged:
     merged = Merged()
     with Reader.open(other_url) as reader, reader.moment() as moment, Store.open(url) as store:
         store.recover()
-        source = Source(moment)
+        source, configs = Source(moment), dict[str, int]()
         with store._backend.transaction() as connection:
             store._backend.exclusive(connection)
             launches, merged.launches = add_launches(connection, source.launches())
         for page in source.pages():
             with store._backend.transaction() as connection:
                 store._backend.exclusive(connection)
-                target = Target(connection, store._backend, source, launches)
+                target = Target(connection, store._backend, source, launches, configs)
                 found = _merge_page(target, source, page)
             _count(merged, found)
     return merged

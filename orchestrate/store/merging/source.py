@@ -35,12 +35,10 @@ _ASSESSMENTS = (
 )
 # All trials of a configuration have the same number of assessments, but for explorations.
 _EXPECTED = (
-    "SELECT max(n) FROM (SELECT count(*) AS n FROM assessment a "
-    "JOIN trial r ON r.trial_id = a.trial_id JOIN trial o ON o.config_id = r.config_id "
-    "JOIN config c ON c.config_id = o.config_id "
-    "WHERE o.trial_id = :trial_id AND o.status = 'done' AND r.status = 'done' "
-    f"AND c.config_json NOT LIKE '{PREQUENTIAL}' "
-    "GROUP BY a.trial_id) AS counts"
+    "SELECT config_id, max(n) FROM (SELECT r.config_id, count(*) AS n FROM assessment a "
+    "JOIN trial r ON r.trial_id = a.trial_id JOIN config c ON c.config_id = r.config_id "
+    f"WHERE r.status = 'done' AND c.config_json NOT LIKE '{PREQUENTIAL}' "
+    "GROUP BY a.trial_id, r.config_id) AS counts GROUP BY config_id"
 )
 
 
@@ -67,6 +65,7 @@ class Source:
 
     def __init__(self, moment: Reader) -> None:
         self._moment = moment
+        self._expected = dict(map(tuple, moment.rows(_EXPECTED)))
 
     def launches(self) -> list[dict[str, Any]]:
         return self._dicts("SELECT * FROM launch ORDER BY launch_id")
@@ -92,7 +91,11 @@ class Source:
 
     def curve(self, row: dict[str, Any]) -> Curve | None:
         """Return the rows of a trial, or None if some are missing."""
-        return curve(self._moment, row["trial_id"], row["n_rows"])
+        found = curve(self._moment, row["trial_id"], row["n_rows"])
+        expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
+        if found is None or expected not in (None, len(found.assessments)):
+            return None
+        return found
 
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
         table = self._moment.rows(sql, **values)
@@ -100,7 +103,7 @@ class Source:
 
 
 def curve(moment: Reader, trial_id: int, n_rows: int) -> Curve | None:
-    """Return the rows of a finished trial, or None if some are missing."""
+    """Return the rows of a finished trial, or None if steps or the trajectory are missing."""
     steps = np.array(list(moment.rows(_STEPS, trial_id=trial_id)), dtype=np.float64)
     arrays = moment.rows("SELECT * FROM trajectory WHERE trial_id = :id", id=trial_id)
     if (
@@ -110,9 +113,6 @@ def curve(moment: Reader, trial_id: int, n_rows: int) -> Curve | None:
     ):
         return None
     assessments = [tuple(row) for row in moment.rows(_ASSESSMENTS, trial_id=trial_id)]
-    ((expected,),) = moment.rows(_EXPECTED, trial_id=trial_id)
-    if expected is not None and len(assessments) != expected:
-        return None
     row = dict(zip(arrays.columns, arrays[0], strict=True))
     del row["trial_id"]
     packed = {key: _bytes(value) for key, value in row.items()}

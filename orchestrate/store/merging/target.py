@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, delete, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.growth import steps_ahead, unpacked
@@ -29,6 +29,10 @@ _NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
 _ASSESSMENTS = select(assessment.c.t, assessment.c.measure, assessment.c.value).order_by(
     assessment.c.t, assessment.c.measure
 )
+_INSERT_TRIAL = insert(trial).returning(trial.c.trial_id)
+_UPDATE_TRIAL = update(trial).where(trial.c.trial_id == bindparam("here"))
+_INSERT_ATTEMPT = insert(attempt)
+_INSERT_TRAJECTORY = insert(trajectory_table)
 _STEPS = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
 
 
@@ -36,12 +40,18 @@ class Target:
     """Transaction of a merge."""
 
     def __init__(
-        self, connection: Connection, backend: Backend, source: Source, launches: Mapping[int, int]
+        self,
+        connection: Connection,
+        backend: Backend,
+        source: Source,
+        launches: Mapping[int, int],
+        configs: dict[str, int],
     ) -> None:
         self._connection = connection
         self._backend = backend
         self._source = source
         self._launches = launches
+        self._configs = configs  # config_id here by key, filled on the way
 
     def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
         """Return the trials with these keys, locked until the end of the transaction."""
@@ -77,9 +87,7 @@ class Target:
         self._write_attempts(trial_id, 0 if here is None else here.attempt, attempts)
         if curve is not None:
             self._backend.insert_steps(self._connection, trial_id, curve.steps)
-            self._connection.execute(
-                insert(trajectory_table), {"trial_id": trial_id, **curve.trajectory}
-            )
+            self._connection.execute(_INSERT_TRAJECTORY, {"trial_id": trial_id, **curve.trajectory})
             self._write_assessments(trial_id, curve)
 
     def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
@@ -131,13 +139,11 @@ class Target:
         values["launch_id"] = self._launches.get(row["launch_id"])
         values["error_id"] = self._error(row["error_hash"])
         if here is not None:
-            where = trial.c.trial_id == here.trial_id
-            self._connection.execute(update(trial).where(where).values(values))
+            self._connection.execute(_UPDATE_TRIAL, {"here": here.trial_id, **values})
             return int(here.trial_id)
         values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
         values["config_id"] = self._config(row["config_key"], row["config_id"])
-        statement = insert(trial).values(values).returning(trial.c.trial_id)
-        return int(self._connection.execute(statement).scalar_one())
+        return int(self._connection.execute(_INSERT_TRIAL, values).scalar_one())
 
     def _write_attempts(
         self, trial_id: int, before: int, attempts: Sequence[Mapping[str, Any]]
@@ -147,9 +153,14 @@ class Target:
             values |= {"trial_id": trial_id, "attempt": number}
             values["launch_id"] = self._launches[row["launch_id"]]
             values["error_id"] = self._error(row["error_hash"])
-            self._connection.execute(insert(attempt), values)
+            self._connection.execute(_INSERT_ATTEMPT, values)
 
     def _config(self, config_key: str, there: int) -> int:
+        if config_key not in self._configs:
+            self._configs[config_key] = self._find_config(config_key, there)
+        return self._configs[config_key]
+
+    def _find_config(self, config_key: str, there: int) -> int:
         statement = select(config.c.config_id).where(config.c.config_key == config_key)
         here = self._connection.execute(statement).scalar()
         if here is None:

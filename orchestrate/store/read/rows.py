@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import namedtuple
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -158,8 +159,13 @@ class Table(list[Any]):
     ) -> None:
         self.columns = tuple(columns)
         self.cut = cut
-        row_type = namedtuple("Row", self.columns, rename=True)  # type: ignore[misc]
-        super().__init__(map(row_type._make, rows))
+        super().__init__(map(_row_type(self.columns)._make, rows))
+
+
+@lru_cache(maxsize=256)
+def _row_type(columns: tuple[str, ...]) -> Any:
+    """Return the named tuple of some columns; making one takes longer than a short query."""
+    return namedtuple("Row", columns, rename=True)
 
 
 @dataclass(frozen=True)
