@@ -188,6 +188,8 @@ def test_every_command_on_results_works(
 ) -> None:
     (tmp_path / "results").mkdir()
     shutil.copy(database.removeprefix("sqlite:///"), tmp_path / "results" / "other.db")
+    (tmp_path / "results" / "shards").mkdir()
+    shutil.copy(tmp_path / "results" / "other.db", tmp_path / "results" / "shards")
     words = tuple("SELECT 1 AS one" if word == "SELECT ..." else word for word in command.words)
     assert typed(Command(command.page, {}, "orchestrate", words))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store import Merged, TrialName, merge
+from orchestrate.store import Merged, TrialName, merge, merge_collected
 
 MAX_LISTED = 10
 """Trials of a kind that are listed; the JSON has all of them."""
@@ -18,18 +18,30 @@ MAX_LISTED = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "other", metavar="OTHER", help="file or URL of the other database, or folder of a bundle"
+        "other",
+        metavar="OTHER",
+        help="file or URL of the other database, or folder of a bundle or of shards",
     )
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
     """Merge and print the counts; exit code 1 if there are conflicts or incomplete trials."""
-    merged = merge(arguments.db, _url(arguments.other))
+    merged = _merge(arguments.db, arguments.other)
     if arguments.json:
         say_json({**_plain(merged), "changed": merged.changed})
     else:
         say("\n".join(_lines(merged)))
     return ExitCode.SOME_FAILED if merged.conflicts or merged.incomplete else ExitCode.DONE
+
+
+def _merge(url: str, other: str) -> Merged:
+    folder = Path(other)
+    if not any(folder.glob("*.db")):  # a bundle has other files
+        return merge(url, _url(other))
+    total = Merged()
+    for merged in merge_collected(url, folder):
+        total.include(merged)
+    return total
 
 
 def _url(text: str) -> str:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from dopt.errors import unknown_name
+from orchestrate.config.share import Share, share
 from orchestrate.config.stopping_rule import Until, until
 from orchestrate.config.value_checks import amount, count, flag, limit, section, text, wrong
+
+SHARD_SUFFIX = ".db"
+"""End of the name of a file that holds a share."""
 
 RETRY = ("failed", "diverged", "all")
 
@@ -27,6 +32,10 @@ class LaunchSettings:
         SQLAlchemy URL of the results database.
     detach
         Register the grid and leave; workers run it.
+    share
+        Part of the grid that this launch runs, or None for the whole grid.
+    collect_in, collect_seconds
+        Folder to which a SQLite database is copied, or None for no copies; time between two copies.
     retry
         Finished trials of the grid that are run again.
     until
@@ -56,6 +65,9 @@ class LaunchSettings:
     dry_run: bool = False
     detach: bool = False
     fail_fast: bool = False
+    share: Share | None = None
+    collect_in: str | None = None
+    collect_seconds: float = 60.0
     retry: Retry | None = None
     until: Until | None = None
     reference: str = "d_optimal"
@@ -79,15 +91,20 @@ class LaunchSettings:
         """
         launch = section("launch", given["launch"])
         executor = section("executor", given["executor"])
+        part = share(launch["share"])
+        place = _place(section("store", given["store"]), part)
         retry = launch["retry"]
         if retry is not None and retry not in RETRY:
             raise unknown_name("launch.retry", retry, RETRY)
         return cls(
             executor=text("executor.name", executor["name"]),
-            store_url=text("store.url", section("store", given["store"])["url"]),
+            store_url=place.url,
             dry_run=flag("launch.dry_run", launch["dry_run"]),
             detach=flag("launch.detach", launch["detach"]),
             fail_fast=flag("launch.fail_fast", launch["fail_fast"]),
+            share=part,
+            collect_in=place.folder,
+            collect_seconds=place.seconds,
             retry=cast("Retry | None", retry),
             until=until(launch["until"]),
             reference=text("launch.reference", launch["reference"]),
@@ -99,6 +116,29 @@ class LaunchSettings:
             ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
             executor_options={key: value for key, value in executor.items() if key != "name"},
         )
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Database of a launch, and the folder and the times of its copies."""
+
+    url: str
+    folder: str | None = None
+    seconds: float = 60.0
+
+
+def _place(store: Mapping[str, Any], part: Share | None) -> _Place:
+    """Return where results go; a store with a folder for copies holds one share of a grid."""
+    url = text("store.url", store["url"])
+    if store.get("folder") is None:
+        return _Place(url)
+    if part is None:
+        raise wrong("launch.share", None, "with store=shards a share such as 3/20")
+    if not url.startswith("sqlite") or not url.endswith(SHARD_SUFFIX):
+        raise wrong("store.url", url, "with store=shards a file such as sqlite:////var/tmp/x.db")
+    file = f"{url.removesuffix(SHARD_SUFFIX)}.{part}.{socket.gethostname()}{SHARD_SUFFIX}"
+    folder = text("store.folder", store["folder"])
+    return _Place(file, folder, amount("store.every", store["every"], "seconds"))
 
 
 def _lease_and_patience(lease: object, patience: object) -> dict[str, float]:

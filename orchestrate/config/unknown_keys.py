@@ -62,7 +62,7 @@ def check_launch(launch: Mapping[str, object], folder: Path) -> None:
     executor = launch["executor"]
     name = executor.get("name") if isinstance(executor, Mapping) else None
     _check("launch", launch["launch"], _read(folder / "config.yaml").get("launch"))
-    _check("store", launch["store"], {"url": None})
+    _check("store", launch["store"], dict.fromkeys(("url", "folder", "every")))
     _check("executor", executor, _read(folder / "executor" / f"{name}.yaml"))
 
 

@@ -60,6 +60,8 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
     path = executor_factory(settings).path
     if path != "kernel":
         grid = grid.on_path(path)
+    if settings.share:
+        grid = grid.only(settings.share.holds)
     if not settings.detach:  # workers may run on other machines
         check_memory(grid, settings)
     _check_kind(settings, single=request.single)
@@ -74,10 +76,17 @@ def _check_kind(settings: LaunchSettings, *, single: bool) -> None:
             "launch.until chooses among the seeds of a grid, but a single trial is asked for: add "
             "-m and a range such as 'seed=range(100)', or leave launch.until out."
         )
-    if settings.detach and single:
+    if single and (settings.detach or settings.share):
+        key = "detach" if settings.detach else "share"
         raise LaunchError(
-            "launch.detach registers a grid for workers, but a single trial is asked for: add -m, "
-            "or leave launch.detach out."
+            f"launch.{key} is for grids, but a single trial is asked for: add -m, or leave "
+            f"launch.{key} out."
+        )
+    if settings.share and (settings.detach or settings.until):
+        key = "detach" if settings.detach else "until"
+        raise LaunchError(
+            f"launch.{key} needs the whole grid in one database, but launch.share takes a part of "
+            "it: leave one of the two out."
         )
     if settings.detach and settings.until:
         raise LaunchError(

@@ -50,6 +50,10 @@ class RetryingStore:
         """The URL without a password."""
         return self._store.safe_url
 
+    def hurry(self) -> None:
+        """Wait no longer for a database that does not answer; a signal handler may call it."""
+        self._seconds = 0.0
+
     def recover(self) -> None:
         """Put the trials of dead launches back to pending."""
         self._persist(self._store.recover)

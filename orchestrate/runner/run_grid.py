@@ -19,6 +19,7 @@ from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Prepare, Run
 from orchestrate.executors.registry import executor_factory, make_executor
 from orchestrate.runner.batching import Chunks
+from orchestrate.runner.collecting import collected
 from orchestrate.runner.heartbeat import Heartbeat
 from orchestrate.runner.progress import Progress, Tally
 from orchestrate.runner.retrying_store import RetryingStore
@@ -115,7 +116,7 @@ def recorded_launch(
     StoreError, InfrastructureError
         If the database or the workers fail; claims are released if that is possible.
     """
-    with Store.open(settings.store_url, lease_seconds=settings.lease) as store:
+    with collected(settings, warn), Store.open(settings.store_url, settings.lease) as store:
         launch = store.begin_launch(record)
         try:
             with Heartbeat(store, launch, settings.lease):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -18,7 +18,7 @@ MAX_HELD_SIGNALS = 3
 
 
 class Interrupt:
-    """Context manager in which the first signal sets ``stop_requested``.
+    """Context manager in which the first signal sets ``stop_requested``, and calls ``at_first``.
 
     Raises
     ------
@@ -27,9 +27,13 @@ class Interrupt:
     """
 
     def __init__(
-        self, signals: Sequence[signal.Signals] = SIGNALS, notice: str = FINISHING
+        self,
+        signals: Sequence[signal.Signals] = SIGNALS,
+        notice: str = FINISHING,
+        at_first: Callable[[], None] = lambda: None,
     ) -> None:
         self.stop_requested = False
+        self._at_first = at_first
         self._signals = signals
         self._notice = notice
         self._before: dict[signal.Signals, Any] = {}
@@ -48,6 +52,7 @@ class Interrupt:
         if self.stop_requested:
             raise KeyboardInterrupt
         self.stop_requested = True
+        self._at_first()
         with suppress(RuntimeError):  # the signal arrived while this stream was being written
             sys.stderr.write(self._notice)
 

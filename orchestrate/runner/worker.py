@@ -153,7 +153,8 @@ def _work(
     if chunks.compiled:
         prepare_workers(work.prepare, output.warn)
     tally = Tally(chunks.left)
-    with make_executor(launch, work.run) as executor, Interrupt(WARNINGS, NOTICE) as interrupt:
+    interrupt = Interrupt(WARNINGS, NOTICE, store.hurry)
+    with make_executor(launch, work.run) as executor, interrupt:
         leave = Leave(interrupt, _length(settings.seconds, start))
         scheduler = Scheduler(store, executor, chunks, tally, leave)
         with Progress(tally, output.progress) as progress:

@@ -42,6 +42,7 @@ from orchestrate.store.records import (
     Result,
 )
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
+from orchestrate.store.shards import collect, merge_collected
 from orchestrate.store.store import Store
 from orchestrate.store.write.explorations import Saved
 
@@ -83,9 +84,11 @@ __all__ = [
     "TrialName",
     "TrialRow",
     "Upgrade",
+    "collect",
     "default_url",
     "examine",
     "explorations",
     "merge",
+    "merge_collected",
     "upgrade",
 ]

@@ -50,7 +50,8 @@ def refuse_network(path: Path, safe_url: str) -> None:
             f"The results database {safe_url} would be on {mount.folder}, a network file system "
             f"({mount.kind}), on which SQLite can lose results, but a disk of this machine is "
             "expected: give a file on one, such as store.url=sqlite:////var/tmp/results.db, and "
-            "copy it afterwards, or use PostgreSQL (store=postgresql), which many machines share."
+            "copy it afterwards, use PostgreSQL (store=postgresql), which many machines share, or "
+            "let each machine write a share of the grid to its own disk (store=shards)."
         )
 
 

@@ -20,7 +20,7 @@ def copy_file(path: Path, version: int) -> Path:
     target = _free_name(f"{path}.v{version}-backup")
     partial = target.with_name(f"{target.name}.partial")
     try:
-        _copy_checked(path, partial)
+        copy_checked(path, partial)
         partial.rename(target)
     except OSError as error:
         raise StoreUnavailableError(
@@ -37,7 +37,8 @@ def _free_name(base: str) -> Path:
     return next(name for name in names if not name.exists())
 
 
-def _copy_checked(path: Path, partial: Path) -> None:
+def copy_checked(path: Path, partial: Path) -> None:
+    """Copy a SQLite database with its log to one file, and check it."""
     partial.unlink(missing_ok=True)
     with (
         contextlib.closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as source,

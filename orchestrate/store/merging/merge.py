@@ -64,6 +64,13 @@ class Merged:
     incomplete: list[TrialName] = field(default_factory=list)
     launches: int = 0
 
+    def include(self, other: Merged) -> None:
+        """Add the counts of one more merge into the same database."""
+        for status, count in other.added.items():
+            self.added[status] = self.added.get(status, 0) + count
+        for name in ("identical", "kept", "running", "launches", "conflicts", "incomplete"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
     @property
     def changed(self) -> bool:
         return bool(self.added or self.launches)

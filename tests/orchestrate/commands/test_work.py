@@ -64,7 +64,7 @@ def test_a_launch_that_left_and_is_repeated_says_what_is_done(command_line: Run,
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("env=pendulum", LEAVE), "launch.detach registers a grid"),
+        (("env=pendulum", LEAVE), "launch.detach is for grids"),
         ((*GRID, LEAVE, "launch.until=ci<5%"), "leave one of the two out"),
     ],
 )

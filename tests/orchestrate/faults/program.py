@@ -25,7 +25,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.runner import launch
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
-from orchestrate.store import Store
+from orchestrate.store import Store, StoreUnavailableError
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
 from tests.orchestrate import lean_ray
@@ -111,6 +111,9 @@ def _pull(order: Order, work: Work) -> int:
         return run_worker(settings, Output(launch.say, launch.say, sys.stderr), work)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
+    except StoreUnavailableError as error:
+        sys.stderr.write(f"{error}\n")
+        return ExitCode.INFRASTRUCTURE
 
 
 def _pause_before_claim(stop: Callable[[], None]) -> None:

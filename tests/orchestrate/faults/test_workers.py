@@ -13,6 +13,7 @@ import pytest
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES
 from tests.orchestrate.faults.laboratory import Laboratory
 from tests.orchestrate.faults.preemptions import OPEN, preempt
+from tests.orchestrate.faults.servers import Server
 from tests.orchestrate.faults.trials import BROKEN_SEED
 
 At = Callable[..., Laboratory]
@@ -63,6 +64,20 @@ def test_a_warned_worker_hands_back_within_five_seconds(
     assert laboratory.count("status = 'pending'") == laboratory.order.trials
     assert laboratory.query("SELECT DISTINCT outcome, cause FROM attempt") == [("released", None)]
     assert "Traceback" not in worker.errors
+
+
+def test_a_warned_worker_does_not_wait_for_its_database(server: Server, laboratory_at: At) -> None:
+    laboratory = laboratory_at(server.new_url())
+    register(laboratory)
+    with laboratory.launched(worker={}, seconds=600.0) as worker:
+        worker.until(lambda: laboratory.count("status = 'running'") > 0)
+        server.stop()
+        try:
+            worker.send(signal.SIGTERM)
+            assert worker.end() == 75, worker.said
+        finally:
+            server.start()
+    assert "cannot be used" in worker.errors
 
 
 def test_a_worker_holds_nothing_at_the_end_of_its_time(sqlite_url: str, laboratory_at: At) -> None:

@@ -1,0 +1,57 @@
+"""Regular copies of the database of a share to the folder in which all shares are collected."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.store import StoreError, collect, merge_collected
+
+
+@contextmanager
+def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator[None]:
+    """Copy the database of the block every ``collect_seconds``, and once more after it.
+
+    What earlier launches of the share have collected, perhaps on machines that are gone, is merged
+    before the block. Without a folder nothing is copied.
+
+    Raises
+    ------
+    StoreError
+        If the last copy fails; the local database is kept.
+    """
+    if settings.collect_in is None:
+        yield
+        return
+    folder, ended = Path(settings.collect_in), threading.Event()
+    earlier = f"*.{settings.share}.*.db"
+    if any(folder.glob(earlier)):
+        for _ in merge_collected(settings.store_url, folder, earlier):
+            pass
+
+    def copy_regularly() -> None:
+        while not ended.wait(settings.collect_seconds):
+            try:
+                collect(settings.store_url, folder)
+            except StoreError as error:
+                warn(f"the results are not copied yet: {error}")
+
+    thread = threading.Thread(target=copy_regularly, name="collect", daemon=True)
+    thread.start()
+    try:
+        yield
+    except BaseException:
+        _stop(thread, ended)
+        with suppress(StoreError):  # the first error is the one to report
+            collect(settings.store_url, folder)
+        raise
+    _stop(thread, ended)
+    collect(settings.store_url, folder)
+
+
+def _stop(thread: threading.Thread, ended: threading.Event) -> None:
+    ended.set()
+    thread.join()
