@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -10,10 +11,13 @@ from pathlib import Path
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.store import StoreError, collect, merge_collected
 
+REST = 20.0
+"""Least time between two copies, as a multiple of the time that a copy takes."""
+
 
 @contextmanager
 def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator[None]:
-    """Copy the database of the block every ``collect_seconds``, and once more after it.
+    """Copy the database of the block every ``collect_seconds`` or less often, and once after it.
 
     What earlier launches of the share have collected, perhaps on machines that are gone, is merged
     before the block. Without a folder nothing is copied.
@@ -33,11 +37,14 @@ def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator
             pass
 
     def copy_regularly() -> None:
-        while not ended.wait(settings.collect_seconds):
+        pause = settings.collect_seconds
+        while not ended.wait(pause):
+            start = time.monotonic()
             try:
                 collect(settings.store_url, folder)
             except StoreError as error:
                 warn(f"the results are not copied yet: {error}")
+            pause = max(settings.collect_seconds, REST * (time.monotonic() - start))
 
     thread = threading.Thread(target=copy_regularly, name="collect", daemon=True)
     thread.start()

@@ -29,7 +29,8 @@ def register(laboratory: Laboratory) -> None:
     assert laboratory.count("status = 'pending'") == laboratory.order.trials
 
 
-def test_workers_share_a_grid_and_run_nothing_twice(laboratory: Laboratory) -> None:
+def test_workers_share_a_grid_and_run_nothing_twice(postgresql_url: str, laboratory_at: At) -> None:
+    laboratory = laboratory_at(postgresql_url)
     register(laboratory)
     with ExitStack() as stack:
         workers = [stack.enter_context(laboratory.launched(worker={})) for _ in range(3)]
@@ -40,9 +41,9 @@ def test_workers_share_a_grid_and_run_nothing_twice(laboratory: Laboratory) -> N
 
 
 def test_preempted_workers_lose_and_double_nothing(url: str, laboratory_at: At) -> None:
-    laboratory = laboratory_at(url, 300, seconds=0.05)
+    laboratory = laboratory_at(url, 200, seconds=0.05)
     register(laboratory)
-    sent = preempt(laboratory, workers=3, pause=1.0, chance=random.Random(1), lease=2.0)
+    sent = preempt(laboratory, workers=3, pause=0.5, chance=random.Random(1), lease=2.0)
     assert sent.total() >= 2
     laboratory.check()
     assert laboratory.count("status = 'failed'") == 0
@@ -84,10 +85,10 @@ def test_a_warned_worker_does_not_wait_for_its_database(server: Server, laborato
 
 
 def test_a_worker_holds_nothing_at_the_end_of_its_time(sqlite_url: str, laboratory_at: At) -> None:
-    laboratory = laboratory_at(sqlite_url, 2000, seconds=0.05)
+    laboratory = laboratory_at(sqlite_url, 1000, seconds=0.05)
     register(laboratory)
     start = time.monotonic()
-    with laboratory.launched(worker={"seconds": 4.0}) as worker:
+    with laboratory.launched(worker={"seconds": 3.0}) as worker:
         assert worker.end() == 3, worker.errors
     assert time.monotonic() - start < 10.0
     assert laboratory.count() > 0
