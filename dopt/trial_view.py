@@ -35,6 +35,9 @@ class TrialView(ABC):
         less what the model's own step differs from its acceleration there.
     parameters : (q,)
         Parameters θ of the model.
+    tie : (m,)
+        Random direction of step t, of norm 1: the numbers that a compiled policy has in
+        ``randomness.ties[t]``. NaN after the last step.
     """
 
     system: System
@@ -45,6 +48,7 @@ class TrialView(ABC):
     sampled: Array
     accelerations: Array
     parameters: Array
+    tie: Array
 
     @abstractmethod
     def predict(self, states: Array) -> Array:

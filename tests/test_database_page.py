@@ -95,3 +95,14 @@ def test_every_table_and_view_is_described() -> None:
     for name in (*metadata.tables, *VIEWS):
         assert f"`{name}`" in page or name == "alembic_version", name
     assert f"The schema is version {SCHEMA_VERSION}." in page
+
+
+def test_every_column_of_a_view_is_named(sqlite_url: str) -> None:
+    fill(sqlite_url, [])
+    page = PAGES[DATABASE]
+    shared = re.findall(r"`(\w+)`", page.split("Every view has the columns ")[1].split("|")[0])
+    with Reader.open(sqlite_url) as reader:
+        for view in VIEWS:
+            (row,) = re.findall(rf"^\| `{view}` \| [^|]+ \| (.*) \|$", page, flags=re.MULTILINE)
+            found = reader.query(f"SELECT * FROM {view}").columns
+            assert list(found) == [*shared, *re.findall(r"`(\w+)`", row)], view

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from analysis.stats.paired_tests import interval_of_mean
+from analysis.stats.intervals import interval_of_mean
 
 Array = npt.NDArray[np.float64]
 

@@ -22,8 +22,15 @@ Counts = npt.NDArray[np.integer[Any]]
 CONFIDENCE = 0.95
 """Confidence level of every interval."""
 
-RESAMPLES = 1999
+BAND_RESAMPLES = 1999
 """Draws of a bootstrap band: the 2.5 % quantile is then the 50th smallest."""
+
+MEAN_RESAMPLES = 9999
+"""Draws of a bootstrap of one mean."""
+
+FEWEST_BOOTSTRAP_VALUES = 30
+"""Values below which a bootstrap is too narrow (95 % meant, of normal differences: 82 % for 5,
+93.8 % for 20; of exponential ones 89 % for 20); Student's is nearer (91 % of exponential ones)."""
 
 
 class Statistic(StrEnum):
@@ -97,6 +104,23 @@ def band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
     return Band(middle, low, high, n)
 
 
+def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, float]:
+    """Return the interval of the mean of (n,): a BCa bootstrap, Student's for few values."""
+    if len(values) < 2:
+        return float("nan"), float("nan")
+    if np.ptp(values) == 0:
+        return float(values[0]), float(values[0])
+    if len(values) < FEWEST_BOOTSTRAP_VALUES:
+        half = student_quantile(len(values) - 1) * float(standard_error(values))
+        return float(np.mean(values)) - half, float(np.mean(values)) + half
+    from scipy import stats
+
+    found = stats.bootstrap(
+        (values,), np.mean, n_resamples=MEAN_RESAMPLES, confidence_level=CONFIDENCE, rng=rng
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
 def student_quantile(freedom: int) -> float:
     """Return how many standard errors Student's two-sided interval reaches to each side."""
     from scipy.special import stdtrit  # what scipy.stats calls, whose import takes longer
@@ -116,7 +140,7 @@ def _bootstrap(values: Array, statistic: Statistic) -> tuple[Array, Array]:
     counts = _draws(n)
     order = np.argsort(values, axis=0, kind="stable")
     ranked = np.take_along_axis(values, order, axis=0)
-    found = np.empty((RESAMPLES, steps))
+    found = np.empty((BAND_RESAMPLES, steps))
     for t in range(steps):
         weights = _middle_counts(counts[order[:, t]], first, last)
         found[:, t] = ranked[:, t] @ weights.astype(float) / (last - first)
@@ -150,10 +174,10 @@ def _middle(n: int, statistic: Statistic) -> tuple[int, int]:
 
 @functools.lru_cache(maxsize=8)
 def _draws(n: int) -> Counts:
-    """Return how often each trial of n is in each draw of n, (n, RESAMPLES)."""
-    drawn = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
-    counts: Counts = np.zeros((n, RESAMPLES), np.int16 if n < 2**15 else np.int32)
-    np.add.at(counts, (drawn, np.arange(RESAMPLES)[:, None]), 1)
+    """Return how often each trial of n is in each draw of n, (n, BAND_RESAMPLES)."""
+    drawn = np.random.default_rng(0).integers(0, n, (BAND_RESAMPLES, n))
+    counts: Counts = np.zeros((n, BAND_RESAMPLES), np.int16 if n < 2**15 else np.int32)
+    np.add.at(counts, (drawn, np.arange(BAND_RESAMPLES)[:, None]), 1)
     return counts
 
 

@@ -12,15 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from analysis.stats.intervals import CONFIDENCE, standard_error, student_quantile
+from analysis.stats.intervals import interval_of_mean
 
 Array = npt.NDArray[np.float64]
-
-RESAMPLES = 9999
-
-FEWEST_BOOTSTRAP_PAIRS = 30
-"""Pairs below which a bootstrap is too narrow (95 % meant, of normal differences: 82 % for 5 pairs,
-93.8 % for 20; of exponential ones 89 % for 20); Student's is nearer (91 % of exponential ones)."""
 
 
 @dataclass(frozen=True)
@@ -79,23 +73,6 @@ def compare(loss: Array, reference: Array, rng: np.random.Generator) -> Comparis
 def without_ratio(loss: Array, reference: Array) -> int:
     """Return how many pairs of (n,) are in no ratio, as one of the two is not finite."""
     return int(np.sum(~(np.isfinite(loss) & np.isfinite(reference))))
-
-
-def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, float]:
-    """Return the interval of the mean of (n,): a BCa bootstrap, Student's for few values."""
-    if len(values) < 2:
-        return float("nan"), float("nan")
-    if np.ptp(values) == 0:
-        return float(values[0]), float(values[0])
-    if len(values) < FEWEST_BOOTSTRAP_PAIRS:
-        half = student_quantile(len(values) - 1) * float(standard_error(values))
-        return float(np.mean(values)) - half, float(np.mean(values)) + half
-    from scipy import stats
-
-    found = stats.bootstrap(
-        (values,), np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, rng=rng
-    ).confidence_interval
-    return float(found.low), float(found.high)
 
 
 def signed_rank(differences: Array) -> float:

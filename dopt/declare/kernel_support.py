@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Iterable
 from typing import ClassVar
 
 from dopt.declare.validated_fields import Validated
@@ -26,6 +28,14 @@ class KernelSupport(Validated):
             cls.compiled = declaring.__dict__["compiled"] and "name" not in declaring.__dict__
 
 
+def default_path(parts: Iterable[object]) -> str:
+    """Return the path of a trial that names none, from its system, policy, model and learner.
+
+    It is the kernel if each of them, an object or its class, is compiled.
+    """
+    return "kernel" if all(getattr(part, "compiled", False) for part in parts) else "reference"
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class KernelPart(KernelSupport):
     """A policy or a learner: what the kernel runs of it is one compiled function.
@@ -42,10 +52,10 @@ class KernelPart(KernelSupport):
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of most parts, the fields are enough
         """Return the numbers that the function takes, for q parameters and λ of M₀ = λI.
 
-        They are the numeric fields in the order of their declaration, base classes first. Added
-        fields (:func:`dopt.declare.validated_fields.parameter`) are left out: the numbers of a
-        class that is derived from theirs keep their places.
+        They are the numeric fields in the order of their declaration, base classes first; None is
+        NaN. Added fields (:func:`dopt.declare.validated_fields.parameter`) are left out: the
+        numbers of a class that is derived from theirs keep their places.
         """
-        fields = [field for field in dataclasses.fields(self) if not field.metadata.get("added")]
-        values = (getattr(self, field.name) for field in fields)
-        return tuple(float(value) for value in values if isinstance(value, (bool, int, float)))
+        fields = [field for field in self.numeric_fields() if not field.metadata.get("added")]
+        values = [getattr(self, field.name) for field in fields]
+        return tuple(math.nan if value is None else float(value) for value in values)

@@ -97,6 +97,13 @@ class Validated:
             object.__setattr__(self, field.name, _converted(path, field, kinds[field.name], value))
 
     @classmethod
+    def numeric_fields(cls) -> list[dataclasses.Field[Any]]:
+        """Return the fields that hold one number, or one number or None, as declared."""
+        kinds = _kinds(cls)
+        single = {name for name, kind in kinds.items() if kind.type is not str and not kind.listed}
+        return [field for field in dataclasses.fields(cls) if field.name in single]
+
+    @classmethod
     def _path(cls, field: str) -> str:
         return f"{getattr(cls, 'section', 'trial')}.{field}"
 

@@ -47,6 +47,7 @@ class Journal:
 
     def __init__(self, path: Path, fsync: bool) -> None:
         self.path, self._fsync = path.expanduser(), fsync
+        new = [path for path in (self.path, *self.path.parents) if not path.exists()]
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("ab", buffering=0)
@@ -63,6 +64,9 @@ class Journal:
             self._file.close()
             raise
         self._file.truncate(self._size)
+        if fsync:
+            for path in new:
+                _sync_folder(path.parent)
 
     def write(self, event: Event, *, durable: bool) -> None:
         """Append an event; one that is not durable may wait for the next one that is.
@@ -100,6 +104,15 @@ class Journal:
             with contextlib.suppress(OSError):
                 os.fsync(self._file.fileno())
             self._file.close()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put the names of the files in a folder on the disk: a new file is lost without its name."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _lock(file: int, path: Path) -> None:

@@ -142,7 +142,9 @@ class CustomPolicy(ClosedLoop):
 class CompiledPolicy(ClosedLoop):
     """A closed-loop policy whose plan the kernel compiles.
 
-    Derived from CustomPolicy as well, it runs on both paths.
+    Derived from CustomPolicy as well, it runs on both paths. They agree where all that is random in
+    the plan comes from the direction of the step, ``randomness.ties[t]`` here and
+    :attr:`dopt.trial_view.TrialView.tie` there.
 
     The plan is a plain function of numbers and arrays as Numba compiles them; its helpers lie in
     the same module, or are functions of :mod:`dopt.kernel`. Its file is part of a trial's key.

@@ -28,7 +28,7 @@ TITLES: dict[str, str] = {
     "e_optimal": "E-optimal",
     "task": "task-optimal",
 }
-"""The policies of the paper come first. A policy without an entry follows by its name."""
+"""The policies of the paper come first; a user's own policy follows by its name."""
 
 
 def policy_title(policy: str) -> str:

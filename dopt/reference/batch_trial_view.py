@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,8 @@ class BatchTrialView(TrialView):
         self.sampled = _array(batch.sampled_states[index, :t])
         self.accelerations = _array(batch.targets[index, :t])
         self.parameters = _array(self.theta)
+        last = t == self.system.horizon
+        self.tie = np.full(self.system.n_inputs, np.nan) if last else _array(batch.ties[index, t])
 
     def model(self, theta: Tensor, state: Tensor) -> Tensor:
         """Return a_θ(x), (r,), for parameters (q,) and a state (d,), differentiable by torch."""

@@ -1,4 +1,4 @@
-"""Plans of closed-loop policies that only the reference knows, by the class of the policy."""
+"""Plans in torch of closed-loop policies that plan by an algorithm of their own, by class."""
 
 from __future__ import annotations
 

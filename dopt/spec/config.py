@@ -27,13 +27,13 @@ from dopt.systems import SYSTEMS, System
 from dopt.systems.black_box import BlackBox
 
 CODE_VERSION = 1
-"""Raised whenever a change of the code changes the numbers of a trial."""
+"""Version of the numbers of trials, part of every key: increased by a change that alters them."""
 
 ASSESSMENT_VERSION = 2
-"""Raised whenever one changes the numbers of an assessment alone: for trials that have a task."""
+"""Version of the numbers of assessments, part of the keys of trials that have a task."""
 
 CRITERION_VERSION = 2
-"""Raised whenever one changes the plans of searches with a noise variance ρ ≠ 1 alone."""
+"""Version of the plans of searches with a noise variance ρ ≠ 1, part of the keys of such trials."""
 
 _VERSIONS = ("code_version", "assessment_version", "criterion_version")
 
@@ -199,6 +199,7 @@ class TrialConfig:
 
     @functools.cached_property
     def key(self) -> str:
+        """SHA-256 of :attr:`canonical_json`: the key of the configuration, without a seed."""
         return hashlib.sha256(self.canonical_json.encode()).hexdigest()
 
 

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from dopt.control import Control
+from dopt.declare.kernel_support import default_path
 from dopt.declare.registry import SOURCE, TARGET, section_of
 from dopt.declare.validated_fields import Validated
 from dopt.errors import SpecificationError
@@ -163,8 +164,7 @@ def usual_values(config: Mapping[str, object]) -> dict[str, object]:
     usual |= {path: None for path in flatten(config) if path.startswith(_NAMED)}
     parts = [classes[key] for key in SECTIONS]
     if None not in parts:
-        compiled = all(getattr(cls, "compiled", False) for cls in parts)
-        usual["path"] = "kernel" if compiled else "reference"
+        usual["path"] = default_path(parts)
     return usual
 
 

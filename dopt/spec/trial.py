@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from dopt.control import Control, task_from
+from dopt.declare.kernel_support import default_path
 from dopt.declare.registry import TARGET, build
 from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError, unknown_name
@@ -85,8 +86,8 @@ class TrialSpec(Validated):
         policy = build("policy", POLICIES, sections["policy"])
         model = _model(sections["model"])
         learner = build("learner", LEARNERS, sections["learner"])
-        compiled = all(part.compiled for part in (system, policy, model, learner))
-        path = str(given.get("path", "kernel" if compiled else "reference"))
+        path = given.get("path")
+        path = default_path((system, policy, model, learner)) if path is None else str(path)
         optional = task_from(given.get("task")), limits_from(given.get("limits"))
         config = TrialConfig(system, policy, model, learner, path, *optional)
         return cls(config, given.get("seed", 0))  # type: ignore[arg-type]  # checked on creation

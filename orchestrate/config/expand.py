@@ -33,10 +33,10 @@ def expand(
     config: DictConfig,
     *grids: Sequence[str],
     sections: Sequence[str] = TRIAL_SECTIONS,
-    inner: str = "seed",
+    grouped: str = "seed",
     check: Check = lambda _: None,
 ) -> list[Combination]:
-    """Return the combinations of one or several grids.
+    """Return the combinations of one or several grids, of which ``build_grid`` makes trials.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def expand(
         Overrides that span each grid; a later one replaces an earlier one of the same key.
     sections
         Top-level keys that the settings of a combination hold.
-    inner
+    grouped
         Scalar whose values stay together in one combination, if nothing else depends on it.
     check
         Called with each composed configuration; raises if that is invalid.
@@ -56,13 +56,13 @@ def expand(
     SpecificationError
         If an override sets a key that no choice of any grid has.
     """
-    expansion = _Expansion(Composer(loader, config), sections, inner, check)
+    expansion = _Expansion(Composer(loader, config), sections, grouped, check)
     result: list[Combination] = []
     for arguments in grids:
         axes = read_axes(loader, arguments)
         fixed = [axis for axis in axes if not (axis.kind == "scalar" and axis.swept)]
         for picks in itertools.product(*(range(len(axis.texts)) for axis in fixed)):
-            result.extend(expansion.of(axes, _arguments(fixed, picks)))
+            result.extend(expansion.combinations(axes, _arguments(fixed, picks)))
     expansion.keys.check_all_used()
     return result
 
@@ -73,11 +73,11 @@ class _Expansion:
 
     composer: Composer
     sections: Sequence[str]
-    inner: str
+    grouped: str
     check: Check
     keys: UnusedKeys = dataclasses.field(default_factory=UnusedKeys)
 
-    def of(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> Iterator[Combination]:
+    def combinations(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> Iterator[Combination]:
         """Yield the combinations of one choice of all overrides except swept scalars."""
         first, lacking = self._compose(axes, fixed)
         self.check(first)
@@ -89,7 +89,7 @@ class _Expansion:
         overrides = tuple(fixed[axis.key] for axis in kept if axis.swept and axis.key in fixed)
         overlay = ScalarOverrides(first, [axis.key for axis in scalars], self.sections)
         if overlay.applicable:
-            found = _overlaid(overlay, scalars, overrides, self.inner)
+            found = _overlaid(overlay, scalars, overrides, self.grouped)
         else:
             found = self._one_by_one(kept, fixed, scalars)
         yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
@@ -135,16 +135,16 @@ def _in_order(axes: Sequence[Axis], fixed: Mapping[str, str]) -> list[str]:
 
 
 def _overlaid(
-    overlay: ScalarOverrides, scalars: Sequence[Axis], overrides: tuple[str, ...], inner: str
+    overlay: ScalarOverrides, scalars: Sequence[Axis], overrides: tuple[str, ...], grouped: str
 ) -> Iterator[Combination]:
-    """Yield a combination for each set of values but those of ``inner``."""
-    together = [axis for axis in scalars if axis.key == inner and overlay.free(inner)]
+    """Yield a combination for each set of values but those of ``grouped``."""
+    together = [axis for axis in scalars if axis.key == grouped and overlay.free(grouped)]
     ranges = [range(1 if axis in together else len(axis.texts)) for axis in scalars]
     for picks in itertools.product(*ranges):
         chosen = list(zip(scalars, picks, strict=True))
         yield Combination(
             settings=overlay.settings([axis.values[pick] for axis, pick in chosen]),
-            inner=together[0].values if together else None,
+            seeds=together[0].values if together else None,
             overrides=overrides
             + tuple(axis.argument(pick) for axis, pick in chosen if axis not in together),
         )

@@ -23,7 +23,7 @@ class Combination:
     ----------
     settings
         Sections of the resolved configuration.
-    inner
+    seeds
         Seeds of the configuration, or None for the one in ``settings``.
     overrides
         Swept overrides of this combination, as they would be typed.
@@ -32,7 +32,7 @@ class Combination:
     """
 
     settings: Mapping[str, Any]
-    inner: Sequence[Any] | None = None
+    seeds: Sequence[Any] | None = None
     overrides: tuple[str, ...] = ()
     used: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ def build_grid(combinations: Iterable[Combination], *, single: bool = False) -> 
     left_out: dict[str, int] = {}
     n_jobs = 0
     for combination in combinations:
-        size = 1 if combination.inner is None else len(combination.inner)
+        size = 1 if combination.seeds is None else len(combination.seeds)
         n_jobs += size
         try:
             by_config.append(_trials(combination))
@@ -125,9 +125,9 @@ def _notes(combinations: Sequence[Combination]) -> Iterator[str]:
 
 def _trials(combination: Combination) -> list[TrialSpec]:
     trial = TrialSpec.from_mapping(combination.settings)
-    if combination.inner is None:
+    if combination.seeds is None:
         return [trial]
-    return [trial.with_seed(seed) for seed in combination.inner]
+    return [trial.with_seed(seed) for seed in combination.seeds]
 
 
 def _choices(combination: Combination) -> str:

@@ -18,7 +18,8 @@ JOIN_TIMEOUT_SECONDS = 2.0
 class Heartbeat:
     """Context manager that renews the lease of a launch from a thread.
 
-    It ignores a lost database, which the main thread notices too.
+    It ignores a lost database, which the main thread notices too. A lease that has run out is
+    renewed all the same: what others claimed meanwhile is refused when it is committed.
     """
 
     def __init__(self, store: Store, launch: int, lease_seconds: float) -> None:

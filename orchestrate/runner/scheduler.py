@@ -49,6 +49,9 @@ class Scheduler:
     ----------
     owned_by_others
         Number of trials that other launches have claimed.
+    refused
+        Number of results that came after the lease had run out and another launch had claimed their
+        trials: they are not stored.
     failures
         Number of failures by cause.
     """
@@ -60,6 +63,7 @@ class Scheduler:
     stop: Stop
     fail_fast: bool = False
     owned_by_others: int = 0
+    refused: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     _running: dict[str, tuple[Claim, TrialSpec]] = field(default_factory=dict)
     _crash_counts: Counter[str] = field(default_factory=Counter)
@@ -123,7 +127,7 @@ class Scheduler:
             claim, _, run = results[0]
             self._fail(claim, Failure(type(error).__name__, str(error), "", "malformed"), run)
             return
-        self.owned_by_others += written.count(False)
+        self._refuse(written.count(False))
         for (_, result, _), accepted in zip(results, written, strict=True):
             self.tally.diverged += accepted and result.diverged
             self.tally.done += accepted and not result.diverged
@@ -133,7 +137,11 @@ class Scheduler:
             self.tally.failed += 1
             self.failures[_summary(failure)] += 1
         else:
-            self.owned_by_others += 1
+            self._refuse(1)
+
+    def _refuse(self, count: int) -> None:
+        self.refused += count
+        self.owned_by_others += count
 
     def _recover(self, lost: WorkerLost) -> None:
         """Queue the trials of a process that died, each alone; fail those that killed it twice."""

@@ -7,6 +7,7 @@ from collections import Counter
 from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.runner.progress import Tally, duration
+from orchestrate.runner.scheduler import Scheduler
 from orchestrate.store import Registration
 
 MAX_LISTED_CAUSES = 3
@@ -62,12 +63,17 @@ def closing(tally: Tally, failures: Counter[str], stop_requested: bool, seconds:
     return "\n".join(lines)
 
 
-def worked(tally: Tally, failures: Counter[str], left: int, seconds: float) -> str:
+def worked(tally: Tally, scheduler: Scheduler, left: int, seconds: float) -> str:
     """Return the counts of outcomes of a worker, and the number of trials left to others."""
     lines = [
         f"{tally.done + tally.diverged:,} trials done, {tally.diverged:,} of them diverged, "
         f"{tally.failed:,} failed, in {duration(seconds)}; {left:,} left"
     ]
-    for cause, count in failures.most_common(MAX_LISTED_CAUSES):
+    if scheduler.refused:
+        lines.append(
+            f"{scheduler.refused:,} results refused: the lease had run out, and others had claimed "
+            f"their trials; give a longer --lease"
+        )
+    for cause, count in scheduler.failures.most_common(MAX_LISTED_CAUSES):
         lines.append(f"{count:,} failed: {cause}")
     return "\n".join(lines)

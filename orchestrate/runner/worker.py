@@ -161,7 +161,7 @@ def _work(
             _pull(scheduler, chunks, leave, progress)
     store.release_all()
     chunks.look()
-    output.say(worked(tally, scheduler.failures, chunks.left, time.monotonic() - start))
+    output.say(worked(tally, scheduler, chunks.left, time.monotonic() - start))
     if not chunks.left:
         return ExitCode.SOME_FAILED if tally.failed else ExitCode.DONE
     return ExitCode.INTERRUPTED if leave.signalled else ExitCode.UNFINISHED

@@ -15,9 +15,11 @@ from dopt.errors import SpecificationError
 from dopt.learning import Adam
 from dopt.learning.base import CompiledLearner
 from dopt.policies import DOptimal
-from dopt.policies.base import CompiledPolicy
+from dopt.policies.base import CompiledPolicy, CustomPolicy, Planner
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from dopt.systems import System
+from dopt.trial_view import TrialView
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
 from tests.paths import EXAMPLE, ROOT
@@ -33,6 +35,26 @@ class Large(CompiledPolicy):
     @staticmethod
     def plan(trial: Any, t: int, u: np.ndarray) -> None:  # noqa: ARG004
         u[:] = trial.algorithm.policy[0] * trial.plant.gamma
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn(CompiledPolicy, CustomPolicy):
+    """A random direction at each step."""
+
+    name: ClassVar[str] = "drawn"
+    compiled: ClassVar[bool] = True
+
+    @staticmethod
+    def plan(trial: Any, t: int, u: np.ndarray) -> None:
+        u[:] = trial.plant.gamma * trial.randomness.ties[t]
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return Directions()
+
+
+class Directions(Planner):
+    def choose(self, view: TrialView) -> np.ndarray:
+        return view.system.gamma * view.tie
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +145,13 @@ def test_an_input_that_is_too_large_is_refused() -> None:
     with pytest.raises(SpecificationError, match=r"'large' chose an input of norm .* at step 1"):
         run_trial(spec)
     run_trial(changed("policy", own("Large", factor=1.0)))
+
+
+def test_both_paths_have_the_same_random_directions() -> None:
+    spec = changed("policy", own("Drawn"), "arm")
+    fast, plain = run_trial(spec), run_trial(spec, "reference")
+    assert np.array_equal(fast.inputs, plain.inputs)
+    assert len(np.unique(fast.inputs, axis=0)) == 12
 
 
 def test_a_function_that_does_not_compile_is_one_sentence() -> None:

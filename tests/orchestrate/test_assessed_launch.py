@@ -32,7 +32,7 @@ SHORT = {
 
 def grid(task: object, seeds: int) -> Grid:
     settings = {**specification(0).to_mapping(), "task": task}
-    return build_grid([Combination(settings, inner=range(seeds))])
+    return build_grid([Combination(settings, seeds=range(seeds))])
 
 
 def launched(folder: Path, executor: str, trials: Grid) -> str:

@@ -5,7 +5,7 @@ import numpy.typing as npt
 import pytest
 from scipy import stats
 
-from analysis.stats.intervals import RESAMPLES, Statistic, centre, mean, standard_error
+from analysis.stats.intervals import BAND_RESAMPLES, Statistic, centre, mean, standard_error
 from analysis.stats.intervals import band as band_of
 
 
@@ -109,7 +109,7 @@ def test_the_bootstrap_is_that_of_scipy(statistic: Statistic, n: int) -> None:
     found = stats.bootstrap(
         (values,),
         centres[statistic],
-        n_resamples=RESAMPLES,
+        n_resamples=BAND_RESAMPLES,
         batch=100,
         confidence_level=0.95,
         method="percentile",

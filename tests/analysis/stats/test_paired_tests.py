@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from analysis.stats.intervals import interval_of_mean
 from analysis.stats.paired_tests import (
     benjamini_hochberg,
     compare,
-    interval_of_mean,
     signed_rank,
     without_ratio,
 )

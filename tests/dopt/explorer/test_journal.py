@@ -51,6 +51,24 @@ def test_a_reopened_exploration_goes_on_as_an_undisturbed_one(journal: Path) -> 
         assert np.array_equal(second.inputs, undisturbed.inputs)
 
 
+def test_the_name_of_a_new_journal_is_on_the_disk(
+    journal: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        synced.append(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    Journal(journal, fsync=True).close()
+    assert {str(journal.parent), str(journal.parent.parent)} <= set(synced)
+    synced.clear()
+    Journal(journal, fsync=True).close()
+    assert synced == [str(journal)]  # as it is closed
+
+
 def test_an_answer_survives_that_was_not_followed_by_a_state(journal: Path) -> None:
     with Explorer(MOTOR, steps=9, journal=journal, **PARTS) as first:
         x = explored(first, 5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,6 +13,7 @@ from orchestrate.cli_parser import UsageError, length_of_time
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.runner import worker
 from orchestrate.runner.run_grid import Work
+from orchestrate.store import Claim, Store
 from tests.orchestrate.standins import raising
 
 GRID = ("-m", "env=pendulum", "policy=random,uniform", "seed=range(3)", "env.horizon=5")
@@ -52,6 +53,23 @@ def test_a_launch_leaves_its_grid_to_workers(command_line: Run, pull: Run) -> No
     assert "2 failed: ZeroDivisionError" in out
     assert pull("work")[0] == 0
     assert "registered a grid for workers" not in pull("status")[1]
+
+
+def test_results_that_come_too_late_are_counted(
+    command_line: Run, pull: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command_line(*GRID, LEAVE)
+    commit = Store.commit_many
+
+    def late(store: Store, results: Sequence[tuple[Claim, object, object]]) -> list[bool]:
+        store.release(results[0][0].launch)
+        return commit(store, results)  # type: ignore[arg-type]
+
+    calls = iter([late])
+    monkeypatch.setattr(Store, "commit_many", lambda *words: next(calls, commit)(*words))
+    _, out, _ = pull("work")
+    assert "results refused: the lease had run out" in out
+    assert "4 trials done" in out
 
 
 def test_a_launch_that_left_and_is_repeated_says_what_is_done(command_line: Run, pull: Run) -> None:

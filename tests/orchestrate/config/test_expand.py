@@ -90,7 +90,7 @@ def plain(config: Any, key: Any) -> object:
 def by_us(sample: Sample, arguments: Sequence[str]) -> Counter[str]:
     jobs: Counter[str] = Counter()
     for combination in expand(sample.loader, sample.master, arguments, sections=SECTIONS):
-        inner = combination.inner or [combination.settings["seed"]]
+        inner = combination.seeds or [combination.settings["seed"]]
         jobs.update(frozen({**combination.settings, "seed": seed}) for seed in inner)
     return jobs
 
@@ -157,8 +157,8 @@ def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> No
     together = expand(
         sample.loader, sample.master, ["seed=range(4)", "model=linear"], sections=("policy", "seed")
     )
-    assert [one.inner for one in apart] == [None] * 4
-    assert [one.inner for one in together] == [(0, 1, 2, 3)]
+    assert [one.seeds for one in apart] == [None] * 4
+    assert [one.seeds for one in together] == [(0, 1, 2, 3)]
 
 
 @pytest.mark.parametrize(
