@@ -63,8 +63,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Let the collector of garbage pass over the modules and tests, which stay to the end."""
+    """Let the collector of garbage pass over the modules and tests, which stay to the end.
+
+    It also runs less often than it does by itself: 5 % of the time of the suite.
+    """
     gc.freeze()
+    gc.set_threshold(100_000, 20, 50)
 
 
 @pytest.fixture

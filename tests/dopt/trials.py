@@ -26,6 +26,8 @@ SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"coun
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}
 SMALL_SEARCHES |= {"episodic": SMALL_SEARCHES["icem"] | {"replan_every": 5}}
 SMALL_GRIDS |= {"mass_spring": (2, 2, 2, 2)}
+SIZES = {"chain": {"n_links": 3}, "coupled_pendulums": {"n_pendulums": 3}}
+"""Systems of any size: as small as an end, a middle and a start can be."""
 MODELS = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}
 LEARNERS = {"oracle": "recursive_least_squares", "linear": "recursive_least_squares"}
 LEARNERS |= {"gaussian_process": "conditioning"}
@@ -34,7 +36,7 @@ LEARNERS |= {"gaussian_process": "conditioning"}
 def trial(env: str, policy: str, seed: int = 0, /, **fields: Mapping[str, Any]) -> TrialSpec:
     """Return a small trial; ``fields`` are the entries of the sections that differ from that."""
     sections: dict[str, dict[str, Any]] = {
-        "env": {"name": env, "horizon": 30, "grid_points": SMALL_GRIDS[env]},
+        "env": {"name": env, "horizon": 30, "grid_points": SMALL_GRIDS[env], **SIZES.get(env, {})},
         "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
         "model": {"name": MODELS.get(policy, "affine" if SYSTEMS[env].reads_inputs else "mlp")},
         "learner": {"name": LEARNERS.get(policy, "adam_window")},

@@ -79,18 +79,25 @@ def test_no_two_systems_share_a_symbol() -> None:
 
 def test_systems_cached_by_different_processes_are_not_confused(tmp_path: Path) -> None:
     program = (
-        "import sys, numpy as np\n"
+        "import os, sys, numpy as np\n"
         "from dopt.kernel.equations import compiled_equations\n"
         "from dopt.systems import SYSTEMS\n"
-        "systems = [SYSTEMS[name]() for name in sys.argv[1:]]\n"
-        "functions = [compiled_equations(system).known for system in systems]\n"
-        "for system, known in zip(systems, functions):\n"
-        "    x, u = np.arange(1.0, 1 + system.n_states), np.ones(system.n_inputs)\n"
-        "    out, p = np.empty(system.n_states), system.parameters\n"
-        "    known(x, u, np.array(p), out)\n"
-        "    assert np.allclose(out, system.known(tuple(x), tuple(u), p)), system.name\n"
+        "def check(names):\n"
+        "    systems = [SYSTEMS[name]() for name in names]\n"
+        "    functions = [compiled_equations(system).known for system in systems]\n"
+        "    for system, known in zip(systems, functions):\n"
+        "        x, u = np.arange(1.0, 1 + system.n_states), np.ones(system.n_inputs)\n"
+        "        out, p = np.empty(system.n_states), system.parameters\n"
+        "        known(x, u, np.array(p), out)\n"
+        "        assert np.allclose(out, system.known(tuple(x), tuple(u), p)), system.name\n"
+        "for words in sys.argv[1:]:\n"  # each in a process that has compiled nothing
+        "    child = os.fork()\n"
+        "    if not child:\n"
+        "        check(words.split())\n"
+        "        os._exit(0)\n"
+        "    assert os.waitpid(child, 0)[1] == 0, words\n"
     )
     environment = os.environ | {"DOPT_CACHE": str(tmp_path)}
-    for names in (["pendulum"], ["cartpole"], ["cartpole", "pendulum"], ["pendulum", "cartpole"]):
-        command = [sys.executable, "-c", program, *names]
-        subprocess.run(command, check=True, env=environment, cwd=ROOT)
+    names = ("pendulum", "cartpole", "cartpole pendulum", "pendulum cartpole")
+    command = [sys.executable, "-c", program, *names]
+    subprocess.run(command, check=True, env=environment, cwd=ROOT)

@@ -34,7 +34,7 @@ def test_every_registered_system_is_held_against_masses(name: str) -> None:
     assert name in FRICTION
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_energy_changes_by_input_power_less_friction_power(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
@@ -44,7 +44,7 @@ def test_energy_changes_by_input_power_less_friction_power(name: str, data: st.D
     assert rate == pytest.approx(power, abs=1e-12 * (1.0 + size))
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_nothing_is_gained_or_lost_without_friction_and_input(
     name: str, data: st.DataObject
@@ -55,7 +55,7 @@ def test_nothing_is_gained_or_lost_without_friction_and_input(
     assert rate == pytest.approx(0.0, abs=1e-12 * (1.0 + size))
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_friction_never_feeds_energy(name: str, data: st.DataObject) -> None:
     system, x = data.draw(systems(name)), data.draw(states(name))
@@ -63,7 +63,7 @@ def test_friction_never_feeds_energy(name: str, data: st.DataObject) -> None:
     assert rate <= 1e-12 * (1.0 + size)
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_equations_are_those_of_euler_and_lagrange(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
