@@ -43,7 +43,7 @@ class OfflineFit:
     residual : float
         Root mean square error over the samples, noise included.
     steps : int
-        Steps of the fit.
+        Steps of the fit; of an ensemble those of the network that took most.
     converged : bool
         Whether further steps would have changed nothing that matters.
     """
@@ -68,8 +68,9 @@ def fit_offline(
 
     θ₀ are the initial parameters of the trial, from which the fit of a network starts: damped
     Gauss-Newton (Levenberg-Marquardt) steps until the objective stays the same
-    (:mod:`dopt.kernel.offline_fit`). A model that is linear in its parameters is solved for. Policy
-    and learner of the trial make no difference.
+    (:mod:`dopt.kernel.offline_fit`). Each network of an ensemble is fitted by itself, from its own
+    θ₀. A model that is linear in its parameters is solved for. Policy and learner of the trial make
+    no difference.
 
     Parameters
     ----------
@@ -90,7 +91,7 @@ def fit_offline(
     ------
     SpecificationError
         If the samples have other shapes or are not finite, the ridge or the number of steps is not
-        positive, or the model is neither 'mlp' nor linear in its parameters.
+        positive, or the model is neither 'mlp', 'ensemble' nor linear in its parameters.
     """
     if not (ridge > 0 and np.isfinite(ridge)):
         raise SpecificationError(
@@ -123,13 +124,13 @@ def fit_offline(
     initial = initial_weights(spec)
     if is_network(spec.model):
         points = spec.model.points(spec.system, x, u)
-        parameters, steps, converged = _fit_network(spec, points, y, initial, ridge, max_steps)
+        parameters, steps, converged = _fit_networks(spec, points, y, initial, ridge, max_steps)
     elif spec.model.structure == "least_squares":
         parameters, steps, converged = _solve(spec, x, u, y, initial, ridge), 1, True
     else:
         raise SpecificationError(
-            f"model '{spec.model.name}' has no offline fit, but 'mlp', or a model that is linear "
-            f"in its parameters, is expected: choose one of these."
+            f"model '{spec.model.name}' has no offline fit, but 'mlp', 'ensemble', or a model that "
+            f"is linear in its parameters, is expected: choose one of these."
         )
     residual = _root_mean_square(spec.model.predict(spec.system, parameters, x, u) - y)
     return OfflineFit(parameters, grid_loss(spec, parameters), residual, steps, converged)
@@ -141,8 +142,8 @@ def can_be_fitted(model: Model) -> bool:
 
 
 def is_network(model: Model) -> bool:
-    """Tell whether a model is the network that the kernel knows."""
-    return isinstance(model, MLP) and model.compiled and model.n_members == 1
+    """Tell whether a model is the network that the kernel knows, or several of them."""
+    return isinstance(model, MLP) and model.compiled
 
 
 def grid_loss(spec: TrialSpec, parameters: Array) -> float:
@@ -174,6 +175,18 @@ def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
 def _root_mean_square(errors: Array) -> float:
     """Return the root of the mean ‖error‖² over samples, (N, r)."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def _fit_networks(
+    spec: TrialSpec, points: Array, accelerations: Array, initial: Array, ridge: float, most: int
+) -> tuple[Array, int, bool]:
+    """Return the parameters of all networks, the most steps of one, and whether all converged."""
+    fits = [
+        _fit_network(spec, points, accelerations, member, ridge, most)
+        for member in initial.reshape(spec.model.n_members, -1)
+    ]
+    parameters, steps, converged = zip(*fits, strict=True)
+    return np.concatenate(parameters), max(steps), all(converged)
 
 
 def _fit_network(

@@ -148,7 +148,7 @@ def _information_of_reference(policy: Policy, form: str, model: Model, q: int) -
 def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str, int]:
     """Return the numbers of a search: M⁻¹ in full, the rows of a path, all scores.
 
-    The kernel holds one path at a time, the reference all of them.
+    The kernel holds the rows of the plans that begin with the same input, the reference all.
     """
     q, r = model.n_member_parameters(system), system.n_learned * _points_of_state(system, model)
     if isinstance(policy, ICEM):
@@ -162,10 +162,24 @@ def _search(policy: Policy, system: System, model: Model, path: str) -> dict[str
     return {
         _size_of(model): q**2 + r * q,
         "policy.lookahead": 2 * rows * q + rows**2 + steps * (system.n_states + r),
-        "policy.candidates": policy.candidates**2 * (1 if path == "kernel" else 2 * rows * q),
+        "policy.candidates": policy.candidates**2 * (1 if path == "kernel" else 2 * rows * q)
+        + (_paths_of_kernel(policy, system, model, rows) if path == "kernel" else 0),
         "policy.count": count * (r * q + system.n_states),
         "policy.subspace": subspace * (2 * q + 2 * subspace) + (r + 1) * q,
     }
+
+
+def _paths_of_kernel(policy: Search, system: System, model: Model, rows: int) -> int:
+    """Return the numbers of paths that advance together, and of the rows along C of them.
+
+    There are C² paths, or C where no input switches, and at most so many ``rows`` along each.
+    """
+    C, d, m, r = policy.candidates, system.n_states, system.n_inputs, system.n_learned
+    q, hidden = model.n_member_parameters(system), len(model.features(system)) + r
+    if isinstance(model, MLP):
+        hidden += model.width * model.depth
+    one = 3 * d + 2 * m + hidden + rows // r * (d + m)
+    return (C**2 if policy.steps(system) > 1 else C) * one + 2 * C * rows * q
 
 
 def _points_of_state(system: System, model: Model) -> int:

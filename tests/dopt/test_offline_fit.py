@@ -75,6 +75,26 @@ def test_a_fit_ends_at_a_minimum_of_its_objective(env: str, ridge: float) -> Non
     assert_close(fitted.residual, np.sqrt(e @ e / len(samples.states)), rel=1e-9)
 
 
+def test_each_network_of_an_ensemble_is_fitted_by_itself() -> None:
+    spec = small("pendulum")
+    model, learner = {"name": "ensemble", "members": 3}, {"name": "gauss_newton"}
+    sizes = {"env": {"horizon": 60}, "model": SMALL | model, "learner": learner}
+    together = trial("pendulum", "random", 2, **sizes)
+    samples = uniform_samples(spec)
+    fitted = fit_offline(together, samples.states, samples.accelerations)
+    first, *others = fitted.parameters.reshape(3, -1)
+    alone = fit_offline(spec, samples.states, samples.accelerations)
+    assert np.array_equal(first, alone.parameters)
+    assert fitted.steps >= alone.steps
+    assert fitted.loss == grid_loss(together, fitted.parameters)
+    drawn = initial_weights(together).reshape(3, -1)
+    for member, start in zip(others, drawn[1:], strict=True):
+        assert not np.allclose(member, first)
+        e = samples.accelerations - spec.model.predict(spec.system, member, samples.states)
+        slope = jacobian(spec, member, samples.states).T @ e.ravel() + RIDGE * (start - member)
+        assert np.linalg.norm(slope) < 1e-2 * np.linalg.norm(start - member)
+
+
 def test_a_fit_of_a_linear_model_is_the_ridge_solution_and_recovers_the_physics() -> None:
     spec = trial("arm", "oracle", 1, env={"horizon": 200})
     samples = uniform_samples(spec)

@@ -32,6 +32,9 @@ from analysis.units import loss_unit
 from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
 
+USUAL = "mlp"
+"""Model that goes without saying."""
+
 FEWEST = 2
 """Configurations of an environment from which they are compared."""
 
@@ -45,7 +48,8 @@ class Point:
     label : str
         What differs among the configurations of the environment.
     policy, policy_words, learner_words : str
-        Name of the policy; the policy and the learner with those of their settings that differ.
+        Name of the policy; the policy and the learner with those of their settings that differ. The
+        learner's are followed by the model, where it is another one than the network.
     us : float
         Microseconds of planning and learning in a step: mean over the steps of a trial, median over
         trials that did not diverge; NaN without any.
@@ -103,17 +107,28 @@ def pareto_part(selection: Selection) -> Selection:
 
 def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -> Points:
     """Return a point for each entry, those of an environment by their time."""
-    policies, learners = (section_words(selection.entries, name) for name in ("policy", "learner"))
+    policies = section_words(selection.entries, "policy")
+    learners = learner_words(selection.entries)
     points = [
-        _point(reader, entry, policies[section_text(entry, "policy")],
-               learners[section_text(entry, "learner")], rule)
-        for entry in selection.entries
-    ]  # fmt: skip
+        _point(reader, entry, policies[section_text(entry, "policy")], learner, rule)
+        for entry, learner in zip(selection.entries, learners, strict=True)
+    ]
     return tuple(
         point
         for env in selection.environments
         for point in _with_front([one for one in points if one.env == env])
     )
+
+
+def learner_words(entries: Sequence[Entry]) -> list[str]:
+    """Return the words of the learner of each entry, and of a model that is not the network."""
+    learners, models = (section_words(entries, name) for name in ("learner", "model"))
+    several = len({entry.config.model for entry in entries}) > 1
+    return [
+        learners[section_text(entry, "learner")]
+        + (f", {models[section_text(entry, 'model')]}" if several and model != USUAL else "")
+        for entry, model in ((entry, entry.config.model) for entry in entries)
+    ]
 
 
 def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:

@@ -1,6 +1,7 @@
-"""Paths of the learned model and the rows of J along them, in compiled code.
+"""Rows of J along a path of the learned model and their products with M⁻¹, in compiled code.
 
-Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, R rows of a state, n rows along a path.
+Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, C candidates, R rows of a state, n rows
+along a path.
 """
 
 from __future__ import annotations
@@ -9,13 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import ModelKind, Score
-from dopt.kernel import network as nn
-from dopt.kernel.checks import within
+from dopt.algorithm import Score
 from dopt.kernel.compiler import compiled, vectorized
 from dopt.kernel.information.primal import add_multiple, inner, multiply_rows
-from dopt.kernel.model import add_linear, euler_step, model_accelerations, regressors, rows_at
-from dopt.kernel.points import model_point, n_next_points, next_points
+from dopt.kernel.model import rows_at
+from dopt.kernel.points import n_next_points
 from dopt.kernel.state_structs import Covariance
 from dopt.kernel.structs import Network, Plant, Search
 from dopt.types import Matrix, Vector
@@ -23,50 +22,63 @@ from dopt.types import Matrix, Vector
 FEW_ROWS = 24
 """Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
 
+BLOCK = 16
+"""Rows and columns of M⁻¹ that are copied to their mirror image at a time."""
+
 
 class Path(NamedTuple):
-    """A path in the making; written in place."""
+    """Rows along paths that share what comes before the switch; written in place.
 
-    states: Matrix  # (H + 1, d)
-    outputs: Matrix  # (H + 1, r), a_θ at the states
-    rows: Matrix  # (n + R, q), J/√ρ along the path; the last R are spare
-    products: Matrix  # (n, q), J M⁻¹, or L⁻¹ J M⁻¹ once a score has needed it
-    factor: Matrix  # (n, n), the Cholesky factor L of I + J M⁻¹ Jᵀ in the lower triangle
-    inverse: Matrix  # (q, q), A of M⁻¹ = A - VᵀV; empty where few products are needed
-    flow: Vector  # (d,)
-    u: Vector  # (m,) input that counts at a state, where the model reads inputs
-    phi: Vector  # (p,)
-    hidden: Matrix  # (L, w)
-    deltas: Matrix  # (L, w)
+    A path has n states whose rows count, b of them before the switch, and there are C paths.
+    """
+
+    rows: Matrix  # (R (b + C (n - b)), q), J/√ρ before the switch, then after it path by path
+    products: Matrix  # of the same size, J M⁻¹
+    factor: Matrix  # (R n, R n), the Cholesky factor L of I + J M⁻¹ Jᵀ of one path
+    inverse: Matrix  # (q, q), M⁻¹; empty where few products are needed
+
+
+class Place(NamedTuple):
+    """Place of the rows of one path among those of all."""
+
+    shared: int  # R b
+    offset: int  # by which the rows after these are moved
 
 
 @compiled
-def new_path(
-    plant: Plant, network: Network, search: Search, covariance: Covariance, d: int
-) -> Path:
+def new_path(plant: Plant, network: Network, search: Search, covariance: Covariance) -> Path:
     """Return an empty path."""
-    r, q = plant.learned_rows.shape[0], covariance.upper.shape[0]
-    C, H, R = search.candidates.shape[0], search.steps, rows_of_state(plant, network)
-    n = R * (H // search.stride)
-    size = q if n * C > FEW_ROWS else 0
-    path = Path(
-        np.empty((H + 1, d)),
-        np.empty((H + 1, r)),
-        np.empty((n + R, q)),
-        np.empty((n, q)),
-        np.zeros((n, n)),
-        np.empty((size, size)),
-        np.empty(d),
-        np.zeros(plant.n_inputs),
-        np.empty(network.feature_kinds.shape[0]),
-        np.empty((network.offsets.shape[0] - 1, network.sizes[1])),
-        np.empty((network.offsets.shape[0] - 1, network.sizes[1])),
-    )
-    for i in range(size):
-        for j in range(i, size):
-            path.inverse[i, j] = covariance.upper[i, j]
-            path.inverse[j, i] = covariance.upper[i, j]
-    return path
+    q, R, C = covariance.upper.shape[0], rows_of_state(plant, network), search.candidates.shape[0]
+    n, shared = search.steps // search.stride, switch_of(search) // search.stride
+    starts = C if shared > 0 else 1
+    size = q if R * starts * (shared + C * (n - shared)) > FEW_ROWS else 0
+    inverse, count = np.empty((size, size)), R * (shared + C * (n - shared))
+    if size > 0:
+        _write_dense(covariance, inverse)
+    return Path(np.empty((count, q)), np.empty((count, q)), np.zeros((R * n, R * n)), inverse)
+
+
+@compiled
+def switch_of(search: Search) -> int:
+    """Return the step at which the input switches, 0 where it never does."""
+    step: int = search.switch if search.switch < search.steps else 0
+    return step
+
+
+@vectorized
+def _write_dense(covariance: Covariance, out: Matrix) -> None:
+    """Write M⁻¹ as a full matrix, (q, q)."""
+    q = out.shape[0]
+    for i in range(q):
+        row = out[i, i:]
+        for j in range(row.shape[0]):
+            row[j] = covariance.upper[i, i + j]
+        for n in range(covariance.n_pending[0]):
+            add_multiple(row, -covariance.pending[n, i], covariance.pending[n, i:])
+    for first in range(0, q, BLOCK):
+        for i in range(first, q):
+            for j in range(first, min(first + BLOCK, i)):
+                out[i, j] = out[j, i]
 
 
 @compiled
@@ -77,99 +89,64 @@ def rows_of_state(plant: Plant, network: Network) -> int:
 
 
 @compiled
-def model_and_jacobian(
-    plant: Plant, network: Network, theta: Vector, path: Path, i: int, rows: Matrix
-) -> None:
-    """Write a_θ, under the present input, and the rows of J at state i of the path, (R, q).
+def rows_of_points(plant: Plant, network: Network, theta: Vector, points: Matrix) -> Matrix:
+    """Return the rows of J at the points of states, one state after the other.
 
-    For a model that reads inputs the rows are those of :func:`next_points`, weighted so that the
-    sum of their JᵀJ is the mean.
+    Where several points stand for a state (:mod:`dopt.kernel.points`) their rows are weighted so
+    that the sum of their JᵀJ is the mean.
     """
-    x, out = path.states[i], path.outputs[i]
-    if network.n_inputs_read > 0:
-        model_accelerations(plant, network, theta, model_point(network, x, path.u), out)
-        if rows.shape[0] > 0:
-            points = next_points(network, x, plant.gamma)
-            rows[:] = rows_at(plant, network, theta, points)
-            scale(rows, 1.0 / np.sqrt(points.shape[0]))
-        return
-    if network.kind != ModelKind.MLP:
-        regressors(plant, network, x, rows, out)
-        add_linear(rows, theta, out)
-        return
-    nn.features_at(network, x, path.phi)
-    nn.activations_at(network, theta, path.phi, path.hidden, out)
-    for k in range(rows.shape[0]):
-        nn.back_signals(network, theta, path.phi, path.hidden, k, path.deltas)
-        nn.parameter_gradient(network, path.phi, path.hidden, path.deltas, k, rows[k])
+    rows: Matrix = rows_at(plant, network, theta, points)
+    per_state = n_next_points(network)
+    if per_state > 1:
+        rows /= np.sqrt(per_state)
+    return rows
 
 
 @compiled
-def rollout(
+def add_rows(
     plant: Plant,
     network: Network,
     search: Search,
     theta: Vector,
+    covariance: Covariance,
+    points: Matrix,
     path: Path,
-    u: Vector,
     first: int,
-    last: int,
-) -> bool:
-    """Hold u from state ``first`` of the path to state ``last``; tell whether it stays in bounds.
+) -> None:
+    """Write the rows at points and their products with M⁻¹, from row ``first``.
 
-    x_{i+1} = x_i + dt f_θ(x_i, u). The rows of J at every stride-th state are written in the units
-    of M, for the determinant of all of them together times the root of the stride.
+    They are in the units of M, for the determinant of all of them together times the root of the
+    stride.
     """
-    R, stride = rows_of_state(plant, network), search.stride
-    spare = path.products.shape[0]
-    if network.n_inputs_read > 0:
-        path.u[:] = u
-        point = model_point(network, path.states[first], u)
-        model_accelerations(plant, network, theta, point, path.outputs[first])
-    for i in range(first, last):
-        x, following = path.states[i], path.states[i + 1]
-        euler_step(plant, x, u, path.outputs[i], path.flow, following)
-        if not within(following, plant.state_limit):
-            return False
-        wanted = (i + 1) % stride == 0
-        block = R * ((i + 1) // stride - 1) if wanted else spare
-        # A network's output comes without rows; those of a linear model are its output.
-        count = R if wanted or network.kind != ModelKind.MLP else 0
-        rows = path.rows[block : block + count]
-        model_and_jacobian(plant, network, theta, path, i + 1, rows)
-        weight = search.row_scale
-        if stride > 1 and search.score == Score.JOINT:
-            weight *= np.sqrt(stride)
-        if weight != 1.0:
-            scale(rows, weight)
-    return True
+    weight = search.row_scale
+    if search.score == Score.JOINT:
+        weight *= np.sqrt(search.stride)
+    last: int = first + points.shape[0] * plant.learned_rows.shape[0]
+    rows = path.rows[first:last]
+    rows[:] = rows_of_points(plant, network, theta, points)
+    if weight != 1.0:
+        rows *= weight
+    _apply_inverse(covariance, path, first, last)
 
 
 @compiled
-def scale(rows: Matrix, factor: float) -> None:
-    """Multiply a matrix by a number in place."""
-    for i in range(rows.shape[0]):
-        for j in range(rows.shape[1]):
-            rows[i, j] *= factor
-
-
-@vectorized
-def apply_inverse(covariance: Covariance, path: Path, first: int, last: int) -> None:
+def _apply_inverse(covariance: Covariance, path: Path, first: int, last: int) -> None:
     """Write the products of rows ``first`` to ``last`` with M⁻¹."""
-    rows, out = path.rows[first:last], path.products[first:last]
     if path.inverse.shape[0] == 0:
-        multiply_rows(covariance, rows, out)
-        return
-    np.dot(rows, path.inverse, out)
-    for n in range(covariance.n_pending[0]):
-        pending = covariance.pending[n]
-        for i in range(rows.shape[0]):
-            add_multiple(out[i], -inner(pending, rows[i]), pending)
+        multiply_rows(covariance, path.rows[first:last], path.products[first:last])
+    elif last > first:
+        np.dot(path.rows[first:last], path.inverse, path.products[first:last])
+
+
+@compiled
+def row_at(place: Place, i: int) -> int:
+    """Return where the i-th row of a path is."""
+    return i if i < place.shared else i + place.offset
 
 
 @vectorized
-def log_determinant(path: Path, first: int, last: int, block: int) -> float:
-    """Extend the factor L by rows ``first`` to ``last``; return the growth of log det.
+def log_determinant(path: Path, place: Place, first: int, last: int, block: int) -> float:
+    """Extend the factor L by rows ``first`` to ``last`` of a path; return the growth of log det.
 
     Only rows of the same block of so many are taken together: all of them for the determinant of
     the whole path, r for those of its states one by one.
@@ -177,9 +154,9 @@ def log_determinant(path: Path, first: int, last: int, block: int) -> float:
     L = path.factor
     total = 0.0
     for i in range(first, last):
-        start = i - i % block
+        start, products = i - i % block, path.products[row_at(place, i)]
         for j in range(start, i + 1):
-            value = inner(path.products[i], path.rows[j])
+            value = inner(products, path.rows[row_at(place, j)])
             value -= inner(L[i, start:j], L[j, start:j])
             L[i, j] = np.sqrt(1.0 + value) if i == j else value / L[j, j]
         total += 2.0 * np.log(L[i, i])
@@ -187,11 +164,15 @@ def log_determinant(path: Path, first: int, last: int, block: int) -> float:
 
 
 @vectorized
-def whiten(path: Path, n: int) -> None:
-    """Replace the first n products V by L⁻¹V, given the factor."""
+def whitened(path: Path, place: Place) -> Matrix:
+    """Return L⁻¹ J M⁻¹, (R n, q), of a path whose factor is known."""
+    n = path.factor.shape[0]
+    out = np.empty((n, path.products.shape[1]))
     for i in range(n):
-        row = path.products[i]
+        row = out[i]
+        row[:] = path.products[row_at(place, i)]
         for j in range(i):
-            add_multiple(row, -path.factor[i, j], path.products[j])
+            add_multiple(row, -path.factor[i, j], out[j])
         for j in range(row.shape[0]):
             row[j] /= path.factor[i, i]
+    return out

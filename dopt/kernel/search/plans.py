@@ -1,4 +1,9 @@
-"""Search for the best plan in compiled code (:mod:`dopt.policies.search`)."""
+"""Search for the best plan in compiled code (:mod:`dopt.policies.search`).
+
+A plan is a pair of candidates: the first is held up to the switch, the second from there on. Where
+there is no switch only plans of the same candidate twice count. Legend beside
+:mod:`dopt.kernel.search.path`; P paths advance together.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +13,17 @@ import numpy as np
 
 from dopt.algorithm import TIE_MARGIN, Score
 from dopt.kernel.compiler import compiled, monotonic_microseconds
+from dopt.kernel.points import n_next_points
 from dopt.kernel.search.path import (
     Path,
-    apply_inverse,
+    Place,
+    add_rows,
     log_determinant,
-    model_and_jacobian,
     new_path,
-    rollout,
     rows_of_state,
+    switch_of,
 )
+from dopt.kernel.search.paths import advance_paths, keep_points, paths_from
 from dopt.kernel.search.scores import ScoreContext, score_context, score_of_path
 from dopt.kernel.state_structs import Covariance
 from dopt.kernel.structs import Network, Plant, Search, Trial
@@ -31,9 +38,18 @@ class Problem(NamedTuple):
     search: Search
     theta: Vector
     covariance: Covariance
+    x: Vector  # (d,), the present state
     path: Path
     context: ScoreContext
     end: float  # when the time is spent [µs]
+
+
+class Halves(NamedTuple):
+    """Paths from one state to another, each under one candidate."""
+
+    ends: Matrix  # (P, d)
+    inside: Booleans  # (P,), whether all states are within bounds
+    points: Matrix  # points of the states whose rows count, path by path
 
 
 @compiled
@@ -43,14 +59,16 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
     theta, covariance = trial.state.theta, trial.state.covariance
     x, tie = trial.record.states[t], trial.randomness.ties[t]
     end = monotonic_microseconds() + search.budget_us
-    path = new_path(plant, network, search, covariance, x.shape[0])
-    context = score_context(plant, network, search, theta, covariance, path)
-    for i in range(x.shape[0]):
-        path.states[0, i] = x[i]
-    model_and_jacobian(plant, network, theta, path, 0, path.rows[path.products.shape[0] :])
-    problem = Problem(plant, network, search, theta, covariance, path, context, end)
-    order = _order(search.candidates, tie)
-    _choose(_values(problem, order), search.candidates, tie, u)
+    path = new_path(plant, network, search, covariance)
+    context = score_context(plant, network, search, theta, covariance)
+    problem = Problem(plant, network, search, theta, covariance, x, path, context, end)
+    hurried = search.budget_us > 0.0
+    values = (
+        _values_in_time(problem, _order(search.candidates, tie))
+        if hurried
+        else _all_values(problem)
+    )
+    _choose(values, search.candidates, tie, u)
 
 
 @compiled
@@ -67,33 +85,54 @@ def _order(candidates: Matrix, tie: Vector) -> Integers:
 
 
 @compiled
-def _values(problem: Problem, order: Integers) -> Matrix:
-    """Return the scores of the plans by their two candidates, (C, C); -∞ where there is none.
+def _all_values(problem: Problem) -> Matrix:
+    """Return the scores of all plans by their two candidates, (C, C); -∞ where there is none."""
+    C, switch = problem.search.candidates.shape[0], switch_of(problem.search)
+    values, candidates = np.full((C, C), -np.inf), np.arange(C)
+    first = candidates if switch > 0 else candidates[:1]
+    n = first.shape[0]
+    begun = _begin(problem, first)
+    ended = _end(problem, begun, np.repeat(np.arange(n), C), np.arange(n * C) % C)
+    for k in range(n):
+        gain = _share(problem, begun, k)
+        scores = _scores(problem, gain, ended, k * C, C)
+        for c in range(C):
+            values[first[k] if switch > 0 else c, c] = scores[c]
+    return values
 
-    In a hurry the plans without a switch come first, then the switches from the best of these.
+
+@compiled
+def _values_in_time(problem: Problem, order: Integers) -> Matrix:
+    """Return the scores of the plans, (C, C), for which there is time; -∞ for the others.
+
+    The plans without a switch come first, then the switches from the best of these.
     """
-    search = problem.search
-    unhurried, switching = search.budget_us == 0.0, search.switch < search.steps
-    C = search.candidates.shape[0]
+    C = problem.search.candidates.shape[0]
     values = np.full((C, C), -np.inf)
     for k in range(C):
         if k > 0 and _late(problem):
-            break
-        c = order[k]
-        begun = _begin(problem, c)
-        values[c, c] = _finish(problem, c, begun)
-        if unhurried and switching:
-            _switches(problem, order, c, begun, values[c])
-    if switching and not unhurried:
-        begun_from = np.zeros(C, np.bool_)
-        for _ in range(C):
-            if _late(problem):
-                break
-            c = _best_hold(values, begun_from)
-            begun_from[c] = True
-            begun = _begin(problem, c)
-            _switches(problem, order, c, begun, values[c])
+            return values
+        _score_one_by_one(problem, order[k], order[k : k + 1], values)
+    done = np.zeros(C, np.bool_)
+    for _ in range(C if switch_of(problem.search) > 0 else 0):
+        if _late(problem):
+            return values
+        c = _best_hold(values, done)
+        done[c] = True
+        _score_one_by_one(problem, c, order[order != c], values)
     return values
+
+
+@compiled
+def _score_one_by_one(problem: Problem, c: int, others: Integers, values: Matrix) -> None:
+    """Score the plans from candidate c to others until the time is spent, the first in any case."""
+    begun, start = _begin(problem, np.full(1, c)), np.zeros(1, np.int64)
+    gain = _share(problem, begun, 0)
+    for k in range(others.shape[0]):
+        if k > 0 and _late(problem):
+            return
+        ended = _end(problem, begun, start, others[k : k + 1])
+        values[c, others[k]] = _scores(problem, gain, ended, 0, 1)[0]
 
 
 @compiled
@@ -114,61 +153,95 @@ def _late(problem: Problem) -> bool:
 
 
 @compiled
-def _switches(problem: Problem, order: Integers, c: int, begun: float, values: Vector) -> None:
-    """Score the plans that begin with candidate c, as the path does, and switch to another."""
-    for other in order:
-        if other != c:
-            if _late(problem):
-                break
-            values[other] = _finish(problem, other, begun)
+def _begin(problem: Problem, chosen: Integers) -> Halves:
+    """Hold candidates from the present state up to the switch."""
+    x, search = problem.x, problem.search
+    starts = np.empty((chosen.shape[0], x.shape[0]))
+    starts[:] = x
+    return _roll(problem, starts, search.candidates[chosen], 0, switch_of(search))
 
 
 @compiled
-def _begin(problem: Problem, c: int) -> float:
-    """Roll the path under candidate c up to the switch; return log det of its rows so far."""
-    switch = problem.search.switch
-    if not _roll(problem, c, 0, switch):
-        return -np.inf
-    return _gain(problem, 0, switch)
-
-
-@compiled
-def _finish(problem: Problem, c: int, begun: float) -> float:
-    """Roll the path under candidate c from the switch to its end; return the plan's score.
-
-    It is -∞ where the path leaves the bounds of a state, or the score is not finite.
-    """
+def _end(problem: Problem, begun: Halves, paths: Integers, chosen: Integers) -> Halves:
+    """Hold candidates from the ends of paths up to the switch to the end of the plan."""
     search = problem.search
-    if begun == -np.inf:
-        return begun
-    if not _roll(problem, c, search.switch, search.steps):
-        return -np.inf
-    value = begun + _gain(problem, search.switch, search.steps)
-    if search.score not in (Score.JOINT, Score.SUM):
-        value = score_of_path(search.score, problem.path, problem.context)
-    return value if np.isfinite(value) else -np.inf
+    inputs, switch = search.candidates[chosen], switch_of(search)
+    ended = _roll(problem, begun.ends[paths], inputs, switch, search.steps)
+    return Halves(ended.ends, ended.inside & begun.inside[paths], ended.points)
 
 
 @compiled
-def _roll(problem: Problem, c: int, first: int, last: int) -> bool:
-    """Hold candidate c from state ``first`` to state ``last`` of the path."""
-    path, search = problem.path, problem.search
-    u = search.candidates[c]
-    plant, network, theta = problem.plant, problem.network, problem.theta
-    inside: bool = rollout(plant, network, search, theta, path, u, first, last)
-    return inside
+def _roll(problem: Problem, starts: Matrix, inputs: Matrix, first: int, last: int) -> Halves:
+    """Hold inputs, (P, m), from states, (P, d), at step ``first`` to step ``last``."""
+    plant, network, stride = problem.plant, problem.network, problem.search.stride
+    (P, d), (_, m) = starts.shape, inputs.shape
+    n = last // stride - first // stride
+    kept = np.empty((P * n * n_next_points(network), d + network.n_inputs_read))
+    paths, held = paths_from(plant, network, starts), inputs.reshape(P, 1, m)
+    for i in range(first, last):
+        advance_paths(plant, network, problem.theta, paths, held, 0)
+        if (i + 1) % stride == 0:
+            place = (i + 1) // stride - first // stride - 1
+            keep_points(plant, network, paths, place, n, kept)
+    return Halves(paths.states, paths.inside, kept)
 
 
 @compiled
-def _gain(problem: Problem, first: int, last: int) -> float:
-    """Return the growth of log det by the rows of steps ``first`` to ``last``."""
-    path, search = problem.path, problem.search
-    R = rows_of_state(problem.plant, problem.network)
-    first, last = R * (first // search.stride), R * (last // search.stride)
-    apply_inverse(problem.covariance, path, first, last)
-    block = R if search.score == Score.SUM else path.products.shape[0]
-    gain: float = log_determinant(path, first, last, block)
+def _share(problem: Problem, begun: Halves, k: int) -> float:
+    """Make the rows of path k up to the switch those that plans share; return their log det."""
+    _write_rows(problem, begun, k, 1, 0)
+    shared = _shared_rows(problem)
+    gain: float = log_determinant(problem.path, Place(shared, 0), 0, shared, _block(problem))
     return gain
+
+
+@compiled
+def _scores(problem: Problem, begun: float, ended: Halves, first: int, count: int) -> Vector:
+    """Return the scores of the plans that end with so many paths, given log det up to the switch.
+
+    They are -∞ where the path leaves the bounds of a state, or the score is not finite.
+    """
+    search, path = problem.search, problem.path
+    shared, n = _shared_rows(problem), path.factor.shape[0]
+    _write_rows(problem, ended, first, count, shared)
+    scores = np.full(count, -np.inf)
+    for k in range(count):
+        if not ended.inside[first + k]:
+            continue
+        place = Place(shared, k * (n - shared))
+        value = begun + log_determinant(path, place, shared, n, _block(problem))
+        if search.score not in (Score.JOINT, Score.SUM):
+            value = score_of_path(search.score, path, place, problem.context)
+        scores[k] = value if np.isfinite(value) else -np.inf
+    return scores
+
+
+@compiled
+def _write_rows(problem: Problem, halves: Halves, first: int, count: int, row: int) -> None:
+    """Write the rows of so many paths and their products, from a row on."""
+    n = halves.points.shape[0] // halves.ends.shape[0]
+    points = halves.points[first * n : (first + count) * n]
+    plant, network, search = problem.plant, problem.network, problem.search
+    add_rows(plant, network, search, problem.theta, problem.covariance, points, problem.path, row)
+
+
+@compiled
+def _shared_rows(problem: Problem) -> int:
+    """Return how many rows of a path come before the switch."""
+    search = problem.search
+    count: int = rows_of_state(problem.plant, problem.network) * (
+        switch_of(search) // search.stride
+    )
+    return count
+
+
+@compiled
+def _block(problem: Problem) -> int:
+    """Return how many rows are taken together: those of a state, or of the whole path."""
+    if problem.search.score == Score.SUM:
+        return rows_of_state(problem.plant, problem.network)
+    n: int = problem.path.factor.shape[0]
+    return n
 
 
 @compiled

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, Score
-from dopt.kernel.checks import within
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import add_multiple, inner
-from dopt.kernel.model import accelerations_at, euler_step, rows_at
+from dopt.kernel.model import rows_at
 from dopt.kernel.points import n_next_points, next_points
+from dopt.kernel.search.paths import advance_paths, keep_points, paths_from
 from dopt.kernel.search.posterior import Directions, changes_along, directions
 from dopt.kernel.structs import Trial
 from dopt.types import Booleans, Integers, Matrix, Stack, Vector
@@ -188,30 +188,17 @@ def _paths(trial: Trial, settings: Settings, t: int, inputs: Stack) -> tuple[Boo
     """
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     P, d, stride = inputs.shape[0], trial.record.states.shape[1], settings.stride
-    n, per_state = settings.steps // stride, n_next_points(network)
-    kept = np.empty((P * n * per_state, d + network.n_inputs_read))
-    inside = np.ones(P, np.bool_)
-    states, flow, value = np.empty((P, d)), np.empty(d), np.empty(plant.learned_rows.shape[0])
-    outputs = np.empty((value.shape[0], P))
-    following = np.empty(d)
-    states[:] = trial.record.states[t]
-    points = states if network.n_inputs_read == 0 else np.empty((P, d + network.n_inputs_read))
+    n = settings.steps // stride
+    kept = np.empty((P * n * n_next_points(network), d + network.n_inputs_read))
+    starts = np.empty((P, d))
+    starts[:] = trial.record.states[t]
+    paths = paths_from(plant, network, starts)
     for i in range(n * stride):
         k = (t + i) // settings.hold - t // settings.hold
-        if network.n_inputs_read > 0:
-            points[:, :d] = states
-            points[:, d:] = inputs[:, k]
-        accelerations_at(plant, network, theta, points, outputs)
-        for p in range(P):
-            for j in range(value.shape[0]):
-                value[j] = outputs[j, p]
-            euler_step(plant, states[p], inputs[p, k], value, flow, following)
-            inside[p] = inside[p] and within(following, plant.state_limit)
-            states[p] = following
-            if (i + 1) % stride == 0:
-                place = per_state * (p * n + (i + 1) // stride - 1)
-                kept[place : place + per_state] = next_points(network, following, plant.gamma)
-    return inside, kept
+        advance_paths(plant, network, theta, paths, inputs, k)
+        if (i + 1) % stride == 0:
+            keep_points(plant, network, paths, (i + 1) // stride - 1, n, kept)
+    return paths.inside, kept
 
 
 @compiled

@@ -9,8 +9,9 @@ import numpy as np
 from dopt.algorithm import Score
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.information.primal import inner
+from dopt.kernel.points import n_next_points, next_points
 from dopt.kernel.search.krylov import krylov_space, largest_eigenvalue
-from dopt.kernel.search.path import Path, model_and_jacobian, rows_of_state, whiten
+from dopt.kernel.search.path import Path, Place, row_at, rows_of_points, whitened
 from dopt.kernel.state_structs import Covariance
 from dopt.kernel.structs import Network, Plant, Search
 from dopt.types import Matrix, Vector
@@ -24,42 +25,37 @@ class ScoreContext(NamedTuple):
 
 
 @vectorized
-def score_of_path(score: int, path: Path, context: ScoreContext) -> float:
+def score_of_path(score: int, path: Path, place: Place, context: ScoreContext) -> float:
     """Return the score of a whole path whose factor is known, if it is not a determinant."""
-    n, total = path.products.shape[0], 0.0
+    n, total = path.factor.shape[0], 0.0
     if score == Score.TRACE:
         for i in range(n):
-            total += inner(path.products[i], path.rows[i])
+            at = row_at(place, i)
+            total += inner(path.products[at], path.rows[at])
         return total
-    whiten(path, n)
+    white = whitened(path, place)
     if score == Score.E:
-        return -largest_eigenvalue(context.projected, context.probes, path.products)
+        return -largest_eigenvalue(context.projected, context.probes, white)
     for i in range(n):
         if score == Score.A:
-            total += inner(path.products[i], path.products[i])
+            total += inner(white[i], white[i])
         for j in range(context.probes.shape[0]):
-            total += squared(inner(path.products[i], context.probes[j]))
+            total += squared(inner(white[i], context.probes[j]))
     return total
 
 
 @compiled
 def score_context(
-    plant: Plant,
-    network: Network,
-    search: Search,
-    theta: Vector,
-    covariance: Covariance,
-    path: Path,
+    plant: Plant, network: Network, search: Search, theta: Vector, covariance: Covariance
 ) -> ScoreContext:
     """Return what the score needs at these parameters and this M⁻¹."""
-    q, R = theta.shape[0], rows_of_state(plant, network)
     if search.score == Score.E:
         basis, projected = krylov_space(covariance, search.starts, search.subspace)
         return ScoreContext(basis, projected)
     n = search.task_states.shape[0] if search.score == Score.TASK else 0
-    rows = np.empty((n * R, q))
+    per_state = n_next_points(network)
+    points = np.empty((n * per_state, search.task_states.shape[1] + network.n_inputs_read))
     for s in range(n):
-        for i in range(path.flow.shape[0]):
-            path.states[0, i] = search.task_states[s, i]
-        model_and_jacobian(plant, network, theta, path, 0, rows[s * R : (s + 1) * R])
-    return ScoreContext(rows, np.empty((0, 0)))
+        at = next_points(network, search.task_states[s], plant.gamma)
+        points[s * per_state : (s + 1) * per_state] = at
+    return ScoreContext(rows_of_points(plant, network, theta, points), np.empty((0, 0)))

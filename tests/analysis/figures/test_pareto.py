@@ -30,6 +30,7 @@ LEARNERS: tuple[dict[str, object], ...] = (
     {"name": "gauss_newton"},
     {"name": "gauss_newton", "refit_every": 10},
 )
+NETWORKS = {"model": {"name": "ensemble"}, "learner": {"name": "gauss_newton"}}
 TASK = {"name": "control", "checkpoints": [20]}
 ENVS = ("pendulum", "quadrotor")
 
@@ -52,6 +53,7 @@ def learners(tmp_path_factory: pytest.TempPathFactory) -> str:
     ]
     fresh = {"information": "fresh"}
     specs += make_grid(ENVS, ("d_optimal",), range(3), policy=fresh, **SHORT)
+    specs += make_grid(ENVS, ("random",), range(3), **NETWORKS, **SHORT)
     specs += make_grid(ENVS[:1], ("d_optimal",), range(3), task=TASK, **SHORT)
     specs += make_grid(ENVS[:1], ("random",), range(2), env={"horizon": 60, "gamma": 3.0})
     specs += make_grid(("arm",), ("random",), range(3), **SHORT)
@@ -69,9 +71,12 @@ def measured(url: str, rule: DivergenceRule = DivergenceRule.EXCLUDE) -> tuple[P
 def test_a_point_is_a_configuration_of_an_environment_that_has_several(learners: str) -> None:
     points = measured(learners)
     labels = [point.label for point in points if point.env == "pendulum"]
-    assert len(labels) == len(set(labels)) == 9  # the task and the other bound are none
+    assert len(labels) == len(set(labels)) == 10  # the task and the other bound are none
     assert {point.env for point in points} == set(ENVS)
     assert "random, gauss_newton, refit_every=10" in labels
+    words = {(one.policy_words, one.learner_words) for one in points if one.env == "pendulum"}
+    assert len(words) == 10
+    assert {("random", "gauss_newton"), ("random", "gauss_newton, ensemble")} <= words
     assert list(policies_of(points)) == ["D-optimal", "D-optimal, information=fresh", "random"]
 
 
@@ -119,7 +124,7 @@ def test_it_is_drawn_from_the_command_line(learners: str, tmp_path: Path) -> Non
     assert (tmp_path / "figure6_pareto.png").read_bytes().startswith(b"\x89PNG")
     with (tmp_path / "figure6_pareto.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 18
+    assert len(rows) == 20
     assert {row["on_front"] for row in rows} == {"True", "False"}
 
 
