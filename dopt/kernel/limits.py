@@ -166,8 +166,8 @@ def largest_excess(
     """Return how far beyond the bounds an input leads, at most 0 if not at all.
 
     It is the largest over the errors of the prediction, none or one of ±``errors``, of the smallest
-    over the backup inputs. It may stop at ``best``. ``errors`` are those of the accelerations, (r,),
-    or also of the state, (r + d,).
+    over the backup inputs. It may stop at ``best``. The errors are of accelerations, (r,), with
+    those of an estimated state behind them, (r + d,).
     """
     largest, kept = -np.inf, 0  # the backup input that has kept the states within bounds
     for case in range(1 + 2 * errors.shape[0]):

@@ -63,7 +63,7 @@ class JointKalmanLearner:
             self._fit(t + 1)
 
     def acceleration_variances(self, x: Tensor) -> Tensor:
-        """Return the variances ρ + g M⁻¹ gᵀ of the accelerations at states without input, (n, r)."""
+        """Return the variances ρ + g M⁻¹ gᵀ of accelerations at states without input, (n, r)."""
         zero = torch.zeros_like(self._batch.inputs[:, 0])
         J = self._rows(self._batch.theta, self._batch.points(x, zero))
         return self._spread(J) + self._learner.noise_variance

@@ -74,15 +74,16 @@ def beyond(result: TrialResult) -> float:
 
 def test_the_true_cart_stays_on_its_rail() -> None:
     """Counted on the true states: without limits it leaves the rail, without a margin also."""
-    free, bare, kept = (
+    free, bare = (
         run_trial(limited(RAIL | given, horizon=300))
-        for given in ({"enforced": False}, {"margin": 0.0}, {})
+        for given in ({"enforced": False}, {"margin": 0.0})
     )
+    kept = [run_trial(limited(RAIL, horizon=300, seed=seed)) for seed in range(3)]
     assert beyond(free) > 0.5
-    assert beyond(kept) <= 0.01
-    assert beyond(kept) < beyond(bare)
-    for result in (free, bare, kept):
-        assert measures(result)["violations"] == 300 * beyond(result)
+    assert sum(map(beyond, kept)) <= 0.01 * 3
+    assert beyond(kept[0]) < beyond(bare)
+    for result in (free, bare, *kept):
+        assert measures(result)["violations"] == pytest.approx(300 * beyond(result))
 
 
 def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None:
