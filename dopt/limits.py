@@ -4,7 +4,8 @@ The input that a policy chooses is moved into the box of inputs and towards the 
 far as the rates demand. Then the states that would follow are predicted with the model, over some
 steps in which a backup input is held: ±γ along an axis, or 0. If none of them keeps the states
 within their bounds, also with accelerations that are wrong by ``margin`` standard deviations, the
-input is replaced (:mod:`dopt.kernel.limits`).
+input is replaced (:mod:`dopt.kernel.limits`). Where states are estimated, the estimate from which
+the prediction starts is taken to be wrong as well (:class:`dopt.learning.JointKalman`).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Limits(Validated):
         Number of predicted steps.
     margin : float
         Error of the predicted accelerations that is reckoned with, in standard deviations: of the
-        model's own uncertainty, scaled by the errors it has made.
+        model's own uncertainty, scaled by the errors it has made; and of estimated states.
     enforced : bool
         Whether inputs are replaced. Otherwise states beyond the bounds are counted alone.
     """

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.free_run import relative_error
-from dopt.control.prediction import forecast_by
 from dopt.errors import SpecificationError
+from dopt.explorer.recorded_run import free_run_error
 from dopt.explorer.state import ExplorerState
 from dopt.spec.trial import TrialSpec
-from dopt.systems.base import System
 from dopt.types import Array
 
 KINDS = (
@@ -95,22 +93,25 @@ class Explored:
         ----------
         states, inputs : (T + 1, d), (T, m)
             States that were measured dt apart, and the inputs between them; best of another run
-            than the one that was learned from.
+            than the one that was learned from. Of a plant some of whose states are measured it may
+            be these alone, (T + 1, n).
         steps : int
-            Steps of a prediction; the run is cut into as many of them as it holds.
+            Steps of a prediction; the run is cut into as many of them as it holds. Where states are
+            measured the first piece has no prediction: the states are estimated in it.
 
         Returns
         -------
         float
             Relative root mean square error, without a unit: 0 for perfect predictions, 1 for those
-            that nothing changes (:func:`dopt.control.free_run.relative_error`).
+            that nothing changes (:func:`dopt.control.free_run.relative_error`). That of measured
+            states alone has their noise in it.
 
         Raises
         ------
         SpecificationError
             If the shapes do not fit, or the run has fewer steps.
         """
-        return free_run_error(self.spec.system, self.predict, states, inputs, steps)
+        return free_run_error(self.spec, self.predict, states, inputs, steps)
 
 
 def predict(
@@ -140,28 +141,3 @@ def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
             f"them."
         )
     return rows
-
-
-def free_run_error(
-    system: System,
-    predict: Callable[[Array, Array], Array],
-    states: npt.ArrayLike,
-    inputs: npt.ArrayLike,
-    steps: int = 50,
-) -> float:
-    """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations."""
-    x, u = np.array(states, dtype=float), np.asarray(inputs, dtype=float)
-    d, m = system.n_states, system.n_inputs
-    n = len(u) // max(steps, 1)
-    if x.shape != (len(u) + 1, d) or u.shape != (len(u), m) or steps < 1 or n < 1:
-        raise SpecificationError(
-            f"a run with states of shape {x.shape} and inputs of shape {u.shape} was given for "
-            f"predictions of {steps} steps, but shapes (T + 1, {d}) and (T, {m}) with at least "
-            f"so many steps T are expected: correct it."
-        )
-    cut = u[: n * steps].reshape(n, steps, m)
-    for angle in system.angle_indices:
-        x[:, angle] = np.unwrap(x[:, angle])
-    starts, ends = x[: n * steps : steps], x[1 : n * steps + 1].reshape(n, steps, d)
-    predicted = forecast_by(system, predict)(starts, cut)
-    return relative_error(predicted, ends.swapaxes(0, 1), starts)

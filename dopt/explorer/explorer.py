@@ -79,7 +79,8 @@ class Explorer(SavedExplored):
     limits : mapping, optional
         Bounds of states and inputs that inputs are to heed, and rates of inputs, such as
         ``{"bounds": {"angle": [-2, 2], "voltage": [-5, 5]}, "rates": {"voltage": 100}}``
-        (:class:`dopt.limits.Limits`).
+        (:class:`dopt.limits.Limits`). Of states that are measured with noise they need the learner
+        'joint_ekf'.
     seed : int
         Seed of the initial parameters and of the policy's own draws.
     steps : int

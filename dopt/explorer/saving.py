@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from dopt.assessment import violations
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.explored import Explored, free_run_error, predict
+from dopt.explorer.explored import Explored, predict
+from dopt.explorer.recorded_run import free_run_error
 from dopt.result import Assessment, TrialResult
 from dopt.spec.prequential import PrequentialTrial
 from dopt.spec.trial import TrialSpec
@@ -118,7 +119,7 @@ class SavedExplored(Explored):
                 f"those of a recorded run."
             )
         predicted = functools.partial(predict, self.spec, parameters)
-        return Assessment(n, "free_run_error", free_run_error(self.spec.system, predicted, *test))
+        return Assessment(n, "free_run_error", free_run_error(self.spec, predicted, *test))
 
     def _close_savers(self) -> None:
         """End the launches of the saves."""

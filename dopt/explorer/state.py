@@ -73,7 +73,7 @@ class ExplorerState:
     time : float or None
         When it was measured [s].
     excess : (T,)
-        How far the state that each step led to is beyond the limits, 0 without limits.
+        How far the state that each step led to, or its estimate, is beyond the limits, 0 without.
     counts : Counter of str
         How often what happened (:class:`dopt.Explorer`).
     """
@@ -152,10 +152,11 @@ class ExplorerState:
         t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
         self.steps.inputs[t] = u
         self.steps.states[t + 1, self._measured] = x
-        if self.spec.limits is not None:
-            self.excess[t] = self.spec.limits.excess(self.spec.system, x[None])[0]
         self._watch_size(t, x, u, event["dt"])
         finite = self.steps.take_in(t, event["dt"])
+        if self.spec.limits is not None:
+            reached = self.steps.states[t + 1 : t + 2]
+            self.excess[t] = self.spec.limits.excess(self.spec.system, reached)[0]
         self.done += 1
         self.counts["learned"] += 1
         self.present, self.time = x, event["time"]

@@ -1,8 +1,9 @@
 """Inputs that keep the states of a plant within bounds, in compiled code (:mod:`dopt.limits`).
 
 An input is accepted if after it some backup input keeps the predicted states within the bounds,
-also where the predicted accelerations are off by the margin. Otherwise the first of a few other
-inputs for which that holds takes its place, or the one that leads least far beyond the bounds.
+also where the predicted accelerations, or an estimated state, are off by the margin. Otherwise the
+first of a few other inputs for which that holds takes its place, or the one that leads least far
+beyond the bounds.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ import numpy as np
 from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
 from dopt.kernel.compiler import compiled
 from dopt.kernel.integration import add_stage, n_stages, write_rate
+from dopt.kernel.learners.joint_kalman import acceleration_variances, state_variances
 from dopt.kernel.learners.samples import sampled_point
 from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import model_point
 from dopt.kernel.policies.prediction import predicted_state
+from dopt.kernel.sensors import has_sensors
 from dopt.kernel.structs import Limits, Trial
 from dopt.types import Matrix, Vector
 
@@ -29,7 +32,7 @@ def limit_input(trial: Trial, t: int, u: Vector) -> None:
     before, x = input_before(trial), record.states[t]
     move_within(limits, before, u)
     if limits.steps > 0:
-        keep_within_bounds(trial, x, before, u)
+        keep_within_bounds(trial, t, x, before, u)
     trial.state.prediction.last_input[:] = u
 
 
@@ -50,11 +53,12 @@ def input_before(trial: Trial) -> Vector:
 
 
 @compiled
-def keep_within_bounds(trial: Trial, x: Vector, before: Vector, u: Vector) -> None:
+def keep_within_bounds(trial: Trial, t: int, x: Vector, before: Vector, u: Vector) -> None:
     """Replace an input that leads beyond the bounds of the states."""
     limits = trial.limits
     backups = backup_inputs(trial.plant.gamma, u.shape[0])
-    errors = error_bounds(trial, x)
+    estimated = has_sensors(trial.sensors)
+    errors = estimate_bounds(trial, t, x) if estimated else error_bounds(trial, x)
     tried, best = np.empty(u.shape[0]), np.inf
     chosen = u.copy()
     for i in range(2 + backups.shape[0]):
@@ -120,10 +124,33 @@ def error_bounds(trial: Trial, x: Vector) -> Vector:
 
 
 @compiled
+def estimate_bounds(trial: Trial, t: int, x: Vector) -> Vector:
+    """Return the largest errors of accelerations and of the estimate x, (r + d,), at step t.
+
+    Each is taken to be off alone, by the margin times the standard deviation that the filter over
+    state and parameters has for it.
+    """
+    plant, theta = trial.plant, trial.state.theta
+    bar = predicted_state(plant, trial.network, theta, x)
+    of_accelerations = acceleration_variances(trial, bar)
+    of_states = state_variances(trial, t)
+    variances = np.concatenate((of_accelerations, of_states))
+    for i in range(variances.shape[0]):  # rounding may leave one below 0
+        variances[i] = variances[i] if variances[i] > 0.0 else 0.0
+    bounds: Vector = trial.limits.margin * np.sqrt(variances)
+    return bounds
+
+
+@compiled
 def note_error(trial: Trial, t: int, target: Vector) -> None:
-    """Take the error of the accelerations observed at step t, (r,), before they are learned."""
+    """Take the error of the accelerations observed at step t, (r,), before they are learned.
+
+    Of estimated states there is none: the filter knows how uncertain they are.
+    """
     error, value = trial.state.prediction, np.empty(target.shape[0])
     error.last_input[:] = trial.record.inputs[t]
+    if has_sensors(trial.sensors):
+        return
     point = sampled_point(trial, t)
     model_accelerations(trial.plant, trial.network, trial.state.theta, point, value)
     share = max(1.0 / (t + 1.0), 1.0 / NEWEST_ERRORS)
@@ -138,8 +165,9 @@ def largest_excess(
 ) -> float:
     """Return how far beyond the bounds an input leads, at most 0 if not at all.
 
-    It is the largest over the errors of the accelerations, none or one of ±``errors`` (r,), of the
-    smallest over the backup inputs. It may stop at ``best``.
+    It is the largest over the errors of the prediction, none or one of ±``errors``, of the smallest
+    over the backup inputs. It may stop at ``best``. The errors are of accelerations, (r,), with
+    those of an estimated state behind them, (r + d,).
     """
     largest, kept = -np.inf, 0  # the backup input that has kept the states within bounds
     for case in range(1 + 2 * errors.shape[0]):
@@ -166,10 +194,14 @@ def path_excess(
     It is in the units of the states, or ``stop`` or more where it is no less than that.
     """
     plant, limits, network = trial.plant, trial.limits, trial.network
-    d, r = x.shape[0], errors.shape[0]
+    d, r = x.shape[0], plant.learned_rows.shape[0]
     state, following, rate, total = x.copy(), np.empty(d), np.empty(d), np.empty(d)
     accelerations, u, target = np.empty(r), first.copy(), np.empty(first.shape[0])
-    largest = -np.inf
+    largest, k, off = -np.inf, (case - 1) // 2, 0.0
+    if case > 0:
+        off = errors[k] if case % 2 == 1 else -errors[k]
+    if k >= r:
+        state[k - r] += off
     for step in range(limits.steps):
         if step > 0:
             target[:] = backup
@@ -179,9 +211,8 @@ def path_excess(
         for stage in range(n_stages(plant)):
             point = model_point(network, following, u)
             model_accelerations(plant, network, trial.state.theta, point, accelerations)
-            if case > 0:
-                k = (case - 1) // 2
-                accelerations[k] += errors[k] if case % 2 == 1 else -errors[k]
+            if 0 <= k < r:
+                accelerations[k] += off
             write_rate(plant, following, u, accelerations, rate)
             add_stage(plant, stage, plant.dt, state, rate, total, following)
         for i in range(d):

@@ -62,6 +62,21 @@ class JointKalmanLearner:
         if (t + 1) % learner.refit_every == 0:
             self._fit(t + 1)
 
+    def acceleration_variances(self, x: Tensor) -> Tensor:
+        """Return the variances ρ + g M⁻¹ gᵀ of accelerations at states without input, (n, r)."""
+        zero = torch.zeros_like(self._batch.inputs[:, 0])
+        J = self._rows(self._batch.theta, self._batch.points(x, zero))
+        return self._spread(J) + self._learner.noise_variance
+
+    def state_variances(self, t: int) -> Tensor:
+        """Return the diagonals of P + Ψ M⁻¹ Ψᵀ, the variances of the estimates x̂_t, (n, d)."""
+        P, psi = self._begun(t, self._P, self._psi)
+        return P.diagonal(dim1=1, dim2=2) + self._spread(psi)
+
+    def _spread(self, rows: Tensor) -> Tensor:
+        """Return the diagonals of R M⁻¹ Rᵀ, (n, k), of rows R, (n, k, q)."""
+        return (rows * self._information.solve(rows.mT).mT).sum(dim=-1)
+
     def _rows(self, theta: Tensor, points: Tensor) -> Tensor:
         """Return J, (n, r, q), at points (n, ·)."""
         return self._batch.learned.jacobian(theta, points.unsqueeze(1)).squeeze(1)

@@ -13,14 +13,21 @@ from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
 from dopt.limits import Limits
 from dopt.policies import ICEM, InformationPolicy, Search
 from dopt.reference.dynamics import next_states
+from dopt.reference.joint_kalman import JointKalmanLearner
+from dopt.reference.learning import BatchLearner
 from dopt.reference.planning import predicted_states
 from dopt.reference.state import BatchState
 
 
 class BatchLimits:
-    """Limits of a batch of trials, and what they know of the errors of its models."""
+    """Limits of a batch of trials, and what they know of the errors of its models.
 
-    def __init__(self, batch: BatchState, limits: Limits) -> None:
+    The learner says how uncertain its estimates are where it estimates states.
+    """
+
+    def __init__(
+        self, batch: BatchState, limits: Limits, learner: BatchLearner | JointKalmanLearner
+    ) -> None:
         system, n = batch.system, len(batch.specs)
         self._batch, self._limits = batch, limits
         self._lower, self._upper = batch.tensor(limits.of_states(system)).unbind(-1)
@@ -36,6 +43,7 @@ class BatchLimits:
         policy = batch.config.policy
         searches = isinstance(policy, (Search, ICEM))
         self._has_information = isinstance(policy, InformationPolicy) and not searches
+        self._filter = learner if isinstance(learner, JointKalmanLearner) else None
 
     def limited(self, t: int, u: Tensor) -> Tensor:
         """Return inputs, (n, m), that heed the limits in the place of u_t, (n, m)."""
@@ -55,10 +63,13 @@ class BatchLimits:
     def note_error(self, t: int, sampled: Tensor) -> None:
         """Take the errors of the accelerations observed at step t, before they are learned.
 
-        ``sampled``, (n, ·), are the points at which they were observed.
+        ``sampled``, (n, ·), are the points at which they were observed. Of estimated states there
+        are none: the filter knows how uncertain they are.
         """
         batch = self._batch
         self._last_input = batch.inputs[:, t]
+        if self._filter is not None:
+            return
         value = batch.model(batch.theta, sampled.unsqueeze(1)).squeeze(1)
         square = (batch.targets[:, t] - value).square() / (1 + self._variances[0])
         self._scale += max(1 / (t + 1), 1 / NEWEST_ERRORS) * (square - self._scale)
@@ -87,12 +98,24 @@ class BatchLimits:
         return chosen
 
     def _error_bounds(self, t: int) -> Tensor:
-        """Return the largest errors that are reckoned with, (n, r)."""
+        """Return the largest errors that are reckoned with, (n, r).
+
+        Where states are estimated, those of the states are behind them, (n, r + d).
+        """
+        if self._filter is not None:
+            return self._limits.margin * self._filtered_variances(self._filter, t).sqrt()
         ahead = torch.zeros_like(self._scale)
         if self._has_information:
             ahead = self._uncertainty(t).clamp(min=0.0).nan_to_num(nan=0.0)
         self._variances = self._variances[1], ahead
         return self._limits.margin * (self._scale * (1 + ahead)).sqrt()
+
+    def _filtered_variances(self, learner: JointKalmanLearner, t: int) -> Tensor:
+        """Return the variances of the accelerations ahead and of the estimates, (n, r + d)."""
+        batch = self._batch
+        bar = predicted_states(batch.learned, batch.theta, batch.states[:, t])
+        both = learner.acceleration_variances(bar), learner.state_variances(t)
+        return torch.cat(both, dim=1).clamp(min=0.0).nan_to_num(nan=0.0)
 
     def _uncertainty(self, t: int) -> Tensor:
         """Return h = g M⁻¹ gᵀ of every acceleration at the predicted state, (n, r)."""
@@ -107,12 +130,14 @@ class BatchLimits:
     def _excess(self, x: Tensor, tried: Tensor, errors: Tensor) -> Tensor:
         """Return how far beyond the bounds each input leads, (n, C), for inputs (n, C, m)."""
         n, count, m = tried.shape
-        r, backups = errors.shape[1], len(self._backups)
-        signs = torch.stack([torch.eye(r), -torch.eye(r)], dim=1).flatten(0, 1).to(errors)
+        k, r, backups = errors.shape[1], self._scale.shape[1], len(self._backups)
+        signs = torch.stack([torch.eye(k), -torch.eye(k)], dim=1).flatten(0, 1).to(errors)
         signs = torch.cat([torch.zeros_like(signs[:1]), signs])
         shape = (n, count, len(signs), backups)
-        off = (signs * errors.unsqueeze(1))[:, None, :, None].expand(*shape, r)
+        off = (signs * errors.unsqueeze(1))[:, None, :, None].expand(*shape, k)
         state = x[:, None, None, None].expand(*shape, -1)
+        off, of_states = off[..., :r], off[..., r:]
+        state = state + of_states if k > r else state
         u = tried[:, :, None, None].expand(*shape, m)
         target = self._backups.expand(*shape, m)
         largest = torch.full(shape, -torch.inf).to(x)

@@ -34,8 +34,9 @@ class BatchSteps(BatchState):
         self.sensors = BatchSensors(self) if self.system.n_measured else None
         self.learner = batch_learner(self, points, self.sensors)
         self.own_plan = plan_for(self, self.learner)
-        limits = self.config.limits
-        self.limits = BatchLimits(self, limits) if limits and limits.enforced else None
+        limits, self.limits = self.config.limits, None
+        if limits and limits.enforced:
+            self.limits = BatchLimits(self, limits, self.learner)
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m); the first of a closed-loop policy is random.

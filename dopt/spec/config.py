@@ -13,7 +13,7 @@ from dopt.control import Control
 from dopt.declare.registry import identifying_section, section_of
 from dopt.declare.validated_fields import Validated
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
-from dopt.learning import LEARNERS, InformationLearner, Learner
+from dopt.learning import LEARNERS, InformationLearner, JointKalman, Learner
 from dopt.learning.base import CompiledLearner, CustomLearner
 from dopt.limits import Limits
 from dopt.models import Model
@@ -79,8 +79,7 @@ class TrialConfig:
         if self.limits is not None:
             self.limits.check(self.system)
             if self.system.n_measured and self.limits.enforced:
-                given = "env.measured_states"
-                raise mismatch("limits", "states that are known without noise", given)
+                self._check_estimates()
         if type(self.system) not in SYSTEMS.values():
             check_system(self.system)
             warn_of_scale(self.system, self.model)
@@ -94,6 +93,13 @@ class TrialConfig:
             )
         check_together(self.system, self.policy, self.model, self.learner)
         warn_of_prior(self.policy, self.model, self.learner)
+
+    def _check_estimates(self) -> None:
+        """Refuse limits where nobody says how uncertain the estimated states are."""
+        if not isinstance(self.learner, JointKalman):
+            expected = "learner 'joint_ekf', which knows how uncertain its estimates are,"
+            given = f"learner '{self.learner.name}'"
+            raise mismatch("limits of measured states", expected, given)
 
     def _check_runnable(self) -> None:
         """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""

@@ -15,6 +15,8 @@ RUNS = [
     ("cartpole", "d_optimal", "gauss_newton"),
     ("cartpole", "random", "adam_window"),
     ("cartpole", "random", "gauss_newton"),
+    ("cartpole", "d_optimal", "joint_ekf"),
+    ("cartpole", "random", "joint_ekf"),
     ("unbalanced_disk", "d_optimal", "gauss_newton"),
     ("unbalanced_disk", "random", "gauss_newton"),
 ]
@@ -47,7 +49,7 @@ def test_rows_are_those_of_the_table(env: str, policy: str, learner: str) -> Non
     assert f"| {env} | `{policy}` | `{learner}` | {shares} | {cells} |" in FINDINGS
 
 
-@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton"])
+@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton", "joint_ekf"])
 def test_the_rail_costs_little(learner: str) -> None:
     """At most 1 % of the steps lead beyond it, at 1.25 times the loss without limits at most."""
     free, kept = (runs("cartpole", "d_optimal", learner, enforced) for enforced in (False, True))

@@ -20,6 +20,7 @@ from dopt.kernel.learners.state_filter import (
     move_sensitivity,
     state_jacobian,
 )
+from dopt.kernel.points import model_point
 from dopt.kernel.structs import Trial
 from dopt.types import Vector
 
@@ -74,3 +75,26 @@ def update(trial: Trial, t: int) -> None:
         correct_sensitivity(gain, row, sensitivity)
         for j in range(x.shape[0]):
             x[j] += gain[j] * error + inner(sensitivity[j], change)
+
+
+@compiled
+def acceleration_variances(trial: Trial, x: Vector) -> Vector:
+    """Return the variances ρ + g M⁻¹ gᵀ of the accelerations at a state without input, (r,)."""
+    plant, network, state = trial.plant, trial.network, trial.state
+    point = model_point(network, x, np.zeros(plant.n_inputs))
+    J = model_rows(plant, network, state.theta, point, np.empty(plant.learned_rows.shape[0]))
+    variances: Vector = np.diag(quadratic_forms(state.covariance, J, J)).copy()
+    variances += trial.algorithm.learner[1]
+    return variances
+
+
+@compiled
+def state_variances(trial: Trial, t: int) -> Vector:
+    """Return the diagonal of P + Ψ M⁻¹ Ψᵀ, the variances of the estimate x̂_t, (d,)."""
+    estimate = trial.state.estimate
+    if np.isfinite(estimate.starts[t, 0]):
+        return trial.sensors.start_variances.copy()
+    psi = estimate.sensitivity
+    spread = quadratic_forms(trial.state.covariance, psi, psi)
+    variances: Vector = np.diag(estimate.covariance) + np.diag(spread)
+    return variances

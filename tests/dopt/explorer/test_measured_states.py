@@ -12,6 +12,7 @@ import pytest
 
 from dopt import Explorer, Plant
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.explorer.recorded_run import free_run_error
 from dopt.types import Array
 from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
 
@@ -182,3 +183,40 @@ def test_a_rate_without_its_angle_needs_the_filter() -> None:
     with pytest.raises(IncompatibleError, match="joint_ekf"):
         Explorer(gyroscope, steps=10)
     Explorer(gyroscope, steps=10, **JOINT)
+
+
+def recorded(steps: int, noise: float) -> tuple[Array, Array, Array]:
+    """Return states, measured angles over one turn, and inputs of a run of the motor."""
+    rng = np.random.default_rng(9)
+    inputs = np.repeat(rng.uniform(-6, 6, (-(-steps // 10), 1)), 10, axis=0)[:steps]
+    states = [np.array([2.0, 5.0])]
+    for u in inputs:
+        states.append(following(states[-1], u))
+    angles = np.array(states)[:, :1] + noise * rng.standard_normal((steps + 1, 1))
+    return np.array(states), (angles + math.pi) % (2 * math.pi) - math.pi, inputs
+
+
+def true_motor(states: Array, inputs: Array) -> Array:  # noqa: ARG001  # they are known
+    return np.array([[motor_acceleration(x)] for x in states])
+
+
+def test_a_run_of_measured_angles_is_predicted_by_the_truth() -> None:
+    """Without noise the rate is found from the angles, and what remains is of its order."""
+    spec = Explorer(dataclasses.replace(MOTOR, measured={"angle": 1e-6}), steps=10, **JOINT).spec
+    _, angles, inputs = recorded(300, 1e-6)
+    right = free_run_error(spec, true_motor, angles, inputs, steps=30)
+    wrong = free_run_error(spec, lambda x, u: 0.9 * true_motor(x, u), angles, inputs, steps=30)
+    assert right < 1e-4 < 0.01 * wrong
+
+
+def test_the_error_of_measured_angles_is_nearly_that_of_the_states() -> None:
+    explorer = Explorer(ENCODER, steps=400, **JOINT)
+    _, angles, inputs = recorded(400, DEGREE)
+    before = explorer.free_run_error(angles, inputs)
+    driven(explorer, 300)
+    states, _, _ = recorded(400, DEGREE)
+    after = explorer.free_run_error(angles, inputs)
+    assert after < 0.3 * before
+    assert after == pytest.approx(explorer.free_run_error(states, inputs), rel=0.3)
+    with pytest.raises(SpecificationError, match=r"\(T \+ 1, 1\) and twice as many"):
+        explorer.free_run_error(angles[:80], inputs[:79])
