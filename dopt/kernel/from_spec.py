@@ -62,33 +62,36 @@ def trial_of(spec: TrialSpec, draws: Draws) -> args.Trial:
     network = network_of_trial(spec, network, draws.weights)
     record = empty_record(spec.system)
     return args.Trial(
-        plant,
-        network,
-        algorithm,
-        information_of(spec.config),
-        limits_of(spec.config),
-        sensors_of(spec.config),
-        randomness_of(spec, draws),
-        initial_state(spec, draws.weights, record),
-        empty_scratch(spec, network),
-        record,
+        plant=plant,
+        network=network,
+        algorithm=algorithm,
+        information=information_of(spec.config),
+        limits=limits_of(spec.config),
+        sensors=sensors_of(spec.config),
+        randomness=randomness_of(spec, draws),
+        state=initial_state(spec, draws.weights, record),
+        scratch=empty_scratch(spec, network),
+        record=record,
     )
 
 
 def plant_of(system: System) -> args.Plant:
     """Return the constants of a system."""
+    equations = compiled_equations(system)
     return args.Plant(
-        *compiled_equations(system),
-        np.array(system.parameters),
-        np.array(system.history),  # a copy: what came through Ray's memory cannot be written to
-        np.array(system.linear_form),
-        np.array(system.learned_rows),
-        system.n_inputs,
-        system.n_inputs if system.reads_inputs else 0,
-        system.dt,
-        system.gamma,
-        system.state_limit,
-        int(Integrator[system.integrator.upper()]),
+        known=equations.known,
+        accelerations=equations.accelerations,
+        complex_accelerations=equations.complex_accelerations,
+        parameters=np.array(system.parameters),
+        history=np.array(system.history),  # a copy: what came through Ray's memory is read-only
+        linear_form=np.array(system.linear_form),
+        learned_rows=np.array(system.learned_rows),
+        n_inputs=system.n_inputs,
+        n_inputs_read=system.n_inputs if system.reads_inputs else 0,
+        dt=system.dt,
+        gamma=system.gamma,
+        state_limit=system.state_limit,
+        integrator=int(Integrator[system.integrator.upper()]),
     )
 
 

@@ -28,20 +28,25 @@ def initial_state(spec: TrialSpec, weights: Vector, record: args.Record) -> args
     """
     system, q = spec.system, n_learned_parameters(spec.config)
     window = spec.learner.samples_kept(system.horizon)
+    covariance, factor, dual, sketch = _information(spec, q)
     return args.State(
-        weights[:q].copy(),
-        weights[:q].copy(),
-        members_of(spec.model, weights),
-        np.zeros(q),
-        np.zeros(q),
-        *_information(spec, q),
-        _visited(spec),
-        _posterior(spec),
-        _prediction_error(spec),
-        _estimate(spec, q, record.inputs),
-        np.zeros((len(spec.model.features(system)), window)),
-        np.zeros((system.n_learned, window)),
-        *(np.zeros(part.memory_size(system, q)) for part in (spec.policy, spec.learner)),
+        theta=weights[:q].copy(),
+        prior=weights[:q].copy(),
+        members=members_of(spec.model, weights),
+        moment_1=np.zeros(q),
+        moment_2=np.zeros(q),
+        covariance=covariance,
+        factor=factor,
+        dual=dual,
+        sketch=sketch,
+        visited=_visited(spec),
+        posterior=_posterior(spec),
+        prediction=_prediction_error(spec),
+        estimate=_estimate(spec, q, record.inputs),
+        window_features=np.zeros((len(spec.model.features(system)), window)),
+        window_targets=np.zeros((system.n_learned, window)),
+        policy_memory=np.zeros(spec.policy.memory_size(system, q)),
+        learner_memory=np.zeros(spec.learner.memory_size(system, q)),
     )
 
 
