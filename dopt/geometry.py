@@ -20,6 +20,7 @@ from dopt.systems import (
     Chain,
     CoupledPendulums,
     MassSpring,
+    MovingStar,
     Pendulum,
     Quadrotor,
     System,
@@ -106,6 +107,13 @@ def _(system: CoupledPendulums, states: Array) -> Body:
         tips.append(pivots[-1] + _hanging(states[:, index], 1.0))
     rods = tuple(_polyline(pivot, tip) for pivot, tip in zip(pivots, tips, strict=True))
     return Body(rods, np.stack(tips, axis=1))
+
+
+@body.register
+def _(system: MovingStar, states: Array) -> Body:
+    turn = np.linspace(0.0, 2.0 * np.pi, 49)
+    orbit = system.orbit * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return Body((np.broadcast_to(orbit, (len(states), *orbit.shape)),), states[:, None])
 
 
 @body.register

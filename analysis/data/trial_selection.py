@@ -33,7 +33,7 @@ ENVIRONMENTS = (
     *("pendulum", "cartpole", "arm", "quadrotor"),
     *("drifting_pendulum", "chain", "mass_spring"),
     *("pendulum_unknown_gain", "cartpole_unknown_gain"),
-    *("unbalanced_disk", "coupled_pendulums"),
+    *("unbalanced_disk", "coupled_pendulums", "moving_star"),
 )
 """The paper's order; other environments follow by name."""
 

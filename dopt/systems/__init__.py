@@ -14,6 +14,7 @@ from dopt.systems.coupled_pendulums import CoupledPendulums
 from dopt.systems.drifting_pendulum import DriftingPendulum
 from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
+from dopt.systems.moving_star import MovingStar
 from dopt.systems.pendulum import Pendulum, PendulumUnknownGain
 from dopt.systems.quadrotor import Quadrotor
 from dopt.systems.unbalanced_disk import UnbalancedDisk
@@ -32,6 +33,7 @@ SYSTEMS: dict[str, type[System]] = {
         CartpoleUnknownGain,
         UnbalancedDisk,
         CoupledPendulums,
+        MovingStar,
     )
 }
 
@@ -53,6 +55,7 @@ __all__ = [
     "DriftingPendulum",
     "Feature",
     "MassSpring",
+    "MovingStar",
     "Pendulum",
     "PendulumUnknownGain",
     "Quadrotor",

@@ -295,6 +295,9 @@ MECHANICS: dict[type[System], type[Mechanics]] = {
     CoupledPendulums: CoupledPendulumsMechanics,
 }
 
+WITHOUT_INERTIA = ("moving_star",)
+"""Systems of first order, which have no kinetic energy: each has tests of its own."""
+
 FRICTION = {
     "pendulum": ("friction",),
     "cartpole": ("pivot_friction", "cart_friction"),

@@ -1,0 +1,166 @@
+"""Distance to a star that moves, after one of its turns: Figure 4 of FLEX, run here."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Hashable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from analysis.data.config_matching import Filter
+from analysis.data.learned_model import learned_model
+from analysis.data.trial_selection import Entry, newest, policy_rank
+from analysis.errors import AnalysisError
+from analysis.formatting import number, within
+from analysis.tables.comparisons import against_reference
+from analysis.tables.rendering import TextTable
+from analysis.yardsticks.growth import Interval, median
+from analysis.yardsticks.published import FLEX_STAR
+from dopt.models import GreyBox
+from dopt.parameter_error import parameter_error
+from dopt.systems import MovingStar
+from orchestrate.store import ConfigRow, Reader
+
+NAME = "flex_star"
+REFERENCE = "random"
+CENTRE = ("center_x", "center_y")
+LEARNERS = ("adam", "gauss_newton")
+"""Columns of the table."""
+
+_SEED = 20_230_426
+
+
+def entries(reader: Reader, wanted: Filter) -> list[Entry]:
+    """Return the configurations with the moving star and its centre unknown, and their trials.
+
+    Raises
+    ------
+    AnalysisError
+        If two of them have the same policy and learner.
+    """
+    found = newest([one for one in reader.configs() if _is_asked_for(one, wanted)])
+    kept = [Entry(one, tuple(reader.trials(one.config_key))) for one in found]
+    kept.sort(key=lambda one: (_place(one), policy_rank(one.config.policy)))
+    for one, other in itertools.pairwise(kept):
+        if _names(one) == _names(other):
+            learner, policy = _names(one)
+            raise AnalysisError(
+                f"Two configurations of the moving star have the policy '{policy}' and the learner "
+                f"'{learner}', but one is expected: choose by --where, such as "
+                f"--where learner.learning_rate=0.02."
+            )
+    return kept
+
+
+def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
+    fits = config.env == MovingStar.name and config.model == GreyBox.name
+    return fits and config.config["model"]["unknown"] == list(CENTRE) and wanted.accepts(config)
+
+
+def _names(entry: Entry) -> tuple[str, str]:
+    return entry.config.learner, entry.config.policy
+
+
+def _place(entry: Entry) -> int:
+    learner = entry.config.learner
+    return LEARNERS.index(learner) if learner in LEARNERS else len(LEARNERS)
+
+
+def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
+    """Return one row for each finished trial: half the squared error of the centre [m²].
+
+    The error is that against the centre at the last step. It is infinite where the trial diverged.
+    """
+    rows: list[dict[str, object]] = []
+    for entry in found:
+        for trial in entry.finished:
+            error = np.inf
+            if trial.status == "done":
+                model = learned_model(reader, entry.config, trial.seed)
+                system = model.spec.system
+                error = parameter_error(system, model.parameters, system.horizon - 1, CENTRE)
+            learner, policy = _names(entry)
+            row = {"learner": learner, "policy": policy, "seed": trial.seed}
+            rows.append(row | {"error": 0.5 * error**2})
+    return pd.DataFrame(rows)
+
+
+def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
+    """Return medians, quantiles and ratios to random inputs, with intervals of 95 %.
+
+    One row for each learner and policy. ``ratio`` is the geometric mean of the errors by those of
+    random inputs of the same seed and learner, ``worst`` the 95 % quantile of the errors.
+    """
+    rows = []
+    for (learner, policy), own in trials.groupby(["learner", "policy"], sort=False):
+        values = own.error.to_numpy(float)
+        row: dict[str, object] = {"learner": learner, "policy": policy, "n": len(values)}
+        row["worst"] = float(np.quantile(values, 0.95, method="higher"))
+        row |= _columns("median", median(values, np.random.default_rng(_SEED)))
+        rows.append(row | _columns("ratio", _ratio(trials, str(learner), str(policy))))
+    return pd.DataFrame(rows)
+
+
+def _columns(name: str, interval: Interval) -> dict[str, float]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
+
+
+def _ratio(trials: pd.DataFrame, learner: str, policy: str) -> Interval:
+    taught = trials[trials.learner == learner]
+    own, reference = (
+        dict(zip(part.seed, part.error, strict=True))
+        for part in (taught[taught.policy == policy], taught[taught.policy == REFERENCE])
+    )
+    if policy == REFERENCE or not reference:
+        return np.nan, np.nan, np.nan
+    found = against_reference(own, reference, f"moving_star/{learner}", policy, "error")
+    return found.ratio, found.low, found.high
+
+
+def tables(table: pd.DataFrame) -> tuple[TextTable, TextTable]:
+    """Return the errors of all policies beside the published ones, and their ratios."""
+    return _error_table(table), _ratio_table(table)
+
+
+def _error_table(table: pd.DataFrame) -> TextTable:
+    learners = list(dict.fromkeys(table.learner))
+    rows = [
+        [policy, *(_cell(own, learner, _error_texts) for learner in learners)]
+        for policy, own in table.groupby("policy", sort=False)
+    ]
+    rows += [
+        [f"published: {policy}", text, *["–"] * (len(learners) - 1)]
+        for policy, text in FLEX_STAR.items()
+    ]
+    note = (
+        "Half the squared distance between the learned and the true centre of the star at the last "
+        "step [m²]: median over the trials [interval of 95 %]; 95 % quantile."
+    )
+    return TextTable(["policy", *learners], rows, note)
+
+
+def _ratio_table(table: pd.DataFrame) -> TextTable:
+    learners = list(dict.fromkeys(table.learner))
+    rows = [
+        [policy, *(_cell(own, learner, _ratio_text) for learner in learners)]
+        for policy, own in table.groupby("policy", sort=False)
+        if policy != REFERENCE
+    ]
+    note = "Errors by those of random inputs: paired geometric mean [interval of 95 %]."
+    return TextTable(["policy", *learners], rows, note)
+
+
+def _cell(own: pd.DataFrame, learner: str, text: Any) -> str:
+    rows = own[own.learner == learner].to_dict("records")
+    return str(text(rows[0])) if rows else "–"
+
+
+def _error_texts(row: Mapping[Hashable, Any]) -> str:
+    shown = within(row["median"], row["median_low"], row["median_high"])
+    return f"{shown}; {number(row['worst'])}"
+
+
+def _ratio_text(row: Mapping[Hashable, Any]) -> str:
+    return within(row["ratio"], row["ratio_low"], row["ratio_high"])
