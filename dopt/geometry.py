@@ -25,12 +25,16 @@ from dopt.systems import (
     Quadrotor,
     System,
     UnbalancedDisk,
+    VanDerPol,
 )
 
 Array = npt.NDArray[np.float64]
 
 CART = (0.3, 0.12)
 """Half the length and half the height of the cart that is drawn, by the rod's length."""
+
+SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+"""Corners of a square about the origin, from one back to it."""
 
 BLOCK = 0.3
 """Half the side of a mass between springs that is drawn [m]; at rest they are 2 m apart."""
@@ -81,7 +85,7 @@ def _(system: UnbalancedDisk, states: Array) -> Body:  # noqa: ARG001  # its cla
 def _(system: Cartpole, states: Array) -> Body:
     cart = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
     tip = cart - _hanging(-states[:, 2], system.length)  # the angle is from upright
-    corners = system.length * np.array(CART) * [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]
+    corners = system.length * np.array(CART) * SQUARE
     return Body((cart[:, None] + corners, _polyline(cart, tip)), tip[:, None])
 
 
@@ -124,10 +128,16 @@ def _(system: Quadrotor, states: Array) -> Body:
 
 
 @body.register
+def _(system: VanDerPol, states: Array) -> Body:  # noqa: ARG001  # its class decides
+    mass = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
+    return Body((mass[:, None] + BLOCK * SQUARE,), mass[:, None])
+
+
+@body.register
 def _(system: MassSpring, states: Array) -> Body:  # noqa: ARG001  # its class decides
     level = np.zeros(len(states))
     masses = [np.stack([rest + states[:, i], level], axis=1) for rest, i in ((-1, 0), (1, 2))]
-    corners = BLOCK * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    corners = BLOCK * SQUARE
     return Body(tuple(mass[:, None] + corners for mass in masses), np.stack(masses, axis=1))
 
 

@@ -18,6 +18,7 @@ from dopt.systems.moving_star import MovingStar
 from dopt.systems.pendulum import Pendulum, PendulumUnknownGain
 from dopt.systems.quadrotor import Quadrotor
 from dopt.systems.unbalanced_disk import UnbalancedDisk
+from dopt.systems.van_der_pol import VanDerPol
 
 SYSTEMS: dict[str, type[System]] = {
     system.name: system
@@ -34,6 +35,7 @@ SYSTEMS: dict[str, type[System]] = {
         UnbalancedDisk,
         CoupledPendulums,
         MovingStar,
+        VanDerPol,
     )
 }
 
@@ -61,5 +63,6 @@ __all__ = [
     "Quadrotor",
     "System",
     "UnbalancedDisk",
+    "VanDerPol",
     "system_from_mapping",
 ]

@@ -22,6 +22,7 @@ SMALL_GRIDS = {
     "unbalanced_disk": (4, 4),
     "coupled_pendulums": (16,),
     "moving_star": (4, 4),
+    "van_der_pol": (4, 4),
 }
 SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"count": 8}}
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}

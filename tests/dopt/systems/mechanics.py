@@ -28,6 +28,7 @@ from dopt.systems import (
     Quadrotor,
     System,
     UnbalancedDisk,
+    VanDerPol,
 )
 
 
@@ -271,6 +272,29 @@ class MassSpringMechanics(Mechanics):
         return -grad(dissipation)(rates)
 
 
+class VanDerPolMechanics(Mechanics):
+    """A unit mass on a spring; its damping depends on where it is and may feed it."""
+
+    coordinates = (0,)
+
+    def masses(self) -> list[float]:
+        return [1.0]
+
+    def positions(self, q: Tensor) -> Tensor:
+        return torch.stack([q[0], torch.zeros_like(q[0])]).unsqueeze(0)
+
+    def potential(self, q: Tensor) -> Tensor:
+        return 0.5 * self.system.stiffness * q.square().sum()
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
+        """Return the input and the damping, which changes its sign at the amplitude."""
+        inside = 1.0 - (q / self.system.amplitude).square()
+        return u + self.system.damping * inside * rates
+
+    def friction(self, rates: Tensor) -> Tensor:
+        return torch.zeros_like(rates)
+
+
 class PendulumUnknownGainMechanics(PendulumMechanics):
     def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
         return super().driving(q, rates, self.system.gain * u)
@@ -293,6 +317,7 @@ MECHANICS: dict[type[System], type[Mechanics]] = {
     CartpoleUnknownGain: CartpoleUnknownGainMechanics,
     UnbalancedDisk: UnbalancedDiskMechanics,
     CoupledPendulums: CoupledPendulumsMechanics,
+    VanDerPol: VanDerPolMechanics,
 }
 
 WITHOUT_INERTIA = ("moving_star",)
@@ -310,4 +335,8 @@ FRICTION = {
     "cartpole_unknown_gain": ("pivot_friction", "cart_friction"),
     "unbalanced_disk": ("friction", "dry_friction"),
     "coupled_pendulums": ("friction",),
+    "van_der_pol": ("damping",),
 }
+
+SELF_EXCITED = ("van_der_pol",)
+"""Systems whose friction feeds energy at some states."""

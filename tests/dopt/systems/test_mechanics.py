@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 
 from dopt.evaluation import simulate
 from dopt.systems import SYSTEMS, System
-from tests.dopt.systems.mechanics import FRICTION, MECHANICS, WITHOUT_INERTIA, Mechanics
+from tests.dopt.systems.mechanics import (
+    FRICTION,
+    MECHANICS,
+    SELF_EXCITED,
+    WITHOUT_INERTIA,
+    Mechanics,
+)
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems
 
 mechanical = pytest.mark.parametrize("name", [n for n in NAMES if SYSTEMS[n] in MECHANICS])
@@ -57,7 +63,7 @@ def test_nothing_is_gained_or_lost_without_friction_and_input(
     assert rate == pytest.approx(0.0, abs=1e-12 * (1.0 + size))
 
 
-@mechanical
+@pytest.mark.parametrize("name", sorted(set(FRICTION) - set(SELF_EXCITED)))
 @settings(max_examples=25)
 @given(data=st.data())
 def test_friction_never_feeds_energy(name: str, data: st.DataObject) -> None:
