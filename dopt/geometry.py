@@ -1,4 +1,4 @@
-"""Drawings of systems in a vertical plane, as polylines and masses.
+"""Drawings of systems in a plane, vertical but for those that move on one, as polylines and masses.
 
 A custom system gets a drawing by registering one::
 
@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from dopt.systems import (
     Arm,
+    Car,
     Cartpole,
     Chain,
     CoupledPendulums,
@@ -35,6 +36,9 @@ CART = (0.3, 0.12)
 
 SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 """Corners of a square about the origin, from one back to it."""
+
+WHEEL = 0.4
+"""Half the length of a steered wheel that is drawn, by its distance from the centre of mass."""
 
 BLOCK = 0.3
 """Half the side of a mass between springs that is drawn [m]; at rest they are 2 m apart."""
@@ -87,6 +91,16 @@ def _(system: Cartpole, states: Array) -> Body:
     tip = cart - _hanging(-states[:, 2], system.length)  # the angle is from upright
     corners = system.length * np.array(CART) * SQUARE
     return Body((cart[:, None] + corners, _polyline(cart, tip)), tip[:, None])
+
+
+@body.register
+def _(system: Car, states: Array) -> Body:
+    axis = np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], axis=1)
+    front, rear = states[:, :2] + system.front * axis, states[:, :2] - system.rear * axis
+    heading = states[:, 2] + states[:, 6]
+    wheel = WHEEL * system.front * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    lines = _polyline(rear, front), _polyline(front - wheel, front + wheel)
+    return Body(lines, states[:, None, :2])
 
 
 @body.register

@@ -8,6 +8,7 @@ from dopt.declare.registry import TARGET, build
 from dopt.systems import plant
 from dopt.systems.arm import Arm
 from dopt.systems.base import System
+from dopt.systems.car import Car
 from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
 from dopt.systems.chain import Chain
 from dopt.systems.coupled_pendulums import CoupledPendulums
@@ -36,6 +37,7 @@ SYSTEMS: dict[str, type[System]] = {
         CoupledPendulums,
         MovingStar,
         VanDerPol,
+        Car,
     )
 }
 
@@ -50,6 +52,7 @@ def system_from_mapping(section: Mapping[str, object]) -> System:
 __all__ = [
     "SYSTEMS",
     "Arm",
+    "Car",
     "Cartpole",
     "CartpoleUnknownGain",
     "Chain",

@@ -47,6 +47,7 @@ POSITIVE = {
         "motor_gain",
         "measurement_noise",
         "velocity_cutoff",
+        *("front", "rear", "slip_speed", "motor", "steering", "steering_time", "amplitude"),
         "core",
         "period",
     ),
@@ -54,7 +55,7 @@ POSITIVE = {
 NONNEGATIVE = {
     *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
-    *("dry_friction", "coupling", "strength", "orbit", "spread"),
+    *("dry_friction", "coupling", "strength", "orbit", "spread", "front_grip", "rear_grip"),
     "measured_states",
 }
 FRACTIONS = {"beta_1", "beta_2"}

@@ -17,6 +17,7 @@ from torch.func import grad, hessian, jacfwd, jacrev, jvp
 
 from dopt.systems import (
     Arm,
+    Car,
     Cartpole,
     CartpoleUnknownGain,
     Chain,
@@ -295,6 +296,60 @@ class VanDerPolMechanics(Mechanics):
         return torch.zeros_like(rates)
 
 
+class CarMechanics(Mechanics):
+    """Two masses at the radius of gyration along the axis; forces act at the wheels."""
+
+    coordinates = (0, 1, 2)
+
+    def masses(self) -> list[float]:
+        return [self.system.mass / 2] * 2
+
+    def along_axis(self, q: Tensor, distances: Tensor) -> Tensor:
+        """Return the points of the body at distances from its centre along its axis."""
+        return q[:2] + distances.unsqueeze(-1) * torch.stack([q[2].cos(), q[2].sin()])
+
+    def positions(self, q: Tensor) -> Tensor:
+        gyration = math.sqrt(self.system.inertia / self.system.mass)
+        return self.along_axis(q, gyration * _tensor([-1.0, 1.0]))
+
+    def potential(self, q: Tensor) -> Tensor:
+        return 0.0 * q.sum()
+
+    def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return place and heading, and their rates in the world."""
+        cosine, sine = state[2].cos(), state[2].sin()
+        ahead, left = state[3], state[4]
+        world = [ahead * cosine - left * sine, ahead * sine + left * cosine, state[5]]
+        return state[:3], torch.stack(world)
+
+    def power(self, state: Tensor, u: Tensor) -> Tensor:
+        self.angle = state[6]
+        return super().power(state, u)
+
+    def accelerations(self, state: Tensor, u: Tensor) -> Tensor:
+        self.angle = state[6]
+        return super().accelerations(state, u)
+
+    def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
+        """Return motor, drag and tyre forces, each where it acts, by virtual work."""
+        axles = _tensor([self.system.front, -self.system.rear, 0.0])
+        moved = jacrev(lambda z: self.along_axis(z, axles))(q)
+        velocity = moved @ rates
+        headings = torch.stack([q[2] + self.angle, q[2], q[2]])
+        rolling = torch.stack([headings.cos(), headings.sin()], dim=-1)
+        across = torch.stack([-headings.sin(), headings.cos()], dim=-1)
+        grips = _tensor([self.system.front_grip, self.system.rear_grip, 0.0])
+        speeds = (velocity.square().sum(-1) + self.system.slip_speed**2).sqrt()
+        ahead = (velocity * rolling).sum(-1)[2]
+        push = self.system.motor * u[0] - self.system.drag * ahead.abs() * ahead
+        held = -grips * (velocity * across).sum(-1) / speeds
+        forces = held.unsqueeze(-1) * across + _tensor([0.0, 0.0, 1.0])[:, None] * push * rolling
+        return torch.einsum("iaq,ia->q", moved, forces)
+
+    def friction(self, rates: Tensor) -> Tensor:
+        return torch.zeros_like(rates)
+
+
 class PendulumUnknownGainMechanics(PendulumMechanics):
     def driving(self, q: Tensor, rates: Tensor, u: Tensor) -> Tensor:
         return super().driving(q, rates, self.system.gain * u)
@@ -318,6 +373,7 @@ MECHANICS: dict[type[System], type[Mechanics]] = {
     UnbalancedDisk: UnbalancedDiskMechanics,
     CoupledPendulums: CoupledPendulumsMechanics,
     VanDerPol: VanDerPolMechanics,
+    Car: CarMechanics,
 }
 
 WITHOUT_INERTIA = ("moving_star",)
@@ -336,6 +392,7 @@ FRICTION = {
     "unbalanced_disk": ("friction", "dry_friction"),
     "coupled_pendulums": ("friction",),
     "van_der_pol": ("damping",),
+    "car": ("front_grip", "rear_grip", "drag"),
 }
 
 SELF_EXCITED = ("van_der_pol",)
