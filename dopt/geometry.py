@@ -20,6 +20,7 @@ from dopt.systems import (
     Cartpole,
     Chain,
     CoupledPendulums,
+    Drone,
     MassSpring,
     MovingStar,
     Pendulum,
@@ -145,6 +146,13 @@ def _(system: Quadrotor, states: Array) -> Body:
 def _(system: VanDerPol, states: Array) -> Body:  # noqa: ARG001  # its class decides
     mass = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
     return Body((mass[:, None] + BLOCK * SQUARE,), mass[:, None])
+
+
+@body.register
+def _(system: Drone, states: Array) -> Body:
+    centre, turn = states[:, [0, 2]], np.linspace(0.0, 2.0 * np.pi, 25)
+    sphere = system.half_span * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return Body((centre[:, None] + sphere,), centre[:, None])
 
 
 @body.register

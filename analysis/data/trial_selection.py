@@ -34,7 +34,7 @@ ENVIRONMENTS = (
     *("drifting_pendulum", "chain", "mass_spring"),
     *("pendulum_unknown_gain", "cartpole_unknown_gain"),
     *("unbalanced_disk", "coupled_pendulums", "moving_star"),
-    *("van_der_pol", "car"),
+    *("van_der_pol", "car", "drone"),
 )
 """The paper's order; other environments follow by name."""
 

@@ -13,6 +13,7 @@ from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
 from dopt.systems.chain import Chain
 from dopt.systems.coupled_pendulums import CoupledPendulums
 from dopt.systems.drifting_pendulum import DriftingPendulum
+from dopt.systems.drone import Drone
 from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
 from dopt.systems.moving_star import MovingStar
@@ -38,6 +39,7 @@ SYSTEMS: dict[str, type[System]] = {
         MovingStar,
         VanDerPol,
         Car,
+        Drone,
     )
 }
 
@@ -58,6 +60,7 @@ __all__ = [
     "Chain",
     "CoupledPendulums",
     "DriftingPendulum",
+    "Drone",
     "Feature",
     "MassSpring",
     "MovingStar",

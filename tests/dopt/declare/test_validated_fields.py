@@ -48,6 +48,7 @@ POSITIVE = {
         "measurement_noise",
         "velocity_cutoff",
         *("front", "rear", "slip_speed", "motor", "steering", "steering_time", "amplitude"),
+        *("inertia_z", "propeller_torque", "slow_speed", "slow_rate"),
         "core",
         "period",
     ),
@@ -55,7 +56,16 @@ POSITIVE = {
 NONNEGATIVE = {
     *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
-    *("dry_friction", "coupling", "strength", "orbit", "spread", "front_grip", "rear_grip"),
+    *(
+        "dry_friction",
+        "coupling",
+        "strength",
+        "orbit",
+        "spread",
+        "front_grip",
+        "rear_grip",
+        "turn_drag",
+    ),
     "measured_states",
 }
 FRACTIONS = {"beta_1", "beta_2"}
