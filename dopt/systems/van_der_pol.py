@@ -48,7 +48,7 @@ class VanDerPol(System):
     stiffness: float = parameter(1.0, "1/s²", "nonnegative")
     gamma: float = parameter(2.0, "m/s²", "positive")
     dt: float = parameter(0.05, "s", "positive")
-    initial_state: tuple[float, ...] = parameter((0.1, 0.0))
+    initial_state: tuple[float, ...] = parameter((0.01, 0.0))
     grid_half_widths: tuple[float, ...] = parameter((2.8, 4.5), bound="positive")
     grid_points: tuple[int, ...] = parameter((32, 32), bound="positive")
 

@@ -67,7 +67,7 @@ def test_the_euler_map_is_stable_where_the_system_is(path: Path) -> None:
     rest = system.equilibrium or system.initial_state
     values = np.linalg.eigvals(jacobians(system, rest, np.zeros(system.n_inputs))[0])
     growth = values.real.max()
-    if growth <= 0.0:
+    if growth <= 1e-12:
         assert euler_spectral_radius(system) <= 1.0 + 1e-12
         return
     assert path.stem in UNSTABLE_AT_REST
@@ -114,10 +114,14 @@ def test_the_thrust_of_the_quadrotor_is_the_stated_one() -> None:
         assert phrase in comment
 
 
-@pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [path for path in ENVS if path.stem != "moving_star"], ids=lambda p: p.stem
+)
 def test_a_trial_starts_close_to_rest(path: Path) -> None:
+    """All but that of the star, which pushes at once."""
     system = system_in(path)
-    rest = system.equilibrium or np.zeros(system.n_states)
+    rest = np.array(system.equilibrium or np.zeros(system.n_states))
+    rest[[i for i, label in enumerate(system.state_labels) if label.startswith("e₀")]] = 1.0
     assert system.initial_state == pytest.approx(rest, abs=0.01)
 
 
