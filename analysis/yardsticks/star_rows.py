@@ -20,7 +20,8 @@ from analysis.yardsticks.growth import Interval, median
 from analysis.yardsticks.published import FLEX_STAR
 from dopt.models import GreyBox
 from dopt.parameter_error import parameter_error
-from dopt.systems import MovingStar
+from dopt.systems import MovingStar, System
+from dopt.types import Array
 from orchestrate.store import ConfigRow, Reader
 
 NAME = "flex_star"
@@ -74,31 +75,42 @@ def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
     """Return one row for each finished trial: half the squared error of the centre [m²].
 
     The error is that against the centre at the last step. It is infinite where the trial diverged.
+    ``apart`` is the distance between mass and star [m], its median over the steps.
     """
     rows: list[dict[str, object]] = []
     for entry in found:
         for trial in entry.finished:
-            error = np.inf
+            error, apart = np.inf, np.nan
             if trial.status == "done":
                 model = learned_model(reader, entry.config, trial.seed)
                 system = model.spec.system
                 error = parameter_error(system, model.parameters, system.horizon - 1, CENTRE)
+                states = reader.trajectory(entry.config.config_key, trial.seed).states
+                apart = _median_distance(system, states)
             learner, policy = _names(entry)
             row = {"learner": learner, "policy": policy, "seed": trial.seed}
-            rows.append(row | {"error": 0.5 * error**2})
+            rows.append(row | {"error": 0.5 * error**2, "apart": apart})
     return pd.DataFrame(rows)
+
+
+def _median_distance(system: System, states: Array) -> float:
+    places = [system.physical.index(name) for name in CENTRE]
+    apart = np.linalg.norm(states[:-1] - system.history[:, places], axis=1)
+    return float(np.median(apart))
 
 
 def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
     """Return medians, numbers of lost stars and ratios to random inputs, with intervals of 95 %.
 
     One row for each learner and policy. ``ratio`` is the geometric mean of the errors by those of
-    random inputs of the same seed and learner, ``lost`` counts the errors above :data:`LOST`.
+    random inputs of the same seed and learner, ``apart`` the median distance over the trials, and
+    ``lost`` counts the errors above :data:`LOST`.
     """
     rows = []
     for (learner, policy), own in trials.groupby(["learner", "policy"], sort=False):
         values = own.error.to_numpy(float)
         row: dict[str, object] = {"learner": learner, "policy": policy, "n": len(values)}
+        row["apart"] = float(own.apart.median())
         row["lost"] = int(np.sum(values > LOST))
         row |= _columns("median", median(values, np.random.default_rng(_SEED)))
         rows.append(row | _columns("ratio", _ratio(trials, str(learner), str(policy))))

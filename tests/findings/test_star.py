@@ -43,6 +43,8 @@ def test_the_sentences_name_the_numbers_of_the_table() -> None:
     slow, fast = (shown(learner, "d_optimal", "median") for learner in (SLOW, FAST))
     assert f"rate 0.02: {fast}; does not hold with the rate 0.01: {slow}" in WORDS
     assert f"`episodic` has the lower ratio, {shown(SLOW, 'episodic', 'ratio')}," in WORDS
+    apart = [f"{ROWS.apart[FAST, policy]:.2f} m under" for policy in ("d_optimal", "random")]
+    assert f"is {apart[0]} `d_optimal` and {apart[1]} `random`" in WORDS
     lost = {policy: ROWS.lost[FAST, policy] for policy in ("d_optimal", "episodic")}
     assert f"{lost['d_optimal']} of 100 trials of `d_optimal` and {lost['episodic']} of" in WORDS
     assert f"loses {ROWS.lost[FIT, 'd_optimal']} stars with `gauss_newton`" in WORDS

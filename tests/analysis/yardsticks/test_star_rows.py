@@ -46,6 +46,7 @@ def test_errors_are_half_the_squared_distances_to_the_star_at_the_last_step(
         rate = spec.learner.learning_rate
         angle = 2 * np.pi * 11 / 1000
         theta = simulated(spec, None).parameters  # type: ignore[arg-type]
+        assert 0.0 < table.apart[(f"adam, rate {rate:g}", spec.policy.name, spec.seed)] < 0.3
         distance = np.hypot(*(theta - 0.9 * np.array([np.cos(angle), np.sin(angle)])))
         row = table.loc[(f"adam, rate {rate:g}", spec.policy.name, spec.seed)]
         assert row.error == pytest.approx(0.5 * distance**2, rel=1e-9)
