@@ -1,4 +1,4 @@
-"""Drawings of systems in a vertical plane, as polylines and masses.
+"""Drawings of systems in a plane, vertical but for those that move on one, as polylines and masses.
 
 A custom system gets a drawing by registering one::
 
@@ -16,20 +16,30 @@ import numpy.typing as npt
 
 from dopt.systems import (
     Arm,
+    Car,
     Cartpole,
     Chain,
     CoupledPendulums,
+    Drone,
     MassSpring,
+    MovingStar,
     Pendulum,
     Quadrotor,
     System,
     UnbalancedDisk,
+    VanDerPol,
 )
 
 Array = npt.NDArray[np.float64]
 
 CART = (0.3, 0.12)
 """Half the length and half the height of the cart that is drawn, by the rod's length."""
+
+SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+"""Corners of a square about the origin, from one back to it."""
+
+WHEEL = 0.4
+"""Half the length of a steered wheel that is drawn, by its distance from the centre of mass."""
 
 BLOCK = 0.3
 """Half the side of a mass between springs that is drawn [m]; at rest they are 2 m apart."""
@@ -80,8 +90,18 @@ def _(system: UnbalancedDisk, states: Array) -> Body:  # noqa: ARG001  # its cla
 def _(system: Cartpole, states: Array) -> Body:
     cart = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
     tip = cart - _hanging(-states[:, 2], system.length)  # the angle is from upright
-    corners = system.length * np.array(CART) * [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]
+    corners = system.length * np.array(CART) * SQUARE
     return Body((cart[:, None] + corners, _polyline(cart, tip)), tip[:, None])
+
+
+@body.register
+def _(system: Car, states: Array) -> Body:
+    axis = np.stack([np.cos(states[:, 2]), np.sin(states[:, 2])], axis=1)
+    front, rear = states[:, :2] + system.front * axis, states[:, :2] - system.rear * axis
+    heading = states[:, 2] + states[:, 6]
+    wheel = WHEEL * system.front * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    lines = _polyline(rear, front), _polyline(front - wheel, front + wheel)
+    return Body(lines, states[:, None, :2])
 
 
 @body.register
@@ -109,6 +129,13 @@ def _(system: CoupledPendulums, states: Array) -> Body:
 
 
 @body.register
+def _(system: MovingStar, states: Array) -> Body:
+    turn = np.linspace(0.0, 2.0 * np.pi, 49)
+    orbit = system.orbit * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return Body((np.broadcast_to(orbit, (len(states), *orbit.shape)),), states[:, None])
+
+
+@body.register
 def _(system: Quadrotor, states: Array) -> Body:
     centre, tilt = states[:, [0, 2]], states[:, 4]
     arm = system.half_span * np.stack([np.cos(tilt), np.sin(tilt)], axis=1)
@@ -116,10 +143,23 @@ def _(system: Quadrotor, states: Array) -> Body:
 
 
 @body.register
+def _(system: VanDerPol, states: Array) -> Body:  # noqa: ARG001  # its class decides
+    mass = np.stack([states[:, 0], np.zeros(len(states))], axis=1)
+    return Body((mass[:, None] + BLOCK * SQUARE,), mass[:, None])
+
+
+@body.register
+def _(system: Drone, states: Array) -> Body:
+    centre, turn = states[:, [0, 2]], np.linspace(0.0, 2.0 * np.pi, 25)
+    sphere = system.half_span * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return Body((centre[:, None] + sphere,), centre[:, None])
+
+
+@body.register
 def _(system: MassSpring, states: Array) -> Body:  # noqa: ARG001  # its class decides
     level = np.zeros(len(states))
     masses = [np.stack([rest + states[:, i], level], axis=1) for rest, i in ((-1, 0), (1, 2))]
-    corners = BLOCK * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    corners = BLOCK * SQUARE
     return Body(tuple(mass[:, None] + corners for mass in masses), np.stack(masses, axis=1))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -16,27 +18,34 @@ TOLERANCE = 1e-9
 """Relative difference of two mean squares of regressors that counts as rounding."""
 
 
-def true_parameters(system: System, step: int = 0) -> Array:
-    """Return the true values, (q,), of a system's ``linear_parameters`` at a step, in their units.
+def true_parameters(system: System, step: int = 0, names: Sequence[str] = ()) -> Array:
+    """Return the true values, (q,), of physical parameters at a step, in their units.
+
+    Without ``names`` they are the system's ``linear_parameters``.
 
     Raises
     ------
     SpecificationError
-        If the system has none: its learned accelerations are not linear in unknown parameters.
+        If it has none: its learned accelerations are not linear in unknown parameters.
     """
-    if not system.linear_parameters:
+    if not (names or system.linear_parameters):
         raise SpecificationError(
             f"env '{system.name}' has no parameters that its accelerations are linear in, but a "
             f"parameter error needs some: choose another env."
         )
     row = system.history[min(step, len(system.history) - 1)]
     values = dict(zip(system.physical, row, strict=True))
-    return np.array([values[name] for name in system.linear_parameters])
+    return np.array([values[name] for name in names or system.linear_parameters])
 
 
-def parameter_error(system: System, parameters: npt.ArrayLike, step: int = 0) -> float:
-    """Return ‖θ - θ*‖₂ for parameters θ, (q,), of the linear model, with θ* true at a step."""
-    return float(np.linalg.norm(np.asarray(parameters) - true_parameters(system, step)))
+def parameter_error(
+    system: System, parameters: npt.ArrayLike, step: int = 0, names: Sequence[str] = ()
+) -> float:
+    """Return ‖θ - θ*‖₂ for learned parameters θ, (q,), with θ* true at a step.
+
+    They are those of the names, or without any those of the linear model.
+    """
+    return float(np.linalg.norm(np.asarray(parameters) - true_parameters(system, step, names)))
 
 
 def loss_by_parameter_error(system: System) -> float:

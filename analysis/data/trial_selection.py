@@ -33,7 +33,8 @@ ENVIRONMENTS = (
     *("pendulum", "cartpole", "arm", "quadrotor"),
     *("drifting_pendulum", "chain", "mass_spring"),
     *("pendulum_unknown_gain", "cartpole_unknown_gain"),
-    *("unbalanced_disk", "coupled_pendulums"),
+    *("unbalanced_disk", "coupled_pendulums", "moving_star"),
+    *("van_der_pol", "car", "drone"),
 )
 """The paper's order; other environments follow by name."""
 

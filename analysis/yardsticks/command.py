@@ -4,19 +4,39 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+
+import pandas as pd
 
 from analysis.data import provenance
 from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import Selection
-from analysis.errors import IncompleteError
+from analysis.data.trial_selection import Entry, Selection
+from analysis.errors import AnalysisError, IncompleteError
 from analysis.outputs import publish
-from analysis.yardsticks import pendulum_rows
+from analysis.tables.rendering import TextTable
+from analysis.yardsticks import pendulum_rows, star_rows
 from orchestrate.store import Reader
 
 HELP = "published tables, run here, beside the published numbers"
-NAME = "flex_table3"
-TRIALS = f"{NAME}_trials"
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """A published table: its experiment, its trials in a database, and what is made of them."""
+
+    name: str
+    entries: Callable[[Reader, Filter], list[Entry]]
+    measure: Callable[[Reader, Iterable[Entry]], pd.DataFrame]
+    tabulate: Callable[[pd.DataFrame], pd.DataFrame]
+    tables: Callable[[pd.DataFrame], Sequence[TextTable]]
+
+
+YARDSTICKS = tuple(
+    Yardstick(rows.NAME, rows.entries, rows.measure, rows.tabulate, rows.tables)
+    for rows in (pendulum_rows, star_rows)
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,22 +45,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, wanted: Filter) -> int:
-    """Print the tables, and write their CSV files and the provenance; 0."""
+    """Print the tables of which there are trials, and write their files; 0."""
     with Reader.open(options.db) as reader, reader.moment() as moment:
-        found = pendulum_rows.entries(moment, wanted)
-        unfinished = sum(len(entry.trials) - len(entry.finished) for entry in found)
-        if unfinished and not options.allow_partial:
-            raise IncompleteError(
-                f"error: {unfinished} trials are not finished, a complete grid is expected: run "
-                f"the launch again, or give --allow-partial to go on with what there is."
+        found = [(one, one.entries(moment, wanted)) for one in YARDSTICKS]
+        found = [(one, entries) for one, entries in found if entries]
+        if not found:
+            names = " or ".join(one.name for one in YARDSTICKS)
+            raise AnalysisError(
+                f"{moment.safe_url} holds no trials of a published table: run "
+                f"orchestrate/launch.py -m experiment={names} first."
             )
-        trials = pendulum_rows.measure(moment, found)
-        facts = provenance.describe(moment, Selection(tuple(found))) | {"name": NAME}
-    table = pendulum_rows.tabulate(trials)
-    options.out.mkdir(parents=True, exist_ok=True)
-    publish.write_table(trials, options.out, TRIALS)
-    publish.write_table(table, options.out, NAME)
-    publish.write_provenance(facts, options.out, NAME)
-    parts = (pendulum_rows.samples_table(table), pendulum_rows.ratio_table(table))
+        for one, entries in found:
+            _check_finished(one, entries, allowed=options.allow_partial)
+        parts = [table for each in found for table in _written(moment, *each, options.out)]
     sys.stdout.write("\n".join(part.markdown() for part in parts))
     return 0
+
+
+def _check_finished(one: Yardstick, entries: Iterable[Entry], *, allowed: bool) -> None:
+    unfinished = sum(len(entry.trials) - len(entry.finished) for entry in entries)
+    if unfinished and not allowed:
+        raise IncompleteError(
+            f"error: {unfinished} trials of {one.name} are not finished, a complete grid is "
+            f"expected: run the launch again, or give --allow-partial to go on with what there is."
+        )
+
+
+def _written(
+    reader: Reader, one: Yardstick, entries: Sequence[Entry], folder: Path
+) -> Sequence[TextTable]:
+    """Write the table of trials, that of the page and the provenance; return what is shown."""
+    trials = one.measure(reader, entries)
+    table = one.tabulate(trials)
+    folder.mkdir(parents=True, exist_ok=True)
+    publish.write_table(trials, folder, f"{one.name}_trials")
+    publish.write_table(table, folder, one.name)
+    facts = provenance.describe(reader, Selection(tuple(entries))) | {"name": one.name}
+    publish.write_provenance(facts, folder, one.name)
+    return one.tables(table)

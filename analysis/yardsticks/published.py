@@ -2,7 +2,8 @@
 
 Table 3 of M. Blanke and M. Lelarge, "FLEX: an adaptive exploration algorithm for nonlinear systems"
 (ICML 2023): samples until the frictions of N coupled pendulums are known to 1e-2. A number that is
-not reached is printed there as "> 1,000"; here it is infinite.
+not reached is printed there as "> 1,000"; here it is infinite. Figure 4: parameter error of the
+moving star after the run, over 100 trials, read off the plot.
 """
 
 from __future__ import annotations
@@ -20,3 +21,6 @@ FLEX_SAMPLES = {
 
 FLEX_LONGEST = 1000
 """Samples of the longest run in the table."""
+
+FLEX_STAR = {"random": "about 3", "episodic": "0.1 to 1", "FLEX": "about 1e-3"}
+"""Parameter errors, by policy; the episodic one plans anew every 50 steps."""

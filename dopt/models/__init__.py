@@ -5,6 +5,7 @@ from __future__ import annotations
 from dopt.models.base import Model
 from dopt.models.ensemble import Ensemble
 from dopt.models.gaussian_process import GaussianProcess
+from dopt.models.grey_box import GreyBox
 from dopt.models.input_networks import AffineMLP, BlackBoxMLP
 from dopt.models.linear import Linear
 from dopt.models.linear_state import LinearState
@@ -22,6 +23,7 @@ MODELS: dict[str, type[Model]] = {
         LinearState,
         RFF,
         GaussianProcess,
+        GreyBox,
     )
 }
 
@@ -33,6 +35,7 @@ __all__ = [
     "BlackBoxMLP",
     "Ensemble",
     "GaussianProcess",
+    "GreyBox",
     "Linear",
     "LinearState",
     "Model",

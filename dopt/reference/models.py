@@ -9,7 +9,16 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
-from dopt.models import MLP, RFF, AffineMLP, GaussianProcess, Linear, LinearState, Model
+from dopt.models import (
+    MLP,
+    RFF,
+    AffineMLP,
+    GaussianProcess,
+    GreyBox,
+    Linear,
+    LinearState,
+    Model,
+)
 from dopt.systems.base import System
 from dopt.systems.features import feature_values
 from dopt.types import Scalar
@@ -41,6 +50,8 @@ def model_function(system: System, model: Model) -> BatchModel:
         return rff_function(system, model)
     if isinstance(model, GaussianProcess):
         return process_function(system, model)
+    if isinstance(model, GreyBox):
+        return grey_box_function(system, model)
     if isinstance(model, Networked):
         return network_function(system, model.module(system), model)
     raise TypeError(f"model {model!r} is no Module and none of this package: give its module.")
@@ -143,6 +154,17 @@ def linear_function(system: System) -> BatchModel:
         psi = torch.stack([unit - offset for unit in units], dim=-1)
         out: Tensor = offset + (psi @ theta[:, None, :, None]).squeeze(-1)
         return out
+
+    return accelerations
+
+
+def grey_box_function(system: System, model: GreyBox) -> BatchModel:
+    """Return the system's own accelerations, with θ in the place of what is unknown."""
+
+    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
+        values = model.physical_values(system, theta.unsqueeze(-1).unbind(1))
+        rows = system.accelerations(x.unbind(-1), values)
+        return stack(rows).expand(len(theta), -1, -1)
 
     return accelerations
 

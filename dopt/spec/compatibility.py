@@ -20,6 +20,7 @@ from dopt.models import (
     BlackBoxMLP,
     Ensemble,
     GaussianProcess,
+    GreyBox,
     Linear,
     LinearState,
     Model,
@@ -127,6 +128,8 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
         raise mismatch("model 'linear'", "policy 'oracle'", given)
     if isinstance(model, Linear) and not system.linear_parameters:
         raise mismatch("model 'linear'", "linear parameters", f"env '{system.name}'")
+    if isinstance(model, GreyBox):
+        _check_unknown(system, model)
     form = getattr(policy, "form", "auto")
     if (sharing or model.structure == "least_squares") and form not in ("auto", "primal"):
         what = f"learner '{learner.name}'" if sharing else f"model '{model.name}'"
@@ -136,6 +139,17 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
     if model.structure == "conditioning" and hasattr(policy, "regularization"):
         expected = "a policy that needs no information matrix of parameters"
         raise mismatch(f"model '{model.name}'", expected, given)
+
+
+def _check_unknown(system: System, model: GreyBox) -> None:
+    """Check that a grey box has unknown parameters, each of the system's and with one guess."""
+    names = model.names(system)
+    if not names or len(set(names)) < len(names) or not set(names) <= set(system.physical):
+        expected = f"names out of {', '.join(system.physical) or 'none'}, none of them twice"
+        raise mismatch("model.unknown", expected, f"{list(names)}")
+    if model.initial and len(model.initial) != len(names):
+        given = f"{len(model.initial)} numbers"
+        raise mismatch("model.initial", f"one number for each of {', '.join(names)}", given, "were")
 
 
 def _check_inputs(system: System, policy: Policy, model: Model, learner: Learner) -> None:

@@ -8,15 +8,19 @@ from dopt.declare.registry import TARGET, build
 from dopt.systems import plant
 from dopt.systems.arm import Arm
 from dopt.systems.base import System
+from dopt.systems.car import Car
 from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
 from dopt.systems.chain import Chain
 from dopt.systems.coupled_pendulums import CoupledPendulums
 from dopt.systems.drifting_pendulum import DriftingPendulum
+from dopt.systems.drone import Drone
 from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
+from dopt.systems.moving_star import MovingStar
 from dopt.systems.pendulum import Pendulum, PendulumUnknownGain
 from dopt.systems.quadrotor import Quadrotor
 from dopt.systems.unbalanced_disk import UnbalancedDisk
+from dopt.systems.van_der_pol import VanDerPol
 
 SYSTEMS: dict[str, type[System]] = {
     system.name: system
@@ -32,6 +36,10 @@ SYSTEMS: dict[str, type[System]] = {
         CartpoleUnknownGain,
         UnbalancedDisk,
         CoupledPendulums,
+        MovingStar,
+        VanDerPol,
+        Car,
+        Drone,
     )
 }
 
@@ -46,17 +54,21 @@ def system_from_mapping(section: Mapping[str, object]) -> System:
 __all__ = [
     "SYSTEMS",
     "Arm",
+    "Car",
     "Cartpole",
     "CartpoleUnknownGain",
     "Chain",
     "CoupledPendulums",
     "DriftingPendulum",
+    "Drone",
     "Feature",
     "MassSpring",
+    "MovingStar",
     "Pendulum",
     "PendulumUnknownGain",
     "Quadrotor",
     "System",
     "UnbalancedDisk",
+    "VanDerPol",
     "system_from_mapping",
 ]

@@ -21,6 +21,10 @@ SMALL_GRIDS = {
     "cartpole_unknown_gain": (3, 4, 3),
     "unbalanced_disk": (4, 4),
     "coupled_pendulums": (16,),
+    "moving_star": (4, 4),
+    "van_der_pol": (4, 4),
+    "car": (2, 2, 2, 2),
+    "drone": (16,),
 }
 SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"count": 8}}
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}

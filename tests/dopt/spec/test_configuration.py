@@ -17,10 +17,13 @@ from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
 from dopt.systems import SYSTEMS, Quadrotor, System, system_from_mapping
-from dopt.systems.equilibrium import euler_spectral_radius
+from dopt.systems.equilibrium import euler_spectral_radius, jacobians
 from tests.paths import CONF
 
 ENVS = sorted((CONF / "env").rglob("*.yaml"))
+UNSTABLE_AT_REST = {"moving_star", "van_der_pol"}
+"""A star that pushes away, and an oscillator that is fed."""
+
 GROUPS: list[tuple[str, dict[str, Any]]] = [
     ("policy", POLICIES),
     ("model", MODELS),
@@ -58,8 +61,18 @@ def test_every_field_of_a_system_is_shown_in_its_file(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
-def test_the_euler_map_is_stable_at_rest(path: Path) -> None:
-    assert euler_spectral_radius(system_in(path)) <= 1.0 + 1e-12
+def test_the_euler_map_is_stable_where_the_system_is(path: Path) -> None:
+    """Where motions about rest grow, those of the map grow alike up to O(dt²)."""
+    system = system_in(path)
+    rest = system.equilibrium or system.initial_state
+    values = np.linalg.eigvals(jacobians(system, rest, np.zeros(system.n_inputs))[0])
+    growth = values.real.max()
+    if growth <= 1e-12:
+        assert euler_spectral_radius(system) <= 1.0 + 1e-12
+        return
+    assert path.stem in UNSTABLE_AT_REST
+    farthest = (system.dt * np.abs(values).max()) ** 2
+    assert euler_spectral_radius(system) <= math.exp(growth * system.dt) + farthest < 1.05
 
 
 @pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
@@ -101,10 +114,14 @@ def test_the_thrust_of_the_quadrotor_is_the_stated_one() -> None:
         assert phrase in comment
 
 
-@pytest.mark.parametrize("path", ENVS, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [path for path in ENVS if path.stem != "moving_star"], ids=lambda p: p.stem
+)
 def test_a_trial_starts_close_to_rest(path: Path) -> None:
+    """All but that of the star, which pushes at once."""
     system = system_in(path)
-    rest = system.equilibrium or np.zeros(system.n_states)
+    rest = np.array(system.equilibrium or np.zeros(system.n_states))
+    rest[[i for i, label in enumerate(system.state_labels) if label.startswith("e₀")]] = 1.0
     assert system.initial_state == pytest.approx(rest, abs=0.01)
 
 

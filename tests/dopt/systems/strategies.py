@@ -25,7 +25,14 @@ def systems(draw: st.DrawFn, name: str, **fixed: Any) -> System:
 
 
 def states(name: str, bound: float = 6.0) -> st.SearchStrategy[np.ndarray]:
-    return vectors(len(SYSTEMS[name].state_labels), bound)
+    drawn = vectors(len(SYSTEMS[name].state_labels), bound)
+    return drawn.map(_with_unit_quaternion) if name == "drone" else drawn
+
+
+def _with_unit_quaternion(state: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(state[6:10])
+    turn = state[6:10] / norm if norm > 1e-3 else np.array([1.0, 0.0, 0.0, 0.0])
+    return np.concatenate([state[:6], turn, state[10:]])
 
 
 def inputs(name: str, bound: float = 10.0) -> st.SearchStrategy[np.ndarray]:

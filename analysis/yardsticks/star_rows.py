@@ -1,0 +1,184 @@
+"""Distance to a star that moves, after one of its turns: Figure 4 of FLEX, run here."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from analysis.data.config_matching import Filter
+from analysis.data.learned_model import learned_model
+from analysis.data.trial_selection import Entry, newest, policy_rank
+from analysis.errors import AnalysisError
+from analysis.formatting import within
+from analysis.tables.comparisons import against_reference
+from analysis.tables.rendering import TextTable
+from analysis.yardsticks.growth import Interval, median
+from analysis.yardsticks.published import FLEX_STAR
+from dopt.models import GreyBox
+from dopt.parameter_error import parameter_error
+from dopt.systems import MovingStar, System
+from dopt.types import Array
+from orchestrate.store import ConfigRow, Reader
+
+NAME = "flex_star"
+REFERENCE = "random"
+CENTRE = ("center_x", "center_y")
+LOST = 0.5
+"""Error above which a star is lost [m²]: that of a distance of 1 m, twice its radius."""
+
+_SEED = 20_230_426
+
+
+def entries(reader: Reader, wanted: Filter) -> list[Entry]:
+    """Return the configurations with the moving star and its centre unknown, and their trials.
+
+    Raises
+    ------
+    AnalysisError
+        If two of them have the same policy and learner.
+    """
+    found = newest([one for one in reader.configs() if _is_asked_for(one, wanted)])
+    kept = [Entry(one, tuple(reader.trials(one.config_key))) for one in found]
+    kept.sort(key=lambda one: (_learner(one), policy_rank(one.config.policy)))
+    for one, other in itertools.pairwise(kept):
+        if _names(one) == _names(other):
+            learner, policy = _names(one)
+            raise AnalysisError(
+                f"Two configurations of the moving star have the policy '{policy}' and the learner "
+                f"'{learner}', but one is expected: choose by --where, such as "
+                f"--where policy.regularization=1e-7."
+            )
+    return kept
+
+
+def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
+    fits = config.env == MovingStar.name and config.model == GreyBox.name
+    return fits and config.config["model"]["unknown"] == list(CENTRE) and wanted.accepts(config)
+
+
+def _names(entry: Entry) -> tuple[str, str]:
+    return _learner(entry), entry.config.policy
+
+
+def _learner(entry: Entry) -> str:
+    """Return the name of a column: that of the learner, with the rate of one by gradients."""
+    section = entry.config.config["learner"]
+    rate = section.get("learning_rate")
+    return str(section["name"]) if rate is None else f"{section['name']}, rate {rate:g}"
+
+
+def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
+    """Return one row for each finished trial: half the squared error of the centre [m²].
+
+    The error is that against the centre at the last step. It is infinite where the trial diverged.
+    ``apart`` is the distance between mass and star [m], its median over the steps.
+    """
+    rows: list[dict[str, object]] = []
+    for entry in found:
+        for trial in entry.finished:
+            error, apart = np.inf, np.nan
+            if trial.status == "done":
+                model = learned_model(reader, entry.config, trial.seed)
+                system = model.spec.system
+                error = parameter_error(system, model.parameters, system.horizon - 1, CENTRE)
+                states = reader.trajectory(entry.config.config_key, trial.seed).states
+                apart = _median_distance(system, states)
+            learner, policy = _names(entry)
+            row = {"learner": learner, "policy": policy, "seed": trial.seed}
+            rows.append(row | {"error": 0.5 * error**2, "apart": apart})
+    return pd.DataFrame(rows)
+
+
+def _median_distance(system: System, states: Array) -> float:
+    places = [system.physical.index(name) for name in CENTRE]
+    apart = np.linalg.norm(states[:-1] - system.history[:, places], axis=1)
+    return float(np.median(apart))
+
+
+def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
+    """Return medians, numbers of lost stars and ratios to random inputs, with intervals of 95 %.
+
+    One row for each learner and policy. ``ratio`` is the geometric mean of the errors by those of
+    random inputs of the same seed and learner, ``apart`` the median distance over the trials, and
+    ``lost`` counts the errors above :data:`LOST`.
+    """
+    rows = []
+    for (learner, policy), own in trials.groupby(["learner", "policy"], sort=False):
+        values = own.error.to_numpy(float)
+        row: dict[str, object] = {"learner": learner, "policy": policy, "n": len(values)}
+        row["apart"] = float(own.apart.median())
+        row["lost"] = int(np.sum(values > LOST))
+        row |= _columns("median", median(values, np.random.default_rng(_SEED)))
+        rows.append(row | _columns("ratio", _ratio(trials, str(learner), str(policy))))
+    return pd.DataFrame(rows)
+
+
+def _columns(name: str, interval: Interval) -> dict[str, float]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
+
+
+def _ratio(trials: pd.DataFrame, learner: str, policy: str) -> Interval:
+    taught = trials[trials.learner == learner]
+    own, reference = (
+        dict(zip(part.seed, part.error, strict=True))
+        for part in (taught[taught.policy == policy], taught[taught.policy == REFERENCE])
+    )
+    if policy == REFERENCE or not reference:
+        return np.nan, np.nan, np.nan
+    found = against_reference(own, reference, f"moving_star/{learner}", policy, "error")
+    return found.ratio, found.low, found.high
+
+
+def tables(table: pd.DataFrame) -> tuple[TextTable, TextTable]:
+    """Return the errors of all policies beside the published ones, and their ratios."""
+    return _error_table(table), _ratio_table(table)
+
+
+def _error_table(table: pd.DataFrame) -> TextTable:
+    learners = list(dict.fromkeys(table.learner))
+    rows = [
+        [policy, *(_cell(own, learner, _error_texts) for learner in learners)]
+        for policy, own in table.groupby("policy", sort=False)
+    ]
+    rows += [
+        [f"published: {policy}", *_beside(learners, text)] for policy, text in FLEX_STAR.items()
+    ]
+    note = (
+        "Half the squared distance between the learned and the true centre of the star at the last "
+        "step [m²]: median over the trials [interval of 95 %]; trials that end 1 m off or farther."
+    )
+    return TextTable(["policy", *learners], rows, note)
+
+
+def _beside(learners: Sequence[str], published: str) -> list[str]:
+    """Return a published error in the first column, whose learner and rate are theirs."""
+    return [published, *["–"] * (len(learners) - 1)]
+
+
+def _ratio_table(table: pd.DataFrame) -> TextTable:
+    learners = list(dict.fromkeys(table.learner))
+    rows = [
+        [policy, *(_cell(own, learner, _ratio_text) for learner in learners)]
+        for policy, own in table.groupby("policy", sort=False)
+        if policy != REFERENCE
+    ]
+    note = "Errors by those of random inputs: paired geometric mean [interval of 95 %]."
+    return TextTable(["policy", *learners], rows, note)
+
+
+def _cell(own: pd.DataFrame, learner: str, text: Callable[[Mapping[Hashable, Any]], str]) -> str:
+    rows = own[own.learner == learner].to_dict("records")
+    return text(rows[0]) if rows else "–"
+
+
+def _error_texts(row: Mapping[Hashable, Any]) -> str:
+    shown = within(row["median"], row["median_low"], row["median_high"])
+    return f"{shown}; {row['lost']}"
+
+
+def _ratio_text(row: Mapping[Hashable, Any]) -> str:
+    return within(row["ratio"], row["ratio_low"], row["ratio_high"])

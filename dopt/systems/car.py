@@ -1,0 +1,119 @@
+"""Car that slides: a bicycle model with unknown tyre forces and drag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dopt.declare.validated_fields import parameter
+from dopt.systems.base import System
+from dopt.systems.elementary import cos, magnitude, sin
+from dopt.systems.features import Feature
+from dopt.types import Scalar
+
+
+@dataclass(frozen=True, kw_only=True)
+class Car(System):
+    """Rigid body on a plane with one steered wheel in front and one behind, and a motor.
+
+    State: position x, y [m] and heading ψ [rad] in the world, velocity vₓ (ahead), v_y (to the
+    left) [m/s] and yaw rate r [rad/s] in the body's frame, steering angle δ [rad]. Inputs: commands
+    of motor u₁ and steering u₂ [1].
+
+    ẋ = vₓ cos ψ - v_y sin ψ, ẏ = vₓ sin ψ + v_y cos ψ, ψ̇ = r, δ̇ = (δₘ u₂ - δ)/τ,
+    m (v̇ₓ - r v_y) = Fₘ u₁ - F₁ sin δ - ρ |vₓ| vₓ, m (v̇_y + r vₓ) = F₁ cos δ + F₂,
+    I ṙ = a F₁ cos δ - b F₂,
+    with the tyre forces Fᵢ = -Cᵢ wᵢ/√(|vᵢ|² + v₀²), wᵢ the part of the axle's velocity vᵢ across
+    the wheel: w₁ = (v_y + a r) cos δ - vₓ sin δ, w₂ = v_y - b r. Far above v₀ a tyre's force is Cᵢ
+    times the sine of its slip angle; it holds a standing car too, without a jump.
+    Learned: the accelerations of tyres and drag. Known: motor, steering, and the turn of the frame.
+
+    Source: the bicycle model of R. Rajamani, "Vehicle dynamics and control" (2012), chapter 2, with
+    tyre forces that saturate.
+
+    Parameters
+    ----------
+    mass : float
+        m [kg].
+    inertia : float
+        I about the vertical through the centre of mass [kg m²].
+    front, rear : float
+        Distances a and b of the axles from the centre of mass [m].
+    front_grip, rear_grip : float
+        Largest forces C₁ and C₂ of the tyres [N].
+    slip_speed : float
+        v₀ [m/s].
+    drag : float
+        ρ [kg/m].
+    motor : float
+        Fₘ, force of the motor by its command [N].
+    steering : float
+        δₘ, steering angle by its command [rad].
+    steering_time : float
+        τ [s].
+    """
+
+    name: ClassVar[str] = "car"
+    physical: ClassVar[tuple[str, ...]] = (
+        *("mass", "inertia", "front", "rear", "front_grip", "rear_grip", "slip_speed", "drag"),
+        *("motor", "steering", "steering_time"),
+    )
+    linear_parameters: ClassVar[tuple[str, ...]] = ("front_grip", "rear_grip", "drag")
+    state_labels: ClassVar[tuple[str, ...]] = (
+        *("x [m]", "y [m]", "ψ [rad]", "vₓ [m/s]", "v_y [m/s]", "r [rad/s]", "δ [rad]"),
+    )
+    input_labels: ClassVar[tuple[str, ...]] = ("u₁ [1]", "u₂ [1]")
+    learned_rows: ClassVar[tuple[int, ...]] = (3, 4, 5)
+    features: ClassVar[tuple[Feature, ...]] = (
+        *(Feature("identity", 3), Feature("identity", 4), Feature("identity", 5)),
+        *(Feature("cos", 6), Feature("sin", 6)),
+    )
+    angle_indices: ClassVar[tuple[int, ...]] = (2, 6)
+    phase_plane: ClassVar[tuple[int, int]] = (3, 4)
+    grid_indices: ClassVar[tuple[int, ...]] = (3, 4, 5, 6)
+
+    mass: float = parameter(3.0, "kg", "positive")
+    inertia: float = parameter(0.05, "kg m²", "positive")
+    front: float = parameter(0.15, "m", "positive")
+    rear: float = parameter(0.15, "m", "positive")
+    front_grip: float = parameter(8.0, "N", "nonnegative")
+    rear_grip: float = parameter(8.0, "N", "nonnegative")
+    slip_speed: float = parameter(0.5, "m/s", "positive")
+    drag: float = parameter(0.5, "kg/m", "nonnegative")
+    motor: float = parameter(10.0, "N", "positive")
+    steering: float = parameter(0.6, "rad", "positive")
+    steering_time: float = parameter(0.1, "s", "positive")
+    gamma: float = parameter(1.0, "1", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((2.5, 1.0, 3.0, 0.6), bound="positive")
+    grid_points: tuple[int, ...] = parameter((6, 6, 6, 6), bound="positive")
+
+    @staticmethod
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
+        _, _, heading, ahead, left, turn, angle = state
+        mass = parameters[0]
+        motor, steering, steering_time = parameters[8:]
+        return (
+            ahead * cos(heading) - left * sin(heading),
+            ahead * sin(heading) + left * cos(heading),
+            turn,
+            turn * left + motor * inputs[0] / mass,
+            -turn * ahead,
+            0.0 * turn,
+            (steering * inputs[1] - angle) / steering_time,
+        )
+
+    @staticmethod
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
+        _, _, _, ahead, left, turn, angle = state
+        mass, inertia, front, rear, front_grip, rear_grip, slip_speed, drag = parameters[:8]
+        cosine, sine, slowest = cos(angle), sin(angle), slip_speed * slip_speed
+        front_left, rear_left = left + front * turn, left - rear * turn
+        across = front_left * cosine - ahead * sine
+        force_1 = -front_grip * across / (ahead * ahead + front_left * front_left + slowest) ** 0.5
+        force_2 = -rear_grip * rear_left / (ahead * ahead + rear_left * rear_left + slowest) ** 0.5
+        return (
+            -(force_1 * sine + drag * magnitude(ahead) * ahead) / mass,
+            (force_1 * cosine + force_2) / mass,
+            (front * force_1 * cosine - rear * force_2) / inertia,
+        )
