@@ -1,0 +1,23 @@
+# shellcheck shell=bash disable=SC2154 # workers, walltime and leave are set above
+
+# The task has left before SLURM warns it of its end.
+end=${SLURM_JOB_END_TIME:-$(squeue --noheader --jobs="$SLURM_JOB_ID" --format=%e | date --file=- +%s)}
+seconds=$((${end:-$(date +%s) + walltime} - $(date +%s) - leave))
+
+"${workers[@]}" --until "${seconds}s" &
+pid=$!
+trap 'kill -USR1 "$pid"' USR1 TERM
+# A signal ends the wait; the workers end within seconds.
+while
+    wait "$pid"
+    code=$?
+    ((code > 128)) && kill -0 "$pid" 2>/dev/null
+do :; done
+
+# SLURM queues a task again that it has stopped, but not one that has left after a warning.
+if ((code > 128)) && [[ $(squeue --noheader --jobs="$SLURM_JOB_ID" --format=%T) == RUNNING ]]; then
+    scontrol requeue "$SLURM_JOB_ID"
+fi
+# Where every trial has an outcome, tasks that wait would find nothing to do.
+((code > 1)) || scancel --quiet --state=PENDING "$SLURM_ARRAY_JOB_ID"
+exit "$code"
