@@ -119,9 +119,7 @@ class Slurm:
             f"NodeName={host.name} NodeAddr={host.address} CPUs={cores}" for host in self.hosts
         )
         (self.folder / "slurm.conf").write_text(
-            _CONFIGURATION.format(
-                address=self.controller.address, folder=self.folder, nodes=nodes
-            )
+            _CONFIGURATION.format(address=self.controller.address, folder=self.folder, nodes=nodes)
         )
 
     def _ready(self) -> bool:
