@@ -83,14 +83,14 @@ class SlurmOptions:
             If a value has the wrong type or is out of bounds.
         """
         return cls(
-            tasks=_number("tasks", given["tasks"]),
-            cpus_per_task=_number("cpus_per_task", given["cpus_per_task"]),
-            minutes=_minutes(given["time"]),
-            memory_gib=limit("executor.memory_gib", given["memory_gib"], "GiB"),
-            partition=_word("partition", given["partition"]),
-            account=_word("account", given["account"]),
-            logs=text("executor.logs", given["logs"]),
-            extra=dict(_extra(section("executor.options", given["options"]))),
+            tasks=_number("tasks", given.get("tasks")),
+            cpus_per_task=_number("cpus_per_task", given.get("cpus_per_task")),
+            minutes=_minutes(given.get("time")),
+            memory_gib=limit("executor.memory_gib", given.get("memory_gib"), "GiB"),
+            partition=_word("partition", given.get("partition")),
+            account=_word("account", given.get("account")),
+            logs=text("executor.logs", given.get("logs")),
+            extra=dict(_extra(section("executor.options", given.get("options", {})))),
         )
 
     def lines(self, trials: int) -> Iterator[str]:
@@ -103,7 +103,7 @@ class SlurmOptions:
         for name in ("partition", "account"):
             if value := getattr(self, name):
                 yield f"--{name}={value}"
-        yield f"--output={self.logs}/%A_%a.log --open-mode=append"
+        yield f"--output={_quoted(f'{self.logs}/%A_%a.log')} --open-mode=append"
         yield f"--requeue --signal=B:USR1@{WARN_SECONDS} --export=ALL"
         for name, value in self.extra.items():
             yield f"--{name}" if value is None else f"--{name}={_quoted(value)}"
