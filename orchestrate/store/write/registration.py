@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, select
 
-from orchestrate.store.backends.base import Backend
+from orchestrate.store.backends.base import Backend, NewTrial
 from orchestrate.store.records import Registrable, Registration
 from orchestrate.store.schema import CONFIG_COLUMNS, config, trial
 from orchestrate.store.serialization import plain
@@ -55,7 +55,7 @@ def register(
     for keys in _chunks(grid.trials):
         known = _known_trials(connection, backend, keys)
         new = [key for key in keys if key not in known]
-        _insert_trials(connection, grid, new, config_ids)
+        _insert_trials(connection, backend, grid, new, config_ids)
         found.update({key: known.get(key, ("pending", None)) for key in keys})
     return _summary(found, launch_id)
 
@@ -88,20 +88,16 @@ def _known_trials(
 
 
 def _insert_trials(
-    connection: Connection, grid: GridRows, keys: Sequence[str], config_ids: Mapping[str, int]
+    connection: Connection,
+    backend: Backend,
+    grid: GridRows,
+    keys: Sequence[str],
+    config_ids: Mapping[str, int],
 ) -> None:
-    rows = [
-        {
-            "trial_key": key,
-            "config_id": config_ids[grid.trials[key][0]],
-            "seed": grid.trials[key][1],
-            "status": "pending",
-            "attempt": 0,
-        }
-        for key in keys
-    ]
-    if rows:
-        connection.execute(insert(trial), rows)
+    placed = ((key, *grid.trials[key]) for key in keys)
+    trials = [NewTrial(key, config_ids[config_key], seed) for key, config_key, seed in placed]
+    if trials:
+        backend.insert_trials(connection, trials)
 
 
 def _summary(found: Mapping[str, tuple[str, int | None]], launch_id: int) -> Registration:
