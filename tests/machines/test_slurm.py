@@ -12,7 +12,7 @@ from tests.machines.lab import GRID, SEEDS, Lab
 from tests.machines.outcome import Outcome
 from tests.machines.slurm import Slurm, need_slurm
 
-TRIALS = 200
+TRIALS = 400
 SECONDS_BETWEEN_PREEMPTIONS = 5.0
 FEWEST_PREEMPTIONS = 3
 

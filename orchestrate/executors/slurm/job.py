@@ -60,7 +60,7 @@ class SlurmJob:
         LaunchError, InfrastructureError
             If SLURM refuses the job, or cannot be reached.
         """
-        Path(self.options.logs).mkdir(parents=True, exist_ok=True)
+        _make_folder(self.options.logs)
         done = subprocess.run(
             ["sbatch", "--parsable"],
             input=self.text(trials),
@@ -96,6 +96,17 @@ class SlurmJob:
             given["memory-gib"] = f"{self.settings.memory_gib:g}"
         words = (word for name, value in given.items() for word in (f"--{name}", str(value)))
         return [sys.executable, "-P", "-m", "orchestrate", "work", *words]
+
+
+def _make_folder(logs: str) -> None:
+    """Make the folder without which SLURM ends a task before it has begun."""
+    try:
+        Path(logs).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LaunchError(
+            f"executor.logs is {logs!r}, a folder that cannot be made ({error.strerror}): give "
+            "another one on a disk that the nodes see, and run the same command again."
+        ) from error
 
 
 def _refusal(errors: str) -> LaunchError | InfrastructureError:

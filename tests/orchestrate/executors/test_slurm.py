@@ -146,6 +146,13 @@ def test_a_refused_job_leaves_the_grid_registered(
         assert reader.query("SELECT count(*) FROM trial WHERE status = 'pending'")[0][0] == 10
 
 
+def test_a_folder_that_cannot_be_made_is_named(command_line: CommandLine, cluster: Path) -> None:
+    (cluster / "file").touch()
+    code, _, errors = command_line(*GRID, "executor.logs=file/logs")
+    assert (code, errors.count("\n")) == (2, 1)
+    assert "executor.logs is 'file/logs', a folder that cannot be made (Not a directory)" in errors
+
+
 def test_nodes_that_do_not_see_a_file_are_named(
     command_line: CommandLine, cluster: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
