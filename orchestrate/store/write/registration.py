@@ -50,10 +50,13 @@ def register(
 ) -> Registration:
     """Insert new configurations and trials, and return the state of the grid."""
     backend.exclusive(connection)
-    config_ids = _insert_configs(connection, backend, grid.configs)
+    before = _config_ids(connection, backend, list(grid.configs))
+    config_ids = _insert_configs(connection, backend, grid.configs, before)
     found: dict[str, tuple[str, int | None]] = {}
     for keys in _chunks(grid.trials):
-        known = _known_trials(connection, backend, keys)
+        # A configuration that was not there has no trials.
+        old = [key for key in keys if grid.trials[key][0] in before]
+        known = _known_trials(connection, backend, old) if old else {}
         new = [key for key in keys if key not in known]
         _insert_trials(connection, backend, grid, new, config_ids)
         found.update({key: known.get(key, ("pending", None)) for key in keys})
@@ -61,14 +64,16 @@ def register(
 
 
 def _insert_configs(
-    connection: Connection, backend: Backend, configs: Mapping[str, dict[str, Any]]
-) -> dict[str, int]:
-    known = _config_ids(connection, backend, list(configs))
+    connection: Connection,
+    backend: Backend,
+    configs: Mapping[str, dict[str, Any]],
+    known: Mapping[str, int],
+) -> Mapping[str, int]:
     rows = [row for key, row in configs.items() if key not in known]
-    if rows:
-        connection.execute(insert(config), rows)
-        known = _config_ids(connection, backend, list(configs))
-    return known
+    if not rows:
+        return known
+    connection.execute(insert(config), rows)
+    return _config_ids(connection, backend, list(configs))
 
 
 def _config_ids(connection: Connection, backend: Backend, keys: Sequence[str]) -> dict[str, int]:
