@@ -70,7 +70,8 @@ def test_every_source_and_every_setting_is_in_it(wheel: Path) -> None:
     sources = {
         str(path.relative_to(ROOT))
         for package in ("dopt", "hydra_plugins", "orchestrate", "analysis")
-        for path in (ROOT / package).rglob("*.py")
+        for path in (ROOT / package).rglob("*")
+        if path.suffix in (".py", ".sh", ".env")
     }
     assert len(settings) > 20
     assert settings <= names

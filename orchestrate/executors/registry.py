@@ -12,14 +12,16 @@ from dopt.errors import unknown_name
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.executors import inprocess, local, lockstep
 from orchestrate.executors.base import Executor, Prepare, Run
-from orchestrate.executors.factory import ExecutorFactory
+from orchestrate.executors.factory import ExecutorFactory, Job
 from orchestrate.executors.ray import factory as ray
+from orchestrate.executors.slurm import factory as slurm
 
 EXECUTORS: Mapping[str, ExecutorFactory] = {
     "inprocess": inprocess.FACTORY,
     "local": local.FACTORY,
     "lockstep": lockstep.FACTORY,
     "ray": ray.FACTORY,
+    "slurm": slurm.FACTORY,
 }
 
 
@@ -38,4 +40,18 @@ def executor_factory(settings: LaunchSettings) -> ExecutorFactory:
 
 def make_executor(settings: LaunchSettings, run: Run, prepare: Prepare | None = None) -> Executor:
     """Return the executor that the settings name, not yet started."""
-    return executor_factory(settings).make(settings, run, prepare)
+    make = executor_factory(settings).make
+    assert make is not None, f"a job runs the trials of executor={settings.executor}"
+    return make(settings, run, prepare)
+
+
+def make_job(settings: LaunchSettings) -> Job | None:
+    """Return the job that a launch submits before it leaves, or None where it submits none.
+
+    Raises
+    ------
+    LaunchError
+        For wrong settings of the job.
+    """
+    make = executor_factory(settings).job
+    return None if make is None or settings.detach else make(settings)

@@ -17,7 +17,7 @@ from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.request import CONFIGURATION, Request, read_command_line
 from orchestrate.config.unknown_keys import check_launch
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
-from orchestrate.executors.registry import executor_factory
+from orchestrate.executors.registry import executor_factory, make_job
 from orchestrate.redaction import without_password
 from orchestrate.runner.dry_run import preview
 from orchestrate.runner.memory_check import check_memory
@@ -76,23 +76,29 @@ def _check_kind(settings: LaunchSettings, *, single: bool) -> None:
             "launch.until chooses among the seeds of a grid, but a single trial is asked for: add "
             "-m and a range such as 'seed=range(100)', or leave launch.until out."
         )
-    if single and (settings.detach or settings.share):
-        key = "detach" if settings.detach else "share"
+    leaving = _leaving(settings)
+    if single and (leaving or settings.share):
+        key = leaving or "launch.share"
         raise LaunchError(
-            f"launch.{key} is for grids, but a single trial is asked for: add -m, or leave "
-            f"launch.{key} out."
+            f"{key} is for grids, but a single trial is asked for: add -m, or leave {key} out."
         )
-    if settings.share and (settings.detach or settings.until):
-        key = "detach" if settings.detach else "until"
+    if settings.share and (leaving or settings.until):
         raise LaunchError(
-            f"launch.{key} needs the whole grid in one database, but launch.share takes a part of "
-            "it: leave one of the two out."
+            f"{leaving or 'launch.until'} needs the whole grid in one database, but launch.share "
+            "takes a part of it: leave one of the two out."
         )
-    if settings.detach and settings.until:
+    if leaving and settings.until:
         raise LaunchError(
-            "launch.until looks at results before it asks for more seeds, but launch.detach leaves "
+            f"launch.until looks at results before it asks for more seeds, but {leaving} leaves "
             "before there are any: leave one of the two out."
         )
+
+
+def _leaving(settings: LaunchSettings) -> str:
+    """Return the setting by which a launch leaves its grid to workers; empty without one."""
+    if settings.detach:
+        return "launch.detach"
+    return f"executor={settings.executor}" if make_job(settings) else ""
 
 
 def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
@@ -104,6 +110,8 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
             say(preview(grid, settings.store_url, settings.retry))
             if settings.until:
                 say("launch.until may need fewer of these seeds: they are run in batches")
+            if job := make_job(settings):
+                say(job.text(len(grid.trials)))
             return ExitCode.DONE
         record = launch_record(sys.argv, request.overrides, ROOT)
         if not request.single:

@@ -17,7 +17,8 @@ from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Prepare, Run
-from orchestrate.executors.registry import executor_factory, make_executor
+from orchestrate.executors.factory import Job
+from orchestrate.executors.registry import executor_factory, make_executor, make_job
 from orchestrate.runner.batching import Chunks
 from orchestrate.runner.collecting import collected
 from orchestrate.runner.heartbeat import Heartbeat
@@ -27,13 +28,21 @@ from orchestrate.runner.scheduler import Scheduler
 from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.runner.signals import Interrupt
 from orchestrate.runner.summary import closing, opening, registered
-from orchestrate.store import LaunchRecord, Registration, Store, StoreUnavailableError
+from orchestrate.store import (
+    URL_VARIABLE,
+    LaunchRecord,
+    Registration,
+    Store,
+    StoreUnavailableError,
+)
 
 POLL_OTHER_LAUNCHES_SECONDS = 1.0
 """Interval of status queries for trials that another launch runs."""
 
 ANNOUNCE_AFTER_SECONDS = 1.0
 """Duration of a preparation after which a message explains the delay."""
+
+WORKER = "python -m orchestrate work"
 
 COMPILING = "compiling the kernel: this takes up to a minute, and later launches reuse it"
 
@@ -66,7 +75,7 @@ def launch_grid(
     stream: TextIO | None = sys.stderr,
     warn: Say | None = None,
 ) -> ExitCode:
-    """Bring every trial of the grid to an outcome.
+    """Bring every trial of the grid to an outcome, or leave that to workers.
 
     Parameters
     ----------
@@ -91,11 +100,13 @@ def launch_grid(
         If the database or the workers fail; nothing that was committed is lost.
     """
     announce = warn or say
-    if settings.detach:
+    if not settings.detach:
+        executor_factory(settings).check(settings)
+    job = make_job(settings)
+    if settings.detach or job is not None:
         return recorded_launch(
-            settings, record, say, announce, lambda store: _leave(store, grid, settings, say)
+            settings, record, say, announce, lambda store: _leave(store, grid, settings, job, say)
         )
-    executor_factory(settings).check(settings)
     output = Output(say, announce, stream)
     return recorded_launch(
         settings, record, say, announce, lambda store: _run(store, grid, settings, work, output)
@@ -177,10 +188,18 @@ def _run(
     return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
 
 
-def _leave(store: RetryingStore, grid: Grid, settings: LaunchSettings, say: Say) -> ExitCode:
-    """Register the grid for workers."""
+def _leave(
+    store: RetryingStore, grid: Grid, settings: LaunchSettings, job: Job | None, say: Say
+) -> ExitCode:
+    """Register the grid for workers, and submit the job in which they run."""
     _free(store, grid, settings)
-    say(registered(grid, store.register(grid.trials), store.safe_url))
+    state = store.register(grid.trials)
+    if job is None:
+        say(f"{registered(grid, state)}; start workers with {WORKER} --db {store.safe_url}")
+        return ExitCode.DONE
+    say(f"{registered(grid, state)} · {store.safe_url}")
+    if state.todo:
+        say(job.submit(len(state.todo), {URL_VARIABLE: settings.store_url}))
     return ExitCode.DONE
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType, TracebackType
@@ -15,6 +16,28 @@ FINISHING = "\nCtrl-C: finishing running trials; press again to stop immediately
 
 MAX_HELD_SIGNALS = 3
 """Signals during one undisturbed block after which it is interrupted."""
+
+
+REPETITION_SECONDS = 1.0
+"""Time after a signal in which others repeat it.
+
+A batch system may signal all processes of a job, whose shell passes the signal on.
+"""
+
+
+class Repetition:
+    """Recognition of signals that repeat an earlier one; Ctrl-C is pressed once more on purpose."""
+
+    def __init__(self) -> None:
+        self._end = 0.0
+
+    def __call__(self, number: int) -> bool:
+        """Return whether the signal, which has just come, repeats another."""
+        now = time.monotonic()
+        if number != signal.SIGINT and now < self._end:
+            return True
+        self._end = now + REPETITION_SECONDS
+        return False
 
 
 class Interrupt:
@@ -37,6 +60,7 @@ class Interrupt:
         self._signals = signals
         self._notice = notice
         self._before: dict[signal.Signals, Any] = {}
+        self._repeated = Repetition()
 
     def __enter__(self) -> Self:
         self._before = {number: signal.signal(number, self._handle) for number in self._signals}
@@ -48,7 +72,9 @@ class Interrupt:
         for number, before in self._before.items():
             signal.signal(number, before)
 
-    def _handle(self, _: int, __: FrameType | None) -> None:
+    def _handle(self, number: int, _: FrameType | None) -> None:
+        if self._repeated(number):
+            return
         if self.stop_requested:
             raise KeyboardInterrupt
         self.stop_requested = True

@@ -14,15 +14,14 @@ MAX_LISTED_CAUSES = 3
 """Causes of failure that the summary lists."""
 
 
-def registered(grid: Grid, state: Registration, url: str) -> str:
-    """Return the counts of a grid that was registered for workers, and the command of a worker."""
+def registered(grid: Grid, state: Registration) -> str:
+    """Return the counts of a grid that was registered for workers."""
     lines = [*left_out(grid), f"{state.done + state.diverged:,} of {state.total:,} already done"]
     if state.failed:
         lines[-1] += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
     if state.running_elsewhere:
         lines[-1] += f", {state.running_elsewhere:,} running"
-    lines[-1] += f", {len(state.todo):,} registered; start workers with "
-    lines[-1] += f"python -m orchestrate work --db {url}"
+    lines[-1] += f", {len(state.todo):,} registered"
     return "\n".join(lines)
 
 

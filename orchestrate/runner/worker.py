@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 from dopt.kernel import warm_up
 from dopt.run import run_trial
@@ -21,7 +22,7 @@ from orchestrate.runner.provenance import launch_record
 from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.runner.run_grid import Output, Work, prepare_workers, recorded_launch
 from orchestrate.runner.scheduler import Scheduler
-from orchestrate.runner.signals import SIGNALS, Interrupt
+from orchestrate.runner.signals import SIGNALS, Interrupt, Repetition
 from orchestrate.runner.stored_chunks import StoredChunks
 from orchestrate.runner.summary import worked
 
@@ -129,7 +130,13 @@ def run_worker(settings: WorkerSettings, output: Output, work: Work | None = Non
 @contextmanager
 def _signals_interrupt() -> Iterator[None]:
     """Let a warning end the preparation, in which nothing is held, as Ctrl-C does."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in WARNINGS}
+    repeated = Repetition()
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        if not repeated(number):
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in WARNINGS}
     try:
         yield
     finally:

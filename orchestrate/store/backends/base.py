@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, Engine, Select
 
@@ -26,6 +26,14 @@ class LaunchLife:
     launch_id: int
     token: str
     lease_until: float | None
+
+
+class NewTrial(NamedTuple):
+    """Trial that is registered: nothing of it has run."""
+
+    trial_key: str
+    config_id: int
+    seed: int
 
 
 class Backend(ABC):
@@ -66,6 +74,10 @@ class Backend(ABC):
     @abstractmethod
     def members(self, keys: Sequence[str]) -> Select[Any]:
         """Return the keys as a one-column query, for ``IN``; any number of them."""
+
+    @abstractmethod
+    def insert_trials(self, connection: Connection, trials: Sequence[NewTrial]) -> None:
+        """Write pending trials, of which none is in the database."""
 
     @abstractmethod
     def insert_steps(

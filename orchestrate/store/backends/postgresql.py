@@ -27,7 +27,7 @@ from sqlalchemy import (
 )
 
 from orchestrate.store import database_url
-from orchestrate.store.backends.base import Backend, LaunchLife
+from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
 from orchestrate.store.backends.postgresql_backup import copy_schema
 from orchestrate.store.errors import StoreError
 from orchestrate.store.records import Array
@@ -51,6 +51,14 @@ _CONNECTION = {
 _NOW = text("SELECT extract(epoch FROM clock_timestamp())::double precision")
 _COPY_STEP = f"COPY step (trial_id, t, {', '.join(STEP_VALUES)}) FROM STDIN (FORMAT BINARY)"
 _COPY_TYPES = ["int8", "int4", *("float8" for _ in STEP_VALUES)]
+# One statement for many rows: a statement for each takes twice the time, here and on the server.
+_INSERT_TRIALS = text(
+    """
+    INSERT INTO trial (trial_key, config_id, seed, status, attempt)
+    SELECT *, 'pending', 0
+    FROM unnest(CAST(:keys AS text[]), CAST(:config_ids AS bigint[]), CAST(:seeds AS bigint[]))
+    """
+)
 _SET_LOCK_TIMEOUT = text("SET LOCAL lock_timeout = '30s'")
 _LOCK = text("SELECT pg_try_advisory_xact_lock(hashtext('dopt.store.' || current_schema()))")
 _LOCK_PAUSE_SECONDS = 0.05
@@ -108,6 +116,11 @@ class PostgreSQLBackend(Backend):
     def members(self, keys: Sequence[str]) -> Select[Any]:
         listed = bindparam("keys", list(keys), type_=ARRAY(Text), unique=True)
         return select(func.unnest(listed).column_valued("key"))
+
+    def insert_trials(self, connection: Connection, trials: Sequence[NewTrial]) -> None:
+        keys, config_ids, seeds = map(list, zip(*trials, strict=True))
+        given = {"keys": keys, "config_ids": config_ids, "seeds": seeds}
+        connection.execute(_INSERT_TRIALS, given)
 
     def insert_steps(
         self, connection: Connection, trial_id: int, values: Array, first: int = 0

@@ -11,10 +11,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import URL, Connection, Select, func, select
+from sqlalchemy import URL, Connection, Select, func, insert, select
 
 from orchestrate.store import database_url
-from orchestrate.store.backends.base import Backend, LaunchLife
+from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
 from orchestrate.store.backends.driver_errors import translated, translated_file
 from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
 from orchestrate.store.backends.network_file_systems import refuse_network
@@ -27,7 +27,7 @@ from orchestrate.store.backends.sqlite_engine import (
 )
 from orchestrate.store.errors import StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
-from orchestrate.store.schema import STEP_VALUES
+from orchestrate.store.schema import STEP_VALUES, trial
 
 __all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "reading"]
 
@@ -108,6 +108,10 @@ class SQLiteBackend(Backend):
 
     def members(self, keys: Sequence[str]) -> Select[Any]:
         return select(func.json_each(json.dumps(list(keys))).table_valued("value").c.value)
+
+    def insert_trials(self, connection: Connection, trials: Sequence[NewTrial]) -> None:
+        rows = [{**one._asdict(), "status": "pending", "attempt": 0} for one in trials]
+        connection.execute(insert(trial), rows)
 
     def insert_steps(
         self, connection: Connection, trial_id: int, values: Array, first: int = 0

@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, select
 
-from orchestrate.store.backends.base import Backend
+from orchestrate.store.backends.base import Backend, NewTrial
 from orchestrate.store.records import Registrable, Registration
 from orchestrate.store.schema import CONFIG_COLUMNS, config, trial
 from orchestrate.store.serialization import plain
@@ -50,25 +50,30 @@ def register(
 ) -> Registration:
     """Insert new configurations and trials, and return the state of the grid."""
     backend.exclusive(connection)
-    config_ids = _insert_configs(connection, backend, grid.configs)
+    before = _config_ids(connection, backend, list(grid.configs))
+    config_ids = _insert_configs(connection, backend, grid.configs, before)
     found: dict[str, tuple[str, int | None]] = {}
     for keys in _chunks(grid.trials):
-        known = _known_trials(connection, backend, keys)
+        # A configuration that was not there has no trials.
+        old = [key for key in keys if grid.trials[key][0] in before]
+        known = _known_trials(connection, backend, old) if old else {}
         new = [key for key in keys if key not in known]
-        _insert_trials(connection, grid, new, config_ids)
+        _insert_trials(connection, backend, grid, new, config_ids)
         found.update({key: known.get(key, ("pending", None)) for key in keys})
     return _summary(found, launch_id)
 
 
 def _insert_configs(
-    connection: Connection, backend: Backend, configs: Mapping[str, dict[str, Any]]
-) -> dict[str, int]:
-    known = _config_ids(connection, backend, list(configs))
+    connection: Connection,
+    backend: Backend,
+    configs: Mapping[str, dict[str, Any]],
+    known: Mapping[str, int],
+) -> Mapping[str, int]:
     rows = [row for key, row in configs.items() if key not in known]
-    if rows:
-        connection.execute(insert(config), rows)
-        known = _config_ids(connection, backend, list(configs))
-    return known
+    if not rows:
+        return known
+    connection.execute(insert(config), rows)
+    return _config_ids(connection, backend, list(configs))
 
 
 def _config_ids(connection: Connection, backend: Backend, keys: Sequence[str]) -> dict[str, int]:
@@ -88,20 +93,16 @@ def _known_trials(
 
 
 def _insert_trials(
-    connection: Connection, grid: GridRows, keys: Sequence[str], config_ids: Mapping[str, int]
+    connection: Connection,
+    backend: Backend,
+    grid: GridRows,
+    keys: Sequence[str],
+    config_ids: Mapping[str, int],
 ) -> None:
-    rows = [
-        {
-            "trial_key": key,
-            "config_id": config_ids[grid.trials[key][0]],
-            "seed": grid.trials[key][1],
-            "status": "pending",
-            "attempt": 0,
-        }
-        for key in keys
-    ]
-    if rows:
-        connection.execute(insert(trial), rows)
+    placed = ((key, *grid.trials[key]) for key in keys)
+    trials = [NewTrial(key, config_ids[config_key], seed) for key, config_key, seed in placed]
+    if trials:
+        backend.insert_trials(connection, trials)
 
 
 def _summary(found: Mapping[str, tuple[str, int | None]], launch_id: int) -> Registration:

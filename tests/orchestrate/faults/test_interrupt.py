@@ -64,6 +64,16 @@ def test_two_interrupts_at_any_moment_leave_no_lock(
     assert laboratory.count("status = 'running'") == 0
 
 
+def test_a_signal_that_is_passed_on_counts_once_and_a_second_ctrl_c_counts() -> None:
+    signals = (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)
+    with Interrupt(signals) as stop:
+        for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGTERM):
+            os.kill(os.getpid(), number)
+        assert stop.stop_requested
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+
+
 def interrupted(times: int, rest: float = 0.0) -> None:
     """Be interrupted so many times in the middle of a transaction, then go on for some seconds."""
     with undisturbed():

@@ -63,8 +63,10 @@ def test_a_warned_worker_hands_back_within_five_seconds(
         for pid in worker.workers():  # as batch systems do, which know nothing of parents
             os.kill(pid, number)
         worker.send(number)
+        worker.send(signal.SIGUSR1)  # the shell of a job passes on what all its processes got
         assert worker.end() == 130, worker.errors
         assert time.monotonic() - start < 5.0
+    assert "0 trials done" in worker.said
     assert laboratory.count("status = 'pending'") == laboratory.order.trials
     assert laboratory.query("SELECT DISTINCT outcome, cause FROM attempt") == [("released", None)]
     assert "Traceback" not in worker.errors

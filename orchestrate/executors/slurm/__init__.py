@@ -1,0 +1,1 @@
+"""Executor on a SLURM cluster: one job array, whose tasks take trials from the database."""
