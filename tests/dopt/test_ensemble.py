@@ -107,7 +107,8 @@ def test_forecasts_follow_the_mean() -> None:
         ({"name": "adam_window"}, "and model 'ensemble' with learner 'gauss_newton', but the two"),
         (
             {"name": "ekf"},
-            "goes with model 'mlp', 'affine', 'black_box' or 'linear' and model 'ensemble' with",
+            "goes with model 'mlp', 'affine', 'black_box', 'linear' or 'grey_box' and model "
+            "'ensemble' with",
         ),
         ({"name": "gauss_newton", "refit_every": 2}, "but learner.refit_every 2 was given"),
     ],

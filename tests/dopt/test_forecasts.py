@@ -14,6 +14,8 @@ from dopt.systems import SYSTEMS, Pendulum
 from dopt.systems.base import System
 
 STATES, STEPS = 7, 12
+CHANGING = {"drifting_pendulum", "moving_star"}
+"""Systems that a forecast takes to stay as they are at the start."""
 
 
 def asked(system: System) -> tuple[np.ndarray, np.ndarray]:
@@ -36,6 +38,8 @@ def test_a_model_is_rolled_as_its_predictions_say(name: str, model: Model) -> No
     system = SYSTEMS[name]()
     rng = np.random.default_rng(1)
     parameters = rng.standard_normal(model.n_parameters(system))
+    if isinstance(model, Linear):  # drags brake, and are small enough for the Euler map
+        parameters = 0.01 * np.abs(parameters)
     expected = forecast_by(system, lambda x, u: model.predict(system, parameters, x, u))(
         *asked(system)
     )
@@ -43,7 +47,7 @@ def test_a_model_is_rolled_as_its_predictions_say(name: str, model: Model) -> No
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", sorted(set(SYSTEMS) - {"drifting_pendulum"}))  # has no one truth
+@pytest.mark.parametrize("name", [one for one in sorted(SYSTEMS) if one not in CHANGING])
 def test_forecasts_are_the_simulation_of_the_evaluation(name: str) -> None:
     system = SYSTEMS[name]()
     _, inputs = asked(system)

@@ -71,7 +71,7 @@ SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["--package"], "--package/-p: expected one argument"),
         (["-m", "--cfg", "job"], "-m and --cfg cannot be combined"),
         (["--resolve"], "--resolve goes with --cfg or --help"),
-        (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor, beyond/cart"),
+        (["env=null"], "env is null, but one of arm, cartpole, pendulum, quadrotor, beyond/car"),
         (["env="], "env is empty, but one of arm"),
         (["policy=5"], "the option of a group is a number, but one of its names is expected"),
         (["--config-dir", str(OPTIONS), "env=boat", "env.mass=3"], "add it with \\+env\\.mass="),

@@ -208,7 +208,7 @@ def test_an_unknown_field_is_answered_with_the_nearest() -> None:
 
 
 def test_a_name_like_none_is_answered_with_all() -> None:
-    with pytest.raises(SpecificationError, match=r": choose one of arm, cartpole, .*\.$"):
+    with pytest.raises(SpecificationError, match=r": choose one of arm, car, cartpole, .*\.$"):
         build("env", SYSTEMS, {"name": "zzzz"})
 
 

@@ -214,7 +214,7 @@ def test_it_is_refused_where_it_would_be_the_accumulated_one(model: str) -> None
     least_squares = {"name": "recursive_least_squares"}
     with pytest.raises(
         IncompatibleError,
-        match=rf"goes with model 'mlp', 'affine' or 'black_box', but model '{model}'",
+        match=rf"goes with model 'mlp', 'affine', 'black_box' or 'grey_box', but model '{model}'",
     ):
         trial(
             "mass_spring" if model == "linear_state" else "arm",

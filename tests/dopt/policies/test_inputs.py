@@ -134,7 +134,7 @@ def test_the_mean_square_of_inputs_is_the_stated_share(policy: str, env: str, sh
 
 @pytest.mark.parametrize("seed", range(5))
 def test_no_two_inputs_of_a_short_binary_sequence_are_the_same(seed: int) -> None:
-    spec = trial("chain", "prbs", seed, env={"horizon": 30}, policy={"hold": 10})
+    spec = trial("chain", "prbs", seed, env={"horizon": 30, "n_links": 5}, policy={"hold": 10})
     columns = np.unique(draw(spec).inputs, axis=1)
     assert columns.shape == (30, 5)
 
