@@ -214,8 +214,9 @@ def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
         (
             "rff",
             "ekf",
-            "learner 'ekf' goes with model 'mlp', 'affine', 'black_box', 'linear' or 'grey_box' and "
-            "model 'rff' with learner 'recursive_least_squares', but the two together were given",
+            "learner 'ekf' goes with model 'mlp', 'affine', 'black_box', 'linear' or 'grey_box' "
+            "and model 'rff' with learner 'recursive_least_squares', but the two together were "
+            "given",
         ),
         (
             "mlp",
