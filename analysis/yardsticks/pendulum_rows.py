@@ -15,10 +15,10 @@ from analysis.data.trial_selection import Entry, newest, policy_rank
 from analysis.errors import AnalysisError
 from analysis.formatting import steps_text, within
 from analysis.stats.trial_scores import last_passage
-from analysis.tables.comparisons import against_reference
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks.growth import Interval, exponent, median, slopes
+from analysis.yardsticks.growth import exponent, median, slopes
 from analysis.yardsticks.published import FLEX_LONGEST, FLEX_SAMPLES, FLEX_SIZES
+from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
 from dopt.parameter_error import loss_by_parameter_error
 from dopt.spec.prequential import system_of
 from dopt.systems import CoupledPendulums
@@ -29,7 +29,6 @@ NAME = "flex_table3"
 ERROR = 1e-2
 """Euclidean norm of the error of the frictions [1/s] that is to be reached."""
 
-REFERENCE = "random"
 _SEED = 20_230_426
 
 
@@ -103,26 +102,13 @@ def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
             row: dict[str, object] = {"policy": policy, "n_pendulums": size, "n": len(values)}
             row["horizon"] = int(own[own.n_pendulums == size].horizon.iloc[0])
             row["reached"] = int(np.isfinite(values).sum())
-            row |= _columns("median", median(values, np.random.default_rng(_SEED)))
-            row |= _columns("ratio", _ratio(trials, str(policy), size))
-            rows.append(row | _columns("exponent", growth))
+            row |= interval_columns("median", median(values, np.random.default_rng(_SEED)))
+            of_size = trials[trials.n_pendulums == size]
+            question = f"coupled_pendulums/{size}"
+            ratio = ratio_to_random(of_size, str(policy), "samples", question)
+            row |= interval_columns("ratio", ratio)
+            rows.append(row | interval_columns("exponent", growth))
     return pd.DataFrame(rows)
-
-
-def _columns(name: str, interval: Interval) -> dict[str, float]:
-    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
-
-
-def _ratio(trials: pd.DataFrame, policy: str, size: int) -> Interval:
-    of_size = trials[trials.n_pendulums == size]
-    own, reference = (
-        dict(zip(part.seed, part.samples, strict=True))
-        for part in (of_size[of_size.policy == policy], of_size[of_size.policy == REFERENCE])
-    )
-    if policy == REFERENCE or not reference:
-        return np.nan, np.nan, np.nan
-    found = against_reference(own, reference, f"coupled_pendulums/{size}", policy, "samples")
-    return found.ratio, found.low, found.high
 
 
 def tables(table: pd.DataFrame) -> tuple[TextTable, TextTable]:

@@ -14,10 +14,10 @@ from analysis.data.learned_model import learned_model
 from analysis.data.trial_selection import Entry, newest, policy_rank
 from analysis.errors import AnalysisError
 from analysis.formatting import within
-from analysis.tables.comparisons import against_reference
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks.growth import Interval, median
+from analysis.yardsticks.growth import median
 from analysis.yardsticks.published import FLEX_STAR
+from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
 from dopt.models import GreyBox
 from dopt.parameter_error import parameter_error
 from dopt.systems import MovingStar, System
@@ -25,7 +25,6 @@ from dopt.types import Array
 from orchestrate.store import ConfigRow, Reader
 
 NAME = "flex_star"
-REFERENCE = "random"
 CENTRE = ("center_x", "center_y")
 LOST = 0.5
 """Error above which a star is lost [m²]: that of a distance of 1 m, twice its radius."""
@@ -112,25 +111,11 @@ def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
         row: dict[str, object] = {"learner": learner, "policy": policy, "n": len(values)}
         row["apart"] = float(own.apart.median())
         row["lost"] = int(np.sum(values > LOST))
-        row |= _columns("median", median(values, np.random.default_rng(_SEED)))
-        rows.append(row | _columns("ratio", _ratio(trials, str(learner), str(policy))))
+        row |= interval_columns("median", median(values, np.random.default_rng(_SEED)))
+        taught = trials[trials.learner == learner]
+        ratio = ratio_to_random(taught, str(policy), "error", f"moving_star/{learner}")
+        rows.append(row | interval_columns("ratio", ratio))
     return pd.DataFrame(rows)
-
-
-def _columns(name: str, interval: Interval) -> dict[str, float]:
-    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
-
-
-def _ratio(trials: pd.DataFrame, learner: str, policy: str) -> Interval:
-    taught = trials[trials.learner == learner]
-    own, reference = (
-        dict(zip(part.seed, part.error, strict=True))
-        for part in (taught[taught.policy == policy], taught[taught.policy == REFERENCE])
-    )
-    if policy == REFERENCE or not reference:
-        return np.nan, np.nan, np.nan
-    found = against_reference(own, reference, f"moving_star/{learner}", policy, "error")
-    return found.ratio, found.low, found.high
 
 
 def tables(table: pd.DataFrame) -> tuple[TextTable, TextTable]:
