@@ -8,7 +8,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from analysis.data.trial_selection import ENVIRONMENTS
 from benchmarks.launches import RECORD, claims_for, run_record
 from benchmarks.processes import database, run
 from benchmarks.rows import Row, Target
@@ -18,7 +17,10 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Store
 
-PAPER = ("random", "uniform", "periodic", "d_optimal", "oracle")
+SYSTEMS = ("pendulum", "cartpole", "arm", "quadrotor")
+POLICIES = ("random", "uniform", "periodic", "d_optimal", "oracle")
+"""Those of the paper."""
+
 SEEDS = 212
 """With 19 configurations of 500 steps, two million rows."""
 
@@ -50,8 +52,8 @@ def fill(url: str, seeds: int) -> int:
 
 
 def _specs() -> Iterator[TrialSpec]:
-    for env in ENVIRONMENTS:
-        for policy in PAPER:
+    for env in SYSTEMS:
+        for policy in POLICIES:
             linear = policy == "oracle"
             learner = "recursive_least_squares" if linear else "adam_window"
             try:
