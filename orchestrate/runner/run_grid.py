@@ -17,19 +17,18 @@ from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Prepare, Run
-from orchestrate.executors.factory import Job
 from orchestrate.executors.registry import executor_factory, make_executor, make_job
 from orchestrate.runner.batching import Chunks
 from orchestrate.runner.collecting import collected
 from orchestrate.runner.heartbeat import Heartbeat
+from orchestrate.runner.leaving import free_trials, leave
 from orchestrate.runner.progress import Progress, Tally
 from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.runner.scheduler import Scheduler
 from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.runner.signals import Interrupt
-from orchestrate.runner.summary import closing, opening, registered
+from orchestrate.runner.summary import closing, opening
 from orchestrate.store import (
-    URL_VARIABLE,
     LaunchRecord,
     Registration,
     Store,
@@ -41,8 +40,6 @@ POLL_OTHER_LAUNCHES_SECONDS = 1.0
 
 ANNOUNCE_AFTER_SECONDS = 1.0
 """Duration of a preparation after which a message explains the delay."""
-
-WORKER = "python -m orchestrate work"
 
 COMPILING = "compiling the kernel: this takes up to a minute, and later launches reuse it"
 
@@ -105,7 +102,7 @@ def launch_grid(
     job = make_job(settings)
     if settings.detach or job is not None:
         return recorded_launch(
-            settings, record, say, announce, lambda store: _leave(store, grid, settings, job, say)
+            settings, record, say, announce, lambda store: leave(store, grid, settings, job, say)
         )
     output = Output(say, announce, stream)
     return recorded_launch(
@@ -175,7 +172,7 @@ def _run(
     work: Work,
     output: Output,
 ) -> ExitCode:
-    _free(store, grid, settings)
+    free_trials(store, grid, settings)
     plan, tally = SeedPlan(grid, settings), Tally(0)
     stages = _open_stages(store, plan, tally, settings, output.say)
     first = next(stages, None)
@@ -186,28 +183,6 @@ def _run(
     if plan.adaptive and not tally.left:
         output.say(plan.report())
     return ExitCode.SOME_FAILED if tally.all_failed else ExitCode.DONE
-
-
-def _leave(
-    store: RetryingStore, grid: Grid, settings: LaunchSettings, job: Job | None, say: Say
-) -> ExitCode:
-    """Register the grid for workers, and submit the job in which they run."""
-    _free(store, grid, settings)
-    state = store.register(grid.trials)
-    if job is None:
-        say(f"{registered(grid, state)}; start workers with {WORKER} --db {store.safe_url}")
-        return ExitCode.DONE
-    say(f"{registered(grid, state)} · {store.safe_url}")
-    if state.todo:
-        say(job.submit(len(state.todo), {URL_VARIABLE: settings.store_url}))
-    return ExitCode.DONE
-
-
-def _free(store: RetryingStore, grid: Grid, settings: LaunchSettings) -> None:
-    """Put the trials of dead launches, and those to be run again, back to pending."""
-    store.recover()
-    if settings.retry:
-        store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
 
 
 def _open_stages(
