@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import multiprocessing
 import os
 import time
@@ -53,12 +54,17 @@ def hear(pipe: Pipe) -> Any:
 
 
 def open_together(pipe: Pipe, urls: Sequence[str], barrier: Barrier) -> None:
-    """Open each database at the same moment as the others do; say how it went."""
+    """Open each database at the same moment as the others do; say how it went.
+
+    One that hangs shows where it does, before the test gives up.
+    """
+    faulthandler.dump_traceback_later(PATIENCE_SECONDS / 2)
     try:
         for url in urls:
-            barrier.wait(PATIENCE_SECONDS)
+            barrier.wait(PATIENCE_SECONDS / 2)
             with Store.open(url) as store:
                 store.begin_launch(LAUNCH)
+        faulthandler.cancel_dump_traceback_later()
         pipe.send("opened")
     except Exception as error:
         pipe.send(repr(error))
