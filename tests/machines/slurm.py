@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 from collections.abc import Sequence
 from datetime import datetime
 
-import pytest
-
 from tests.machines import servers
 from tests.machines.hosts import Host, Process, until
 from tests.machines.lab import Lab
+from tests.machines.requirements import unavailable
 
 PROGRAMS = ("slurmctld", "slurmd", "sbatch")
 
@@ -52,9 +50,7 @@ def need_slurm() -> None:
     if not missing:
         return
     message = f"{' and '.join(missing)} not on PATH: install slurm-wlm"
-    if os.environ.get("DOPT_REQUIRE_MACHINES") == "1":
-        pytest.fail(message)
-    pytest.skip(message)
+    unavailable(message)
 
 
 class Slurm:

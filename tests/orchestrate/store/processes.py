@@ -61,7 +61,7 @@ def open_together(pipe: Pipe, urls: Sequence[str], barrier: Barrier) -> None:
     faulthandler.dump_traceback_later(PATIENCE_SECONDS / 2)
     try:
         for url in urls:
-            barrier.wait(PATIENCE_SECONDS / 2)
+            barrier.wait(PATIENCE_SECONDS)
             with Store.open(url) as store:
                 store.begin_launch(LAUNCH)
         faulthandler.cancel_dump_traceback_later()
