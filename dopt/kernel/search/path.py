@@ -19,7 +19,7 @@ from dopt.kernel.state_structs import Covariance
 from dopt.kernel.structs import Network, Plant, Search
 from dopt.types import Matrix, Vector
 
-FEW_ROWS = 24
+FEW_ROWS = 40
 """Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
 
 BLOCK = 16
