@@ -20,6 +20,9 @@ read_password() {
 
 # Start this container's node with the words given and the options of every node.
 start_node() {
+    set -a # all nodes need the same settings; the launch has those of its node
+    . orchestrate/executors/ray/ray.env
+    set +a
     address=${DOPT_NODE_IP:-$(hostname -i | cut -d ' ' -f 1)}
     echo "${DOPT_HEAD:-$address:6379} $address" >"$NODE_FILE"
     "$@" --node-ip-address="$address" --object-store-memory=268435456 \

@@ -6,7 +6,7 @@ import argparse
 import sys
 from functools import partial
 
-from orchestrate.cli_parser import length_of_time, positive
+from orchestrate.cli_parser import UsageError, length_of_time, positive
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
@@ -36,6 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--memory-gib", type=seconds("--memory-gib"), metavar="GIB", help="memory of one process"
     )
     parser.add_argument(
+        "--retry-memory",
+        type=_factor,
+        metavar="FACTOR",
+        help="run a trial that exceeds --memory-gib once more, with so many times as much",
+    )
+    parser.add_argument(
         "--lease",
         type=seconds("--lease"),
         default=60.0,
@@ -49,13 +55,26 @@ def run(arguments: argparse.Namespace) -> ExitCode:
     from orchestrate.runner.worker import WorkerSettings, run_worker
 
     Reader.open(arguments.db).close()  # a worker creates no database
-    given = {name: getattr(arguments, name) for name in ("processes", "timeout", "memory_gib")}
+    if arguments.retry_memory is not None and arguments.memory_gib is None:
+        raise UsageError(
+            "--retry-memory raises the limit --memory-gib, which is missing: give both, or neither."
+        )
+    names = ("processes", "timeout", "memory_gib", "retry_memory")
+    given = {name: getattr(arguments, name) for name in names}
     settings = WorkerSettings(arguments.db, arguments.until, lease=arguments.lease, **given)
     tell = _to_stderr if arguments.json else say
     code = run_worker(settings, Output(tell, _to_stderr, sys.stderr))
     if arguments.json:
         say_json({"exit_code": code.value, "complete": code in (0, ExitCode.SOME_FAILED)})
     return code
+
+
+def _factor(text: str) -> float:
+    """Return a factor above 1."""
+    factor = positive("--retry-memory", float)(text)
+    if factor <= 1:
+        raise UsageError(f"--retry-memory is {text}, but a factor above 1 is expected: change it.")
+    return factor
 
 
 def _to_stderr(line: str) -> None:

@@ -11,6 +11,7 @@ from dopt.errors import unknown_name
 from orchestrate.config.share import Share, share
 from orchestrate.config.stopping_rule import Until, until
 from orchestrate.config.value_checks import amount, count, flag, limit, section, text, wrong
+from orchestrate.errors import LaunchError
 
 SHARD_SUFFIX = ".db"
 """End of the name of a file that holds a share."""
@@ -50,6 +51,8 @@ class LaunchSettings:
         Seconds of wall time that one trial may take, or None for no limit.
     memory_gib
         Memory that one worker process may take, or None for no limit.
+    retry_memory
+        Factor on ``memory_gib`` with which a trial that runs out of memory runs once more, or None.
     lease
         Seconds after its last heartbeat for which a launch on PostgreSQL keeps its trials.
     patience
@@ -75,6 +78,7 @@ class LaunchSettings:
     chunk_seconds: float = 1.0
     timeout: float | None = 3600.0
     memory_gib: float | None = None
+    retry_memory: float | None = None
     lease: float = 60.0
     patience: float = 30.0
     ray_address: str = "local"
@@ -111,11 +115,26 @@ class LaunchSettings:
             workers=count("launch.workers", launch["workers"]),
             chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
             timeout=limit("launch.timeout", launch["timeout"], "seconds"),
-            memory_gib=limit("launch.memory_gib", launch["memory_gib"], "GiB"),
+            **_memory(launch["memory_gib"], launch["retry_memory"]),
             **_lease_and_patience(launch["lease"], launch["patience"]),
             ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
             executor_options={key: value for key, value in executor.items() if key != "name"},
         )
+
+
+def _memory(gib: object, factor: object) -> dict[str, float | None]:
+    """Return the limit of memory, and the factor for the trials that exceed it."""
+    memory_gib = limit("launch.memory_gib", gib, "GiB")
+    if factor is None:
+        return {"memory_gib": memory_gib, "retry_memory": None}
+    if isinstance(factor, bool) or not isinstance(factor, int | float) or not 1 < factor <= 100:
+        raise wrong("launch.retry_memory", factor, "null or a factor above 1, at most 100,")
+    if memory_gib is None:
+        raise LaunchError(
+            f"launch.retry_memory is {factor:g}, but there is no limit that it could raise: set "
+            "launch.memory_gib, or leave launch.retry_memory out."
+        )
+    return {"memory_gib": memory_gib, "retry_memory": float(factor)}
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,11 @@ Prepare = Callable[[], None]
 
 @dataclass(frozen=True)
 class Task:
-    """Trial to run, with its key."""
+    """Trial to run, with its key, and the factor on the memory that its process may take."""
 
     key: str
     spec: TrialSpec
+    memory: float = 1.0
 
 
 @dataclass(frozen=True)

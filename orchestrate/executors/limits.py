@@ -88,10 +88,10 @@ def ended_after(limits: Limits, descriptor: int) -> Iterator[None]:
         faulthandler.cancel_dump_traceback_later()
 
 
-def limit_memory(limits: Limits) -> None:
+def limit_memory(limits: Limits, factor: float = 1.0) -> None:
     """Set the memory limit of this process, beyond which ``MemoryError`` is raised."""
     if limits.memory_gib is not None:
-        most_bytes = int(limits.memory_gib * BYTES_PER_GIB)
+        most_bytes = int(factor * limits.memory_gib * BYTES_PER_GIB)
         resource.setrlimit(
             resource.RLIMIT_DATA, (most_bytes, resource.getrlimit(resource.RLIMIT_DATA)[1])
         )

@@ -41,6 +41,7 @@ def main(descriptor: int, crash_report: int) -> None:
     connection.send(None)  # ready
     while True:
         for task in chunks.get():
+            limit_memory(limits, task.memory)
             with ended_after(limits, crash_report):
                 finished = run_task(run, task, limits)
             connection.send(finished)

@@ -215,7 +215,9 @@ def _run_stages(
     start = time.monotonic()
     with make_executor(settings, work.run, prepare) as executor, Interrupt() as stop:
         chunks = Chunks([], settings.chunk_seconds, executor.slots, executor.batch)
-        scheduler = Scheduler(store, executor, chunks, tally, stop, settings.fail_fast)
+        scheduler = Scheduler(
+            store, executor, chunks, tally, stop, settings.fail_fast, settings.retry_memory
+        )
         for stage, state in stages:
             chunks.add(_waiting(stage, state))
             scheduler.owned_by_others = state.running_elsewhere

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Protocol
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.executors.base import Executor, TaskDone, WorkerLost
+from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
 from orchestrate.records import Failure, RunRecord
 from orchestrate.runner.batching import Chunks
 from orchestrate.runner.progress import Tally
@@ -19,6 +19,7 @@ from orchestrate.store import Claim, InvalidResultError
 
 POLL_SECONDS = 0.2
 NODE_LOST = "node lost"
+OUT_OF_MEMORY = "out of memory"
 
 MAX_WORKER_LOSSES = 2
 """Worker deaths while a trial runs alone after which the trial fails."""
@@ -54,6 +55,8 @@ class Scheduler:
         trials: they are not stored.
     failures
         Number of failures by cause.
+    retry_memory
+        Factor on the limit of memory for a trial that exceeded it; None fails it at once.
     """
 
     store: RetryingStore
@@ -62,12 +65,14 @@ class Scheduler:
     tally: Tally
     stop: Stop
     fail_fast: bool = False
+    retry_memory: float | None = None
     owned_by_others: int = 0
     refused: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     _running: dict[str, tuple[Claim, TrialSpec]] = field(default_factory=dict)
     _crash_counts: Counter[str] = field(default_factory=Counter)
     _node_losses: Counter[str] = field(default_factory=Counter)
+    _out_of_memory: set[str] = field(default_factory=set)
 
     def step(self) -> bool:
         """Submit waiting trials and commit finished ones; return False when none is left."""
@@ -98,7 +103,15 @@ class Scheduler:
             self.owned_by_others += len(tasks) - len(held)
             mine = [task for task in tasks if task.key in held]
             self._running |= {task.key: (held[task.key], task.spec) for task in mine}
-            self.executor.submit([task for task in mine if not self._give_up(task.key)])
+            self.executor.submit(
+                [self._sized(task) for task in mine if not self._give_up(task.key)]
+            )
+
+    def _sized(self, task: Task) -> Task:
+        """Return the task with more memory if it has run out of memory here."""
+        if self.retry_memory is None or task.key not in self._out_of_memory:
+            return task
+        return replace(task, memory=self.retry_memory)
 
     @property
     def _window(self) -> int:
@@ -107,6 +120,10 @@ class Scheduler:
     def _commit(self, events: Sequence[TaskDone]) -> None:
         results: list[tuple[Claim, TrialResult, RunRecord]] = []
         for event in events:
+            if self._wants_more_memory(event):
+                self._out_of_memory.add(event.key)
+                self.chunks.add(self._release([event.key], OUT_OF_MEMORY), alone=True)
+                continue
             claim, trial = self._running.pop(event.key)
             self.chunks.observe(trial.config_key, event.run.wall_seconds)
             if isinstance(event.outcome, Failure):
@@ -115,6 +132,15 @@ class Scheduler:
                 results.append((claim, event.outcome, event.run))
         if results:
             self._write(results)
+
+    def _wants_more_memory(self, event: TaskDone) -> bool:
+        """Return whether a trial ran out of memory, and has not had more of it yet."""
+        return (
+            self.retry_memory is not None
+            and isinstance(event.outcome, Failure)
+            and event.outcome.cause == OUT_OF_MEMORY
+            and event.key not in self._out_of_memory
+        )
 
     def _write(self, results: Sequence[tuple[Claim, TrialResult, RunRecord]]) -> None:
         try:

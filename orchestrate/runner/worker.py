@@ -56,7 +56,7 @@ class WorkerSettings:
         Time after which nothing is held any more; None until no trial is left.
     processes
         Trials at once; None for one on each core that this process may use.
-    timeout, memory_gib, lease
+    timeout, memory_gib, retry_memory, lease
         As those of a launch (:class:`orchestrate.config.launch_settings.LaunchSettings`).
     """
 
@@ -65,6 +65,7 @@ class WorkerSettings:
     processes: int | None = None
     timeout: float | None = 3600.0
     memory_gib: float | None = None
+    retry_memory: float | None = None
     lease: float = 60.0
 
     @property
@@ -76,6 +77,7 @@ class WorkerSettings:
             workers=self.processes or len(os.sched_getaffinity(0)),
             timeout=self.timeout,
             memory_gib=self.memory_gib,
+            retry_memory=self.retry_memory,
             lease=self.lease,
             patience=min(30.0, self.lease / 2),
         )
@@ -163,7 +165,9 @@ def _work(
     interrupt = Interrupt(WARNINGS, NOTICE, store.hurry)
     with make_executor(launch, work.run) as executor, interrupt:
         leave = Leave(interrupt, _length(settings.seconds, start))
-        scheduler = Scheduler(store, executor, chunks, tally, leave)
+        scheduler = Scheduler(
+            store, executor, chunks, tally, leave, retry_memory=launch.retry_memory
+        )
         with Progress(tally, output.progress) as progress:
             _pull(scheduler, chunks, leave, progress)
     store.release_all()

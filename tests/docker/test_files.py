@@ -32,9 +32,11 @@ def test_every_service_of_ours_runs_the_one_image_without_rights(service: str) -
     assert not wanted.get("privileged")
 
 
-@pytest.mark.parametrize("service", OURS)
-def test_every_node_and_launch_has_the_settings_of_ray(service: str) -> None:
-    assert (DOCKER / SERVICES[service]["env_file"]).is_file()
+def test_every_node_has_the_settings_of_ray() -> None:
+    [path] = re.findall(
+        r"^    \. (\S+ray\.env)$", (DOCKER / "entrypoint.sh").read_text(), re.MULTILINE
+    )
+    assert (ROOT / path).is_file()
 
 
 @pytest.mark.parametrize("services", [COMPOSE["services"], HOSTS["services"]])

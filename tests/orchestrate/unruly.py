@@ -74,3 +74,10 @@ def greedy_in_a_group(spec: TrialSpec) -> TrialResult:
         Path(os.environ["DOPT_TEST_GROUP"], "cgroup.procs").write_text(str(os.getpid()))
         hoard()
     return quick(spec)
+
+
+def wants_a_gigabyte(spec: TrialSpec) -> TrialResult:
+    """Use 1 GiB, and give it back."""
+    if spec.seed == BROKEN_SEED:
+        np.ones(2**27)
+    return quick(spec)

@@ -20,11 +20,11 @@ def run_chunk(
     ``prepare`` is called first, on machines where the launch has not called it.
     """
     pin_threads()
-    limit_memory(limits)
     if prepare:
         prepare()
     yield None
     for task in tasks:
+        limit_memory(limits, task.memory)
         with ended_after(limits, _STDERR):
             finished = run_task(run, task, limits)
         yield finished

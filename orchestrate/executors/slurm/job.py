@@ -94,6 +94,8 @@ class SlurmJob:
         }
         if self.settings.memory_gib is not None:
             given["memory-gib"] = f"{self.settings.memory_gib:g}"
+        if self.settings.retry_memory is not None:
+            given["retry-memory"] = f"{self.settings.retry_memory:g}"
         words = (word for name, value in given.items() for word in (f"--{name}", str(value)))
         return [sys.executable, "-P", "-m", "orchestrate", "work", *words]
 

@@ -127,3 +127,19 @@ def test_every_trial_is_rebuilt_as_it_was_registered(command_line: Run, pull: Ru
     assert len({spec.trial_key for spec in ran}) == 6
     _, out, _ = pull("query", "SELECT trial_key FROM trial", "--json")
     assert all(spec.trial_key in out for spec in ran)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--retry-memory", "2"), "raises the limit --memory-gib, which is missing"),
+        (("--retry-memory", "1", "--memory-gib", "1"), "is 1, but a factor above 1 is expected"),
+    ],
+)
+def test_a_factor_of_memory_needs_a_limit_and_raises_it(
+    command_line: Run, pull: Run, words: Sequence[str], sentence: str
+) -> None:
+    command_line(*GRID, LEAVE)
+    code, _, errors = pull("work", *words)
+    assert code == 2
+    assert sentence in errors

@@ -28,7 +28,15 @@ from tests.orchestrate.conftest import ROOT, Launches
 from tests.orchestrate.executors.names import ALL, WITH_PROCESSES
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.standins import BROKEN_SEED, quick
-from tests.orchestrate.unruly import deaf, empty, faulty, greedy, greedy_in_a_group, hanging
+from tests.orchestrate.unruly import (
+    deaf,
+    empty,
+    faulty,
+    greedy,
+    greedy_in_a_group,
+    hanging,
+    wants_a_gigabyte,
+)
 
 SEEDS = 6
 
@@ -141,6 +149,23 @@ def test_a_greedy_trial_fails_by_itself(launches: Launches, executor: str) -> No
     assert "Unable to allocate" in str(message)
     [(text,)] = launches.query("SELECT traceback FROM v_failures")
     assert "in hoard" in text
+
+
+@pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
+def test_a_trial_with_too_little_memory_gets_more_once(launches: Launches, executor: str) -> None:
+    """Its process has 0.75 GiB, of which the trial that is greedy wants a half more."""
+    settings = {"seeds": SEEDS, "executor": executor, "memory_gib": 0.75}
+    assert launches(wants_a_gigabyte, **settings, retry_memory=1.2) == ExitCode.SOME_FAILED
+    assert only_the_broken_one_failed(launches)
+    [(_, cause, _, _, attempt)] = failures(launches)
+    assert (cause, attempt) == ("out of memory", 2)
+    assert launches(wants_a_gigabyte, **settings, retry_memory=4.0, retry="failed") == ExitCode.DONE
+    ends = "SELECT attempt, outcome, cause FROM attempt WHERE attempt > 1 ORDER BY attempt"
+    assert launches.query(ends) == [
+        (2, "failed", "out of memory"),
+        (3, "released", "out of memory"),
+        (4, "done", None),
+    ]
 
 
 @pytest.fixture

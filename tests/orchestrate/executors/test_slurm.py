@@ -58,6 +58,7 @@ def test_a_dry_run_prints_the_script_and_needs_no_slurm(command_line: CommandLin
         "executor.memory_gib=1.5", "executor.partition=long", "executor.account=lab",
         "+executor.options.qos=low", "+executor.options.exclusive=true",
         "+executor.options.comment='a \"b\"'", "launch.lease=90",
+        "launch.memory_gib=1", "launch.retry_memory=1.5",
     )  # fmt: skip
     assert code == 0, errors
     lines = [line for line in output.splitlines() if line.startswith("#SBATCH ")]
@@ -67,7 +68,8 @@ def test_a_dry_run_prints_the_script_and_needs_no_slurm(command_line: CommandLin
         "--output=results/slurm/%A_%a.log", "--open-mode=append", "--signal=B:USR1@60",
         "--export=ALL", "--qos=low", "--exclusive", '--comment="a \\"b\\""',
     }  # fmt: skip
-    assert "-m orchestrate work --processes 4 --timeout 3600 --lease 90)" in output
+    command = "-m orchestrate work --processes 4 --timeout 3600 --lease 90"
+    assert f"{command} --memory-gib 1 --retry-memory 1.5)" in output
 
 
 @pytest.mark.parametrize(

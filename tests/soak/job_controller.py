@@ -1,0 +1,153 @@
+"""A stand-in for Kubernetes: runs the pods of an Indexed Job as processes, by its manifest."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from tests.docker.kubernetes import Manifest
+from tests.paths import ROOT
+
+ENTRY_POINT = ROOT / "docker" / "entrypoint.sh"
+
+
+@dataclass
+class Pod:
+    """A pod of a Job: its first containers one after the other, then its only other one."""
+
+    job: JobController
+    index: int
+    log: IO[str]
+    number: int = 0  # of the container that runs
+    process: subprocess.Popen[str] | None = None
+    evicted: float | None = None
+
+    def __post_init__(self) -> None:
+        self._start()
+
+    @property
+    def container(self) -> str:
+        return str(self.job.containers[self.number]["name"])
+
+    @property
+    def works(self) -> bool:
+        """Whether the pod has come to its main container, which runs."""
+        last = self.number == len(self.job.containers) - 1
+        return last and self.process is not None and self.process.poll() is None
+
+    def evict(self) -> None:
+        """Do what the eviction of a pod does to its process."""
+        assert self.process is not None
+        self.evicted = time.monotonic()
+        self.process.send_signal(signal.SIGTERM)
+
+    def exit_code(self) -> int | None:
+        """Return the exit code of the pod, or None while it runs."""
+        assert self.process is not None
+        if self.evicted is not None and time.monotonic() - self.evicted > self.job.grace:
+            self.process.kill()
+        code = self.process.poll()
+        if code == 0 and self.number < len(self.job.containers) - 1 and self.evicted is None:
+            self.number += 1
+            self._start()
+            return None
+        return code
+
+    def _start(self) -> None:
+        self.process = subprocess.Popen(
+            ["sh", str(ENTRY_POINT), *self.job.words(self.number)],
+            cwd=ROOT,
+            env=self.job.environment,
+            stdout=self.log,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+
+@dataclass
+class JobController:
+    """Keeps the pods of a Job running until each index has ended with success.
+
+    Attributes
+    ----------
+    words_of
+        Words that take the place of those of the manifest, by the name of the container.
+    ended
+        How often a pod ended with which exit code, evicted ones included.
+    """
+
+    manifest: Manifest
+    folder: Path
+    environment: Mapping[str, str]
+    words_of: Mapping[str, Sequence[str]]
+    ended: Counter[int] = field(default_factory=Counter)
+    counted: Counter[int] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        spec = self.manifest["spec"]
+        pod = spec["template"]["spec"]
+        self.containers = [*pod.get("initContainers", []), *pod["containers"]]
+        self.grace = float(pod["terminationGracePeriodSeconds"])
+        self.limit = int(spec["backoffLimitPerIndex"])
+        self.rules = spec["podFailurePolicy"]["rules"]
+        self.pods = {index: self._new(index) for index in range(spec["completions"])}
+
+    def words(self, number: int) -> Sequence[str]:
+        container = self.containers[number]
+        return self.words_of.get(container["name"], container["args"])
+
+    def look(self) -> bool:
+        """Replace the pods that have failed; return whether the Job goes on."""
+        for index, pod in list(self.pods.items()):
+            if (code := pod.exit_code()) is None:
+                continue
+            self.ended[code] += 1
+            del self.pods[index]
+            if code == 0:
+                continue
+            action = "Ignore" if pod.evicted is not None else self._action(pod.container, code)
+            assert action != "FailJob", f"{pod.container} ended with {code}:\n{self.logs()}"
+            self.counted[index] += action == "Count"
+            assert self.counted[index] <= self.limit, self.logs()
+            self.pods[index] = self._new(index)
+        return bool(self.pods)
+
+    def close(self) -> None:
+        """End what still runs."""
+        for pod in self.pods.values():
+            assert pod.process is not None
+            pod.process.kill()
+            pod.process.wait()
+
+    def logs(self) -> str:
+        return "\n".join(path.read_text()[-3000:] for path in sorted(self.folder.glob("*.log")))
+
+    def _new(self, index: int) -> Pod:
+        return Pod(self, index, (self.folder / f"{index}.log").open("a"))
+
+    def _action(self, container: str, code: int) -> str:
+        """Return what the policy says of a container that failed by itself."""
+        for rule in self.rules:
+            wanted = rule.get("onExitCodes")
+            if wanted and wanted["containerName"] == container and code in wanted["values"]:
+                return str(rule["action"])
+        return "Count"
+
+
+def environment_of_pods(database: str, home: Path) -> dict[str, str]:
+    """Return the variables of the pods of these processes."""
+    folder = Path(sys.executable).parent
+    return {
+        **os.environ,
+        "PATH": f"{folder}:{os.environ['PATH']}",
+        "HOME": str(home),
+        "DOPT_DB": database,
+    }
