@@ -56,7 +56,8 @@ def hear(pipe: Pipe) -> Any:
 def open_together(pipe: Pipe, urls: Sequence[str], barrier: Barrier) -> None:
     """Open each database at the same moment as the others do; say how it went.
 
-    One that hangs shows where it does, before the test gives up.
+    One that hangs shows where it does, before the test gives up; after an error of one the others
+    do not wait for it, so that the test shows the error.
     """
     faulthandler.dump_traceback_later(PATIENCE_SECONDS / 2)
     try:
@@ -67,6 +68,7 @@ def open_together(pipe: Pipe, urls: Sequence[str], barrier: Barrier) -> None:
         faulthandler.cancel_dump_traceback_later()
         pipe.send("opened")
     except Exception as error:
+        barrier.abort()
         pipe.send(repr(error))
 
 
