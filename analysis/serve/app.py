@@ -18,7 +18,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from analysis.errors import AnalysisError
-from analysis.serve import compare, control, curves, gallery, grid, sql, trial, trials
+from analysis.serve import compare, control, curves, gallery, grid, launches, sql, trial, trials
 from analysis.serve.database import Database
 from analysis.serve.errors import BusyError, NotFoundError
 from analysis.serve.progress import read_progress
@@ -42,6 +42,7 @@ PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/trials/{trial_key}", "trial", trial.trial),
     ("/compare", "compare", compare.compare),
     ("/control", "control", control.control),
+    ("/launches", "launches", launches.launches),
     ("/figures", "figures", gallery.gallery),
     ("/sql", "sql", sql.sql),
 )
@@ -54,6 +55,7 @@ DATA: tuple[tuple[str, Numbers], ...] = (
     ("/api/trials/{trial_key}/arrays", trial.arrays),
     ("/api/compare", compare.compare),
     ("/api/control", control.control),
+    ("/api/launches", launches.launches),
     ("/api/figures", gallery.gallery),
     ("/api/sql", sql.sql),
 )

@@ -21,7 +21,7 @@ expect.set_options(timeout=1000 * PATIENCE)
 
 CONTRAST = (Path(__file__).parent / "contrast.js").read_text()
 PATHS = (
-    *("/", "/curves", "/trials", "/compare", "/control", "/figures"),
+    *("/", "/curves", "/trials", "/compare", "/control", "/launches", "/figures"),
     "/sql?q=SELECT env, seed FROM v_trial",
 )
 TRIALS = ("/trials?status=failed", "/trials?env=cartpole&status=diverged")

@@ -145,7 +145,7 @@ NAMES = st.sampled_from(
         *("after", "before", "column", "x", "diverged", "where", "measure", "q", "hide"),
     ]
 )
-PAGES = ("/", "/curves", "/trials", "/compare", "/control", "/figures", "/sql")
+PAGES = ("/", "/curves", "/trials", "/compare", "/control", "/launches", "/figures", "/sql")
 DATA = ("progress", "grid", "curves", "trials", "compare", "control", "figures", "sql")
 TABLES = ("curves.csv", "compare.csv", "control.csv", "sql.csv")
 PATHS = st.sampled_from([*PAGES, *(f"/api/{name}" for name in (*DATA, *TABLES))]) | st.builds(

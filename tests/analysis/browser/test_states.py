@@ -15,7 +15,7 @@ from orchestrate.store import Reader, Store
 from tests.analysis.browser import grids
 from tests.analysis.synthetic import make_grid
 
-PAGES = ("/", "/curves", "/trials", "/control", "/figures", "/sql")
+PAGES = ("/", "/curves", "/trials", "/control", "/launches", "/figures", "/sql")
 Visit = Callable[..., TestClient]
 
 
