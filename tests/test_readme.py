@@ -110,7 +110,7 @@ def test_the_swing_ups_of_the_readme_are_counted() -> None:
     assert phrase in WORDS
 
 
-@pytest.mark.parametrize("limit", ["0.2", "1", "10"])
+@pytest.mark.parametrize("limit", ["0.2", "1", "5", "10"])
 def test_the_table_by_time_names_what_is_best_within_it(limit: str) -> None:
     name, losses = best_within(float(limit))
     cells = [number(losses[env]) for env in ("pendulum", "cartpole", "arm", "quadrotor")]

@@ -244,9 +244,9 @@ def test_successes_with_the_lowest_losses_are_rounded_once(task: str, env: str) 
 
 
 def test_the_best_configurations_by_time_are_those_of_the_figure() -> None:
-    names = [best_within(limit)[0] for limit in (0.2, 1.0, 10.0)]
-    phrase = "at most 0.2 ms in all of them is {}, at most 1 ms {}, and at most 10 ms {}."
-    assert phrase.format(*names) in FINDINGS
+    names = [best_within(limit)[0] for limit in (0.2, 1.0, 5.0, 10.0)]
+    phrase = "0.2 ms in all of them is {}, at most 1 ms {}, at most 5 ms {}, and at most 10 ms {}."
+    assert phrase.format(*names) in " ".join(FINDINGS.split())
     kept = [gain_kept(f"D-optimal, {name}") for name in CHEAPER]
     phrase = "keeps {:.0f} % and `gauss_newton` with `learner.refit_every=10` {:.0f} % of what"
     assert phrase.format(*(100 * share for share in kept)) in FINDINGS

@@ -142,12 +142,11 @@ class JobController:
         return "Count"
 
 
-def environment_of_pods(database: str, home: Path) -> dict[str, str]:
+def environment_of_pods(database: str) -> dict[str, str]:
     """Return the variables of the pods of these processes."""
     folder = Path(sys.executable).parent
     return {
         **os.environ,
         "PATH": f"{folder}:{os.environ['PATH']}",
-        "HOME": str(home),
         "DOPT_DB": database,
     }

@@ -31,7 +31,7 @@ def test_evicted_pods_lose_nothing_and_compute_little_twice(
     job = JobController(
         of_kind("workers", "Job", "dopt-workers"),
         tmp_path,
-        environment_of_pods(postgresql_url, tmp_path),
+        environment_of_pods(postgresql_url),
         words_of={
             "register": ("launch", "-m", *grid, "launch.detach=true"),
             "worker": ("orchestrate", "work", "--processes=1", "--memory-gib=1.5"),
