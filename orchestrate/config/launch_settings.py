@@ -97,6 +97,7 @@ class LaunchSettings:
         executor = section("executor", given["executor"])
         part = share(launch["share"])
         place = _place(section("store", given["store"]), part)
+        memory_gib = limit("launch.memory_gib", launch["memory_gib"], "GiB")
         retry = launch["retry"]
         if retry is not None and retry not in RETRY:
             raise unknown_name("launch.retry", retry, RETRY)
@@ -115,18 +116,18 @@ class LaunchSettings:
             workers=count("launch.workers", launch["workers"]),
             chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
             timeout=limit("launch.timeout", launch["timeout"], "seconds"),
-            **_memory(launch["memory_gib"], launch["retry_memory"]),
+            memory_gib=memory_gib,
+            retry_memory=_factor_of_memory(launch["retry_memory"], memory_gib),
             **_lease_and_patience(launch["lease"], launch["patience"]),
             ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
             executor_options={key: value for key, value in executor.items() if key != "name"},
         )
 
 
-def _memory(gib: object, factor: object) -> dict[str, float | None]:
-    """Return the limit of memory, and the factor for the trials that exceed it."""
-    memory_gib = limit("launch.memory_gib", gib, "GiB")
+def _factor_of_memory(factor: object, memory_gib: float | None) -> float | None:
+    """Return the factor on the limit for a trial that exceeded it, or None."""
     if factor is None:
-        return {"memory_gib": memory_gib, "retry_memory": None}
+        return None
     if isinstance(factor, bool) or not isinstance(factor, int | float) or not 1 < factor <= 100:
         raise wrong("launch.retry_memory", factor, "null or a factor above 1, at most 100,")
     if memory_gib is None:
@@ -134,7 +135,7 @@ def _memory(gib: object, factor: object) -> dict[str, float | None]:
             f"launch.retry_memory is {factor:g}, but there is no limit that it could raise: set "
             "launch.memory_gib, or leave launch.retry_memory out."
         )
-    return {"memory_gib": memory_gib, "retry_memory": float(factor)}
+    return float(factor)
 
 
 @dataclass(frozen=True)
