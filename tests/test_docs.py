@@ -42,7 +42,17 @@ MADE = {"docker/secrets"}
 SHELL = {
     "docs/plants.md": {"rig.py"},  # tests/dopt/explorer/test_rig.py
     "docs/install.md": {".", "make"},
-    "docs/many_machines.md": {"sh", "export", "docker", "mkdir", "git", "make", "set", "ray"},
+    "docs/many_machines.md": {
+        "sh",
+        "export",
+        "docker",
+        "mkdir",
+        "git",
+        "make",
+        "set",
+        "ray",
+        "kubectl",
+    },
     "README.md": {"make"},
 }
 """Programs that no test here runs, by page; those of three machines have tests of their own."""

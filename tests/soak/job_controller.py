@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
 from tests.docker.kubernetes import Manifest
 from tests.paths import ROOT
@@ -25,9 +24,9 @@ class Pod:
 
     job: JobController
     index: int
-    log: IO[str]
+    log: Path
     number: int = 0  # of the container that runs
-    process: subprocess.Popen[str] | None = None
+    process: subprocess.Popen[bytes] | None = None
     evicted: float | None = None
 
     def __post_init__(self) -> None:
@@ -62,14 +61,14 @@ class Pod:
         return code
 
     def _start(self) -> None:
-        self.process = subprocess.Popen(
-            ["sh", str(ENTRY_POINT), *self.job.words(self.number)],
-            cwd=ROOT,
-            env=self.job.environment,
-            stdout=self.log,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        with self.log.open("a") as log:
+            self.process = subprocess.Popen(
+                ["sh", str(ENTRY_POINT), *self.job.words(self.number)],
+                cwd=ROOT,
+                env=self.job.environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
 
 
 @dataclass
@@ -131,7 +130,7 @@ class JobController:
         return "\n".join(path.read_text()[-3000:] for path in sorted(self.folder.glob("*.log")))
 
     def _new(self, index: int) -> Pod:
-        return Pod(self, index, (self.folder / f"{index}.log").open("a"))
+        return Pod(self, index, self.folder / f"{index}.log")
 
     def _action(self, container: str, code: int) -> str:
         """Return what the policy says of a container that failed by itself."""
