@@ -10,15 +10,13 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, text
 
-from orchestrate.runner.worker import FINISHING_SECONDS
 from tests.docker.kubernetes import of_kind
 from tests.soak.job_controller import JobController, environment_of_pods
 
 TRIALS = 2_000
-"""Trials of the drill, unless DOPT_SOAK_TRIALS says how many."""
+"""Trials of the drill, unless DOPT_EVICTION_TRIALS says how many."""
 
 SECONDS_BETWEEN_EVICTIONS = 5.0
-FEWEST_EVICTIONS = 5
 LARGEST_SHARE_TWICE = 0.02
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1800)]
@@ -27,7 +25,7 @@ pytestmark = [pytest.mark.soak, pytest.mark.timeout(1800)]
 def test_evicted_pods_lose_nothing_and_compute_little_twice(
     request: pytest.FixtureRequest, postgresql_url: str, tmp_path: Path
 ) -> None:
-    trials, chance = int(os.environ.get("DOPT_SOAK_TRIALS", TRIALS)), random.Random(3)
+    trials, chance = int(os.environ.get("DOPT_EVICTION_TRIALS", TRIALS)), random.Random(3)
     grid = ("env=pendulum", "policy=d_optimal", f"seed=range({trials})")
     job = JobController(
         of_kind("workers", "Job", "dopt-workers"),
@@ -48,23 +46,26 @@ def test_evicted_pods_lose_nothing_and_compute_little_twice(
             time.sleep(0.1)
     finally:
         job.close()
-    statuses, attempts, longest = outcomes(postgresql_url)
+    statuses, attempts, in_vain = outcomes(postgresql_url)
     terminal = request.config.get_terminal_writer()
     terminal.line(
         f"\n{trials:,} trials, {evictions} evictions, pods ended with {dict(job.ended)}, "
-        f"attempts {attempts}, longest trial {longest:.2f} s"
+        f"attempts {attempts}, at most {in_vain} of them begun in vain"
     )
-    assert evictions >= FEWEST_EVICTIONS
+    assert evictions >= trials / 200
     assert statuses == {"done": trials}
     assert attempts["done"] == trials
     assert attempts.keys() <= {"done", "released", "lost"}
-    # Trials that run are finished within this time; those that are handed back had not begun.
-    assert longest < FINISHING_SECONDS
-    assert attempts.get("lost", 0) <= LARGEST_SHARE_TWICE * trials
+    assert in_vain + attempts.get("lost", 0) <= LARGEST_SHARE_TWICE * trials
 
 
-def outcomes(url: str) -> tuple[dict[str, int], dict[str, int], float]:
-    """Return the trials by status, the attempts by outcome, and the longest wall time [s]."""
+def outcomes(url: str) -> tuple[dict[str, int], dict[str, int], int]:
+    """Return the trials by status, the attempts by outcome, and how many were begun in vain.
+
+    These are at most the first trials of the workers, which load the compiled code: a worker that
+    is warned finishes a later one, which takes less than a tenth of a second, and hands back trials
+    that have not begun. It runs one at a time.
+    """
     engine = create_engine(url)
     with engine.connect() as connection:
 
@@ -73,6 +74,10 @@ def outcomes(url: str) -> tuple[dict[str, int], dict[str, int], float]:
 
         statuses = table("SELECT status, count(*) FROM trial GROUP BY 1")
         attempts = table("SELECT outcome, count(*) FROM attempt GROUP BY 1")
-        longest = connection.execute(text("SELECT max(wall_seconds) FROM attempt")).scalar_one()
+        workers = (
+            "SELECT launch_id, count(*) FILTER (WHERE outcome = 'done') FROM attempt "
+            "GROUP BY launch_id HAVING count(*) FILTER (WHERE outcome = 'released') > 0"
+        )
+        in_vain = sum(done == 0 for done in table(workers).values())
     engine.dispose()
-    return statuses, attempts, float(longest)
+    return statuses, attempts, in_vain
