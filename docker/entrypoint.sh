@@ -21,6 +21,7 @@ read_password() {
 # Start this container's node with the words given and the options of every node.
 start_node() {
     set -a # all nodes need the same settings; the launch has those of its node
+    # shellcheck source=/dev/null
     . orchestrate/executors/ray/ray.env
     set +a
     address=${DOPT_NODE_IP:-$(hostname -i | cut -d ' ' -f 1)}

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from analysis.cli import main
+from analysis.cli import main, parser
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import fill, make_grid
+from tests.paths import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +21,13 @@ def partial(tmp_path_factory: pytest.TempPathFactory) -> str:
     lost = {spec.trial_key: 9 for spec in specs if spec.policy.name == "random"}
     fill(address, specs, skipped=specs[1:3], diverged=lost)
     return address
+
+
+def test_what_a_command_writes_by_default_is_ignored_by_git() -> None:
+    """Otherwise later launches would be marked as run with changes."""
+    ignored = (ROOT / ".gitignore").read_text().splitlines()
+    for words in (["figures"], ["report"], ["floor"], ["yardsticks"]):
+        assert f"/{parser().parse_args(words).out}/" in ignored
 
 
 def test_summary_prints_markdown_or_csv(url: str, capsys: pytest.CaptureFixture[str]) -> None:
