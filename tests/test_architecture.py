@@ -163,7 +163,7 @@ def test_what_saves_an_exploration_is_loaded_by_the_first_save() -> None:
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
-    shared = ("orchestrate.store", "orchestrate.queries", "orchestrate.cli_parser")
+    shared = ("orchestrate.store", "orchestrate.cli_parser")
     for path in sources("analysis"):
         names = imports(path)
         assert not {name.split(".")[0] for name in names} & {"torch", "ray", "hydra", "numba"}, path

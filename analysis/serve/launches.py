@@ -9,8 +9,7 @@ from typing import Any
 from analysis.serve.progress import read_progress
 from analysis.serve.query_params import QueryParams
 from analysis.serve.state import ServerState
-from orchestrate.queries.status import DETACHED, FailureKind, gather, seconds_since
-from orchestrate.store import LaunchRow
+from orchestrate.store import FailureKind, LaunchRow, failure_kinds
 
 MAX_LAUNCHES = 100
 """Launches on the page, the newest first."""
@@ -25,11 +24,11 @@ FROM attempt GROUP BY launch_id
 """
 
 
-def launches(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa: ARG001
+def launches(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa: ARG001  # the signature is that of every page
     """Return the newest launches with the trials that they ended, and the failures by kind."""
     with state.database.reader().moment() as reader:
-        configs = reader.configs()
-        status = gather(reader, configs, MAX_KINDS)
+        configs = {config.config_key: config for config in reader.configs()}
+        failures = failure_kinds(reader, configs, MAX_KINDS)
         found = reader.launches()[::-1]
         outcomes = {int(row[0]): row[1:] for row in reader.rows(_OUTCOMES)}
         progress = read_progress(reader)
@@ -42,34 +41,26 @@ def launches(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa
             for one in found[:MAX_LAUNCHES]
         ],
         "total": len(found),
-        "per_second": status.rate,
-        "seconds_left": status.seconds_left,
-        "failures": [_failure(kind) for kind in status.failures[:MAX_KINDS]],
-        "total_failures": len(status.failures),
+        "failures": [_failure(kind) for kind in failures[:MAX_KINDS]],
+        "total_failures": len(failures),
     }
 
 
 def _launch(launch: LaunchRow, now: datetime) -> dict[str, Any]:
     lost = launch.state == "running" and not launch.alive
     end = now if launch.ended is None else datetime.fromisoformat(launch.ended)
+    length = end - datetime.fromisoformat(launch.started)
     return {
         "launch_id": launch.launch_id,
-        "kind": _kind(launch),
+        "kind": launch.kind,
         "state": "lost" if lost else launch.state,
         "started": launch.started,
-        "seconds": None if lost else seconds_since(launch.started, end),
+        "seconds": None if lost else length.total_seconds(),
         "host": launch.host,
         "command": shlex.join(launch.argv),
         "commit": launch.git_commit,
         "changed": bool(launch.git_dirty),
     }
-
-
-def _kind(launch: LaunchRow) -> str:
-    """Return what a launch did: ran its grid, left it to workers, or took trials as one."""
-    if "work" in launch.argv[1:2]:
-        return "worker"
-    return "registration" if DETACHED in launch.overrides else "launch"
 
 
 def _failure(kind: FailureKind) -> dict[str, Any]:

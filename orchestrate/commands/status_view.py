@@ -12,10 +12,10 @@ from rich.text import Text
 
 from orchestrate.commands.configs_table import grid_table
 from orchestrate.commands.display import plain
-from orchestrate.queries.status import STATES, FailureKind, Status, seconds_since
+from orchestrate.queries.status import STATES, Status, seconds_since
 from orchestrate.redaction import without_password
 from orchestrate.runner.progress import duration
-from orchestrate.store import ExplorationRow, LaunchRow
+from orchestrate.store import ExplorationRow, FailureKind, LaunchRow
 
 WORK = "python -m orchestrate work"
 _NAMES = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
@@ -88,7 +88,7 @@ def _launch(launch: LaunchRow) -> Text:
     age = duration(max(0.0, seconds_since(launch.started, datetime.now(UTC))))
     since = f"{launch.started[:19]}Z"
     where = f"  {launch.launch_id} on {launch.host}, process {launch.pid}, since {since}"
-    worker = "work" in launch.argv[1:2]
+    worker = launch.kind == "worker"
     if launch.alive:
         return Text(f"{where}: {'worker, ' if worker else ''}alive for {age}")
     hint = "run the same launch command again to continue"

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from orchestrate.store import ConfigRow, ExplorationRow, LaunchRow, Reader, explorations
+from orchestrate.store import (
+    ConfigRow,
+    ExplorationRow,
+    FailureKind,
+    LaunchRow,
+    Reader,
+    explorations,
+    failure_kinds,
+)
 from orchestrate.store.serialization import utc_text
 
 RATE_WINDOW_SECONDS = 300.0
@@ -18,19 +25,6 @@ RATE_WINDOW_SECONDS = 300.0
 STATES = ("done", "diverged", "failed", "cancelled", "running", "pending")
 """Statuses of a trial in the order of display."""
 
-DETACHED = "launch.detach=true"
-
-_FAILURES = """
-SELECT c.config_key, a.cause, a.error_id, e.type, e.message, count(*) AS attempts,
-       sum(CASE WHEN r.status = 'failed' AND r.attempt = a.attempt THEN 1 ELSE 0 END) AS trials
-FROM attempt a
-JOIN trial r ON r.trial_id = a.trial_id
-JOIN config c ON c.config_id = r.config_id
-LEFT JOIN error e ON e.error_id = a.error_id
-WHERE a.cause IS NOT NULL
-GROUP BY c.config_key, a.cause, a.error_id, e.type, e.message
-ORDER BY a.error_id
-"""
 _ENDED = """
 SELECT c.config_key, a.launch_id, count(*) AS ended
 FROM attempt a
@@ -39,44 +33,6 @@ JOIN config c ON c.config_id = r.config_id
 WHERE a.ended >= :since AND a.outcome IN ('done', 'diverged', 'failed')
 GROUP BY c.config_key, a.launch_id
 """
-_TRACEBACK = "SELECT traceback FROM error WHERE error_id = :error_id"
-_NUMBER = re.compile(r"0x[0-9a-f]+|\d+(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
-
-
-@dataclass
-class FailureKind:
-    """Failures with one cause, type and message, up to the numbers in the message.
-
-    Attributes
-    ----------
-    trials
-        Trials whose last attempt failed in this way.
-    attempts
-        Attempts that failed in this way, including those followed by a successful one.
-    places
-        Names (env, policy) of the configurations.
-    """
-
-    cause: str
-    type: str | None
-    message: str | None
-    error_id: int | None
-    trials: int = 0
-    attempts: int = 0
-    places: set[tuple[str, str]] = field(default_factory=set)
-    traceback: str = ""
-
-    @property
-    def last_line(self) -> str:
-        """Last line of the traceback."""
-        lines = self.traceback.strip().splitlines()
-        return lines[-1].strip() if lines else ""
-
-    @property
-    def place(self) -> str:
-        """Innermost frame of the traceback."""
-        frames = re.findall(r"^ *File (.+)$", self.traceback, flags=re.MULTILINE)
-        return frames[-1] if frames else ""
 
 
 @dataclass(frozen=True)
@@ -137,27 +93,10 @@ def gather(reader: Reader, configs: Sequence[ConfigRow], kinds: int = 10) -> Sta
     by_key = {config.config_key: config for config in configs}
     launches = reader.launches()
     running = [launch for launch in launches if launch.state == "running"]
-    detached = [launch for launch in launches if DETACHED in launch.overrides]
-    failures = _failures(reader, by_key)
-    for kind in failures[:kinds]:
-        if kind.error_id is not None:
-            kind.traceback = str(reader.rows(_TRACEBACK, error_id=kind.error_id)[0][0])
+    detached = [launch for launch in launches if launch.kind == "registration"]
+    failures = failure_kinds(reader, by_key, kinds)
     explored = [one for one in explorations(reader) if one.config_key in by_key]
     return Status(configs, failures, running, _rate(reader, by_key, running), explored, detached)
-
-
-def _failures(reader: Reader, by_key: dict[str, ConfigRow]) -> list[FailureKind]:
-    found: dict[tuple[str, ...], FailureKind] = {}
-    for row in reader.rows(_FAILURES):
-        if row.config_key in by_key:
-            name = (row.cause, row.type or "", _NUMBER.sub("#", row.message or ""))
-            new = FailureKind(row.cause, row.type, row.message, row.error_id)
-            kind = found.setdefault(name, new)
-            kind.attempts += row.attempts
-            kind.trials += row.trials
-            config = by_key[row.config_key]
-            kind.places.add((config.env, config.policy))
-    return sorted(found.values(), key=lambda kind: (-kind.trials, -kind.attempts, kind.cause))
 
 
 def _rate(reader: Reader, by_key: dict[str, ConfigRow], running: Sequence[LaunchRow]) -> float:
@@ -171,11 +110,6 @@ def _rate(reader: Reader, by_key: dict[str, ConfigRow], running: Sequence[Launch
         for one in alive
     }
     return math.fsum(ended[launch_id] / span for launch_id, span in spans.items())
-
-
-def _counted_seconds(launch: LaunchRow, now: datetime) -> float:
-    """Return the part of the rate window in which the launch has run, at least 1 s."""
-    return min(RATE_WINDOW_SECONDS, max(1.0, seconds_since(launch.started, now)))
 
 
 def seconds_since(moment: str, now: datetime) -> float:

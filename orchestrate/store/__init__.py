@@ -23,6 +23,7 @@ from orchestrate.store.errors import (
 from orchestrate.store.merging.merge import Merged, TrialName, merge
 from orchestrate.store.migrations.upgrade import Upgrade, upgrade
 from orchestrate.store.read.explorations import ExplorationRow, explorations
+from orchestrate.store.read.failures import FailureKind, failure_kinds
 from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.read.rows import (
@@ -59,6 +60,7 @@ __all__ = [
     "Curves",
     "ExplorationRow",
     "Failure",
+    "FailureKind",
     "Finding",
     "InvalidResultError",
     "LaunchAliveError",
@@ -88,6 +90,7 @@ __all__ = [
     "default_url",
     "examine",
     "explorations",
+    "failure_kinds",
     "merge",
     "merge_collected",
     "upgrade",

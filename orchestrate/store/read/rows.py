@@ -145,6 +145,13 @@ class LaunchRow:
     git_diff_hash: str | None
     versions: Mapping[str, str]
 
+    @property
+    def kind(self) -> str:
+        """What it was: a "worker", the "registration" of a grid for workers, or a "launch"."""
+        if "work" in self.argv[1:2]:
+            return "worker"
+        return "registration" if "launch.detach=true" in self.overrides else "launch"
+
 
 class Table(list[Any]):
     """Rows of a query as named tuples.
