@@ -6,9 +6,10 @@ import argparse
 import sys
 from functools import partial
 
-from orchestrate.cli_parser import UsageError, length_of_time, positive
+from orchestrate.cli_parser import length_of_time, positive
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
+from orchestrate.config.value_checks import factor
 from orchestrate.errors import ExitCode
 from orchestrate.redaction import without_password
 from orchestrate.store import Reader
@@ -28,22 +29,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="trials at once (default: one for each core that this process may use)",
     )
-    seconds = partial(positive, number=float)
+    number = partial(positive, number=float)
     parser.add_argument(
-        "--timeout", type=seconds("--timeout"), default=3600.0, help="seconds that a trial may take"
+        "--timeout", type=number("--timeout"), default=3600.0, help="seconds that a trial may take"
     )
     parser.add_argument(
-        "--memory-gib", type=seconds("--memory-gib"), metavar="GIB", help="memory of one process"
+        "--memory-gib", type=number("--memory-gib"), metavar="GIB", help="memory of one process"
     )
     parser.add_argument(
         "--retry-memory",
-        type=_factor,
+        type=number("--retry-memory"),
         metavar="FACTOR",
         help="run a trial that exceeds --memory-gib once more, with so many times as much",
     )
     parser.add_argument(
         "--lease",
-        type=seconds("--lease"),
+        type=number("--lease"),
         default=60.0,
         help="seconds for which a worker that is lost keeps its trials on PostgreSQL",
     )
@@ -55,10 +56,7 @@ def run(arguments: argparse.Namespace) -> ExitCode:
     from orchestrate.runner.worker import WorkerSettings, run_worker
 
     Reader.open(arguments.db).close()  # a worker creates no database
-    if arguments.retry_memory is not None and arguments.memory_gib is None:
-        raise UsageError(
-            "--retry-memory raises the limit --memory-gib, which is missing: give both, or neither."
-        )
+    factor("--retry-memory", arguments.retry_memory, "--memory-gib", arguments.memory_gib)
     names = ("processes", "timeout", "memory_gib", "retry_memory")
     given = {name: getattr(arguments, name) for name in names}
     settings = WorkerSettings(arguments.db, arguments.until, lease=arguments.lease, **given)
@@ -67,14 +65,6 @@ def run(arguments: argparse.Namespace) -> ExitCode:
     if arguments.json:
         say_json({"exit_code": code.value, "complete": code in (0, ExitCode.SOME_FAILED)})
     return code
-
-
-def _factor(text: str) -> float:
-    """Return a factor above 1."""
-    factor = positive("--retry-memory", float)(text)
-    if factor <= 1:
-        raise UsageError(f"--retry-memory is {text}, but a factor above 1 is expected: change it.")
-    return factor
 
 
 def _to_stderr(line: str) -> None:

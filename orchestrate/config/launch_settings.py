@@ -10,8 +10,7 @@ from typing import Any, Literal, cast
 from dopt.errors import unknown_name
 from orchestrate.config.share import Share, share
 from orchestrate.config.stopping_rule import Until, until
-from orchestrate.config.value_checks import amount, count, flag, limit, section, text, wrong
-from orchestrate.errors import LaunchError
+from orchestrate.config.value_checks import amount, count, factor, flag, limit, section, text, wrong
 
 SHARD_SUFFIX = ".db"
 """End of the name of a file that holds a share."""
@@ -117,25 +116,13 @@ class LaunchSettings:
             chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
             timeout=limit("launch.timeout", launch["timeout"], "seconds"),
             memory_gib=memory_gib,
-            retry_memory=_factor_of_memory(launch["retry_memory"], memory_gib),
+            retry_memory=factor(
+                "launch.retry_memory", launch["retry_memory"], "launch.memory_gib", memory_gib
+            ),
             **_lease_and_patience(launch["lease"], launch["patience"]),
             ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
             executor_options={key: value for key, value in executor.items() if key != "name"},
         )
-
-
-def _factor_of_memory(factor: object, memory_gib: float | None) -> float | None:
-    """Return the factor on the limit for a trial that exceeded it, or None."""
-    if factor is None:
-        return None
-    if isinstance(factor, bool) or not isinstance(factor, int | float) or not 1 < factor <= 100:
-        raise wrong("launch.retry_memory", factor, "null or a factor above 1, at most 100,")
-    if memory_gib is None:
-        raise LaunchError(
-            f"launch.retry_memory is {factor:g}, but there is no limit that it could raise: set "
-            "launch.memory_gib, or leave launch.retry_memory out."
-        )
-    return float(factor)
 
 
 @dataclass(frozen=True)

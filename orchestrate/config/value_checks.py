@@ -51,6 +51,20 @@ def amount(key: str, value: object, unit: str, kind: str = "a number") -> float:
     raise wrong(key, value, f"{kind} of {unit} above 0 and below {LARGEST:,}")
 
 
+def factor(key: str, value: object, limit_key: str, limited: object) -> float | None:
+    """Return a factor by which a limit is raised, which has to be set; or None."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 1 < value <= 100:
+        raise wrong(key, value, "null or a factor above 1, at most 100,")
+    if limited is None:
+        raise LaunchError(
+            f"{key} is {value:g}, but there is no limit that it could raise: set {limit_key}, or "
+            f"leave {key} out."
+        )
+    return float(value)
+
+
 def wrong(key: str, value: object, expected: str) -> LaunchError:
     """Return the error for a setting with an invalid value."""
     return LaunchError(f"{key} is {value!r}, but {expected} is expected: change {key}.")

@@ -28,7 +28,7 @@ class Task:
 
     key: str
     spec: TrialSpec
-    memory: float = 1.0
+    memory_factor: float = 1.0
 
 
 @dataclass(frozen=True)

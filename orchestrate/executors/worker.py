@@ -35,13 +35,12 @@ def main(descriptor: int, crash_report: int) -> None:
     run: Run
     limits: Limits
     run, limits = connection.recv()
-    limit_memory(limits)
     chunks: queue.SimpleQueue[list[Task]] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(connection, chunks), daemon=True).start()
     connection.send(None)  # ready
     while True:
         for task in chunks.get():
-            limit_memory(limits, task.memory)
+            limit_memory(limits, task.memory_factor)
             with ended_after(limits, crash_report):
                 finished = run_task(run, task, limits)
             connection.send(finished)

@@ -111,7 +111,7 @@ class Scheduler:
         """Return the task with more memory if it has run out of memory here."""
         if self.retry_memory is None or task.key not in self._out_of_memory:
             return task
-        return replace(task, memory=self.retry_memory)
+        return replace(task, memory_factor=self.retry_memory)
 
     @property
     def _window(self) -> int:

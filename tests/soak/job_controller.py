@@ -26,7 +26,7 @@ class Pod:
     index: int
     log: Path
     number: int = 0  # of the container that runs
-    process: subprocess.Popen[bytes] | None = None
+    process: subprocess.Popen[bytes] = field(init=False)
     evicted: float | None = None
 
     def __post_init__(self) -> None:
@@ -40,17 +40,15 @@ class Pod:
     def works(self) -> bool:
         """Whether the pod has come to its main container, which runs."""
         last = self.number == len(self.job.containers) - 1
-        return last and self.process is not None and self.process.poll() is None
+        return last and self.process.poll() is None
 
     def evict(self) -> None:
         """Do what the eviction of a pod does to its process."""
-        assert self.process is not None
         self.evicted = time.monotonic()
         self.process.send_signal(signal.SIGTERM)
 
     def exit_code(self) -> int | None:
         """Return the exit code of the pod, or None while it runs."""
-        assert self.process is not None
         if self.evicted is not None and time.monotonic() - self.evicted > self.job.grace:
             self.process.kill()
         code = self.process.poll()
@@ -112,7 +110,7 @@ class JobController:
             del self.pods[index]
             if code == 0:
                 continue
-            action = "Ignore" if pod.evicted is not None else self._action(pod.container, code)
+            action = self._action(pod, code)
             assert action != "FailJob", f"{pod.container} ended with {code}:\n{self.logs()}"
             self.counted[index] += action == "Count"
             assert self.counted[index] <= self.limit, self.logs()
@@ -122,7 +120,6 @@ class JobController:
     def close(self) -> None:
         """End what still runs."""
         for pod in self.pods.values():
-            assert pod.process is not None
             pod.process.kill()
             pod.process.wait()
 
@@ -132,11 +129,13 @@ class JobController:
     def _new(self, index: int) -> Pod:
         return Pod(self, index, self.folder / f"{index}.log")
 
-    def _action(self, container: str, code: int) -> str:
-        """Return what the policy says of a container that failed by itself."""
+    def _action(self, pod: Pod, code: int) -> str:
+        """Return what the first rule of the policy that applies says of a pod that failed."""
         for rule in self.rules:
-            wanted = rule.get("onExitCodes")
-            if wanted and wanted["containerName"] == container and code in wanted["values"]:
+            codes = rule.get("onExitCodes", {"containerName": None, "values": ()})
+            by_code = codes["containerName"] == pod.container and code in codes["values"]
+            kinds = [condition["type"] for condition in rule.get("onPodConditions", ())]
+            if by_code or (pod.evicted is not None and "DisruptionTarget" in kinds):
                 return str(rule["action"])
         return "Count"
 

@@ -24,7 +24,7 @@ def run_chunk(
         prepare()
     yield None
     for task in tasks:
-        limit_memory(limits, task.memory)
+        limit_memory(limits, task.memory_factor)
         with ended_after(limits, _STDERR):
             finished = run_task(run, task, limits)
         yield finished

@@ -132,8 +132,14 @@ def test_every_trial_is_rebuilt_as_it_was_registered(command_line: Run, pull: Ru
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--retry-memory", "2"), "raises the limit --memory-gib, which is missing"),
-        (("--retry-memory", "1", "--memory-gib", "1"), "is 1, but a factor above 1 is expected"),
+        (
+            ("--retry-memory", "2"),
+            "is 2, but there is no limit that it could raise: set --memory-gib",
+        ),
+        (
+            ("--retry-memory", "1", "--memory-gib", "1"),
+            "is 1.0, but null or a factor above 1, at most 100, is expected",
+        ),
     ],
 )
 def test_a_factor_of_memory_needs_a_limit_and_raises_it(
