@@ -1,4 +1,4 @@
-"""What a trial is assessed by is the same however it runs."""
+"""Assessments of a trial, which are the same however it runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user types, and what comes back."""
+"""Command lines of a user, and the answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``launch.dry_run=true`` shows of a grid."""
+"""Preview of a grid by ``launch.dry_run=true``."""
 
 from __future__ import annotations
 

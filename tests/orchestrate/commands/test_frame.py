@@ -1,4 +1,4 @@
-"""What all commands have in common: words, refusals, exit codes, pipes."""
+"""Common parts of all commands: words, refusals, exit codes, pipes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ends a Ray instance on this machine, or its workers: no fault of a trial."""
+"""Ends of a Ray instance on this machine, or of its workers, that no trial causes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a database holds, row by row, and what must be true of it at every moment."""
+"""Content of a database, row by row, and its invariants at every moment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is written down about a command."""
+"""Provenance of a command in the database."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a database lies, and what lies beside it."""
+"""Place of a database, and the files beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What other processes do to a database in the tests of faults; each forked from a clean server."""
+"""Processes that use a database in the tests of faults, each forked from a clean server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reader sees while launches run: who lives, and one moment of everything."""
+"""View of a reader while launches run: who lives, and one moment of everything."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What only a server can do: leases on its clock, connections that it ends."""
+"""Behaviour of a server alone: leases on its clock, connections that it ends."""
 
 from __future__ import annotations
 

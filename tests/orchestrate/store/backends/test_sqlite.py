@@ -1,4 +1,4 @@
-"""What only a file can do: locks, permissions, damage, a full disk."""
+"""Behaviour of a file alone: locks, permissions, damage, a full disk."""
 
 from __future__ import annotations
 

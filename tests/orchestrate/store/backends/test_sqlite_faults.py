@@ -1,4 +1,4 @@
-"""What happens to a file: torn, damaged, read-only, or read for long."""
+"""Faults of a file: torn, damaged, read-only, or read for long."""
 
 from __future__ import annotations
 

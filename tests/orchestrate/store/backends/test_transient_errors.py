@@ -1,4 +1,4 @@
-"""Where waiting may help, the error says so."""
+"""Errors that say that waiting may help."""
 
 from __future__ import annotations
 
