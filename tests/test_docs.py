@@ -40,8 +40,6 @@ SHELL = {
     "docs/plants.md": {"rig.py"},  # tests/dopt/explorer/test_rig.py
     "docs/install.md": {".", "make"},
     "docs/many_machines.md": {
-        *("sh", "export", "docker", "mkdir", "git", "make", "set", "ray", "kubectl"),
-    },
         "sh",
         "export",
         "docker",
