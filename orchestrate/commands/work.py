@@ -9,7 +9,6 @@ from functools import partial
 from orchestrate.cli_parser import length_of_time, positive
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
-from orchestrate.config.value_checks import factor
 from orchestrate.errors import ExitCode
 from orchestrate.redaction import without_password
 from orchestrate.store import Reader
@@ -56,7 +55,6 @@ def run(arguments: argparse.Namespace) -> ExitCode:
     from orchestrate.runner.worker import WorkerSettings, run_worker
 
     Reader.open(arguments.db).close()  # a worker creates no database
-    factor("--retry-memory", arguments.retry_memory, "--memory-gib", arguments.memory_gib)
     names = ("processes", "timeout", "memory_gib", "retry_memory")
     given = {name: getattr(arguments, name) for name in names}
     settings = WorkerSettings(arguments.db, arguments.until, lease=arguments.lease, **given)

@@ -15,6 +15,7 @@ from types import FrameType
 from dopt.kernel import warm_up
 from dopt.run import run_trial
 from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config.value_checks import factor
 from orchestrate.errors import ExitCode
 from orchestrate.executors.registry import make_executor
 from orchestrate.runner.progress import Progress, Tally
@@ -58,6 +59,11 @@ class WorkerSettings:
         Trials at once; None for one on each core that this process may use.
     timeout, memory_gib, retry_memory, lease
         As those of a launch (:class:`orchestrate.config.launch_settings.LaunchSettings`).
+
+    Raises
+    ------
+    LaunchError
+        If ``retry_memory`` raises no limit.
     """
 
     url: str
@@ -67,6 +73,9 @@ class WorkerSettings:
     memory_gib: float | None = None
     retry_memory: float | None = None
     lease: float = 60.0
+
+    def __post_init__(self) -> None:
+        factor("--retry-memory", self.retry_memory, "--memory-gib", self.memory_gib)
 
     @property
     def launch(self) -> LaunchSettings:
