@@ -16,6 +16,7 @@ from benchmarks.rows import Row
 QUESTIONS = (
     "step",
     "compiled_plugins",
+    "black_box",
     "jax_scan",
     "reference",
     "linearisation_gap",

@@ -45,6 +45,11 @@ def stream(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_STREAMS[name],)))
 
 
+def episode_seed(seed: int) -> int:
+    """Return the seed of the episode of a trial's black box."""
+    return int(stream(seed, "environment").integers(2**31))
+
+
 @dataclass(frozen=True)
 class Draws:
     """Random numbers of one trial.

@@ -80,6 +80,6 @@ def _run(spec: TrialSpec) -> Run:
         from dopt.reference.stepper import ReferenceTrial
 
         return ReferenceTrial(spec)
-    from dopt.kernel.run import KernelTrial
+    from dopt.kernel.run import trial_in_kernel
 
-    return KernelTrial(spec)
+    return trial_in_kernel(spec)

@@ -8,7 +8,6 @@ from typing import Any
 from dopt.declare.registry import section_of
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
-from dopt.systems.plant import unknown_accelerations
 
 
 def measured(system: System) -> System:
@@ -17,12 +16,12 @@ def measured(system: System) -> System:
     A black box, such as an environment of Gymnasium, is not started: its known part is compiled,
     and its states are those that the explorer is told.
     """
-    if not isinstance(system, BlackBox) or system.compiled:
+    if not isinstance(system, BlackBox) or system.measured:
         return system
     kind, section = type(system), section_of(system)
     declared: dict[str, Any] = {
         "compiled": True,
-        "accelerations": staticmethod(unknown_accelerations(system.n_learned)),
+        "measured": True,
         "to_section": lambda self: section,  # noqa: ARG005  # that of the system itself
         "__module__": kind.__module__,
     }

@@ -29,6 +29,7 @@ from dopt.kernel.compiler import compilable
 from dopt.kernel.stored_code import stored
 from dopt.systems import elementary
 from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox, unknown_accelerations
 from dopt.types import Array, CompiledFunction, Equation, NumbaType, Scalar
 
 KNOWN = types.void(float64[::1], float64[::1], float64[::1], float64[::1])
@@ -111,10 +112,15 @@ class Equations(NamedTuple):
 
 
 def compiled_equations(system: System) -> Equations:
-    """Compile the equations of a system's class, or load them from the disk cache."""
+    """Compile the equations of a system's class, or load them from the disk cache.
+
+    The accelerations of a black box are NaN.
+    """
     read = system.n_inputs if system.reads_inputs else 0
     sizes = (system.n_states, system.n_inputs, len(system.physical), read)
-    return _compiled_functions(system.known, system.accelerations, *sizes)
+    unknown = isinstance(system, BlackBox)
+    accelerations = unknown_accelerations(system.n_learned) if unknown else system.accelerations
+    return _compiled_functions(system.known, accelerations, *sizes)
 
 
 def name_of_equations(system: System) -> str:

@@ -112,5 +112,7 @@ def _linear_evaluation(system: System, points: EvaluationSet) -> args.Evaluation
 
 def _size(system: System, points: EvaluationSet) -> float:
     """Return the root mean square norm of the targets, at the first or the last step."""
-    ends = (points.accelerations, system.learned(points.states, system.horizon - 1, points.inputs))
+    ends = [points.accelerations]
+    if len(system.history) > 1:
+        ends.append(system.learned(points.states, system.horizon - 1, points.inputs))
     return max(float(np.sqrt(np.mean(np.sum(targets**2, axis=1)))) for targets in ends)

@@ -1,7 +1,8 @@
 """Algorithm 1 in compiled code: plan, act, observe, learn, update M, evaluate.
 
 :func:`plan_input` and :func:`take_in` are the steps that an exploration of a plant
-(:class:`dopt.explorer.Explorer`) consists of; a trial puts between them the simulated system.
+(:class:`dopt.explorer.Explorer`) consists of; a trial puts between them the simulated system, or a
+black box that is stepped by the interpreter (:mod:`dopt.kernel.episodes`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,13 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, copy_into, monotonic_microseconds
-from dopt.kernel.evaluation import add_sample, evaluation_buffers, follow_truth, model_error
+from dopt.kernel.evaluation import (
+    Buffers,
+    add_sample,
+    evaluation_buffers,
+    follow_truth,
+    model_error,
+)
 from dopt.kernel.held_trial import HeldTrial, trial_in
 from dopt.kernel.integration import next_true_state
 from dopt.kernel.learners.samples import sampled_point
@@ -20,7 +27,7 @@ from dopt.kernel.model import model_accelerations
 from dopt.kernel.points import sampled_state
 from dopt.kernel.sensors import has_sensors, measure, output_error
 from dopt.kernel.structs import Evaluation, Plant, Steps, Trial
-from dopt.types import Vector
+from dopt.types import Matrix, Vector
 
 
 @compiled
@@ -110,6 +117,33 @@ def take_in_next(held: HeldTrial, t: int, dt: float) -> bool:
     return take_in(trial, steps, t, dt)
 
 
+@compiled
+def evaluate(trial: Trial, points: Evaluation, t: int, thetas: Matrix, buffers: Buffers) -> bool:
+    """Write the errors of the model after step t, and return whether that over the grid is finite.
+
+    Parameters (members, q) and buffers are those of the whole trial.
+    """
+    plant, network, record, bounds = trial.plant, trial.network, trial.record, points.bounds
+    start = monotonic_microseconds()
+    if network.kind == ModelKind.GAUSSIAN_PROCESS:
+        add_sample(network, points, sampled_state(plant, record.states, t))
+    if plant.history.shape[0] > 1:
+        follow_truth(plant, network, points, t)
+    loss = model_error(network, thetas, points, bounds[0], bounds[1], buffers)
+    reachable_loss = model_error(network, thetas, points, bounds[1], bounds[2], buffers)
+    record.loss[t], record.reachable_loss[t] = loss, reachable_loss
+    record.evaluate_us[t] = monotonic_microseconds() - start
+    return bool(np.isfinite(loss))
+
+
+@called_from_python
+def evaluate_next(held: HeldTrial, points: Evaluation, t: int) -> bool:
+    """Write the errors of the model after step t (:func:`evaluate`)."""
+    trial = trial_in(held)
+    thetas, r = members_or_one(trial.state), trial.plant.learned_rows.shape[0]
+    return evaluate(trial, points, t, thetas, evaluation_buffers(trial.network, thetas, r))
+
+
 @called_from_python
 def advance(held: HeldTrial, points: Evaluation, first: int, last: int) -> int:
     """Run the steps from ``first`` to ``last`` in place.
@@ -118,9 +152,8 @@ def advance(held: HeldTrial, points: Evaluation, first: int, last: int) -> int:
     trial diverged.
     """
     trial, steps = trial_in(held), held.steps
-    plant, network, record = trial.plant, trial.network, trial.record
-    thetas, bounds = members_or_one(trial.state), points.bounds
-    buffers = evaluation_buffers(network, thetas, plant.learned_rows.shape[0])
+    plant, record, thetas = trial.plant, trial.record, members_or_one(trial.state)
+    buffers = evaluation_buffers(trial.network, thetas, plant.learned_rows.shape[0])
     for t in range(first, last):
         x, following = record.true_states[t], record.true_states[t + 1]
         plan_input(trial, steps, t)
@@ -132,15 +165,6 @@ def advance(held: HeldTrial, points: Evaluation, first: int, last: int) -> int:
             return t
         if not take_in(trial, steps, t, plant.dt):
             return t
-        start = monotonic_microseconds()
-        if network.kind == ModelKind.GAUSSIAN_PROCESS:
-            add_sample(network, points, sampled_state(plant, record.states, t))
-        if plant.history.shape[0] > 1:
-            follow_truth(plant, network, points, t)
-        loss = model_error(network, thetas, points, bounds[0], bounds[1], buffers)
-        reachable_loss = model_error(network, thetas, points, bounds[1], bounds[2], buffers)
-        record.loss[t], record.reachable_loss[t] = loss, reachable_loss
-        record.evaluate_us[t] = monotonic_microseconds() - start
-        if not np.isfinite(loss):
+        if not evaluate(trial, points, t, thetas, buffers):
             return t
     return last

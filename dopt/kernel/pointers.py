@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numba
@@ -41,7 +41,7 @@ class Compiled(NamedTuple):
 
 
 class CompiledSteps(NamedTuple):
-    """Compiled code of an exploration whose steps are taken one by one."""
+    """Compiled code of a trial whose steps are taken one by one."""
 
     hold: Callable[..., HeldTrial]
     plan_input: Callable[..., int]
@@ -63,15 +63,20 @@ def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evalu
 _trials: dict[Hashable, Compiled] = {}
 
 
-def compiled_steps(policy: Policy, learner: Learner, trial: Trial) -> CompiledSteps:
-    """Compile the steps of a trial, with the functions of its policy and its learner."""
-    steps = _compiled_parts(policy, learner, trial, list(STEPS))
+def compiled_steps(
+    policy: Policy, learner: Learner, trial: Trial, others: Sequence[CompiledFunction]
+) -> CompiledSteps:
+    """Compile the steps of a trial, with the functions of its policy and its learner.
+
+    What is missing in the cache of others is compiled beside them.
+    """
+    steps = _compiled_parts(policy, learner, trial, [*STEPS, *others])
     hold, plan_input, take_in = (compiled_step(trial, step) for step in STEPS)
     return CompiledSteps(hold, plan_input, take_in, steps)
 
 
 STEPS = (held_trial.hold, loop.plan_next, loop.take_in_next)
-"""Functions of an exploration, which do not depend on its policy and its learner."""
+"""Functions of steps one by one, which do not depend on the policy and the learner."""
 
 
 OTHER_STEPS = {
@@ -170,8 +175,14 @@ def compiled_loop(trial: Trial, points: Evaluation) -> Callable[..., int]:
     return compiled_for(path_of(loop.advance), loop.advance, kinds)
 
 
+def compiled_evaluation(trial: Trial, points: Evaluation) -> Callable[..., bool]:
+    """Compile the evaluation of a trial whose steps are taken one by one."""
+    kinds = (held_kind(trial), kind_of(points), int64)
+    return compiled_for(path_of(loop.evaluate_next), loop.evaluate_next, kinds)
+
+
 def compiled_step(trial: Trial, step: CompiledFunction) -> Callable[..., Any]:
-    """Compile one of the functions of an exploration."""
+    """Compile one of :data:`STEPS`."""
     held = held_kind(trial)
     kinds = {
         held_trial.hold: tuple(held.field_dict.values()),
@@ -254,7 +265,7 @@ def pointer(signature: NumbaType) -> NumbaType:
 
 def compiled_for(
     name: str, function: CompiledFunction, kinds: tuple[NumbaType, ...]
-) -> Callable[..., int]:
+) -> Callable[..., Any]:
     """Return the machine code of a function for types of arguments; compile it unless it is."""
     if (name, kinds) not in _done:
         with one_compiler_at_a_time(
@@ -264,4 +275,4 @@ def compiled_for(
     return _done[name, kinds]
 
 
-_done: dict[tuple[str, tuple[NumbaType, ...]], Callable[..., int]] = {}
+_done: dict[tuple[str, tuple[NumbaType, ...]], Callable[..., Any]] = {}

@@ -8,14 +8,16 @@ import time
 import numpy as np
 
 from dopt.errors import SpecificationError
+from dopt.kernel.episodes import EpisodeTrial
 from dopt.kernel.evaluation_points import points_of_trial
-from dopt.kernel.from_spec import shared_points, trial_of
+from dopt.kernel.from_spec import shared_points
 from dopt.kernel.held_trial import HeldTrial
 from dopt.kernel.pointers import Compiled, compiled_trial
+from dopt.kernel.trial_state import KernelState
 from dopt.policies.base import CompiledPolicy, check_norms
-from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from dopt.systems.black_box import BlackBox
 from dopt.types import Array
 
 FIRST_STEPS = 300
@@ -23,40 +25,6 @@ FIRST_STEPS = 300
 
 PIECE_SECONDS = 1.0
 """Interval at which compiled code comes back to the interpreter, which can then heed a signal."""
-
-
-class KernelState:
-    """What a trial in the compiled kernel has observed, and what its model has learned.
-
-    Attributes
-    ----------
-    trial : Trial
-        All that compiled functions work on.
-    state, record : State, Record
-        Its arrays that they write in place.
-    """
-
-    def __init__(self, spec: TrialSpec) -> None:
-        draws = draw(spec)
-        self.spec, self.trial = spec, trial_of(spec, draws)
-        self.state, self.record = self.trial.state, self.trial.record
-        n_fixed = spec.model.n_fixed_parameters(spec.system)
-        self._fixed = draws.weights[len(draws.weights) - n_fixed :]
-
-    @property
-    def parameters(self) -> Array:
-        """Parameters of the model, (q,), of all members, and those that stay as they were drawn."""
-        if self.state.members.parameters.shape[0] > 0:
-            return self.state.members.parameters.flatten()
-        return np.concatenate([self.state.theta, self._fixed])
-
-    @property
-    def states(self) -> Array:
-        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet.
-
-        Of a simulation they are the true ones.
-        """
-        return self.record.true_states
 
 
 class KernelTrial(KernelState):
@@ -119,7 +87,7 @@ def _check_inputs(spec: TrialSpec, inputs: Array, first: int, last: int) -> None
 def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     """Run a whole trial in compiled code."""
     wall, cpu = time.perf_counter(), time.process_time()
-    trial = KernelTrial(spec)
+    trial = trial_in_kernel(spec)
     checkpoints = {}
     for step in spec.assessed_steps:
         _advance_in_pieces(trial, step)
@@ -144,7 +112,12 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     )
 
 
-def _advance_in_pieces(trial: KernelTrial, last: int) -> None:
+def trial_in_kernel(spec: TrialSpec) -> KernelTrial | EpisodeTrial:
+    """Return a trial before its first step."""
+    return EpisodeTrial(spec) if isinstance(spec.system, BlackBox) else KernelTrial(spec)
+
+
+def _advance_in_pieces(trial: KernelTrial | EpisodeTrial, last: int) -> None:
     """Run a trial up to a step; the numbers do not depend on where it is cut."""
     steps = FIRST_STEPS
     while trial.done < last and trial.diverged_at is None:

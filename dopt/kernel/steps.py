@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from dopt.kernel.pointers import compiled_steps
-from dopt.kernel.run import KernelState
+from dopt.kernel.trial_state import KernelState
 from dopt.spec.trial import TrialSpec
 from dopt.systems.sensors import start_variances
-from dopt.types import Array
+from dopt.types import Array, CompiledFunction
 
 
 class KernelSteps(KernelState):
@@ -15,11 +17,13 @@ class KernelSteps(KernelState):
     The states and the inputs of the record are theirs to write.
     """
 
+    also_called: ClassVar[tuple[CompiledFunction, ...]] = ()
+
     def __init__(self, spec: TrialSpec) -> None:
         super().__init__(spec)
         if spec.system.n_measured:
             self.trial.sensors.start_variances[:] = start_variances(spec.system)
-        self._code = compiled_steps(spec.policy, spec.learner, self.trial)
+        self._code = compiled_steps(spec.policy, spec.learner, self.trial, self.also_called)
         self._held = self._code.hold(self.trial, self._code.steps)
 
     @property

@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
-from dopt.kernel.loop import advance
+from dopt.kernel.loop import advance, evaluate_next
 from dopt.kernel.pointers import (
     OTHER_STEPS,
     STEPS,
     compile_form,
     compiled_at,
+    compiled_evaluation,
     compiled_loop,
     compiled_step,
     path_of,
@@ -62,9 +63,11 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
     }
     systems = [system() for system in SYSTEMS.values()]
     forms = [one for form in chosen.forms for one in (form.add_rows, form.planning_forms)]
-    steps = STEPS if everything else STEPS[:1]
+    steps, whole = STEPS if everything else STEPS[:1], (trial.trial, trial.points)
+    evaluation = {path_of(evaluate_next): partial(compiled_evaluation, *whole)}
     return {
-        path_of(advance): partial(compiled_loop, trial.trial, trial.points),
+        path_of(advance): partial(compiled_loop, *whole),
+        **(evaluation if everything else {}),
         **{path_of(step): partial(compiled_step, trial.trial, step) for step in steps},
         **{path_of(one): partial(compiled_at, path_of(one), others[one]) for one in others},
         **{path: partial(compiled_at, path, kinds.learn) for path in chosen.learns},

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dopt.randomness import stream
+from dopt.randomness import episode_seed
 from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import BlackBox, Episode
 
@@ -18,8 +18,7 @@ def episodes_for(specs: Sequence[TrialSpec]) -> list[Episode]:
     system = specs[0].system
     if not isinstance(system, BlackBox):
         return []
-    seeds = [int(stream(spec.seed, "environment").integers(2**31)) for spec in specs]
-    return [system.episode(seed) for seed in seeds]
+    return [system.episode(episode_seed(spec.seed)) for spec in specs]
 
 
 def initial_states(episodes: Sequence[Episode]) -> Tensor:

@@ -41,8 +41,8 @@ def check_system(system: System) -> None:
         derivative by a complex step; if a run of a black box says so.
     """
     _check_indices(system)
-    if isinstance(system, BlackBox) and system.compiled:
-        return  # it is measured, and nothing may run on it
+    if isinstance(system, BlackBox) and system.measured:
+        return  # nothing may run on it
     if isinstance(system, BlackBox):
         system.episode(0)
         return

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -12,7 +15,7 @@ import numpy.typing as npt
 from dopt.declare.validated_fields import parameter
 from dopt.errors import SpecificationError
 from dopt.systems.base import Array, System
-from dopt.types import Scalar
+from dopt.types import Equation, Scalar
 
 
 class Episode(Protocol):
@@ -40,13 +43,18 @@ class BlackBox(System):
     starts where its reset leaves it, the same for all policies of a seed. A run that ends early is
     one that diverged.
 
+    The interpreter steps it between the compiled steps of a trial, for which ``known`` is compiled;
+    with ``compiled = False`` the steps are those of the reference. Where ``measured`` is true it is
+    explored by what somebody tells of it (:class:`dopt.Explorer`), and no episode of it is begun.
+
     The truth at a state of one's choice is unknown, so that the loss is the root mean square error
     of the modelled accelerations over transitions of runs of its own, which no trial sees: under
     random inputs for the loss, at most as many as the product of ``grid_points``, and under square
     waves and a chirp for the reachable loss (:func:`dopt.evaluation.evaluation_set`).
     """
 
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
+    measured: ClassVar[bool] = False
     physical: ClassVar[tuple[str, ...]] = ()
 
     noise: float = parameter(0.0, bound="nonnegative")
@@ -90,6 +98,18 @@ class BlackBox(System):
         flow = np.stack(np.broadcast_arrays(*known), axis=-1)
         difference: Array = np.diff(states, axis=0) / self.dt - flow
         return difference[:, list(self.learned_rows)]
+
+
+@functools.cache
+def unknown_accelerations(n: int) -> Equation:
+    """Return the equation of n accelerations that are known from measurements alone: NaN."""
+    nothing = (math.nan,) * n
+
+    def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:  # noqa: ARG001
+        return nothing
+
+    accelerations.__module__ = "measured"  # not of the package, whose code is stored
+    return accelerations
 
 
 def transitions(

@@ -15,7 +15,6 @@ from dopt.systems.black_box import BlackBox
 from dopt.systems.expressions import check_names, compiled_text
 from dopt.systems.features import Feature
 from dopt.systems.input_effect import input_effect
-from dopt.types import Equation, Scalar
 
 NAME = "plant"
 """Name of every plant in configurations and in the results database."""
@@ -231,7 +230,6 @@ class Plant:
             "grid_indices": tuple(axes),
             "phase_plane": _phase_plane(axes, names),
             "known": staticmethod(compiled_text(known, groups)),
-            "accelerations": staticmethod(unknown_accelerations(len(self.learned))),
         }
         return dataclasses.dataclass(frozen=True, kw_only=True)(
             type(ExploredPlant.__name__, (ExploredPlant,), declared)
@@ -247,6 +245,7 @@ class ExploredPlant(BlackBox):
 
     name: ClassVar[str] = NAME
     compiled: ClassVar[bool] = True
+    measured: ClassVar[bool] = True
     plant: ClassVar[Plant]
     _constants: ClassVar[tuple[float, ...]] = ()
 
@@ -275,17 +274,6 @@ def _phase_plane(axes: Sequence[int], names: Sequence[str]) -> tuple[int, int]:
     """Return the two states of a phase portrait: the first two that the accelerations depend on."""
     chosen = [*axes, *(i for i in range(len(names)) if i not in axes), 0]
     return chosen[0], chosen[1]
-
-
-def unknown_accelerations(n: int) -> Equation:
-    """Return the equation of n accelerations that are known from measurements alone: NaN."""
-    nothing = (math.nan,) * n
-
-    def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:  # noqa: ARG001
-        return nothing
-
-    accelerations.__module__ = NAME
-    return accelerations
 
 
 def _check_effect(system: ExploredPlant) -> None:

@@ -86,6 +86,26 @@ class Point(Environment):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Interpreted(Point):
+    """Has a known part that does not compile, and says so."""
+
+    name: ClassVar[str] = "interpreted"
+    compiled: ClassVar[bool] = False
+
+    @staticmethod
+    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+        return tuple(getattr(Point, "known")(state, inputs, parameters))  # noqa: B009
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mistaken(Interpreted):
+    """Says that it does."""
+
+    name: ClassVar[str] = "mistaken"
+    compiled: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, kw_only=True)
 class Blurred(Point):
     """Forgets the speed."""
 

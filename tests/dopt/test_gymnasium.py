@@ -11,6 +11,7 @@ import pytest
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.reference.batch import run_trials
+from dopt.rerun import rerun
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
@@ -138,10 +139,30 @@ def test_the_seed_decides_about_the_start_and_policies_share_it() -> None:
     np.testing.assert_array_equal(second.states, run_trial(specification(**short)).states)
 
 
-def test_black_boxes_in_lockstep_are_those_run_alone() -> None:
-    specs = [specification(seed=seed, horizon=20) for seed in range(3)]
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "lookahead", "random"])
+def test_the_kernel_steps_a_black_box_as_the_reference_does(policy: str) -> None:
+    """The reference takes the steps of all seeds together."""
+    specs = [specification(policy=policy, seed=seed, horizon=20) for seed in range(3)]
     for together, spec in zip(run_trials(specs), specs, strict=True):
-        np.testing.assert_allclose(together.states, run_trial(spec).states, rtol=1e-9)
+        alone = run_trial(spec)
+        assert spec.config.path == "kernel"
+        np.testing.assert_allclose(together.states, alone.states, rtol=1e-9)
+        np.testing.assert_allclose(together.inputs, alone.inputs, atol=1e-9)
+        np.testing.assert_allclose(together.loss, alone.loss, rtol=1e-6)
+        np.testing.assert_allclose(together.reachable_loss, alone.reachable_loss, rtol=1e-6)
+
+
+def test_a_black_box_is_run_again_in_the_kernel() -> None:
+    spec = specification(horizon=20)
+    np.testing.assert_array_equal(rerun(spec, [0, 20]).parameters[1], run_trial(spec).parameters)
+
+
+def test_a_black_box_whose_known_part_does_not_compile_runs_on_the_reference() -> None:
+    spec = specification("tests.dopt.custom_environments.Interpreted", horizon=5)
+    assert spec.config.path == "reference"
+    np.testing.assert_allclose(run_trial(spec).loss, run_trial(specification(horizon=5)).loss)
+    with pytest.raises(SpecificationError, match=r"known of custom_environments\.py does not comp"):
+        run_trial(specification("tests.dopt.custom_environments.Mistaken"))
 
 
 def test_an_episode_that_ends_is_a_trial_that_diverged() -> None:
@@ -189,5 +210,3 @@ def test_what_needs_the_truth_is_refused() -> None:
         spec.system.learned(np.zeros((1, 2)))
     with pytest.raises(IncompatibleError, match="a task goes with a system with equations"):
         TrialSpec.from_mapping(spec.to_mapping() | {"task": {"name": "control"}})
-    with pytest.raises(SpecificationError, match="env 'point' is not written for it"):
-        TrialSpec.from_mapping(spec.to_mapping() | {"path": "kernel"})
