@@ -21,7 +21,7 @@ from analysis.errors import AnalysisError
 from analysis.serve import compare, control, curves, gallery, grid, launches, sql, trial, trials
 from analysis.serve.database import Database
 from analysis.serve.errors import BusyError, NotFoundError
-from analysis.serve.progress import read_progress
+from analysis.serve.events import respond
 from analysis.serve.query_params import QueryParams
 from analysis.serve.responses import FOLDER, as_csv, as_json, as_page
 from analysis.serve.security import SecurityMiddleware
@@ -47,7 +47,6 @@ PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/sql", "sql", sql.sql),
 )
 DATA: tuple[tuple[str, Numbers], ...] = (
-    ("/api/progress", lambda state, _: read_progress(state.database.reader())),
     ("/api/grid", grid.grid),
     ("/api/curves", curves.curves),
     ("/api/trials", trials.trials),
@@ -85,6 +84,7 @@ def create_app(url: str, figures: Path, host: str = "127.0.0.1") -> Starlette:
         *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
         *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
         *(Route(f"/api/{name}.csv", partial(_table, state, name)) for name in TABLES),
+        Route("/api/events", partial(_events, state)),
         Route("/figures/{name}", partial(_file, state)),
         Mount("/static", static),
     ]
@@ -94,7 +94,7 @@ def create_app(url: str, figures: Path, host: str = "127.0.0.1") -> Starlette:
         yield
         state.database.close()
 
-    return Starlette(
+    app = Starlette(
         routes=routes,
         middleware=[Middleware(SecurityMiddleware, host=host)],
         exception_handlers={
@@ -105,6 +105,13 @@ def create_app(url: str, figures: Path, host: str = "127.0.0.1") -> Starlette:
         },
         lifespan=lifespan,
     )
+    app.state.events = state.events
+    return app
+
+
+def end_streams(app: Starlette) -> None:
+    """End the event streams, without which open pages keep the server from ending."""
+    app.state.events.end()
 
 
 def _query_params(request: Request) -> QueryParams:
@@ -120,6 +127,10 @@ def _page(state: ServerState, name: str, numbers: Numbers, request: Request) -> 
 def _data(state: ServerState, numbers: Numbers, request: Request) -> Response:
     content = numbers(state, _query_params(request))
     return as_json(content, 400 if content.get("error") else 200)
+
+
+async def _events(state: ServerState, request: Request) -> Response:
+    return respond(state.events, request)
 
 
 def _table(state: ServerState, name: str, request: Request) -> Response:

@@ -28,9 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Serve until the user ends it with Ctrl-C."""
     try:
-        import uvicorn
-
         from analysis.serve.app import create_app
+        from analysis.serve.server import Server
     except ModuleNotFoundError as error:
         raise AnalysisError(
             f"The browser needs the library {error.name}: "
@@ -40,9 +39,8 @@ def run(options: argparse.Namespace) -> int:
     listening = _listen(options.host, options.port)
     sys.stdout.write(_greeting(options, listening.getsockname()[1]))
     sys.stdout.flush()
-    config = uvicorn.Config(app, log_level="warning", server_header=False, lifespan="on")
     try:
-        uvicorn.Server(config).run(sockets=[listening])
+        Server(app).run(sockets=[listening])
     except KeyboardInterrupt:
         return 0
     finally:

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Selection, select
 from analysis.serve.cache import Cache
 from analysis.serve.database import Database
+from analysis.serve.events import Events
 from analysis.serve.progress import read_progress
 from orchestrate.store import Reader
 
 
 @dataclass(frozen=True)
 class ServerState:
-    """The database, the folder of figures, and the caches of computed values."""
+    """The database with its event stream, the folder of figures, and caches of computed values."""
 
     database: Database
     figures: Path
     cache: Cache = field(default_factory=Cache)
     selections: Cache = field(default_factory=lambda: Cache(4))  # each contains all its trials
+
+    @cached_property
+    def events(self) -> Events:
+        """The event stream of the database."""
+        return Events(self.database)
 
     def select(self, reader: Reader, wanted: Filter) -> Selection:
         """Return the requested trials; they are read again after any trial changed."""
