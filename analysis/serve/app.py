@@ -52,6 +52,7 @@ DATA: tuple[tuple[str, Numbers], ...] = (
     ("/api/trials", trials.trials),
     ("/api/trials/{trial_key}", trial.trial),
     ("/api/trials/{trial_key}/arrays", trial.arrays),
+    ("/api/trials/{trial_key}/samples", trial.samples),
     ("/api/compare", compare.compare),
     ("/api/control", control.control),
     ("/api/launches", launches.launches),

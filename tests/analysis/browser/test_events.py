@@ -19,10 +19,11 @@ from analysis.serve import events
 from analysis.serve.database import Database
 from analysis.serve.events import Events
 from analysis.serve.progress import read_progress
+from orchestrate.records import Sample
 from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.browser.chromium import PATIENCE
-from tests.analysis.synthetic import make_grid
+from tests.analysis.synthetic import fake_result, make_grid
 
 
 @contextmanager
@@ -131,6 +132,37 @@ def test_a_defect_ends_the_stream(sqlite_grid: str, monkeypatch: pytest.MonkeyPa
 
     with pytest.raises(KeyError):
         asyncio.run(follow())
+
+
+@pytest.mark.browser
+@pytest.mark.xdist_group("browser")
+def test_the_curve_of_a_running_trial_grows(
+    browser: Browser, sqlite_url: str, figures: Path
+) -> None:
+    (spec,) = make_grid(("pendulum",), ("random",), range(1), **grids.SHORT)
+    with (
+        Store.open(sqlite_url) as store,
+        chromium.served(sqlite_url, figures) as address,
+        chromium.strict_page(browser, address) as page,
+    ):
+        launch = grids.begin(store)
+        store.register(launch, [spec])
+        page.goto(f"/trials/{spec.trial_key}")
+        expect(page.locator("#waiting")).to_contain_text("This trial is pending")
+        (claim,) = store.claim(launch, [spec.trial_key])
+        expect(page.locator("#waiting")).to_contain_text("This trial is running")
+        expect(page.locator("#charts")).to_be_hidden()
+        for count in (2, 3):
+            store.sample([(claim, Sample(spec.trial_key, count, 1.0 / count, 2.0))])
+            store.sample([(claim, Sample(spec.trial_key, 0, 2.0, 3.0))])
+            expect(page.locator("#charts")).to_have_attribute("data-drawn", str(count))
+        expect(page.locator("#loss canvas")).to_have_count(1)
+        samples = httpx.get(f"{address}/api/trials/{spec.trial_key}/samples").json()
+        assert (samples["t"], samples["loss"]) == ([0, 2, 3], [2.0, 1 / 2, 1 / 3])
+        assert store.commit(claim, fake_result(spec), grids.RUN)
+        expect(page.locator("#charts")).to_have_attribute("data-drawn", "yes")
+        expect(page.locator("#phase path.path")).to_have_count(1)
+        assert httpx.get(f"{address}/api/trials/{spec.trial_key}/samples").json()["t"] == []
 
 
 @pytest.mark.browser

@@ -4,6 +4,7 @@ const AGAIN = 2000;
 const state = document.getElementById("state");
 const words = document.getElementById("state-text");
 let token = document.body.dataset.token;
+let samples = "";
 /** @type {EventSource|null} */
 let stream = null;
 /** @type {Progress|null} */
@@ -18,6 +19,7 @@ let busy = false;
  * @property {number} ended
  * @property {number} running
  * @property {number} launches_running
+ * @property {string} samples changes with each sample of a trial that runs
  */
 
 /** Show the progress of the grid in the header. @param {Progress} progress */
@@ -64,10 +66,13 @@ async function show(progress) {
   if ("retry" in document.body.dataset) location.reload();
   say(progress);
   const changed = token && token !== progress.token;
-  token = progress.token;
-  if (!changed) return;
-  await refresh();
-  document.dispatchEvent(new CustomEvent("dopt:change"));
+  const sampled = samples !== progress.samples;
+  ({ token, samples } = progress);
+  if (changed) {
+    await refresh();
+    document.dispatchEvent(new CustomEvent("dopt:change"));
+  }
+  if (sampled) document.dispatchEvent(new CustomEvent("dopt:samples"));
 }
 
 /** Take an event; of those that come during an update, only the last counts. @param {MessageEvent} event */
