@@ -16,13 +16,39 @@ from orchestrate.store import Reader
 
 
 @dataclass(frozen=True)
+class Link:
+    """Name of a database on its pages, and the start of their paths."""
+
+    name: str
+    base: str
+
+
+@dataclass(frozen=True)
 class ServerState:
-    """The database with its event stream, the folder of figures, and caches of computed values."""
+    """A database with its event stream, the folder of figures, and caches of computed values.
+
+    Attributes
+    ----------
+    link
+        Where the pages of the database are.
+    links
+        Where those of all databases of the server are, this one included.
+    """
 
     database: Database
     figures: Path
+    link: Link
+    links: tuple[Link, ...]
     cache: Cache = field(default_factory=Cache)
     selections: Cache = field(default_factory=lambda: Cache(4))  # each contains all its trials
+
+    @property
+    def name(self) -> str:
+        return self.link.name
+
+    @property
+    def base(self) -> str:
+        return self.link.base
 
     @cached_property
     def events(self) -> Events:

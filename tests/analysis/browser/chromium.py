@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -59,9 +59,9 @@ def opened() -> Iterator[Browser]:
 
 
 @contextmanager
-def served(url: str, figures: Path, port: int = 0) -> Iterator[str]:
-    """Serve a database from a thread of this process; yield the address."""
-    app = create_app(url, figures)
+def served(url: str, figures: Path, port: int = 0, others: Sequence[str] = ()) -> Iterator[str]:
+    """Serve databases from a thread of this process; yield the address."""
+    app = create_app(url, figures, others=others)
     server = Server(app, port)
     thread = threading.Thread(target=server.run)
     thread.start()

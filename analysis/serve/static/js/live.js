@@ -98,7 +98,7 @@ function follow() {
   stream?.close();
   stream = null;
   if (document.hidden) return;
-  stream = new EventSource("/api/events");
+  stream = new EventSource(`${document.body.dataset.base}/api/events`);
   stream.addEventListener("progress", take);
   stream.addEventListener("unavailable", () => lose("database not available"));
   stream.addEventListener("error", () => {

@@ -175,7 +175,7 @@ function mark(u, frequency) {
 
 /** Fetch a part of the trial. @param {string} name */
 async function fetched(name) {
-  const answer = await fetch(`/api/trials/${encodeURIComponent(charts.dataset.key)}/${name}`);
+  const answer = await fetch(`${document.body.dataset.base}/api/trials/${encodeURIComponent(charts.dataset.key)}/${name}`);
   const found = await answer.json();
   if (!answer.ok) throw new Error(found.error);
   return found;
