@@ -129,7 +129,6 @@ def parser() -> Parser:
     film.add_arguments(animate)
     serve = commands.add_parser("serve", help=browser.HELP, description=browser.HELP)
     serve.set_defaults(alone=browser.run)
-    _add_database(serve)
     browser.add_arguments(serve)
     return top
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -19,12 +19,13 @@ from starlette.staticfiles import StaticFiles
 
 from analysis.errors import AnalysisError
 from analysis.serve import compare, control, curves, gallery, grid, launches, sql, trial, trials
-from analysis.serve.database import Database
 from analysis.serve.errors import BusyError, NotFoundError
-from analysis.serve.progress import read_progress
+from analysis.serve.events import respond
 from analysis.serve.query_params import QueryParams
 from analysis.serve.responses import FOLDER, as_csv, as_json, as_page
 from analysis.serve.security import SecurityMiddleware
+from analysis.serve.side_by_side import side_by_side
+from analysis.serve.sites import state_at, states_of
 from analysis.serve.state import ServerState
 from dopt.errors import DoptError
 from orchestrate.store.errors import (
@@ -47,12 +48,12 @@ PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/sql", "sql", sql.sql),
 )
 DATA: tuple[tuple[str, Numbers], ...] = (
-    ("/api/progress", lambda state, _: read_progress(state.database.reader())),
     ("/api/grid", grid.grid),
     ("/api/curves", curves.curves),
     ("/api/trials", trials.trials),
     ("/api/trials/{trial_key}", trial.trial),
     ("/api/trials/{trial_key}/arrays", trial.arrays),
+    ("/api/trials/{trial_key}/samples", trial.samples),
     ("/api/compare", compare.compare),
     ("/api/control", control.control),
     ("/api/launches", launches.launches),
@@ -73,38 +74,59 @@ STATES = (
 )
 
 
-def create_app(url: str, figures: Path, host: str = "127.0.0.1") -> Starlette:
-    """Return the application for a database and a folder of figures.
+def create_app(
+    url: str, figures: Path, host: str = "127.0.0.1", others: Sequence[str] = ()
+) -> Starlette:
+    """Return the application for a database, ``others`` beside it, and a folder of figures.
 
     ``host`` is the address that the server listens at. Raises ``StoreError`` for an invalid
     database URL. A database that does not exist yet gives an error page until it is created.
     """
-    state = ServerState(Database(url), figures)
-    static = StaticFiles(directory=FOLDER / "static")
+    states = states_of([url, *others], figures)
     routes = [
-        *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
-        *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
-        *(Route(f"/api/{name}.csv", partial(_table, state, name)) for name in TABLES),
-        Route("/figures/{name}", partial(_file, state)),
-        Mount("/static", static),
+        Route("/databases", partial(_both, states)),
+        Route("/api/databases", partial(_both_data, states)),
+        Mount("/static", StaticFiles(directory=FOLDER / "static")),
+        *(Mount(state.base, routes=_routes(state)) for state in states[1:]),
+        *_routes(states[0]),
     ]
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
-        state.database.close()
+        for state in states:
+            state.database.close()
 
-    return Starlette(
+    app = Starlette(
         routes=routes,
         middleware=[Middleware(SecurityMiddleware, host=host)],
         exception_handlers={
-            AnalysisError: partial(_error_response, state),
-            DoptError: partial(_error_response, state),
-            HTTPException: partial(_error_response, state),
-            Exception: partial(_server_error, state),
+            AnalysisError: partial(_error_response, states),
+            DoptError: partial(_error_response, states),
+            HTTPException: partial(_error_response, states),
+            Exception: partial(_server_error, states),
         },
         lifespan=lifespan,
     )
+    app.state.events = [state.events for state in states]
+    return app
+
+
+def end_streams(app: Starlette) -> None:
+    """End the event streams, without which open pages keep the server from ending."""
+    for events in app.state.events:
+        events.end()
+
+
+def _routes(state: ServerState) -> list[Route]:
+    """Return the pages of one database, and what is behind them."""
+    return [
+        *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
+        *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
+        *(Route(f"/api/{name}.csv", partial(_table, state, name)) for name in TABLES),
+        Route("/api/events", partial(_events, state)),
+        Route("/figures/{name}", partial(_file, state)),
+    ]
 
 
 def _query_params(request: Request) -> QueryParams:
@@ -120,6 +142,19 @@ def _page(state: ServerState, name: str, numbers: Numbers, request: Request) -> 
 def _data(state: ServerState, numbers: Numbers, request: Request) -> Response:
     content = numbers(state, _query_params(request))
     return as_json(content, 400 if content.get("error") else 200)
+
+
+def _both(states: Sequence[ServerState], request: Request) -> Response:
+    content = side_by_side(states, _query_params(request))
+    return as_page("databases.html", _page_context(states[0], "databases", request) | content)
+
+
+def _both_data(states: Sequence[ServerState], request: Request) -> Response:
+    return as_json(side_by_side(states, _query_params(request)))
+
+
+async def _events(state: ServerState, request: Request) -> Response:
+    return respond(state.events, request)
 
 
 def _table(state: ServerState, name: str, request: Request) -> Response:
@@ -141,35 +176,50 @@ class QueryText(dict[str, str]):
 def _page_context(state: ServerState, name: str, request: Request) -> dict[str, Any]:
     """Return the content that every page shows beside its own."""
     query = QueryText({key: value for key, value in request.query_params.items() if value})
-    return {"page": name, "query": query, "database": state.database.safe_url}
+    return {"query": query, **_frame(state, name)}
 
 
-def _error_response(state: ServerState, request: Request, error: Exception) -> Response:
+def _frame(state: ServerState, name: str) -> dict[str, Any]:
+    """Return what the menus of a page need; ``here`` is its path under each database."""
+    paths = {name: path for path, name, _ in PAGES} | {"trial": "/trials"}
+    return {
+        "page": name,
+        "here": paths.get(name, "/"),
+        "base": state.base,
+        "databases": state.links,
+        "database": state.database.safe_url,
+    }
+
+
+def _error_response(states: Sequence[ServerState], request: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException):
         sentence = (
             "This page does not exist: choose a page from the menu above."
             if error.status_code == 404
             else (f"{error.detail}.")
         )
-        return _message(state, request, error.status_code, sentence)
+        return _message(states, request, error.status_code, sentence)
     status = next(code for kinds, code in STATES if isinstance(error, kinds))
-    return _message(state, request, status, str(error))
+    return _message(states, request, status, str(error))
 
 
-def _server_error(state: ServerState, request: Request, error: Exception) -> Response:
+def _server_error(states: Sequence[ServerState], request: Request, error: Exception) -> Response:
     logging.getLogger(__name__).error("%s failed", request.scope["path"], exc_info=error)
     return _message(
-        state,
+        states,
         request,
         500,
         "This page failed: the server's terminal shows the traceback.",
     )
 
 
-def _message(state: ServerState, request: Request, status: int, sentence: str) -> Response:
-    path = request.scope["path"]
+def _message(
+    states: Sequence[ServerState], request: Request, status: int, sentence: str
+) -> Response:
+    state = state_at(states, request.scope["path"])
+    path = request.scope["path"].removeprefix(state.base)
     if path.startswith("/api/"):
         return as_json({"error": sentence}, status)
     name = path.split("/")[1] or "grid"
-    content = {"sentence": sentence, "status": status, "page": name, "query": QueryText()}
-    return as_page("message.html", content | {"database": state.database.safe_url}, status)
+    content = {"sentence": sentence, "status": status, "query": QueryText()}
+    return as_page("message.html", _frame(state, name) | content, status)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from analysis.errors import AnalysisError
 from analysis.serve.addresses import is_loopback
+from orchestrate.store import DEFAULT_URL, default_url
 
 HELP = "show the results in a browser, read-only, while a launch writes"
 PORT = 8000
@@ -17,7 +18,14 @@ HOST = "127.0.0.1"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command, but ``--db``."""
+    """Add the options of the command."""
+    parser.add_argument(
+        "--db",
+        nargs="+",
+        default=[default_url()],
+        metavar="URL",
+        help=f"databases, side by side where there are several (DOPT_DB, {DEFAULT_URL})",
+    )
     parser.add_argument("--port", type=int, default=PORT, help=f"port, 0: any free one ({PORT})")
     parser.add_argument("--host", default=HOST, help=f"address to listen at ({HOST})")
     parser.add_argument(
@@ -28,21 +36,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Serve until the user ends it with Ctrl-C."""
     try:
-        import uvicorn
-
         from analysis.serve.app import create_app
+        from analysis.serve.server import Server
     except ModuleNotFoundError as error:
         raise AnalysisError(
             f"The browser needs the library {error.name}: "
             f"install it with pip install 'dopt[serve]'."
         ) from error
-    app = create_app(options.db, options.figures, options.host)
+    app = create_app(options.db[0], options.figures, options.host, options.db[1:])
     listening = _listen(options.host, options.port)
     sys.stdout.write(_greeting(options, listening.getsockname()[1]))
     sys.stdout.flush()
-    config = uvicorn.Config(app, log_level="warning", server_header=False, lifespan="on")
     try:
-        uvicorn.Server(config).run(sockets=[listening])
+        Server(app).run(sockets=[listening])
     except KeyboardInterrupt:
         return 0
     finally:

@@ -48,6 +48,9 @@ _ASSESSED = """
 SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure
 """
 _STEPS = "SELECT t, loss, reachable_loss FROM step WHERE trial_id = :trial_id ORDER BY t"
+_SAMPLES = """
+SELECT t, loss, reachable_loss FROM live_step WHERE trial_id = :trial_id ORDER BY t
+"""
 _TEXTS = ("argv", "overrides", "versions")
 
 
@@ -68,6 +71,7 @@ def trial(state: ServerState, params: QueryParams) -> dict[str, Any]:
         ],
         "assessments": _table(reader, _ASSESSED, row["trial_id"]),
         "has_arrays": row["status"] in ("done", "diverged"),
+        "waits": row["status"] in ("pending", "running"),
         "exploration": _exploration(reader, row["trial_key"]),
         "system_is_known": system is not None,
         "has_bounded_states": bool(system and bounded_states(config, system)),
@@ -79,7 +83,6 @@ def arrays(state: ServerState, params: QueryParams) -> dict[str, Any]:
     """Return loss, phase-plane path, inputs and their spectrum for the charts."""
     reader = state.database.reader()
     row = _row(reader, params)
-    steps = _table(reader, _STEPS, row["trial_id"])
     try:
         trajectory = reader.trajectory(row["config_key"], row["seed"])
     except QueryError as error:
@@ -89,15 +92,10 @@ def arrays(state: ServerState, params: QueryParams) -> dict[str, Any]:
     config = json.loads(row["config_json"])
     system = _system(config)
     labels = system.input_labels if system else _numbered(trajectory)
-    return {
-        "t": [step["t"] for step in steps],
-        "loss": [step["loss"] for step in steps],
-        "reachable_loss": [step["reachable_loss"] for step in steps],
+    return _losses(reader, _STEPS, row) | {
         "diverged_at": row["diverged_at"],
-        "is_prequential": is_prequential(config),
         "dt": row["dt"],
         "gamma": row["gamma"],
-        "legend_entry": legend_entry(row["policy"]),
         "inputs": [
             {"label": label, "values": values}
             for label, values in zip(labels, trajectory.inputs.T, strict=True)
@@ -105,6 +103,22 @@ def arrays(state: ServerState, params: QueryParams) -> dict[str, Any]:
         "spectrum": _spectrum(trajectory, row["dt"], system),
         "phase": _phase(trajectory, system) if system else None,
         "bounded": _bounded(trajectory, config, system) if system else [],
+    }
+
+
+def samples(state: ServerState, params: QueryParams) -> dict[str, Any]:
+    """Return the samples of the losses of a trial that runs, none of another trial."""
+    reader = state.database.reader()
+    return _losses(reader, _SAMPLES, _row(reader, params))
+
+
+def _losses(reader: Reader, sql: str, row: dict[str, Any]) -> dict[str, Any]:
+    """Return what the chart of the losses shows."""
+    steps = _table(reader, sql, row["trial_id"])
+    return {
+        **{name: [step[name] for step in steps] for name in ("t", "loss", "reachable_loss")},
+        "is_prequential": is_prequential(json.loads(row["config_json"])),
+        "legend_entry": legend_entry(row["policy"]),
     }
 
 

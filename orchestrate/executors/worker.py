@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits, die_with_parent, ended_after, limit_memory
+from orchestrate.executors.live import Live
 from orchestrate.executors.task import run_task
 from orchestrate.executors.worker_environment import pin_threads
 
@@ -34,7 +35,11 @@ def main(descriptor: int, crash_report: int) -> None:
     connection = Connection(descriptor)
     run: Run
     limits: Limits
-    run, limits = connection.recv()
+    seconds: float | None
+    run, limits, seconds = connection.recv()
+    # The time limit of a trial cannot tear a message apart: the system takes one as short as a
+    # sample whole or not at all.
+    live = None if seconds is None else Live(seconds, connection.send)
     chunks: queue.SimpleQueue[list[Task]] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(connection, chunks), daemon=True).start()
     connection.send(None)  # ready
@@ -42,7 +47,7 @@ def main(descriptor: int, crash_report: int) -> None:
         for task in chunks.get():
             limit_memory(limits, task.memory_factor)
             with ended_after(limits, crash_report):
-                finished = run_task(run, task, limits)
+                finished = run_task(run, task, limits, live)
             connection.send(finished)
         connection.send(None)
 

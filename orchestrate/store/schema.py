@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """Number of the newest script in ``migrations/versions``."""
 
 STATUSES = ("pending", "running", "done", "diverged", "failed", "cancelled")
@@ -181,6 +181,15 @@ step = _table(
     _trial_key(primary_key=True),
     Column("t", Integer, primary_key=True, autoincrement=False),
     *(Column(name, _Real) for name in STEP_VALUES),
+    rowid=False,
+)
+
+live_step = _table(
+    "live_step",
+    _trial_key(primary_key=True),
+    Column("t", Integer, primary_key=True, autoincrement=False),
+    Column("loss", _Real),
+    Column("reachable_loss", _Real),
     rowid=False,
 )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Self
 
-from orchestrate.records import Failure, RunRecord
+from orchestrate.records import Failure, RunRecord, Sample
 from orchestrate.store import database_url, schema_version
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, make_backend
@@ -19,7 +19,14 @@ from orchestrate.store.records import (
     Registration,
     Result,
 )
-from orchestrate.store.write import claims, explorations, launches, registration, results
+from orchestrate.store.write import (
+    claims,
+    explorations,
+    launches,
+    live_steps,
+    registration,
+    results,
+)
 from orchestrate.store.write.explorations import Saved
 
 
@@ -138,6 +145,7 @@ class Store:
         with self._backend.transaction() as connection:
             for i in order:
                 written[i] = results.write(connection, self._backend, prepared[i])
+            live_steps.clear(connection)
         return written
 
     def holds_more(self, spec: Registrable, result: Result) -> bool:
@@ -165,7 +173,14 @@ class Store:
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
         """Write a failed trial with its error; return False if the claim is lost."""
         with self._backend.transaction() as connection:
-            return results.write_failure(connection, claim, failure, run)
+            written = results.write_failure(connection, claim, failure, run)
+            live_steps.clear(connection)
+        return written
+
+    def sample(self, samples: Sequence[tuple[Claim, Sample]]) -> None:
+        """Write samples of running trials; those of lost claims are left out."""
+        with self._backend.transaction() as connection:
+            live_steps.add(connection, samples)
 
     def written(self, claims: Sequence[Claim]) -> list[bool]:
         """Return for each claim whether its attempt has an outcome."""

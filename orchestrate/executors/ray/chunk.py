@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from orchestrate.executors.base import Prepare, Run, Task, TaskDone
 from orchestrate.executors.limits import Limits, ended_after, limit_memory
+from orchestrate.executors.ray.samples import Channel, live_to
 from orchestrate.executors.task import run_task
 from orchestrate.executors.worker_environment import pin_threads
 
@@ -13,12 +14,18 @@ _STDERR = 2  # Ray writes it to a log file of the worker on its node
 
 
 def run_chunk(
-    run: Run, tasks: list[Task], limits: Limits, prepare: Prepare | None = None
+    run: Run,
+    tasks: list[Task],
+    limits: Limits,
+    prepare: Prepare | None = None,
+    channel: Channel | None = None,
 ) -> Iterator[TaskDone | None]:
     """Run tasks in order; yield None when the first begins, then each outcome as it ends.
 
-    ``prepare`` is called first, on machines where the launch has not called it.
+    ``prepare`` is called first, on machines where the launch has not called it. Samples of running
+    tasks go through the channel.
     """
+    live = live_to(channel)
     pin_threads()
     if prepare:
         prepare()
@@ -26,5 +33,5 @@ def run_chunk(
     for task in tasks:
         limit_memory(limits, task.memory_factor)
         with ended_after(limits, _STDERR):
-            finished = run_task(run, task, limits)
+            finished = run_task(run, task, limits, live)
         yield finished

@@ -16,6 +16,7 @@ from orchestrate.executors.limits import Limits
 from orchestrate.executors.ray import fingerprint
 from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection, unreachable
 from orchestrate.executors.ray.health import ClusterWatch
+from orchestrate.executors.ray.samples import Channel
 from orchestrate.executors.worker_environment import ONE_THREAD
 
 CONNECT_SECONDS = 5.0
@@ -51,11 +52,11 @@ class Cluster(Connection):
     def slots(self) -> int:
         return self._workers or max(1, self._watch.cores)
 
-    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
+    def run(self, run: Run, tasks: list[Task], limits: Limits, channel: Channel | None) -> Any:
         payload = cloudpickle.dumps(  # type: ignore[no-untyped-call]
             (run, tasks, limits, self._prepare)
         )
-        return self._task.remote(self._expected, payload)
+        return self._task.remote(self._expected, payload, channel)
 
     def check(self) -> None:
         self._watch.check()

@@ -12,6 +12,7 @@ import ray
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
+from orchestrate.executors.ray.samples import Channel
 
 TASK_OPTIONS: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "num_returns": "streaming"}
 """One core for each chunk; Ray never repeats it, and streams its outcomes."""
@@ -35,8 +36,8 @@ class Connection(ABC):
         """Number of tasks that run at the same time, now."""
 
     @abstractmethod
-    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
-        """Start a chunk and return the stream of its outcomes."""
+    def run(self, run: Run, tasks: list[Task], limits: Limits, channel: Channel | None) -> Any:
+        """Start a chunk and return the stream of its outcomes; its samples go to the channel."""
 
     @abstractmethod
     def check(self) -> None:

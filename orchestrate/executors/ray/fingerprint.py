@@ -37,11 +37,14 @@ def fingerprint(settings: Sequence[str]) -> dict[str, str]:
     return found | {name: os.environ.get(name, "unset") for name in settings}
 
 
-def run_where_alike(expected: Fingerprint, payload: bytes) -> Iterator[Any]:
+def run_where_alike(
+    expected: Fingerprint, payload: bytes, channel: tuple[float, Any] | None = None
+) -> Iterator[Any]:
     """Run a chunk, or yield one clause that names the difference.
 
     ``payload`` holds the pickled arguments of
-    :func:`orchestrate.executors.ray.chunk.run_chunk`, whose outcomes are yielded.
+    :func:`orchestrate.executors.ray.chunk.run_chunk`, whose outcomes are yielded, but for the
+    channel, which holds an actor.
     """
     if not _verified:
         found = fingerprint([name for name in expected if name.startswith(_SETTING)])
@@ -53,7 +56,7 @@ def run_where_alike(expected: Fingerprint, payload: bytes) -> Iterator[Any]:
     from ray import cloudpickle
 
     chunk = importlib.import_module("orchestrate.executors.ray.chunk")
-    yield from chunk.run_chunk(*cloudpickle.loads(payload))
+    yield from chunk.run_chunk(*cloudpickle.loads(payload), channel)
 
 
 def _digest(package: str, parts: Sequence[str]) -> str:

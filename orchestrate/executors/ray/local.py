@@ -12,6 +12,7 @@ from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.ray.chunk import run_chunk
 from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection
+from orchestrate.executors.ray.samples import Channel
 from orchestrate.executors.ray.start import start
 from orchestrate.executors.worker_environment import ONE_THREAD, module_path
 
@@ -30,7 +31,7 @@ class OwnRay(Connection):
         os.environ.update({**ONE_THREAD, **module_path()})
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         start(self._start)
-        self._task = ray.remote(**TASK_OPTIONS)(run_chunk)
+        self._task: Any = ray.remote(**TASK_OPTIONS)(run_chunk)
         resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
         self._cores = int(resources.get("CPU", 1.0))
 
@@ -46,8 +47,8 @@ class OwnRay(Connection):
     def slots(self) -> int:
         return self._workers or self._cores
 
-    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
-        return self._task.remote(run, tasks, limits)
+    def run(self, run: Run, tasks: list[Task], limits: Limits, channel: Channel | None) -> Any:
+        return self._task.remote(run, tasks, limits, None, channel)
 
     def check(self) -> None:
         """Check that Ray's processes run; Ray itself notices after a minute."""

@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING
 from sqlalchemy import Double, LargeBinary
 from sqlalchemy.types import Integer
 
-from orchestrate.store.schema import alembic_version, metadata
+from orchestrate.store.schema import alembic_version, live_step, metadata
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-TABLES = tuple(sorted({*metadata.tables} - {alembic_version.name}))
-"""Names of all tables but that of the version, which is written in the provenance."""
+TABLES = tuple(sorted({*metadata.tables} - {alembic_version.name, live_step.name}))
+"""Names of the tables but that of the version, which is written in the provenance, and of samples.
+
+Samples are of trials that run, and a bundle holds results.
+"""
 
 ARRAY_AXES = {"states": 2, "inputs": 2, "parameters": 1}
 """Number of axes of the arrays of a trajectory: states (T + 1, d), inputs (T, m), parameters."""

@@ -21,6 +21,7 @@ from orchestrate.store.schema import (
     trial,
 )
 from orchestrate.store.serialization import now
+from orchestrate.store.write import live_steps
 
 
 def claim(
@@ -88,6 +89,7 @@ def free_claims(
     over = open_attempt & attempt.c.trial_id.not_in(still_held)
     end = {"outcome": outcome, "cause": cause, "ended": now()}
     connection.execute(update(attempt).where(over).values(end))
+    live_steps.clear(connection)
     return freed.rowcount
 
 

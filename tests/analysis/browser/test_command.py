@@ -52,6 +52,7 @@ def test_a_port_that_is_taken_is_one_sentence(
 def test_without_its_libraries_it_says_which_to_install(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delitem(sys.modules, "analysis.serve.server", raising=False)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["serve"]) == 2
     assert "pip install 'dopt[serve]'" in capsys.readouterr().err

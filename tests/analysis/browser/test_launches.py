@@ -46,9 +46,9 @@ def test_what_a_launch_did_is_told(visit: Callable[..., TestClient], url: str) -
         assert [one["kind"] for one in found] == ["launch", "registration", "worker", "launch"]
         assert [one["state"] for one in found] == ["running", "done", "done", "done"]
         assert found[-1]["command"] == "launch.py -m 'env=glob(*)'"
-        token = client.get("/api/progress").json()["token"]
+        token = client.get("/api/grid").json()["progress"]["token"]
         store.end_launch(store.begin_launch(plain), "failed")
-        assert client.get("/api/progress").json()["token"] != token
+        assert client.get("/api/grid").json()["progress"]["token"] != token
 
 
 def test_a_launch_that_was_killed_is_lost(

@@ -181,7 +181,7 @@ def test_a_failed_trial_shows_its_traceback_as_text(client: TestClient) -> None:
 
 
 def test_the_token_changes_with_the_grid_alone(client: TestClient) -> None:
-    first, second = (client.get("/api/progress").json() for _ in range(2))
+    first, second = (client.get("/api/grid").json()["progress"] for _ in range(2))
     assert first == second
     assert first["counts"] == {"diverged": 1, "done": 43, "failed": 1, "pending": 3}
     assert (first["ended"], first["total"]) == (45, 48)

@@ -146,7 +146,7 @@ NAMES = st.sampled_from(
     ]
 )
 PAGES = ("/", "/curves", "/trials", "/compare", "/control", "/launches", "/figures", "/sql")
-DATA = ("progress", "grid", "curves", "trials", "compare", "control", "figures", "sql")
+DATA = ("grid", "curves", "trials", "compare", "control", "figures", "sql")
 TABLES = ("curves.csv", "compare.csv", "control.csv", "sql.csv")
 PATHS = st.sampled_from([*PAGES, *(f"/api/{name}" for name in (*DATA, *TABLES))]) | st.builds(
     lambda base, tail: base + tail,

@@ -109,14 +109,14 @@ def test_a_slow_query_is_ended(client: TestClient, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("statement", [*WRITES, *SQLITE_ONLY, *POSTGRESQL_ONLY])
 def test_whatever_does_not_only_read_is_refused(client: TestClient, statement: str) -> None:
-    before = client.get("/api/progress").json()
+    before = client.get("/api/grid").json()["progress"]
     status, found = ask(client, statement)
     assert status == 400, found
     assert found["error"]
     page = client.get("/sql", params={"q": statement})
     assert page.status_code == 400
     assert 'role="alert"' in page.text
-    assert client.get("/api/progress").json() == before
+    assert client.get("/api/grid").json()["progress"] == before
     assert ask(client, "SELECT count(*) FROM step")[1]["rows"] == [[44 * 40]]
     assert not Path("/tmp/evil").exists()
 

@@ -67,7 +67,7 @@ def test_an_empty_database_says_so(url: str, visit: Visit) -> None:
         check(client, path)
     assert "has no trials yet" in client.get("/").text
     assert "has no trials yet" in client.get("/curves").text
-    assert client.get("/api/progress").json()["total"] == 0
+    assert client.get("/api/grid").json()["progress"]["total"] == 0
     for path in ("/api/curves", "/api/compare", "/compare"):
         assert client.get(path).status_code == 400
 
@@ -125,19 +125,19 @@ def test_a_trial_with_limits_shows_bounds_and_what_is_beyond(url: str, visit: Vi
 def test_a_database_may_come_later_and_be_made_anew(tmp_path: Path, visit: Visit) -> None:
     url = f"sqlite:///{tmp_path}/results.db"
     client = visit(url)
-    for path in ("/", "/trials", "/api/progress", "/api/curves"):
+    for path in ("/", "/trials", "/api/grid", "/api/curves"):
         answer = client.get(path)
         assert answer.status_code == 503
         assert "There is no results database" in answer.text
     assert not (tmp_path / "results.db").exists()
     assert "data-retry" in client.get("/").text
     grids.one_trial(url)
-    assert client.get("/api/progress").json()["total"] == 1
+    assert client.get("/api/grid").json()["progress"]["total"] == 1
     for path in tmp_path.glob("results.db*"):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     assert client.get("/").status_code == 503
     grids.all_diverged(url)
-    assert client.get("/api/progress").json()["total"] == 6
+    assert client.get("/api/grid").json()["progress"]["total"] == 6
 
 
 def test_an_old_schema_is_one_sentence(tmp_path: Path, visit: Visit) -> None:
@@ -165,13 +165,13 @@ def test_what_a_launch_writes_is_seen_at_once(url: str, visit: Visit, way: str) 
     with Store.open(url) as store:
         launch = grids.begin(store)
         store.register(launch, specs)
-        before = client.get("/api/progress").json()
+        before = client.get("/api/grid").json()["progress"]
         assert before["launches_running"] == 1
         assert client.get("/api/curves").json()["curves"][0]["count"] == "0"
         if way == "commit":
             for spec in specs[:2]:
                 grids.finish(store, launch, spec)
-            after = client.get("/api/progress").json()
+            after = client.get("/api/grid").json()["progress"]
             assert after["ended"] == 2
             found = client.get("/api/curves").json()["curves"][0]
             assert found["count"] == "2"
@@ -182,8 +182,8 @@ def test_what_a_launch_writes_is_seen_at_once(url: str, visit: Visit, way: str) 
         else:
             (claim,) = store.claim(launch, [specs[0].trial_key])
             store.fail(claim, grids.FAILURE, grids.RUN)
-            failed = client.get("/api/progress").json()
+            failed = client.get("/api/grid").json()["progress"]
             store.retry()
-            after = client.get("/api/progress").json()
+            after = client.get("/api/grid").json()["progress"]
             assert len({before["token"], failed["token"], after["token"]}) == 3
         assert after["token"] != before["token"]

@@ -107,11 +107,11 @@ def test_the_pages_show_it_live(url: str, client: TestClient, run: Explorer) -> 
     assert arrays["loss"] == run.errors.tolist()
     assert arrays["is_prequential"] is True
     assert arrays["phase"]["labels"] == ["angle [rad]", "rate [rad/s]"]
-    token = client.get("/api/progress").json()["token"]
+    token = client.get("/api/grid").json()["progress"]["token"]
     assert len(client.get("/api/curves?env=plant").json()["x"]) == 40
     drive(run, 10)
     run.save(url)
-    assert client.get("/api/progress").json()["token"] != token
+    assert client.get("/api/grid").json()["progress"]["token"] != token
     assert len(client.get("/api/curves?env=plant").json()["x"]) == 50
     run.close()
     assert "done, 50 of 300 steps" in client.get(f"/trials/{key}").text

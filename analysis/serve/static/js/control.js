@@ -61,7 +61,7 @@ function values({ curves, steps }, name, ideal, index) {
 
 /** Fetch the results and draw the charts of every environment. */
 async function load() {
-  const answer = await fetch(`/api/control${location.search}`);
+  const answer = await fetch(`${document.body.dataset.base}/api/control${location.search}`);
   if (!answer.ok) return;
   const found = await answer.json();
   for (const chart of charts) chart.destroy();

@@ -49,7 +49,7 @@ async function load() {
   const query = new URLSearchParams([...chosen()].filter(([name]) => ASKED.includes(name)));
   place.setAttribute("aria-busy", "true");
   try {
-    const found = await fetch(`/api/curves?${query}`, { signal: mine.signal });
+    const found = await fetch(`${document.body.dataset.base}/api/curves?${query}`, { signal: mine.signal });
     const content = await found.json();
     if (!found.ok) throw new Error(content.error);
     answer = content;
@@ -60,7 +60,7 @@ async function load() {
   } finally {
     if (asking === mine) place.removeAttribute("aria-busy");
   }
-  part("csv").href = `/api/curves.csv?${query}`;
+  part("csv").href = `${document.body.dataset.base}/api/curves.csv?${query}`;
 }
 
 /** Show an error message in place of the chart, or hide it. @param {string} sentence */

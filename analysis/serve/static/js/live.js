@@ -1,9 +1,15 @@
-/** Live updates: polls the progress and replaces the content of the page after a change. */
+/** Live updates: follows the event stream and replaces the content of the page after a change. */
 
-const PERIOD = 2000;
+const AGAIN = 2000;
 const state = document.getElementById("state");
 const words = document.getElementById("state-text");
 let token = document.body.dataset.token;
+let samples = "";
+/** @type {EventSource|null} */
+let stream = null;
+/** @type {Progress|null} */
+let newest = null;
+let busy = false;
 
 /**
  * @typedef {object} Progress
@@ -13,6 +19,7 @@ let token = document.body.dataset.token;
  * @property {number} ended
  * @property {number} running
  * @property {number} launches_running
+ * @property {string} samples changes with each sample of a trial that runs
  */
 
 /** Show the progress of the grid in the header. @param {Progress} progress */
@@ -24,6 +31,13 @@ function say(progress) {
   const text = progress.total ? `${counts} trials ended${failed}` : "no trials yet";
   if (words.textContent !== text) words.textContent = text;
   state.title = writing ? "A launch is running; this page updates itself." : "No launch is running.";
+}
+
+/** Show that there is no news. @param {string} text */
+function lose(text) {
+  state.dataset.mode = "lost";
+  state.title = "";
+  words.textContent = text;
 }
 
 /** Replace the parts of the page that show data by their new content. */
@@ -47,32 +61,53 @@ async function refresh() {
   }
 }
 
-/** Fetch the progress once; update the page after a change. */
-async function poll() {
+/** Show the progress, and update the page if a trial has changed. @param {Progress} progress */
+async function show(progress) {
+  if ("retry" in document.body.dataset) location.reload();
+  say(progress);
+  const changed = token && token !== progress.token;
+  const sampled = samples !== progress.samples;
+  ({ token, samples } = progress);
+  if (changed) {
+    await refresh();
+    document.dispatchEvent(new CustomEvent("dopt:change"));
+  }
+  if (sampled) document.dispatchEvent(new CustomEvent("dopt:samples"));
+}
+
+/** Take an event; of those that come during an update, only the last counts. @param {MessageEvent} event */
+async function take(event) {
+  newest = JSON.parse(event.data);
+  if (busy) return;
+  busy = true;
   try {
-    const answer = await fetch("/api/progress", { signal: AbortSignal.timeout(10_000) });
-    if (!answer.ok) throw new Error(String(answer.status));
-    /** @type {Progress} */
-    const progress = await answer.json();
-    if ("retry" in document.body.dataset) location.reload();
-    say(progress);
-    const changed = token && token !== progress.token;
-    token = progress.token;
-    if (changed) {
-      await refresh();
-      document.dispatchEvent(new CustomEvent("dopt:change"));
+    while (newest) {
+      const progress = newest;
+      newest = null;
+      await show(progress);
     }
   } catch {
-    state.dataset.mode = "lost";
-    words.textContent = "server not reachable";
+    lose("server not reachable");
+  } finally {
+    busy = false;
   }
 }
 
-/** Poll while the page is visible. */
-async function follow() {
-  if (!document.hidden) await poll();
-  setTimeout(follow, PERIOD);
+/** Follow the stream while the page is visible: a browser has few connections for all its tabs. */
+function follow() {
+  stream?.close();
+  stream = null;
+  if (document.hidden) return;
+  stream = new EventSource(`${document.body.dataset.base}/api/events`);
+  stream.addEventListener("progress", take);
+  stream.addEventListener("unavailable", () => lose("database not available"));
+  stream.addEventListener("error", () => {
+    lose("server not reachable"); // the browser connects again, unless the server has refused
+    if (stream?.readyState === EventSource.CLOSED) setTimeout(follow, AGAIN);
+  });
 }
 
-document.addEventListener("visibilitychange", () => !document.hidden && poll());
+document.addEventListener("visibilitychange", follow);
+addEventListener("pagehide", () => stream?.close());
+addEventListener("pageshow", ({ persisted }) => persisted && follow());
 follow();

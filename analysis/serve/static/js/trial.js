@@ -173,12 +173,31 @@ function mark(u, frequency) {
   ctx.restore();
 }
 
+/** Fetch a part of the trial. @param {string} name */
+async function fetched(name) {
+  const answer = await fetch(`${document.body.dataset.base}/api/trials/${encodeURIComponent(charts.dataset.key)}/${name}`);
+  const found = await answer.json();
+  if (!answer.ok) throw new Error(found.error);
+  return found;
+}
+
+/** Draw the samples of a trial that runs; without any there is no chart. */
+async function loadSamples() {
+  const found = await fetched("samples");
+  charts.hidden = !found.t.length;
+  if (charts.hidden) return;
+  drawLoss(found);
+  charts.dataset.drawn = String(found.t.length);
+}
+
 /** Fetch the arrays and draw all charts. */
 async function load() {
   try {
-    const answer = await fetch(`/api/trials/${encodeURIComponent(charts.dataset.key)}/arrays`);
-    const found = await answer.json();
-    if (!answer.ok) throw new Error(found.error);
+    if ("running" in charts.dataset) {
+      await loadSamples();
+      return;
+    }
+    const found = await fetched("arrays");
     drawLoss(found);
     drawInputs(found);
     if (part("states")) drawStates(found);
@@ -196,4 +215,5 @@ async function load() {
 if (charts) {
   load();
   if (document.getElementById("exploration")) document.addEventListener("dopt:change", load); // it grows
+  if ("running" in charts.dataset) document.addEventListener("dopt:samples", load);
 }
