@@ -9,6 +9,7 @@ from dopt.kernel.from_spec import shared_points
 from dopt.kernel.loop import evaluate_next
 from dopt.kernel.pointers import compiled_evaluation
 from dopt.kernel.steps import KernelSteps
+from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import episode_seed
 from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import BlackBox
@@ -42,6 +43,8 @@ class EpisodeTrial(KernelSteps):
         """Take step t, and return whether the trial goes on."""
         system, following = self.spec.system, self.record.states[t + 1]
         self.plan_input(t)
+        if isinstance(self.spec.policy, CompiledPolicy):
+            check_norms(self.spec.policy.name, self.inputs[t : t + 1], t, system.gamma)
         self.inputs[t] = self._episode.step(self.inputs[t].copy())
         following[:] = self._episode.state
         inside = bool(np.all(np.abs(following) <= system.state_limit))  # false for NaN
