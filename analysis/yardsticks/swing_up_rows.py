@@ -79,7 +79,7 @@ def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
     for entry in (one for one in found if one.finished):
         config = entry.config
         solved = reader.assessments(config.config_key, "control_success")
-        facts: dict[str, object] = {"env": config.env, "model": config.model}
+        facts: dict[str, str | int] = {"env": config.env, "model": config.model}
         facts |= {"policy": config.policy, "horizon": config.horizon}
         own = pd.DataFrame(_samples(solved), index=solved.seeds)
         own = own.reindex([trial.seed for trial in entry.finished], fill_value=np.inf)
