@@ -27,6 +27,7 @@ from analysis.serve import command as browser
 from analysis.stats.intervals import Statistic
 from analysis.stats.tolerance import BandKind
 from analysis.stats.trial_scores import Measure
+from analysis.tables import calibration
 from analysis.tables.registry import TABLES, TableKind, comparison
 from analysis.tables.rendering import TextTable, gaps_table
 from analysis.yardsticks import command as yardsticks
@@ -91,9 +92,10 @@ def parser() -> Parser:
     aggregate = _command(
         commands, "aggregate", _aggregate, "every variant against the reference, over all systems"
     )
+    calibrated = _command(commands, "calibration", _calibration, calibration.HELP, diverged=False)
     floor = _command(commands, "floor", _floor, offline.HELP, diverged=False)
     offline.add_arguments(floor)
-    for table in (summary, compare, aggregate, floor):
+    for table in (summary, compare, aggregate, calibrated, floor):
         table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
     for command in (figures, compare):
         command.add_argument(
@@ -107,7 +109,7 @@ def parser() -> Parser:
             metavar="POLICY",
             help=f"what all others are compared with ({REFERENCE}); with --group-by a value",
         )
-    for command in (figures, summary, compare, aggregate, floor):
+    for command in (figures, summary, compare, aggregate, calibrated, floor):
         command.add_argument(
             "--group-by",
             nargs="+",
@@ -230,6 +232,10 @@ def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) 
     kind = comparison(options.column, Measure(options.measure))
     plot_options = PlotOptions(DivergenceRule(options.diverged), epsilon=options.epsilon)
     return _print_table(kind, reader, selection, plot_options, options.format)
+
+
+def _calibration(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    return _print_table(calibration.KIND, reader, selection, PlotOptions(), options.format)
 
 
 def _floor(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:

@@ -240,6 +240,7 @@ def test_every_command_of_the_analysis_works(
 ) -> None:
     extra = {"animate": ("--frames", "2"), "floor": ()}
     extra |= dict.fromkeys(("summary", "compare", "aggregate", "report", "yardsticks"), ())
+    extra["calibration"] = ()
     if command.words[0] == "floor":
         monkeypatch.setenv("DOPT_DB", narrow_database)
     if command.words[0] == "yardsticks":
