@@ -9,6 +9,8 @@ STUDY_DB ?= sqlite:///results/study.db
 CLAIMS_DB ?= sqlite:///results/claims.db
 CLAIMS_CONTROL_DB ?= sqlite:///results/claims_control.db
 SMOKE_DB := sqlite:///results/smoke.db
+# The questions that are compared with their history.
+CHECKED := step,evaluation,trial,store,expansion
 # The policies of which figure 5 shows what their models are good for: all would hide each other.
 CONTROLLED := d_optimal lookahead uniform periodic random random_held
 
@@ -30,7 +32,7 @@ FAST := tests/test_architecture.py tests/test_release.py tests/dopt/declare test
 	tests/dopt/spec tests/dopt/stopping tests/dopt/control tests/dopt/systems tests/analysis/stats tests/orchestrate/config \
 	--ignore=tests/dopt/systems/test_chain.py --ignore=tests/orchestrate/config/test_several_grids.py
 .PHONY: help setup run test test-fast test-lowest test-machines soak image coverage lint format docs \
-	grid figures study claims smoke bench clean
+	grid figures study claims smoke bench bench-check clean
 
 help:  ## show the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 16
@@ -126,6 +128,9 @@ bench: run  ## print measured speed beside its targets, and draw cost against wi
 	$(BIN)/python orchestrate/launch.py -m experiment=width executor=local store.url='$(DB)'
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width_loss
+
+bench-check: run  ## fail where a step, a trial, the store or the expansion of a grid has become slower
+	$(BIN)/python -m benchmarks --quick --only $(CHECKED) --against benchmarks/history.jsonl
 
 clean:  ## remove what the targets made, except results
 	rm -rf $(VENV) .venv-lowest figures site build htmlcov .coverage* .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

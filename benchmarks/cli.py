@@ -1,4 +1,4 @@
-"""Command line of the benchmarks and the table that it prints."""
+"""Command line of the benchmarks: a table, and the history of runs that it is added to."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import importlib
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 from tabulate import tabulate
 
+from benchmarks import calibration, history
+from benchmarks.history import Run
 from benchmarks.machine import describe
 from benchmarks.rows import Row
 
@@ -34,6 +37,7 @@ QUESTIONS = (
     "pages",
 )
 HEADERS = ("question", "what", "measured", "target", "of target", "others", "× others", "note")
+HISTORY = Path("results/benchmarks.jsonl")
 LEGEND = (
     "target: number of the target and its bound; of target: 1 or more meets it; others: the same "
     "in other people's code (benchmarks/anchors.py), and how many times faster this is."
@@ -41,15 +45,16 @@ LEGEND = (
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Ask the questions and print the answers; 1 if one of them failed."""
+    """Ask the questions and print the answers; 1 if one failed, or a row has become slower."""
     options = parser().parse_args(arguments)
+    known = history.read(options.against) if options.against else []
     start = time.perf_counter()
     lines: list[list[str]] = []
     failed: list[str] = []
-    about = describe()
+    about, run = describe(), Run.now()
     for question in options.only:
         try:
-            rows = ask(question, options.quick)
+            rows = _ask_for(run, question, options.quick)
         except Exception as error:
             failed.append(question)
             rows = [Row("failed", None, note=_first_line(error))]
@@ -58,7 +63,11 @@ def main(arguments: Sequence[str]) -> int:
     mode = "quick, for a look only" if options.quick else "medians"
     seconds = f"{time.perf_counter() - start:.0f} s in all"
     _say("\n".join([*about, f"{mode}, {seconds}", "", table, "", LEGEND]))
-    return 1 if failed else 0
+    _keep(options.history, run)
+    slower = history.slower(known, run)
+    for row in slower:
+        _say(f"slower: {row}")
+    return 1 if failed or slower else 0
 
 
 def ask(question: str, quick: bool) -> list[Row]:
@@ -66,6 +75,22 @@ def ask(question: str, quick: bool) -> list[Row]:
     sys.stderr.write(f"{question} ...\n")
     rows: list[Row] = importlib.import_module(f"benchmarks.{question}").measure(quick)
     return rows
+
+
+def _ask_for(run: Run, question: str, quick: bool) -> list[Row]:
+    """Return the rows of one question, and add them to a run."""
+    before = calibration.seconds()
+    rows = ask(question, quick)
+    run.add(question, rows, (before + calibration.seconds()) / 2)
+    return rows
+
+
+def _keep(path: Path, run: Run) -> None:
+    """Add a run to the history, and draw that."""
+    from benchmarks.history_plot import draw  # Matplotlib, which the tests of the table do without
+
+    history.append(path, run)
+    draw(history.read(path), path.with_suffix(".png"))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -79,6 +104,19 @@ def parser() -> argparse.ArgumentParser:
         help=f"only these questions: {', '.join(QUESTIONS)}",
     )
     parser.add_argument("--quick", action="store_true", help="few repeats, for a look")
+    parser.add_argument(
+        "--history",
+        type=Path,
+        default=HISTORY,
+        metavar="FILE",
+        help="file that the run is added to; it is drawn beside it (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--against",
+        type=Path,
+        metavar="FILE",
+        help=f"history of earlier runs: fail if a row takes {history.SLOWER:g} times its median",
+    )
     return parser
 
 

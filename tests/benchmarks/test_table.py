@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from benchmarks.cli import HEADERS, QUESTIONS, main, parser
+from benchmarks.history import read
 from benchmarks.launches import _accounts
 from benchmarks.rows import Anchor, Row, Target
 from tests.paths import ROOT
@@ -21,8 +23,10 @@ def table(text: str) -> list[dict[str, str]]:
     return [dict(zip(headers, row, strict=True)) for row in rows]
 
 
-def test_the_step_is_measured_beside_its_targets() -> None:
+def test_the_step_is_measured_beside_its_targets(tmp_path: Path) -> None:
+    history = tmp_path / "history.jsonl"
     command = [sys.executable, "-m", "benchmarks", "--quick", "--only", "step"]
+    command += ["--history", str(history)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     rows = table(done.stdout)
     assert tuple(rows[0]) == HEADERS
@@ -35,10 +39,13 @@ def test_the_step_is_measured_beside_its_targets() -> None:
         assert float(row["of target"]) > 0
     assert "machine: " in done.stdout
     assert "numba " in done.stdout
+    (run,) = read(history)
+    assert [f"step: {row['what']}" for row in rows] == list(run.rows)
+    assert history.with_suffix(".png").stat().st_size > 0
 
 
 def test_a_question_that_fails_is_said_and_the_others_are_asked(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     def ask(question: str, quick: bool) -> list[Row]:
         if question == "store":
@@ -46,11 +53,12 @@ def test_a_question_that_fails_is_said_and_the_others_are_asked(
         return [Row("quick" if quick else "whole", 1.0, "s")]
 
     monkeypatch.setattr("benchmarks.cli.ask", ask)
-    assert main(["--only", "store,step"]) == 1
+    keep = ["--history", str(tmp_path / "history.jsonl")]
+    assert main(["--only", "store,step", *keep]) == 1
     first, second = table(capsys.readouterr().out)
     assert first["note"] == "OSError: the disk is full"
     assert (second["what"], second["measured"]) == ("whole", "1 s")
-    assert main(["--only", "step", "--quick"]) == 0
+    assert main(["--only", "step", "--quick", *keep]) == 0
 
 
 def test_a_question_that_does_not_exist_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

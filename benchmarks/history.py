@@ -1,0 +1,138 @@
+"""History of the benchmarks: a line of JSON a run, and which of its rows have become slower."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import median
+
+from benchmarks.machine import describe
+from benchmarks.processes import ROOT
+from benchmarks.rows import Row
+
+FEWEST = 3
+"""Runs of a row before its median says anything."""
+
+SLOWER = 1.5
+"""Times the median at which a row counts as slower."""
+
+TIMES = frozenset({"µs", "ms", "s", "min"})
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One row of a run.
+
+    Attributes
+    ----------
+    value, unit
+        What was measured: a time, or a rate in a unit that ends in ``/s``.
+    calibration
+        Seconds that the fixed work took around it (:mod:`benchmarks.calibration`).
+    """
+
+    value: float
+    unit: str
+    calibration: float
+
+    @property
+    def cost(self) -> float:
+        """Time in times of the fixed work, up to a factor that depends on the unit alone."""
+        time = self.value if self.unit in TIMES else 1.0 / self.value
+        return time / self.calibration
+
+
+@dataclass(frozen=True)
+class Run:
+    """Rows of one run of the benchmarks, by question and what was measured."""
+
+    date: str
+    commit: str
+    machine: str
+    rows: dict[str, Timing] = field(default_factory=dict)
+
+    @classmethod
+    def now(cls) -> Run:
+        """Return a run that has no rows yet."""
+        date = datetime.now(UTC).isoformat(timespec="seconds")
+        return cls(date, _commit(), " ".join(describe()))
+
+    def add(self, question: str, rows: Sequence[Row], calibration: float) -> None:
+        """Take in those rows of a question that are times or rates."""
+        for row in rows:
+            if row.value and (row.unit in TIMES or row.unit.endswith("/s")):
+                timing = Timing(row.value, row.unit, calibration)
+                self.rows[f"{question}: {row.what}"] = timing
+
+
+@dataclass(frozen=True)
+class Slower:
+    """A row that takes longer than it did."""
+
+    name: str
+    times: float
+    runs: int
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.times:.2f} times the median of {self.runs} runs"
+
+
+def append(path: Path, run: Run) -> None:
+    """Add a run to a file, which is made if it is not there."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"{json.dumps(asdict(run), ensure_ascii=False)}\n")
+
+
+def read(path: Path) -> list[Run]:
+    """Return the runs of a file, the oldest first.
+
+    Raises
+    ------
+    ValueError
+        If a line is no run.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [_run(path, number, line) for number, line in enumerate(lines, start=1)]
+
+
+def costs(runs: Sequence[Run]) -> Mapping[str, list[float]]:
+    """Return the costs of each row in the runs that have it."""
+    found: dict[str, list[float]] = {}
+    for run in runs:
+        for name, timing in run.rows.items():
+            found.setdefault(name, []).append(timing.cost)
+    return found
+
+
+def slower(runs: Sequence[Run], run: Run, limit: float = SLOWER) -> list[Slower]:
+    """Return the rows of a run that take so many times the median of earlier ones, or longer."""
+    known = {name: past for name, past in costs(runs).items() if len(past) >= FEWEST}
+    ratios = [
+        Slower(name, timing.cost / median(known[name]), len(known[name]))
+        for name, timing in run.rows.items()
+        if name in known
+    ]
+    return [row for row in ratios if row.times >= limit]
+
+
+def _run(path: Path, number: int, line: str) -> Run:
+    try:
+        stored = json.loads(line)
+        rows = {name: Timing(**timing) for name, timing in stored.pop("rows").items()}
+        return Run(**stored, rows=rows)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(
+            f"line {number} of {path} is no run of the benchmarks ({error!r}): remove it, or give "
+            f"another file."
+        ) from error
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"

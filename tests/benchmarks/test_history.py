@@ -1,0 +1,98 @@
+"""The history of the benchmarks is read as it was written, and says which rows became slower."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from benchmarks import calibration
+from benchmarks.cli import main
+from benchmarks.history import FEWEST, Run, append, costs, read, slower
+from benchmarks.rows import Row
+from tests.paths import ROOT
+
+
+def run(value: float, unit_seconds: float = 0.01, unit: str = "µs") -> Run:
+    made = Run("2026-01-01T00:00:00+00:00", "abc", "a machine")
+    made.add("step", [Row("D-optimal", value, unit)], unit_seconds)
+    return made
+
+
+@pytest.fixture
+def past(tmp_path: Path) -> Path:
+    """Return a history in which a step took 100, 102 and 98 µs."""
+    path = tmp_path / "past.jsonl"
+    for value in (100.0, 102.0, 98.0):
+        append(path, run(value))
+    return path
+
+
+def test_a_history_is_read_as_it_was_written(tmp_path: Path) -> None:
+    runs = [run(100.0), run(3.0, unit="rows/s")]
+    for each in runs:
+        append(tmp_path / "new" / "history.jsonl", each)
+    assert read(tmp_path / "new" / "history.jsonl") == runs
+
+
+def test_a_line_that_is_no_run_is_named(past: Path) -> None:
+    with past.open("a") as file:
+        file.write('{"rows": {}}\n')
+    with pytest.raises(ValueError, match=r"^line 4 of .*past.jsonl is no run of the benchmarks"):
+        read(past)
+
+
+@pytest.mark.parametrize(("value", "slow"), [(149.0, False), (151.0, True), (50.0, False)])
+def test_a_row_is_slower_at_half_as_much_again_as_the_median(
+    past: Path, value: float, slow: bool
+) -> None:
+    assert bool(slower(read(past), run(value))) is slow
+
+
+def test_a_rate_is_slower_when_it_falls() -> None:
+    runs = [run(value, unit="rows/s") for value in (100.0, 102.0, 98.0)]
+    assert not slower(runs, run(200.0, unit="rows/s"))
+    (found,) = slower(runs, run(50.0, unit="rows/s"))
+    assert str(found) == "step: D-optimal: 2.00 times the median of 3 runs"
+
+
+def test_a_slow_machine_is_not_a_slow_row(past: Path) -> None:
+    assert not slower(read(past), run(200.0, unit_seconds=0.02))
+    assert slower(read(past), run(100.0, unit_seconds=0.005))
+
+
+def test_two_runs_are_no_median(past: Path) -> None:
+    assert not slower(read(past)[:2], run(1000.0))
+
+
+def test_what_is_no_time_is_left_out() -> None:
+    made = run(1.0)
+    made.add("width", [Row("share", 5.0, "%"), Row("scan", None, note="no jax")], 0.01)
+    assert list(made.rows) == ["step: D-optimal"]
+
+
+def test_the_command_fails_where_a_row_became_slower(
+    past: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(calibration, "seconds", lambda: 0.01)
+    arguments = ["--only", "step", "--history", str(tmp_path / "history.jsonl")]
+    arguments += ["--against", str(past)]
+    for value, status in ((101.0, 0), (170.0, 1)):
+        rows = [Row("D-optimal", value, "µs")]
+        module = SimpleNamespace(measure=lambda _, rows=rows: rows)
+        monkeypatch.setitem(sys.modules, "benchmarks.step", module)
+        assert main(arguments) == status
+    assert "slower: step: D-optimal: 1.70 times the median of 3 runs" in capsys.readouterr().out
+    assert len(read(tmp_path / "history.jsonl")) == 2
+
+
+def test_the_calibration_takes_time() -> None:
+    assert 0.0 < calibration.seconds() < 10.0
+
+
+def test_the_stored_history_holds_enough_runs_of_what_is_checked() -> None:
+    known = costs(read(ROOT / "benchmarks" / "history.jsonl"))
+    assert known
+    assert all(len(past) >= FEWEST for past in known.values())
