@@ -65,6 +65,7 @@ class TestReader:
         self, store: Store, reader: Reader, damage: str
     ) -> None:
         with store._backend.transaction() as connection:
+            connection.exec_driver_sql("DELETE FROM curve")
             connection.exec_driver_sql(damage)
         with pytest.raises(StoreUnavailableError, match=r"18 steps instead of 21.*doctor"):
             reader.curves(KEY)
