@@ -26,7 +26,13 @@ def measure(quick: bool) -> list[Row]:
     sys.path.insert(0, folder)
     try:
         spec = TrialSpec.from_mapping(
-            {"env": {"_target_": "swing.Swing"}, "policy": {"name": "d_optimal"}, "seed": 0}
+            {
+                "env": {"_target_": "swing.Swing"},
+                "policy": {"name": "d_optimal"},
+                "model": {"name": "mlp"},
+                "learner": {"name": "adam_window"},
+                "seed": 0,
+            }
         )
     finally:
         sys.path.remove(folder)

@@ -74,18 +74,17 @@ def positive(option: str, number: type[int] | type[float]) -> Callable[[str], fl
     return read
 
 
-_TIME = re.compile(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
+_TIME = re.compile(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
 
 
 def length_of_time(option: str) -> Callable[[str], float]:
-    """Return the argument type for a time in seconds, such as ``1h30m``, ``55m`` or ``90``."""
+    """Return the argument type for a time in seconds, such as ``90d``, ``1h30m`` or ``90``."""
 
     def read(given: str) -> float:
         found = _TIME.fullmatch(given)
-        hours, minutes, seconds = (
-            (float(part or 0) for part in found.groups()) if found else 3 * [0]
-        )
-        if not (whole := 3600 * hours + 60 * minutes + seconds):
+        parts = [float(part or 0) for part in found.groups()] if found else [0.0] * 4
+        whole = sum(part * unit for part, unit in zip(parts, (86_400, 3_600, 60, 1), strict=True))
+        if not whole:
             raise UsageError(
                 f"{option} is {given!r}, a time such as 55m, 1h30m or 90s is expected: give one."
             )

@@ -6,14 +6,17 @@ A new command is a file with a ``COMMAND`` and a line in ``COMMANDS``.
 from __future__ import annotations
 
 from orchestrate.commands import (
+    backup,
     doctor,
     export,
     merge,
+    prune,
     query,
     retry,
     show,
     status,
     upgrade,
+    vacuum,
     work,
 )
 from orchestrate.commands.command import Command
@@ -28,5 +31,8 @@ COMMANDS: tuple[Command, ...] = (
     merge.COMMAND,
     doctor.COMMAND,
     upgrade.COMMAND,
+    backup.COMMAND,
+    prune.COMMAND,
+    vacuum.COMMAND,
 )
 """In the order in which the help shows them."""

@@ -26,8 +26,10 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 
 
 def _sentence(done: Upgrade) -> str:
-    if not done.changed:
-        return f"{done.safe_url} has schema {done.after}, the newest: there is nothing to do."
+    if done.before == done.after:
+        found = f"{done.safe_url} has schema {done.after}, the newest"
+        packed = f"the curves of {done.packed:,} trials were packed"
+        return f"{found}; {packed}." if done.packed else f"{found}: there is nothing to do."
     if done.before is None:
         return f"{done.safe_url} was empty and has schema {done.after} now."
     kind = "file" if "sqlite" in done.safe_url.partition(":")[0] else "schema"

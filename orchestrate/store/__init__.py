@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from orchestrate.records import Failure, RunRecord
 from orchestrate.store.backends.open import LEASE_SECONDS
+from orchestrate.store.backup import back_up
 from orchestrate.store.database_url import DEFAULT_URL, URL_VARIABLE, default_url
 from orchestrate.store.doctor.examine import examine
 from orchestrate.store.doctor.findings import Finding
@@ -25,6 +26,7 @@ from orchestrate.store.migrations.upgrade import Upgrade, upgrade
 from orchestrate.store.read.explorations import ExplorationRow, explorations
 from orchestrate.store.read.failures import FailureKind, failure_kinds
 from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
+from orchestrate.store.read.prunable import Prunable, prunable
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.read.rows import (
     Assessments,
@@ -45,6 +47,7 @@ from orchestrate.store.records import (
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
 from orchestrate.store.shards import collect, merge_collected
 from orchestrate.store.store import Store
+from orchestrate.store.vacuum import Vacuumed, vacuum
 from orchestrate.store.write.explorations import Saved
 
 __all__ = [
@@ -70,6 +73,7 @@ __all__ = [
     "NoDatabaseError",
     "OpenConfig",
     "OpenTrial",
+    "Prunable",
     "QueryError",
     "Reader",
     "Registrable",
@@ -86,6 +90,8 @@ __all__ = [
     "TrialName",
     "TrialRow",
     "Upgrade",
+    "Vacuumed",
+    "back_up",
     "collect",
     "default_url",
     "examine",
@@ -93,5 +99,7 @@ __all__ = [
     "failure_kinds",
     "merge",
     "merge_collected",
+    "prunable",
     "upgrade",
+    "vacuum",
 ]

@@ -33,6 +33,9 @@ STATUSES = ("pending", "running", "done", "diverged", "failed", "cancelled")
 FINISHED = ("done", "diverged")
 """Statuses of a trial that has a result."""
 
+ENDED = (*FINISHED, "failed", "cancelled")
+"""Statuses of a trial that has an outcome."""
+
 LAUNCH_STATES = ("running", "done", "failed", "interrupted", "lost")
 CONFIG_COLUMNS = (
     "env",
@@ -232,4 +235,16 @@ attempt = _table(
     Column("error_id", _Long, ForeignKey("error.error_id")),
     Index("attempt_by_end", "ended"),
     rowid=False,
+)
+
+derived = MetaData()
+"""Tables that repeat others in a form that is faster to read; a database may lack them."""
+
+curve = Table(
+    "curve",
+    derived,
+    Column("trial_id", _Long, ForeignKey(trial.c.trial_id), primary_key=True, autoincrement=False),
+    Column("attempt", Integer, nullable=False),
+    *(Column(name, LargeBinary, nullable=False) for name in STEP_VALUES),
+    sqlite_strict=True,
 )

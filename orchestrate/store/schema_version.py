@@ -6,7 +6,7 @@ import shlex
 
 from sqlalchemy import Connection, inspect, text
 
-from orchestrate.store import migrations
+from orchestrate.store import migrations, packed_curves
 from orchestrate.store.errors import SchemaVersionError
 from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, metadata
 
@@ -29,6 +29,7 @@ def is_empty(connection: Connection) -> bool:
 def create(connection: Connection) -> None:
     """Create the newest tables and views in an empty database."""
     metadata.create_all(connection, checkfirst=False)
+    packed_curves.create(connection)
     migrations.create_views(connection)
     migrations.stamp(connection, SCHEMA_VERSION)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Self
 
 from orchestrate.records import Failure, RunRecord, Sample
-from orchestrate.store import database_url, schema_version
+from orchestrate.store import database_url, packed_curves, schema_version
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, make_backend
 from orchestrate.store.read import open_trials
@@ -24,6 +24,7 @@ from orchestrate.store.write import (
     explorations,
     launches,
     live_steps,
+    pruning,
     registration,
     results,
 )
@@ -50,6 +51,7 @@ class Store:
         try:
             with backend.creation() as connection:
                 schema_version.create_or_check(connection, backend.safe_url)
+                backend.has_curves = packed_curves.exist(connection)
         except BaseException:
             backend.close()
             raise
@@ -206,6 +208,21 @@ class Store:
         """
         with self._backend.transaction() as connection:
             return claims.retry(connection, self._backend, status, trial_keys)
+
+    def prune(self, trial_keys: Sequence[str]) -> int:
+        """Delete those of the trials that have an outcome, and return their number.
+
+        Those of a living launch stay. The trials are deleted in several transactions, so that
+        launches wait for none of them long; one that was interrupted can be repeated.
+        """
+        deleted = 0
+        for start in range(0, len(trial_keys), pruning.PAGE):
+            with self._backend.transaction() as connection:
+                page = trial_keys[start : start + pruning.PAGE]
+                deleted += pruning.prune(connection, self._backend, page)
+        with self._backend.transaction() as connection:
+            pruning.prune_unused(connection, self._backend)
+        return deleted
 
     def close(self) -> None:
         """Close connections and locks; a launch that has not ended counts as dead from now on."""

@@ -14,11 +14,11 @@ JOIN config c ON c.config_id = r.config_id
 LEFT JOIN error e ON e.error_id = r.error_id
 """
 
+# SQLite keeps the order of a CROSS JOIN: it would read the steps of all configurations otherwise.
 _CURVE = f"""
 SELECT {_CONFIG}, r.seed, s.t, s.loss, s.reachable_loss
-FROM config c
-JOIN trial r ON r.config_id = c.config_id
-JOIN step s ON s.trial_id = r.trial_id
+FROM config c CROSS JOIN trial r CROSS JOIN step s
+WHERE r.config_id = c.config_id AND s.trial_id = r.trial_id
 """
 
 # One pass is exact enough: losses of different seeds differ by far more than 1e-6 of their mean,

@@ -43,6 +43,8 @@ class Backend(ABC):
         self.engine = engine
         self.safe_url = safe_url
         self._has_answered = False
+        self.has_curves = False
+        """Whether the database has the table of packed curves."""
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
@@ -103,6 +105,15 @@ class Backend(ABC):
     def token(self) -> str:
         """Return a unique name for a launch of this process."""
         return uuid.uuid4().hex
+
+    @property
+    @abstractmethod
+    def needs_rest(self) -> bool:
+        """Whether :meth:`vacuum` keeps launches from writing for as long as it takes."""
+
+    @abstractmethod
+    def vacuum(self) -> None:
+        """Free the space of deleted rows."""
 
     @abstractmethod
     def evict(self) -> None:

@@ -12,9 +12,10 @@ from orchestrate.store.backends.base import LaunchLife
 from orchestrate.store.backends.driver_errors import translated, translated_file
 from orchestrate.store.bundles.cached import database_of
 
-__all__ = ["dead", "read_engine", "reading"]
+__all__ = ["dead", "read_engine", "reading", "size"]
 
 reading = sqlite.reading
+size = sqlite.size
 
 
 def read_engine(url: URL) -> Engine:

@@ -79,6 +79,9 @@ _EVICT = text(
       )
     """
 )
+_OWN = "FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace(current_schema())"
+_TABLES = text(f"SELECT oid::regclass::text {_OWN} AND relname <> 'alembic_version'")
+_SIZE = text(f"SELECT coalesce(sum(pg_total_relation_size(oid)), 0) {_OWN}")
 _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
 
 
@@ -147,6 +150,17 @@ class PostgreSQLBackend(Backend):
     def token(self) -> str:
         return f"{self._session}-{super().token()}"
 
+    @property
+    def needs_rest(self) -> bool:
+        return False
+
+    def vacuum(self) -> None:
+        with self.engine.connect() as connection:
+            tables = ", ".join(connection.execute(_TABLES).scalars())
+            connection.rollback()
+            alone = connection.execution_options(isolation_level="AUTOCOMMIT")
+            alone.exec_driver_sql(f"VACUUM (ANALYZE) {tables}")
+
     def evict(self) -> None:
         # In a short transaction of its own: it reads a table that an upgrade locks.
         with self.transaction() as connection:
@@ -200,6 +214,11 @@ def read_engine(url: URL) -> Engine:
         connection.commit()
 
     return engine.execution_options(isolation_level="REPEATABLE READ")
+
+
+def size(connection: Connection) -> int:
+    """Return the bytes of the tables and indexes of the schema."""
+    return int(connection.execute(_SIZE).scalar_one())
 
 
 @contextmanager

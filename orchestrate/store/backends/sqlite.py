@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import URL, Connection, Select, func, insert, select
+from sqlalchemy import URL, Connection, Select, func, insert, select, text
 
 from orchestrate.store import database_url
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
@@ -29,7 +29,7 @@ from orchestrate.store.errors import StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, trial
 
-__all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "reading"]
+__all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "reading", "size"]
 
 # Rows in one statement: its 502 parameters stay below the 999 that every SQLite takes.
 _BLOCK = 100
@@ -41,6 +41,7 @@ _READING = (
     sqlite3.SQLITE_RECURSIVE,
 )
 _SAFE_PRAGMAS = ("table_info", "table_xinfo", "table_list", "index_list", "index_xinfo")
+_SIZE = text("SELECT page_count * page_size FROM pragma_page_count, pragma_page_size")
 _MAX_VALUE_BYTES = 2**26  # holds the parameters of a network with 2,800 units in each layer
 _PROGRESS_STEPS = 10_000  # instructions of SQLite's virtual machine, well below a millisecond
 
@@ -131,6 +132,18 @@ class SQLiteBackend(Backend):
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:  # noqa: ARG002
         return [launch for launch in launches if not self._locks.is_held(launch.token)]
 
+    @property
+    def needs_rest(self) -> bool:
+        return True
+
+    def vacuum(self) -> None:
+        with self.engine.connect() as connection:
+            driver = driver_of(connection)
+            driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 1)  # the new file
+            driver.execute("VACUUM")
+            driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+            driver.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+
     def evict(self) -> None:
         """Do nothing: the kernel releases the locks of a dead process."""
 
@@ -176,6 +189,11 @@ def dead(url: URL, _: Connection, launches: Sequence[LaunchLife]) -> list[Launch
     """Return the launches whose process is gone, for a reader."""
     locks = LaunchLocks(_locks_folder(database_url.sqlite_path(url)))
     return [launch for launch in launches if not locks.is_held(launch.token)]
+
+
+def size(connection: Connection) -> int:
+    """Return the bytes of the database, without its log."""
+    return int(connection.execute(_SIZE).scalar_one())
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
 
+from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.growth import steps_ahead, unpacked
 from orchestrate.store.merging.source import Curve, Source
@@ -84,9 +85,13 @@ class Target:
     ) -> None:
         """Write a trial with its outcome."""
         trial_id = self._write_trial(row, here, attempts)
-        self._write_attempts(trial_id, 0 if here is None else here.attempt, attempts)
+        before = 0 if here is None else here.attempt
+        self._write_attempts(trial_id, before, attempts)
         if curve is not None:
             self._backend.insert_steps(self._connection, trial_id, curve.steps)
+            if self._backend.has_curves:
+                last = before + len(attempts)
+                packed_curves.write(self._connection, trial_id, last, curve.steps)
             self._connection.execute(_INSERT_TRAJECTORY, {"trial_id": trial_id, **curve.trajectory})
             self._write_assessments(trial_id, curve)
 

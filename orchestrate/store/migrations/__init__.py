@@ -41,8 +41,14 @@ def migrate(connection: Connection, version: int) -> None:
 
 
 def create_views(connection: Connection) -> None:
+    """Create the views, in place of those that an older program of this version has created."""
+    if connection.dialect.name == "sqlite":
+        drop_views(connection)
+        create = "CREATE VIEW"
+    else:
+        create = "CREATE OR REPLACE VIEW"  # those of others may depend on them
     for name, query in VIEWS.items():
-        connection.execute(text(f"CREATE VIEW {name} AS {query}"))
+        connection.execute(text(f"{create} {name} AS {query}"))
 
 
 def drop_views(connection: Connection) -> None:

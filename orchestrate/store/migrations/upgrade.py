@@ -7,16 +7,13 @@ current program computes, the labels, is written after the scripts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from sqlalchemy import Connection, select
-
-from orchestrate.store import database_url, migrations, schema_version
+from orchestrate.store import database_url, migrations, packed_curves, schema_version
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import make_backend
-from orchestrate.store.errors import LaunchAliveError
-from orchestrate.store.schema import SCHEMA_VERSION, launch
+from orchestrate.store.schema import SCHEMA_VERSION
 from orchestrate.store.write import labels, launches
 
 
@@ -31,12 +28,15 @@ class Upgrade:
     backup
         Name of the backup, a file beside a SQLite database or a schema beside the PostgreSQL
         one; None without a backup.
+    packed
+        Trials whose curve was packed.
     """
 
     safe_url: str
     before: int | None
     after: int
     backup: str | None
+    packed: int = 0
 
     @property
     def changed(self) -> bool:
@@ -44,7 +44,7 @@ class Upgrade:
 
 
 def upgrade(url: str, backup: bool = True) -> Upgrade:
-    """Migrate a results database to the newest schema, if it has an older one.
+    """Migrate a results database to the newest schema, and pack the curves that lack it.
 
     Raises
     ------
@@ -62,7 +62,8 @@ def upgrade(url: str, backup: bool = True) -> Upgrade:
         sqlite.existing_path(parsed)
     backend = make_backend(parsed)
     try:
-        return _upgrade(backend, backup)
+        done = _upgrade(backend, backup)
+        return replace(done, packed=packed_curves.write_missing(backend))
     finally:
         backend.close()
 
@@ -77,27 +78,15 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
             before = schema_version.version_of(connection, backend.safe_url)
             schema_version.check_not_newer(before, backend.safe_url)
             if before < SCHEMA_VERSION:
-                _refuse_living(connection, backend)
+                launches.refuse_living(connection, backend)
                 name = backend.back_up(connection, before) if backup else None
                 migrations.migrate(connection, before)
                 labels.write_missing(connection)
+            else:
+                migrations.create_views(connection)
+            packed_curves.create(connection)
     except BaseException:
         if name is not None:
             backend.discard_backup(name)
         raise
     return Upgrade(backend.safe_url, before, SCHEMA_VERSION, name)
-
-
-def _refuse_living(connection: Connection, backend: Backend) -> None:
-    """Raise ``LaunchAliveError`` if a launch is running."""
-    candidates = launches.maybe_alive(connection)
-    dead = {one.launch_id for one in backend.dead(connection, candidates)}
-    alive = [one.launch_id for one in candidates if one.launch_id not in dead]
-    if not alive:
-        return
-    columns = select(launch.c.launch_id, launch.c.pid, launch.c.host)
-    row = connection.execute(columns.where(launch.c.launch_id == min(alive))).one()
-    raise LaunchAliveError(
-        f"Launch {row.launch_id} (process {row.pid} on {row.host}) is running in "
-        f"{backend.safe_url}: wait for its end, or stop it, and run the same command again."
-    )

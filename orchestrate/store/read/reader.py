@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from types import ModuleType
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import URL, Connection, CursorResult, Engine, select, text
+from sqlalchemy import URL, Connection, Engine, select, text
 
 from dopt.errors import suggestion
 from dopt.spec.added_fields import completed
-from orchestrate.store import database_url, schema_version
+from orchestrate.store import database_url, packed_curves, schema_version
 from orchestrate.store.backends import bundle, postgresql, sqlite
 from orchestrate.store.backends.driver_errors import translated, translated_query
-from orchestrate.store.errors import QueryError, StoreUnavailableError
+from orchestrate.store.errors import QueryError
 from orchestrate.store.read import liveness
+from orchestrate.store.read.curves import read_curves
 from orchestrate.store.read.rows import (
     Assessments,
     ConfigRow,
@@ -30,14 +31,11 @@ from orchestrate.store.read.rows import (
     TrialRow,
 )
 from orchestrate.store.read.user_query import run_select
-from orchestrate.store.records import Array
 from orchestrate.store.schema import (
     FINISHED,
-    N_ROWS,
     STEP_VALUES,
     assessment,
     config,
-    step,
     trajectory,
     trial,
 )
@@ -54,12 +52,6 @@ _TRIALS = text(
     "wall_seconds, cpu_seconds, peak_memory_bytes, node, launch_id, error_type, error_message "
     "FROM v_trial WHERE config_key = :config_key ORDER BY seed"
 )
-_LENGTHS = text(
-    f"SELECT r.seed, r.status, {N_ROWS} AS n FROM trial r "
-    "JOIN config c ON c.config_id = r.config_id "
-    "WHERE c.config_key = :config_key AND r.status IN ('done', 'diverged') ORDER BY r.seed"
-)
-
 _MEASURES = (
     "SELECT DISTINCT measure FROM v_assessment WHERE config_key = :config_key ORDER BY measure"
 )
@@ -111,6 +103,16 @@ class Reader:
         with self._snapshot() as connection:
             return str(schema_version.check(connection, self.safe_url))
 
+    def has_packed_curves(self) -> bool:
+        """Return whether the database has the table of packed curves."""
+        with self._snapshot() as connection:
+            return packed_curves.exist(connection)
+
+    def size(self) -> int:
+        """Return the bytes of the database."""
+        with self._snapshot() as connection:
+            return int(self._kind.size(connection))
+
     def configs(self) -> list[ConfigRow]:
         """Return all configurations, sorted by name, with the counts of their trials."""
         with self._snapshot() as connection:
@@ -135,33 +137,9 @@ class Reader:
         ``StoreUnavailableError`` if a step is missing.
         """
         _check_column(column)
+        place = f"configuration {config_key[:12]} in {self.safe_url}"
         with self._snapshot() as connection:
-            config_id, horizon = _config(connection, config_key)
-            finished = (trial.c.config_id == config_id) & trial.c.status.in_(FINISHED)
-            trials = connection.execute(_LENGTHS, {"config_key": config_key}).all()
-            rows = connection.execute(
-                select(step.c[column])
-                .join(trial, trial.c.trial_id == step.c.trial_id)
-                .where(finished, step.c.t.between(0, horizon - 1))
-                .order_by(trial.c.seed, step.c.t)
-            )
-            numbers = _numbers(rows)
-        lengths = np.array([n for _, _, n in trials], dtype=np.int64)
-        if numbers.size != lengths.sum():
-            raise StoreUnavailableError(
-                f"The curves of configuration {config_key[:12]} in {self.safe_url} are incomplete "
-                f"({numbers.size:,} steps instead of {lengths.sum():,}): the database is "
-                "damaged; run python -m orchestrate doctor."
-            )
-        t = np.arange(lengths.max(initial=0) if trials else horizon, dtype=np.int64)
-        values = np.full((len(trials), len(t)), np.nan)
-        values[t < lengths[:, None]] = numbers
-        return Curves(
-            seeds=np.array([seed for seed, _, _ in trials], dtype=np.int64),
-            t=t,
-            values=values,
-            diverged=np.array([status == "diverged" for _, status, _ in trials], dtype=np.bool_),
-        )
+            return read_curves(connection, *_config(connection, config_key), column, place)
 
     def assessments(self, config_key: str, measure: str) -> Assessments:
         """Return one measure of all done and diverged trials; empty if nothing was assessed.
@@ -256,15 +234,6 @@ def _names(row: ConfigRow) -> tuple[str | int, ...]:
     """Return the sort key; not in SQL, where databases order letters and NULL differently."""
     sizes = (-1 if size is None else size for size in (row.width, row.depth))
     return (row.env, row.policy, row.model, row.learner, *sizes, row.config_key)
-
-
-def _numbers(result: CursorResult[Any]) -> Array:
-    """Return the only column of a result, NULL as NaN.
-
-    The driver's cursor is read directly, because a SQLAlchemy row for each number doubles the time.
-    """
-    rows = cast("Iterable[tuple[float | None]]", result.cursor)
-    return np.fromiter(chain.from_iterable(rows), np.float64)
 
 
 def _assessments(rows: Sequence[Sequence[Any]]) -> Assessments:

@@ -16,6 +16,7 @@ from orchestrate.store.schema import (
     assessment,
     attempt,
     config,
+    curve,
     step,
     trajectory,
     trial,
@@ -111,7 +112,8 @@ def retry(
     if trial_keys is not None:
         which = which & trial.c.trial_key.in_(backend.members(trial_keys))
     chosen = select(trial.c.trial_id).where(which)
-    for table in (step, trajectory, assessment):
+    packed = (curve,) if backend.has_curves else ()
+    for table in (step, trajectory, assessment, *packed):
         connection.execute(delete(table).where(table.c.trial_id.in_(chosen)))
     pending = {"status": "pending", **dict.fromkeys((*OUTCOME_COLUMNS, "launch_id", "error_id"))}
     return connection.execute(update(trial).where(which).values(pending)).rowcount

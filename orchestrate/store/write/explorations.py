@@ -13,6 +13,7 @@ import numpy as np
 from sqlalchemy import Connection, delete, insert, select, update
 
 from orchestrate.records import RunRecord
+from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.errors import StoreError
 from orchestrate.store.growth import steps_ahead, unpacked
@@ -131,6 +132,8 @@ def _write_steps(
         steps, n_stored = np.concatenate([steps, missing]), 0
         connection.execute(delete(step).where(step.c.trial_id == trial_id))
     backend.insert_steps(connection, trial_id, steps[n_stored:], n_stored)
+    if backend.has_curves:
+        packed_curves.write(connection, trial_id, rows.claim.attempt, steps)
 
 
 def _replace_arrays(connection: Connection, rows: PreparedRows) -> None:

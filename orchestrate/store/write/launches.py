@@ -7,6 +7,7 @@ import json
 from sqlalchemy import Connection, insert, or_, select, update
 
 from orchestrate.store.backends.base import Backend, LaunchLife
+from orchestrate.store.errors import LaunchAliveError
 from orchestrate.store.records import LaunchRecord
 from orchestrate.store.schema import LAUNCH_STATES, launch, trial
 from orchestrate.store.serialization import now
@@ -112,3 +113,23 @@ def maybe_alive(connection: Connection, skip_locked: bool = False) -> list[Launc
         .with_for_update(key_share=True, skip_locked=skip_locked)
     )
     return [LaunchLife(*row) for row in connection.execute(statement)]
+
+
+def living(connection: Connection, backend: Backend) -> list[LaunchLife]:
+    """Return the launches whose process lives."""
+    candidates = maybe_alive(connection)
+    dead = {one.launch_id for one in backend.dead(connection, candidates)}
+    return [one for one in candidates if one.launch_id not in dead]
+
+
+def refuse_living(connection: Connection, backend: Backend) -> None:
+    """Raise ``LaunchAliveError`` if a launch is running."""
+    alive = [one.launch_id for one in living(connection, backend)]
+    if not alive:
+        return
+    columns = select(launch.c.launch_id, launch.c.pid, launch.c.host)
+    row = connection.execute(columns.where(launch.c.launch_id == min(alive))).one()
+    raise LaunchAliveError(
+        f"Launch {row.launch_id} (process {row.pid} on {row.host}) is running in "
+        f"{backend.safe_url}: wait for its end, or stop it, and run the same command again."
+    )

@@ -21,6 +21,7 @@ from sqlalchemy import (
 
 from orchestrate.records import Failure, RunRecord
 from orchestrate.redaction import without_password
+from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Array, Claim, Result
 from orchestrate.store.schema import (
@@ -161,6 +162,8 @@ def write(connection: Connection, backend: Backend, rows: PreparedRows) -> bool:
         return False
     check_horizon(rows.claim.trial_key, len(rows.steps), horizon)
     backend.insert_steps(connection, rows.claim.trial_id, rows.steps)
+    if backend.has_curves:
+        packed_curves.write(connection, rows.claim.trial_id, rows.claim.attempt, rows.steps)
     connection.execute(_INSERT_TRAJECTORY, rows.trajectory)
     if rows.assessments:
         connection.execute(_INSERT_ASSESSMENT, rows.assessments)

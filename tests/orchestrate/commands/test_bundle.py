@@ -22,6 +22,7 @@ from orchestrate.redaction import without_password
 from orchestrate.store import Claim, NoDatabaseError, Reader, SchemaVersionError, Store, StoreError
 from orchestrate.store.bundles import cached, checksums
 from orchestrate.store.bundles.tables import TABLES, arrow_schema, primary_key
+from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, run_now
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import HORIZON, Spec, assessed, diverged, result
@@ -238,7 +239,9 @@ class TestOpening:
         path = bundle / "provenance.json"
         path.write_text(json.dumps(json.loads(path.read_text()) | {"schema_version": "3"}))
         checksums.write(bundle)
-        with pytest.raises(SchemaVersionError, match="has schema 3, this program reads schema 4"):
+        with pytest.raises(
+            SchemaVersionError, match=f"has schema 3, this program reads schema {SCHEMA_VERSION}"
+        ):
             Reader.open(str(bundle))
 
     def test_what_is_no_bundle_is_refused(self, tmp_path: Path) -> None:

@@ -57,7 +57,8 @@ class TestUpgrade:
         restore(1, url)
         document = command("upgrade", "--no-backup", "--json").document
         assert document == {
-            "safe_url": url, "before": 1, "after": SCHEMA_VERSION, "backup": None, "changed": True
+            "safe_url": url, "before": 1, "after": SCHEMA_VERSION, "backup": None, "packed": 5,
+            "changed": True,
         }  # fmt: skip
         assert not list(_path(url).parent.glob("*backup*"))
 

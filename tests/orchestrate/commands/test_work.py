@@ -102,7 +102,8 @@ def test_a_worker_makes_no_database(pull: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "seconds"), [("55m", 3300.0), ("1h30m", 5400.0), ("90", 90.0), ("0.5s", 0.5)]
+    ("given", "seconds"),
+    [("55m", 3300.0), ("1h30m", 5400.0), ("90", 90.0), ("0.5s", 0.5), ("2d", 172_800.0)],
 )
 def test_a_length_of_time(given: str, seconds: float) -> None:
     assert length_of_time("--until")(given) == seconds

@@ -24,6 +24,8 @@ ALL = (
     "SELECT hash, type, message, traceback FROM error",
     "SELECT r.trial_key, b.t, b.measure, b.value FROM assessment b "
     "JOIN trial r ON r.trial_id = b.trial_id",
+    "SELECT r.trial_key, p.attempt - r.attempt, p.loss, p.reachable_loss, p.plan_us, p.learn_us, "
+    "p.evaluate_us FROM curve p JOIN trial r ON r.trial_id = p.trial_id",
 )
 
 

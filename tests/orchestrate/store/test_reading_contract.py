@@ -20,6 +20,7 @@ from orchestrate.store import (
     StoreError,
     StoreUnavailableError,
 )
+from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, diverged, result
 
 Take = Callable[..., list[Claim]]
@@ -65,6 +66,7 @@ class TestReader:
         self, store: Store, reader: Reader, damage: str
     ) -> None:
         with store._backend.transaction() as connection:
+            connection.exec_driver_sql("DELETE FROM curve")
             connection.exec_driver_sql(damage)
         with pytest.raises(StoreUnavailableError, match=r"18 steps instead of 21.*doctor"):
             reader.curves(KEY)
@@ -206,7 +208,7 @@ class TestOpening:
                 side.open(url)
 
     def test_shows_the_version(self, reader: Reader) -> None:
-        assert reader.schema_version() == "4"
+        assert reader.schema_version() == str(SCHEMA_VERSION)
 
     @pytest.mark.parametrize("side", [Store, Reader])
     @pytest.mark.parametrize(

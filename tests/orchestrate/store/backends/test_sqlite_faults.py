@@ -123,7 +123,7 @@ class TestDamagedFile:
 
         return damage
 
-    @pytest.mark.parametrize("table", ["step", "trial", "config", "trajectory", "attempt"])
+    @pytest.mark.parametrize("table", ["step", "curve", "trial", "trajectory", "attempt"])
     def test_the_doctor_says_so(self, url: str, damaged: Callable[[str], None], table: str) -> None:
         damaged(table)
         first = examine(url)[0]
@@ -132,7 +132,7 @@ class TestDamagedFile:
         assert "restore a copy" in first.advice
 
     def test_a_reader_gives_no_wrong_number(self, url: str, damaged: Callable[[str], None]) -> None:
-        damaged("step")
+        damaged("curve")
         with Reader.open(url) as reader:
             assert len(reader.trials(KEY)) == 60
             with pytest.raises(StoreUnavailableError, match="the file is damaged; restore") as one:
