@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from dopt.errors import SpecificationError, unknown_name
-from dopt.systems.black_box import BlackBox
+from dopt.systems.black_box import BlackBox, unknown_accelerations
 from dopt.systems.expressions import check_names, compiled_text
 from dopt.systems.features import Feature
 from dopt.systems.input_effect import input_effect
@@ -230,6 +230,7 @@ class Plant:
             "grid_indices": tuple(axes),
             "phase_plane": _phase_plane(axes, names),
             "known": staticmethod(compiled_text(known, groups)),
+            "accelerations": staticmethod(unknown_accelerations(len(self.learned))),
         }
         return dataclasses.dataclass(frozen=True, kw_only=True)(
             type(ExploredPlant.__name__, (ExploredPlant,), declared)
