@@ -10,7 +10,7 @@ CLAIMS_DB ?= sqlite:///results/claims.db
 CLAIMS_CONTROL_DB ?= sqlite:///results/claims_control.db
 SMOKE_DB := sqlite:///results/smoke.db
 # The questions that are compared with their history.
-CHECKED := step,evaluation,trial,store,expansion
+CHECKED := step,evaluation,trial,expansion
 # The policies of which figure 5 shows what their models are good for: all would hide each other.
 CONTROLLED := d_optimal lookahead uniform periodic random random_held
 
@@ -129,7 +129,7 @@ bench: run  ## print measured speed beside its targets, and draw cost against wi
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width
 	$(BIN)/python -m analysis figures --db '$(DB)' --out figures --only figure4_width_loss
 
-bench-check: run  ## fail where a step, a trial, the store or the expansion of a grid has become slower
+bench-check: run  ## fail where a step, a trial or the expansion of a grid has become slower
 	$(BIN)/python -m benchmarks --quick --only $(CHECKED) --against benchmarks/history.jsonl
 
 clean:  ## remove what the targets made, except results
