@@ -103,11 +103,20 @@ def _refuse_read_only(path: Path) -> None:
     """
     for suffix in ("", "-wal", "-shm"):
         file = path.with_name(path.name + suffix)
-        if file.exists() and not os.access(file, os.W_OK):
+        if _is_read_only(file):
             raise StoreUnavailableError(
                 f"The results database {path} cannot be written, because {file} is read-only: "
                 "make it writable or give another path."
             )
+
+
+def _is_read_only(file: Path) -> bool:
+    # Another process may delete the log beside the database at any moment, and create it again.
+    try:
+        number = file.stat().st_ino
+        return not os.access(file, os.W_OK) and file.stat().st_ino == number
+    except FileNotFoundError:
+        return False
 
 
 def _read_mode(path: Path) -> str:

@@ -77,7 +77,8 @@ def eight_open(urls: Sequence[str]) -> None:
     barrier = CLEAN.Barrier(8)
     with ExitStack() as stack:
         pipes = [stack.enter_context(running(open_together, urls, barrier))[1] for _ in range(8)]
-        assert [hear(pipe) for pipe in pipes] == ["opened"] * 8
+        answers = [hear(pipe) for pipe in pipes]
+        assert answers == ["opened"] * 8, answers
 
 
 def hold_claims(pipe: Pipe, url: str, n: int, lease_seconds: float = 60.0) -> None:

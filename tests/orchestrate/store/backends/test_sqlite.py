@@ -19,7 +19,7 @@ from orchestrate.store import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.backends.sqlite_engine import _read_mode
+from orchestrate.store.backends.sqlite_engine import _is_read_only, _read_mode
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import eight_open
 
@@ -75,6 +75,28 @@ def test_creation_is_safe_many_times_over(tmp_path: Path) -> None:
     for url in urls:
         with Store.open(url) as store:
             assert store.begin_launch(LAUNCH) == 9
+
+
+def test_a_log_that_another_process_deletes_meanwhile_is_not_read_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = tmp_path / "results.db-wal"
+
+    def deleted(file: Path, _: int) -> bool:
+        file.unlink()
+        return False
+
+    def replaced(file: Path, _: int) -> bool:
+        (tmp_path / "new").touch()
+        (tmp_path / "new").rename(file)
+        return False
+
+    for change in (deleted, replaced):
+        log.touch()
+        monkeypatch.setattr(os, "access", change)
+        assert not _is_read_only(log)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert _is_read_only(log)
 
 
 def test_a_transaction_locks_before_it_reads(store: Store, path: Path) -> None:
