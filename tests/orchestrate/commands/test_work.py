@@ -10,10 +10,12 @@ import pytest
 from dopt.spec.trial import TrialSpec
 from orchestrate.__main__ import main
 from orchestrate.cli_parser import UsageError, length_of_time
+from orchestrate.executors.base import Event, Task
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.runner import worker
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import Claim, Store
+from tests.orchestrate.runner.test_scheduler import Scripted, finish, keys
 from tests.orchestrate.standins import raising
 
 GRID = ("-m", "env=pendulum", "policy=random,uniform", "seed=range(3)", "env.horizon=5")
@@ -70,6 +72,38 @@ def test_results_that_come_too_late_are_counted(
     _, out, _ = pull("work")
     assert "results refused: the lease had run out" in out
     assert "4 trials done" in out
+
+
+def test_a_trial_that_was_taken_away_is_not_run_twice_at_once(
+    command_line: Run, pull: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its lease had run out while it ran here, and it waits in the database again."""
+    command_line(*GRID, LEAVE)
+
+    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
+        executor.held -= {*keys(chunk)}
+        if executor.held and len(executor.given) <= 3:
+            with Store.open(f"sqlite:///{tmp_path}/results/results.db") as other:
+                other.release(2)
+        return finish(chunk)
+
+    class Watched(Scripted):
+        held = frozenset[str]()
+
+        def start(self) -> None:
+            self.slots = 1
+
+        def submit(self, chunk: Sequence[Task]) -> None:
+            super().submit(chunk)
+            assert self.held.isdisjoint(keys(chunk))
+            self.held |= {*keys(chunk)}
+
+    executor = Watched(fate)
+    monkeypatch.setattr(worker, "make_executor", lambda *_: executor)
+    code, out, _ = pull("work")
+    assert "results refused: the lease had run out" in out
+    assert "6 trials done" in out
+    assert code == 0
 
 
 def test_a_launch_that_left_and_is_repeated_says_what_is_done(command_line: Run, pull: Run) -> None:
