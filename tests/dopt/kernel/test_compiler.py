@@ -53,6 +53,7 @@ def test_a_second_compiler_of_a_function_waits_for_the_first(folder: Path) -> No
 
 
 def test_compiling_is_said_at_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:  # noqa: ARG001
+    caplog.set_level("INFO")
     with one_compiler_at_a_time("loop-1"):
         [record] = caplog.records
     assert record.name == "dopt.kernel"
