@@ -20,6 +20,7 @@ QUESTIONS = (
     "step",
     "compiled_plugins",
     "black_box",
+    "numpy_parts",
     "jax_scan",
     "reference",
     "linearisation_gap",

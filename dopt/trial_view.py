@@ -34,7 +34,7 @@ class TrialView(ABC):
         Observed there: (x_{s+1} - x_s)/dt less the known part, in the learned rows; with rk4 also
         less what the model's own step differs from its acceleration there.
     parameters : (q,)
-        Parameters θ of the model.
+        Parameters θ of the model that are learned.
     tie : (m,)
         Random direction of step t, of norm 1: the numbers that a compiled policy has in
         ``randomness.ties[t]``. NaN after the last step.

@@ -2,7 +2,8 @@
 
 :func:`plan_input` and :func:`take_in` are the steps that an exploration of a plant
 (:class:`dopt.explorer.Explorer`) consists of; a trial puts between them the simulated system, or a
-black box that is stepped by the interpreter (:mod:`dopt.kernel.episodes`).
+black box that is stepped by the interpreter (:mod:`dopt.kernel.stepped_trial`). Where a policy or a
+learner of a user's own is written in numpy, the interpreter calls it between compiled steps.
 """
 
 from __future__ import annotations
@@ -55,17 +56,40 @@ def act(plant: Plant, x: Vector, u: Vector, noise: Vector, t: int, following: Ve
 
 
 @compiled
-def take_in(trial: Trial, steps: Steps, t: int, dt: float) -> bool:
-    """Learn from x_t, u_t and x_{t+1}, dt seconds later, and add the rows at (x_t, u_t) to M.
+def act_and_measure(trial: Trial, t: int) -> bool:
+    """Write x_{t+1} of the simulated system and what is measured of it.
+
+    Returns whether it is within the limit of the states.
+    """
+    plant, record = trial.plant, trial.record
+    following = record.true_states[t + 1]
+    noise = trial.randomness.noise[t]
+    act(plant, record.true_states[t], record.inputs[t], noise, t, following)
+    if has_sensors(trial.sensors):
+        noise = trial.randomness.measurement_noise[t]
+        measure(trial.sensors, noise, following, record.states[t + 1])
+    return within(following, plant.state_limit)
+
+
+@compiled
+def observe(trial: Trial, steps: Steps, t: int, dt: float, target: Vector) -> None:
+    """Write the accelerations observed from x_t to x_{t+1}, (r,), which came dt seconds later.
 
     Where states are measured with noise, an estimate takes the place of what was measured of
-    x_{t+1}. Returns whether the parameters are finite: otherwise nothing is added.
+    x_{t+1}.
     """
-    plant, state, record = trial.plant, trial.state, trial.record
     steps.estimate_state(trial, t, dt)
-    target = np.empty(plant.learned_rows.shape[0])
     steps.observe(trial, t, dt, target)
     steps.note_error(trial, t, target)
+
+
+@compiled
+def learn_and_inform(trial: Trial, steps: Steps, t: int, target: Vector) -> bool:
+    """Learn the accelerations observed in step t, (r,), and add the rows at (x_t, u_t) to M.
+
+    Returns whether the parameters are finite: otherwise nothing is added.
+    """
+    plant, state, record = trial.plant, trial.state, trial.record
     clock_0 = monotonic_microseconds()
     learn_members(trial, steps.learn, t, target)
     clock_1 = monotonic_microseconds()
@@ -75,6 +99,14 @@ def take_in(trial: Trial, steps: Steps, t: int, dt: float) -> bool:
     record.learn_us[t] = clock_1 - clock_0
     record.plan_us[t] += monotonic_microseconds() - clock_1
     return True
+
+
+@compiled
+def take_in(trial: Trial, steps: Steps, t: int, dt: float) -> bool:
+    """Learn from x_t, u_t and x_{t+1}, dt seconds later, and return whether θ is finite."""
+    target = np.empty(trial.plant.learned_rows.shape[0])
+    observe(trial, steps, t, dt, target)
+    return learn_and_inform(trial, steps, t, target)
 
 
 @compiled
@@ -117,6 +149,26 @@ def take_in_next(held: HeldTrial, t: int, dt: float) -> bool:
     return take_in(trial, steps, t, dt)
 
 
+@called_from_python
+def act_next(held: HeldTrial, t: int) -> bool:
+    """Let the simulated system take step t (:func:`act_and_measure`)."""
+    return act_and_measure(trial_in(held), t)
+
+
+@called_from_python
+def observe_next(held: HeldTrial, t: int, dt: float, target: Vector) -> None:
+    """Write the accelerations observed in step t (:func:`observe`), and their error as its loss."""
+    trial, steps = trial_in(held), held.steps
+    trial.record.loss[t] = prediction_error(trial, steps, t, dt)
+    observe(trial, steps, t, dt, target)
+
+
+@called_from_python
+def learn_next(held: HeldTrial, t: int, target: Vector) -> bool:
+    """Learn the accelerations observed in step t (:func:`learn_and_inform`)."""
+    return learn_and_inform(trial_in(held), held.steps, t, target)
+
+
 @compiled
 def evaluate(trial: Trial, points: Evaluation, t: int, thetas: Matrix, buffers: Buffers) -> bool:
     """Write the errors of the model after step t, and return whether that over the grid is finite.
@@ -152,16 +204,11 @@ def advance(held: HeldTrial, points: Evaluation, first: int, last: int) -> int:
     trial diverged.
     """
     trial, steps = trial_in(held), held.steps
-    plant, record, thetas = trial.plant, trial.record, members_or_one(trial.state)
+    plant, thetas = trial.plant, members_or_one(trial.state)
     buffers = evaluation_buffers(trial.network, thetas, plant.learned_rows.shape[0])
     for t in range(first, last):
-        x, following = record.true_states[t], record.true_states[t + 1]
         plan_input(trial, steps, t)
-        act(plant, x, record.inputs[t], trial.randomness.noise[t], t, following)
-        if has_sensors(trial.sensors):
-            noise = trial.randomness.measurement_noise[t]
-            measure(trial.sensors, noise, following, record.states[t + 1])
-        if not within(following, plant.state_limit):
+        if not act_and_measure(trial, t):
             return t
         if not take_in(trial, steps, t, plant.dt):
             return t

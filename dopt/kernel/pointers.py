@@ -18,7 +18,7 @@ from numba.core.errors import NumbaError
 
 from dopt.algorithm import Integrator
 from dopt.errors import SpecificationError
-from dopt.kernel import absent_steps, held_trial, limits, loop, observation, sensors
+from dopt.kernel import absent_steps, held_trial, limits, loop, model_queries, observation, sensors
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compilation import compile_missing
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
@@ -182,14 +182,29 @@ def compiled_evaluation(trial: Trial, points: Evaluation) -> Callable[..., bool]
 
 
 def compiled_step(trial: Trial, step: CompiledFunction) -> Callable[..., Any]:
-    """Compile one of :data:`STEPS`."""
+    """Compile one of :data:`STEPS` or :data:`BETWEEN`."""
     held = held_kind(trial)
-    kinds = {
-        held_trial.hold: tuple(held.field_dict.values()),
-        loop.plan_next: (held, int64),
-        loop.take_in_next: (held, int64, float64),
-    }
-    return compiled_for(path_of(step), step, kinds[step])
+    given = tuple(held.field_dict.values())
+    kinds = given if step is held_trial.hold else (held, *_FURTHER_ARGUMENTS[step])
+    return compiled_for(path_of(step), step, kinds)
+
+
+_ROW, _MATRIX, _STACK = float64[::1], float64[:, ::1], float64[:, :, ::1]
+_FURTHER_ARGUMENTS: dict[CompiledFunction, tuple[NumbaType, ...]] = {
+    loop.plan_next: (int64,),
+    loop.take_in_next: (int64, float64),
+    loop.act_next: (int64,),
+    loop.observe_next: (int64, float64, _ROW),
+    loop.learn_next: (int64, _ROW),
+    model_queries.write_accelerations: (_MATRIX, _MATRIX),
+    model_queries.write_jacobian: (_MATRIX, _MATRIX),
+    model_queries.write_jacobian_change: (_ROW, _MATRIX, _STACK),
+    model_queries.write_following: (_ROW, _MATRIX, _MATRIX),
+    model_queries.write_input_matrix: (_ROW, _MATRIX),
+}
+
+BETWEEN = tuple(step for step in _FURTHER_ARGUMENTS if step not in STEPS)
+"""Functions that the interpreter calls where a plan or an update is written in numpy."""
 
 
 def held_kind(trial: Trial) -> NumbaType:

@@ -8,16 +8,15 @@ import time
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.kernel.episodes import EpisodeTrial
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
 from dopt.kernel.held_trial import HeldTrial
 from dopt.kernel.pointers import Compiled, compiled_trial
+from dopt.kernel.stepped_trial import SteppedTrial, is_stepped
 from dopt.kernel.trial_state import KernelState
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from dopt.systems.black_box import BlackBox
 from dopt.types import Array
 from dopt.watching import current_watch
 
@@ -119,12 +118,12 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     )
 
 
-def trial_in_kernel(spec: TrialSpec) -> KernelTrial | EpisodeTrial:
+def trial_in_kernel(spec: TrialSpec) -> KernelTrial | SteppedTrial:
     """Return a trial before its first step."""
-    return EpisodeTrial(spec) if isinstance(spec.system, BlackBox) else KernelTrial(spec)
+    return SteppedTrial(spec) if is_stepped(spec) else KernelTrial(spec)
 
 
-def _advance_in_pieces(trial: KernelTrial | EpisodeTrial, last: int) -> None:
+def _advance_in_pieces(trial: KernelTrial | SteppedTrial, last: int) -> None:
     """Run a trial up to a step; the numbers do not depend on where it is cut."""
     watch, record = current_watch(), trial.record
     steps, seconds = FIRST_STEPS, PIECE_SECONDS

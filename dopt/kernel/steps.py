@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from dopt.kernel.pointers import compiled_steps
+from dopt.kernel.loop import learn_next, observe_next
+from dopt.kernel.numpy_parts import NumpyParts
+from dopt.kernel.pointers import BETWEEN, compiled_step, compiled_steps
 from dopt.kernel.trial_state import KernelState
 from dopt.spec.trial import TrialSpec
 from dopt.systems.sensors import start_variances
@@ -23,8 +25,15 @@ class KernelSteps(KernelState):
         super().__init__(spec)
         if spec.system.n_measured:
             self.trial.sensors.start_variances[:] = start_variances(spec.system)
-        self._code = compiled_steps(spec.policy, spec.learner, self.trial, self.also_called)
+        in_numpy = NumpyParts.needed_by(spec.config)
+        others = (*self.also_called, *(BETWEEN if in_numpy else ()))
+        self._code = compiled_steps(spec.policy, spec.learner, self.trial, others)
         self._held = self._code.hold(self.trial, self._code.steps)
+        self._parts: NumpyParts | None = None
+        if in_numpy:
+            self._parts = NumpyParts(spec, self.trial, self._held)
+            self._observe = compiled_step(self.trial, observe_next)
+            self._learn = compiled_step(self.trial, learn_next)
 
     @property
     def states(self) -> Array:
@@ -49,11 +58,22 @@ class KernelSteps(KernelState):
 
     def plan_input(self, t: int) -> None:
         """Write the input u_t that the policy chooses at x_t."""
+        chosen_in = self._parts.choose(t, self.record.inputs[t]) if self._parts else 0.0
         self._code.plan_input(self._held, t)
+        self.record.plan_us[t] += chosen_in
 
     def take_in(self, t: int, dt: float) -> bool:
         """Learn from x_t, u_t and x_{t+1}, which came dt seconds later.
 
         Returns whether the parameters are finite.
         """
-        return bool(self._code.take_in(self._held, t, dt))
+        if self._parts is None:
+            return bool(self._code.take_in(self._held, t, dt))
+        target = self._parts.targets[t]
+        self._observe(self._held, t, dt, target)
+        updated_in = self._parts.update(t)
+        finite = bool(self._learn(self._held, t, target))
+        self.record.learn_us[t] += updated_in
+        if finite:
+            self.record.plan_us[t] += self._parts.note(t)
+        return finite

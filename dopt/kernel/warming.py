@@ -11,10 +11,12 @@ from functools import partial
 from types import ModuleType
 from typing import NamedTuple
 
+from dopt.kernel import absent_steps
 from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.loop import advance, evaluate_next
 from dopt.kernel.pointers import (
+    BETWEEN,
     OTHER_STEPS,
     STEPS,
     compile_form,
@@ -44,9 +46,11 @@ def choices(everything: bool) -> Choices:
     """Return what a trial of the paper needs, or all that the package holds."""
     if not everything:
         return Choices([DOptimal.kernel_function], [Adam.kernel_function], [primal_network])
+    plans = {policy.kernel_function for policy in POLICIES.values() if policy.compiled}
+    learns = {learner.kernel_function for learner in LEARNERS.values() if learner.compiled}
     return Choices(
-        sorted({policy.kernel_function for policy in POLICIES.values() if policy.compiled}),
-        sorted({learner.kernel_function for learner in LEARNERS.values() if learner.compiled}),
+        sorted(plans | {path_of(absent_steps.plan)}),
+        sorted(learns | {path_of(absent_steps.learn)}),
         [absent, primal_network, primal_linear, dual, sketch, fresh],
     )
 
@@ -63,7 +67,7 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
     }
     systems = [system() for system in SYSTEMS.values()]
     forms = [one for form in chosen.forms for one in (form.add_rows, form.planning_forms)]
-    steps, whole = STEPS if everything else STEPS[:1], (trial.trial, trial.points)
+    steps, whole = (*STEPS, *BETWEEN) if everything else STEPS[:1], (trial.trial, trial.points)
     evaluation = {path_of(evaluate_next): partial(compiled_evaluation, *whole)}
     return {
         path_of(advance): partial(compiled_loop, *whole),

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.declare.kernel_support import KernelPart
+from dopt.declare.kernel_support import LEARN_IN_NUMPY, KernelPart
+from dopt.errors import SpecificationError
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 
@@ -56,9 +57,15 @@ class Updater(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class CustomLearner(Learner):
-    """A learner whose update is written in numpy; it runs on the reference path."""
+    """A learner whose update is written in numpy.
 
-    compiled: ClassVar[bool] = False
+    In the kernel the interpreter calls it between compiled steps. An update that is written in
+    torch (:class:`dopt.reference.batch_trial_view.BatchTrialView`) runs on the reference path
+    alone: its class declares ``compiled = False``.
+    """
+
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = LEARN_IN_NUMPY
 
     @abstractmethod
     def updater(self, system: System, rng: np.random.Generator) -> Updater:
@@ -76,6 +83,7 @@ class CompiledLearner(Learner):
     """
 
     compiled: ClassVar[bool] = True
+    brings_function: ClassVar[bool] = True
 
     @staticmethod
     @abstractmethod
@@ -96,3 +104,12 @@ class CompiledLearner(Learner):
         target : (r,)
             Accelerations observed in step t.
         """
+
+
+def check_update(name: str, updated: Array, shape: tuple[int, ...]) -> None:
+    """Raise SpecificationError if a learner has returned parameters of another shape."""
+    if updated.shape != shape:
+        raise SpecificationError(
+            f"learner '{name}' returned parameters of shape {updated.shape}, but {shape} is "
+            f"expected: correct its update."
+        )

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.declare.kernel_support import KernelPart
+from dopt.declare.kernel_support import PLAN_IN_NUMPY, KernelPart
 from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.systems.base import System
@@ -128,9 +128,15 @@ class Planner(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class CustomPolicy(ClosedLoop):
-    """A closed-loop policy whose plan is written in numpy; it runs on the reference path."""
+    """A closed-loop policy whose plan is written in numpy.
 
-    compiled: ClassVar[bool] = False
+    In the kernel the interpreter calls it between compiled steps. A plan that is written in torch
+    (:class:`dopt.reference.batch_trial_view.BatchTrialView`) runs on the reference path alone: its
+    class declares ``compiled = False``.
+    """
+
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = PLAN_IN_NUMPY
     uses_full_amplitude: ClassVar[bool] = False
 
     @abstractmethod
@@ -151,6 +157,7 @@ class CompiledPolicy(ClosedLoop):
     """
 
     compiled: ClassVar[bool] = True
+    brings_function: ClassVar[bool] = True
     uses_full_amplitude: ClassVar[bool] = False
 
     @staticmethod
@@ -173,6 +180,16 @@ class CompiledPolicy(ClosedLoop):
         u : (m,)
             Where the input is written. One that is not finite ends the trial as diverged.
         """
+
+
+def check_choice(name: str, chosen: Array, t: int, system: System) -> None:
+    """Raise SpecificationError if the input of step t has the wrong shape or is larger than γ."""
+    if chosen.shape != (system.n_inputs,):
+        raise SpecificationError(
+            f"policy '{name}' chose an input of shape {chosen.shape} at step {t}, but "
+            f"{(system.n_inputs,)} is expected: correct its plan."
+        )
+    check_norms(name, chosen[None], t, system.gamma)
 
 
 def check_norms(name: str, inputs: Array, first: int, gamma: float) -> None:

@@ -18,18 +18,19 @@ class BatchTrialView(TrialView):
     Attributes
     ----------
     theta : (q,) tensor
-        Parameters, for plans that are written in torch.
+        All parameters, for plans that are written in torch.
     """
 
     def __init__(self, batch: BatchState, index: int, t: int) -> None:
         self.system, self.t = batch.system, t
         self._learned, self.theta = batch.learned, batch.theta[index].clone()
+        self._size = batch.n_learned
         self.states = _array(batch.states[index, : t + 1])
         self.inputs = _array(batch.inputs[index, :t])
         self.sampled_inputs = _array(batch.sampled_inputs(slice(0, t))[index])
         self.sampled = _array(batch.sampled_states[index, :t])
         self.accelerations = _array(batch.targets[index, :t])
-        self.parameters = _array(self.theta)
+        self.parameters = _array(self.theta[: self._size])
         last = t == self.system.horizon
         self.tie = np.full(self.system.n_inputs, np.nan) if last else _array(batch.ties[index, t])
 
@@ -41,9 +42,8 @@ class BatchTrialView(TrialView):
         return _array(self._learned.model(self.theta[None], self.tensor(states)[None])[0])
 
     def jacobian(self, state: Array) -> Array:
-        return _array(
-            self._learned.jacobian(self.theta[None], self.tensor(state)[None, None])[0, 0]
-        )
+        J = self._learned.jacobian(self.theta[None], self.tensor(state)[None, None])[0, 0]
+        return _array(J[:, : self._size])
 
     def jacobian_change(self, state: Array, directions: Array) -> Array:
         along, r = self.tensor(directions), self.system.n_learned
@@ -55,7 +55,7 @@ class BatchTrialView(TrialView):
             torch.arange(r, device=along.device).repeat(len(along)),
             along.repeat_interleave(r, dim=0),
         )
-        return _array(changes.view(len(along), r, -1))
+        return _array(changes.view(len(along), r, -1)[..., : self._size])
 
     def following(self, state: Array, inputs: Array) -> Array:
         system, u = self.system, self.tensor(inputs)
@@ -71,7 +71,8 @@ class BatchTrialView(TrialView):
 
     def tensor(self, values: Array) -> Tensor:
         """Return values as a tensor where the model is."""
-        return torch.as_tensor(values, dtype=self.theta.dtype, device=self.theta.device)
+        contiguous = np.ascontiguousarray(values)  # torch takes no negative strides
+        return torch.as_tensor(contiguous, dtype=self.theta.dtype, device=self.theta.device)
 
 
 def _array(values: Tensor) -> Array:

@@ -8,9 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dopt.errors import SpecificationError
-from dopt.learning.base import CustomLearner
-from dopt.policies.base import ROUNDING, Array, CustomPolicy, Planner
+from dopt.learning.base import CustomLearner, check_update
+from dopt.policies.base import CustomPolicy, Planner, check_choice
 from dopt.randomness import stream
 from dopt.reference.batch_trial_view import BatchTrialView
 from dopt.reference.state import BatchState
@@ -36,7 +35,7 @@ def planned_inputs(batch: BatchState, planners: Sequence[Planner], t: int) -> Te
     inputs = batch.open_loop[:, t].clone()
     for i in _alive(batch):
         chosen = np.asarray(planners[i].choose(BatchTrialView(batch, i, t)), dtype=np.float64)
-        _check(batch, chosen, t)
+        check_choice(batch.config.policy.name, chosen, t, batch.system)
         inputs[i] = torch.as_tensor(chosen).to(inputs)
     return inputs
 
@@ -68,30 +67,10 @@ class OwnLearner:
         for i in _alive(self._batch):
             updated = self._updaters[i].update(BatchTrialView(self._batch, i, states.shape[1]))
             theta = np.asarray(updated, dtype=np.float64)
-            if theta.shape != self._batch.theta[i].shape:
-                raise SpecificationError(
-                    f"learner '{self._batch.config.learner.name}' returned parameters of shape "
-                    f"{theta.shape}, but {tuple(self._batch.theta[i].shape)} is expected: correct "
-                    f"its update."
-                )
+            check_update(self._batch.config.learner.name, theta, tuple(self._batch.theta[i].shape))
             self._batch.theta[i] = torch.as_tensor(theta).to(self._batch.theta)
 
 
 def _alive(batch: BatchState) -> list[int]:
     diverged: list[bool] = batch.diverged[:, 0].tolist()
     return [i for i, ended in enumerate(diverged) if not ended]
-
-
-def _check(batch: BatchState, chosen: Array, t: int) -> None:
-    system, name = batch.system, batch.config.policy.name
-    if chosen.shape != (system.n_inputs,):
-        raise SpecificationError(
-            f"policy '{name}' chose an input of shape {chosen.shape} at step {t}, but "
-            f"{(system.n_inputs,)} is expected: correct its plan."
-        )
-    norm = float(np.linalg.norm(chosen))
-    if norm > system.gamma * (1 + ROUNDING):
-        raise SpecificationError(
-            f"policy '{name}' chose an input of norm {norm:.6g} at step {t}, but env.gamma is "
-            f"{system.gamma:g}: scale it down."
-        )

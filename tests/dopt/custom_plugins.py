@@ -74,7 +74,7 @@ class Lost(Wild):
 
 @dataclass(frozen=True, kw_only=True)
 class Coin(CustomPolicy):
-    """±γ by chance."""
+    """±γ/√m along each axis, by chance."""
 
     name: ClassVar[str] = "coin"
 
@@ -87,7 +87,95 @@ class CoinPlanner(Planner):
         self._gamma, self._rng = gamma, rng
 
     def choose(self, view: TrialView) -> Array:
-        return self._rng.choice([-self._gamma, self._gamma], size=view.inputs.shape[1])
+        m = view.inputs.shape[1]
+        return self._rng.choice([-self._gamma, self._gamma], size=m) / np.sqrt(m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tampering(CustomPolicy):
+    """Writes into what was observed."""
+
+    name: ClassVar[str] = "tampering"
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return TamperingPlanner()
+
+
+class TamperingPlanner(Planner):
+    def choose(self, view: TrialView) -> Array:
+        view.states[0] = 0.0
+        return view.inputs[-1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Misasking(CustomPolicy):
+    """Asks for the states that follow with one axis too many."""
+
+    name: ClassVar[str] = "misasking"
+
+    of_inputs: bool = False
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return MisaskingPlanner(self.of_inputs)
+
+
+class MisaskingPlanner(Planner):
+    def __init__(self, of_inputs: bool) -> None:
+        self._of_inputs = of_inputs
+
+    def choose(self, view: TrialView) -> Array:
+        x, m = view.states[-1:], view.system.n_inputs
+        if self._of_inputs:
+            return view.following(x[0], np.zeros((1, m + 1)))
+        return view.jacobian(x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InTorch(Coin):
+    """Asks for what a view has on the reference path alone."""
+
+    name: ClassVar[str] = "in_torch"
+    compiled: ClassVar[bool] = False
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:
+        return TorchPlanner(system.gamma, rng)
+
+
+class TorchPlanner(CoinPlanner):
+    def choose(self, view: TrialView) -> Array:
+        assert view.theta.isfinite().all()  # type: ignore[attr-defined]
+        return super().choose(view)
+
+
+ANSWERS: list[dict[str, Array]] = []
+"""What views have answered to the plans of :class:`Asking`, step by step."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asking(CustomPolicy):
+    """Random directions, for which the model is not asked; all that it is asked is kept."""
+
+    name: ClassVar[str] = "asking"
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return AskingPlanner()
+
+
+class AskingPlanner(Planner):
+    def choose(self, view: TrialView) -> Array:
+        x, u = view.states[-1], view.system.gamma * view.tie
+        matrix = view.input_matrix(x)
+        answers = {
+            "predict": view.predict(view.states[::-1]),  # not contiguous
+            "jacobian": view.jacobian(x),
+            "jacobian_change": view.jacobian_change(x, matrix.T),
+            "following": view.following(x, np.array([u, -0.5 * u])),
+            "input_matrix": matrix,
+        }
+        given = ("states", "inputs", "sampled_inputs", "sampled", "accelerations", "parameters")
+        answers |= {name: np.array(getattr(view, name)) for name in given}
+        ANSWERS.append(answers)
+        return u
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from dopt.reference.batch import run_trials
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
+from tests.dopt.custom_plugins import ANSWERS
 from tests.paths import ROOT
 
 HERE = "tests.dopt.custom_plugins"
@@ -34,23 +35,90 @@ def own(name: str, **fields: Any) -> dict[str, Any]:
     return {"_target_": f"{HERE}.{name}", **fields}
 
 
-def test_a_plan_in_numpy_repeats_algorithm_2() -> None:
-    plain = run_trial(specification(policy=own("Copy")))
-    shipped = run_trial(specification(), path="reference")
+PATHS = pytest.mark.parametrize("path", ["kernel", "reference"])
+
+
+@PATHS
+def test_a_plan_in_numpy_repeats_algorithm_2(path: str) -> None:
+    plain = run_trial(specification(policy=own("Copy")), path)
+    shipped = run_trial(specification(), path)
     np.testing.assert_allclose(plain.inputs, shipped.inputs, atol=1e-12)
     np.testing.assert_allclose(plain.loss, shipped.loss, rtol=1e-9)
 
 
-def test_an_update_in_numpy_repeats_adam() -> None:
-    plain = run_trial(specification(learner=own("Descent")))
-    shipped = run_trial(specification(), path="reference")
+@PATHS
+def test_an_update_in_numpy_repeats_adam(path: str) -> None:
+    plain = run_trial(specification(learner=own("Descent")), path)
+    shipped = run_trial(specification(), path)
     np.testing.assert_allclose(plain.states, shipped.states, rtol=1e-9)
     np.testing.assert_allclose(plain.parameters, shipped.parameters, rtol=1e-9)
 
 
+@PATHS
+def test_a_plan_and_an_update_in_numpy_go_together(path: str) -> None:
+    plain = run_trial(specification(policy=own("Copy"), learner=own("Descent")), path)
+    shipped = run_trial(specification(), path)
+    np.testing.assert_allclose(plain.inputs, shipped.inputs, atol=1e-12)
+    np.testing.assert_allclose(plain.parameters, shipped.parameters, rtol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["mlp", "rff", "ensemble"])
+@pytest.mark.parametrize(
+    "env",
+    [
+        {"name": "pendulum"},
+        {"name": "arm", "integrator": "rk4"},
+        {"name": "pendulum", "measured_states": [0], "measurement_noise": [0.01]},
+    ],
+)
+def test_both_paths_answer_the_same(env: dict[str, Any], model: str) -> None:
+    learner = {"mlp": "adam", "ensemble": "gauss_newton"}.get(model, "recursive_least_squares")
+    parts = {"model": {"name": model}, "learner": {"name": learner}}
+    spec = specification(policy=own("Asking"), env={**env, "horizon": 12}, **parts)
+    answered = []
+    for path in ("kernel", "reference"):
+        ANSWERS.clear()
+        run_trial(spec, path)
+        answered.append([dict(answers) for answers in ANSWERS])
+    fast, plain = answered
+    assert len(fast) == len(plain) == 11
+    for one, other in zip(fast, plain, strict=True):
+        for name, values in one.items():
+            assert values.shape == other[name].shape, name
+            np.testing.assert_allclose(values, other[name], rtol=1e-7, atol=1e-9, err_msg=name)
+
+
+def test_a_plan_in_the_kernel_cannot_change_what_was_observed() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        run_trial(specification(policy=own("Tampering")))
+
+
+def test_what_the_model_is_asked_has_the_right_shape() -> None:
+    """Compiled code would read beyond the end of an array."""
+    expected = r"inputs of shape \(1, 2\), but \(N, 1\) is expected"
+    with pytest.raises(SpecificationError, match=expected):
+        run_trial(specification(policy=own("Misasking", of_inputs=True)))
+    with pytest.raises(SpecificationError, match=r"a state of shape \(1, 2\), but \(2,\) is expec"):
+        run_trial(specification(policy=own("Misasking")))
+
+
+def test_the_time_of_a_plan_and_an_update_in_numpy_is_measured() -> None:
+    result = run_trial(specification(policy=own("Copy"), learner=own("Descent")))
+    assert (result.plan_us[1:] > 10.0).all()
+    assert (result.learn_us > 10.0).all()
+
+
+def test_limits_hold_for_a_plan_in_numpy() -> None:
+    limits = {"bounds": {"u": [-0.5, 0.5]}}
+    spec = specification(policy=own("Coin"), limits=limits)
+    for path in ("kernel", "reference"):
+        inputs = run_trial(spec, path).inputs
+        assert np.abs(inputs).max() == 0.5
+
+
 def test_trials_in_lockstep_are_those_run_alone() -> None:
     specs = [specification(seed, policy=own("Coin")) for seed in range(3)]
-    together, alone = run_trials(specs), [run_trial(spec) for spec in specs]
+    together, alone = run_trials(specs), [run_trial(spec, "reference") for spec in specs]
     for one, other in zip(together, alone, strict=True):
         np.testing.assert_allclose(one.states, other.states, rtol=1e-9)
     assert not np.array_equal(alone[0].inputs, alone[1].inputs)
@@ -58,22 +126,24 @@ def test_trials_in_lockstep_are_those_run_alone() -> None:
 
 
 def test_what_the_kernel_lacks_runs_on_the_reference_by_itself() -> None:
-    assert specification().config.path == "kernel"
-    assert specification(policy=own("Coin")).config.path == "reference"
-    assert specification(learner=own("Descent")).config.path == "reference"
-    spec = specification(policy=own("Coin"))
+    assert specification(policy=own("Coin")).config.path == "kernel"
+    assert specification(learner=own("Descent")).config.path == "kernel"
+    spec = specification(policy=own("InTorch"))
+    assert spec.config.path == "reference"
     assert TrialSpec.from_mapping(spec.to_mapping()).trial_key == spec.trial_key
+    assert np.isfinite(run_trial(spec).loss).all()
 
 
 def test_the_kernel_refuses_what_it_lacks() -> None:
-    config = specification(policy=own("Coin")).config
-    with pytest.raises(SpecificationError, match="policy 'coin' is not written for it"):
+    config = specification(policy=own("InTorch")).config
+    with pytest.raises(SpecificationError, match="policy 'in_torch' is not written for it"):
         dataclasses.replace(config, path="kernel")
-    mapping = specification(learner=own("Descent")).to_mapping()
-    with pytest.raises(SpecificationError, match="learner 'descent' is not written for it"):
+    mapping = specification(policy=own("InTorch")).to_mapping()
+    with pytest.raises(SpecificationError, match="policy 'in_torch' is not written for it"):
         TrialSpec.from_mapping(mapping | {"path": "kernel"})
 
 
+@PATHS
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
@@ -81,18 +151,22 @@ def test_the_kernel_refuses_what_it_lacks() -> None:
         ({"size": 2}, r"chose an input of shape \(2,\) at step 1, but \(1,\) is expected"),
     ],
 )
-def test_an_input_out_of_bounds_is_refused(fields: dict[str, Any], sentence: str) -> None:
+def test_an_input_out_of_bounds_is_refused(
+    fields: dict[str, Any], sentence: str, path: str
+) -> None:
     with pytest.raises(SpecificationError, match=sentence):
-        run_trial(specification(policy=own("Wild", **fields)))
+        run_trial(specification(policy=own("Wild", **fields)), path)
 
 
-def test_an_update_of_another_size_is_refused() -> None:
+@PATHS
+def test_an_update_of_another_size_is_refused(path: str) -> None:
     with pytest.raises(SpecificationError, match="learner 'descent' returned parameters of shape"):
-        run_trial(specification(learner=own("Descent", extra=1)))
+        run_trial(specification(learner=own("Descent", extra=1)), path)
 
 
-def test_a_plan_that_gets_lost_ends_its_trial_alone() -> None:
-    result = run_trial(specification(policy=own("Lost")))
+@PATHS
+def test_a_plan_that_gets_lost_ends_its_trial_alone(path: str) -> None:
+    result = run_trial(specification(policy=own("Lost")), path)
     assert result.diverged_at == 5
     assert np.isfinite(result.loss[:5]).all()
     assert np.isnan(result.loss[5:]).all()
@@ -105,13 +179,15 @@ def test_a_config_of_own_parts_is_a_value() -> None:
     assert hash(first) == hash(second)
 
 
-def test_torch_is_loaded_where_a_trial_runs_and_no_sooner() -> None:
+def test_torch_is_loaded_where_a_trial_needs_it_and_no_sooner() -> None:
     """The driver of a grid only makes the specification, and sends it to its workers."""
-    mapping = specification(policy=own("Coin"), learner=own("Descent")).to_mapping()
+    plain = specification(policy=own("Coin"), learner=own("Descent")).to_mapping()
+    in_torch = specification(policy=own("InTorch")).to_mapping()
     program = (
         "import pickle, sys; from dopt.spec.trial import TrialSpec; "
-        f"spec = TrialSpec.from_mapping({mapping!r}); pickle.dumps(spec); spec.trial_key; "
-        "assert 'torch' not in sys.modules; "
-        "from dopt.run import run_trial; run_trial(spec); assert 'torch' in sys.modules"
+        f"plain, in_torch = map(TrialSpec.from_mapping, ({plain!r}, {in_torch!r})); "
+        "[pickle.dumps(spec) for spec in (plain, in_torch)]; in_torch.trial_key; "
+        "from dopt.run import run_trial; run_trial(plain); assert 'torch' not in sys.modules; "
+        "run_trial(in_torch); assert 'torch' in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)

@@ -152,6 +152,19 @@ def test_the_kernel_steps_a_black_box_as_the_reference_does(policy: str) -> None
         np.testing.assert_allclose(together.reachable_loss, alone.reachable_loss, rtol=1e-6)
 
 
+def test_a_plan_and_an_update_in_numpy_explore_a_black_box() -> None:
+    own = {
+        "policy": {"_target_": "tests.dopt.custom_plugins.Coin"},
+        "learner": {"_target_": "tests.dopt.custom_plugins.Descent"},
+    }
+    spec = TrialSpec.from_mapping({**specification(horizon=20).to_mapping(), **own})
+    assert spec.config.path == "kernel"
+    fast, plain = run_trial(spec), run_trial(spec, "reference")
+    assert np.array_equal(fast.inputs, plain.inputs)
+    assert np.array_equal(fast.states, plain.states)
+    np.testing.assert_allclose(fast.parameters, plain.parameters, rtol=1e-9)
+
+
 def test_a_black_box_is_run_again_in_the_kernel() -> None:
     spec = specification(horizon=20)
     np.testing.assert_array_equal(rerun(spec, [0, 20]).parameters[1], run_trial(spec).parameters)

@@ -18,7 +18,10 @@ from tests.paths import EXAMPLE
 
 SHORT: dict[str, object] = {"name": "icem", "lookahead": 10, "hold": 5, "stride": 5, "plans": 12}
 
-CHOICES: list[tuple[str | dict[str, object], str, str]] = [
+COIN: dict[str, object] = {"_target_": "tests.dopt.custom_plugins.Coin"}
+DESCENT: dict[str, object] = {"_target_": "tests.dopt.custom_plugins.Descent"}
+
+CHOICES: list[tuple[str | dict[str, object], str, str | dict[str, object]]] = [
     ("d_optimal", "mlp", "adam_window"),
     ("random", "mlp", "adam_replay"),
     ("uniform", "mlp", "ekf"),
@@ -29,16 +32,17 @@ CHOICES: list[tuple[str | dict[str, object], str, str]] = [
     ("gaussian_process", "gaussian_process", "conditioning"),
     ("d_optimal", "affine", "adam_window"),
     (SHORT, "black_box", "gauss_newton"),
+    (COIN, "mlp", DESCENT),
 ]
 
 
 @pytest.mark.parametrize("path", ["kernel", "reference"])
 @pytest.mark.parametrize(("policy", "model", "learner"), CHOICES)
 def test_fed_the_states_of_a_trial_it_chooses_its_inputs(
-    policy: str | dict[str, object], model: str, learner: str, path: str
+    policy: str | dict[str, object], model: str, learner: str | dict[str, object], path: str
 ) -> None:
     system = dopt.SYSTEMS["quadrotor"](horizon=12)
-    parts = {"model": model, "learner": learner, "seed": 4, "path": path}
+    parts: dict[str, Any] = {"model": model, "learner": learner, "seed": 4, "path": path}
     trial = dopt.run_trial(TrialSpec.of_system(system, policy, **parts))
     explorer = Explorer(system, policy=policy, **parts)
     for x, u, x_next in zip(trial.states, trial.inputs, trial.states[1:], strict=False):
