@@ -1,9 +1,9 @@
 """Quadratic maximisation on a sphere: max uᵀQu - 2vᵀu subject to ‖u‖ = γ (equation 7).
 
-With Q = V diag(λ) Vᵀ, a point is a global maximum if and only if (Q - μI) u = v for a multiplier
-μ ≥ λ_max. In the eigenbasis u_i = -w_i / (s + g_i), with w = Vᵀv, the gaps g_i = λ_max - λ_i ≥ 0
-and s = μ - λ_max ≥ 0 the root of the secular equation ‖u(s)‖ = γ. Newton's method on 1/‖u(s)‖,
-which is nearly linear, is kept inside a bracket. Working in s and not in μ loses no digits when
+With Q = Z diag(ξ) Zᵀ, a point is a global maximum if and only if (Q - μI) u = v for a multiplier
+μ ≥ ξ_max. In the eigenbasis ũ_i = -ṽ_i / (τ + δ_i), with ṽ = Zᵀv, the gaps δ_i = ξ_max - ξ_i ≥ 0
+and τ = μ - ξ_max ≥ 0 the root of the secular equation ‖ũ(τ)‖ = γ. Newton's method on 1/‖ũ(τ)‖,
+which is nearly linear, is kept inside a bracket. Working in τ and not in μ loses no digits when
 the root lies close to the pole. Reference: J. Moré and D. Sorensen, "Computing a trust region
 step", SIAM J. Sci. Stat. Comput. 4 (1983).
 
@@ -84,22 +84,22 @@ def sphere_maximizer(Q: Array, v: Array, radius: float, tie: Array) -> Array:
             # Divided one by one: the inverse of a denormal scale is infinite.
             A[i, j] = 0.5 * radius * (Q[i, j] / divisor / scale + Q[j, i] / divisor / scale)
     values, axes = np.linalg.eigh(A)
-    w, preferred, gaps = np.zeros(m), np.zeros(m), np.zeros(m)
+    rotated, preferred, gaps = np.zeros(m), np.zeros(m), np.zeros(m)
     largest = max(abs(values[0]), abs(values[m - 1]))
     top = 0.0
     for i in range(m):
         for j in range(m):
-            w[i] += axes[j, i] * (v[j] / divisor / scale)
+            rotated[i] += axes[j, i] * (v[j] / divisor / scale)
             preferred[i] += axes[j, i] * tie[j]
         # Eigenvalues that differ from the largest by rounding errors only count as equal to it.
         gaps[i] = values[m - 1] - values[i]
         if gaps[i] <= ROUNDING * m * largest:
             gaps[i] = 0.0
-            top += w[i] * w[i]
+            top += rotated[i] * rotated[i]
     if np.sqrt(top) > TINY:
-        unit = _easy_case(w, gaps, np.sqrt(top))
+        unit = _easy_case(rotated, gaps, np.sqrt(top))
     else:
-        unit = _hard_case(w, gaps, preferred)
+        unit = _hard_case(rotated, gaps, preferred)
     u = np.zeros(m)
     for i in range(m):
         for j in range(m):
@@ -128,46 +128,46 @@ def _largest(Q: Array) -> float:
     return largest
 
 
-def _easy_case(w: Array, gaps: Array, top: float) -> Array:
-    """Return the unit vector -w/(gaps + s), with s the root of the secular equation.
+def _easy_case(rotated: Array, gaps: Array, top: float) -> Array:
+    """Return the unit vector -ṽ/(δ + τ), with τ the root of the secular equation.
 
-    The root lies between ``top``, the norm of w in the eigenspace of the largest eigenvalue, and
-    ‖w‖.
+    ``rotated`` is ṽ and ``gaps`` δ. The root lies between ``top``, the norm of ṽ in the eigenspace of
+    the largest eigenvalue, and ‖ṽ‖.
     """
-    low, high = top, _norm(w)
-    s = low
-    u = np.empty_like(w)
+    low, high = top, _norm(rotated)
+    tau = low
+    u = np.empty_like(rotated)
     for _ in range(NEWTON_STEPS):
         curvature = 0.0
-        for i in range(w.shape[0]):
-            u[i] = -w[i] / (gaps[i] + s)
-            curvature += u[i] * u[i] / (gaps[i] + s)
+        for i in range(rotated.shape[0]):
+            u[i] = -rotated[i] / (gaps[i] + tau)
+            curvature += u[i] * u[i] / (gaps[i] + tau)
         norm = _norm(u)
         if norm >= 1.0:
-            low = s
+            low = tau
         else:
-            high = s
+            high = tau
         step = (norm - 1.0) * norm * norm / curvature
-        if abs(step) <= ROUNDING * s or high <= low:
+        if abs(step) <= ROUNDING * tau or high <= low:
             break
-        s = s + step
-        if not low < s < high:
-            s = 0.5 * (low + high)
+        tau = tau + step
+        if not low < tau < high:
+            tau = 0.5 * (low + high)
     return u
 
 
-def _hard_case(w: Array, gaps: Array, preferred: Array) -> Array:
-    """Return the unit maximiser where w has no part in the top eigenspace.
+def _hard_case(rotated: Array, gaps: Array, preferred: Array) -> Array:
+    """Return the unit maximiser where ṽ has no part in the top eigenspace.
 
-    Either the root s is positive all the same, or s = 0 and the missing length goes along the top
+    Either the root τ is positive all the same, or τ = 0 and the missing length goes along the top
     eigenspace, in the direction of ``preferred``.
     """
-    m = w.shape[0]
+    m = rotated.shape[0]
     inside, u, along = np.zeros(m), np.zeros(m), np.zeros(m)
     for i in range(m):
         if gaps[i] > 0.0:
-            inside[i] = w[i]
-            u[i] = -w[i] / gaps[i]
+            inside[i] = rotated[i]
+            u[i] = -rotated[i] / gaps[i]
         else:
             along[i] = preferred[i]
     norm = _norm(u)

@@ -23,7 +23,8 @@ class AtEigenfrequency(OpenLoop):
     ----------
     frequency : float or None
         Angular frequency ω [rad/s]; None takes the damped eigenfrequency of the least damped
-        oscillation about the stable equilibrium.
+        oscillation about the stable equilibrium. A system without such an oscillation, with one
+        input, needs it.
     """
 
     frequency: float | None = parameter(None, "rad/s", "positive")
@@ -33,19 +34,31 @@ class AtEigenfrequency(OpenLoop):
         """Return the values, (T,), between -1 and 1, at phases, (T,) [rad]."""
 
     def check(self, system: System) -> None:
-        if eigenmode(system) is None:
+        if self._wave_of(system) is None:
+            ways = "choose another policy"
+            if system.n_inputs == 1:
+                ways = f"set policy.frequency, or {ways}"
             raise IncompatibleError(
                 f"policy '{self.name}' needs an eigenmode, but env '{system.name}' with these "
-                f"parameters has no oscillation about a stable equilibrium: choose another policy."
+                f"parameters has no oscillation about a stable equilibrium: {ways}."
             )
 
-    def inputs(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
+    def _wave_of(self, system: System) -> tuple[float, Array] | None:
+        """Return ω and e, (m,), if they are known."""
         mode = eigenmode(system)
-        assert mode is not None, "check() is called before"
-        frequency = mode.frequency if self.frequency is None else self.frequency
+        if mode is not None:
+            return mode.frequency if self.frequency is None else self.frequency, mode.direction
+        if self.frequency is not None and system.n_inputs == 1:
+            return self.frequency, np.ones(1)
+        return None
+
+    def inputs(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
+        known = self._wave_of(system)
+        assert known is not None, "check() is called before"
+        frequency, direction = known
         times = system.dt * np.arange(system.horizon)
         phase = np.asarray(frequency * times, np.float64)
-        inputs: Array = system.gamma * self.wave(phase)[:, None] * mode.direction
+        inputs: Array = system.gamma * self.wave(phase)[:, None] * direction
         return inputs
 
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES
 from dopt.policies.base import OpenLoop
 from dopt.randomness import draw
@@ -93,6 +93,15 @@ def test_a_periodic_input_takes_another_frequency() -> None:
     u = open_loop("pendulum", "periodic", 1_000, frequency=5.0)
     times = 0.02 * np.arange(1_000)
     assert np.abs(u[:, 0]) == pytest.approx(np.abs(3.0 * np.sin(5.0 * times)), abs=1e-12)
+
+
+def test_a_system_without_an_oscillation_takes_a_frequency() -> None:
+    damped, policy = {"horizon": 50, "friction": 10.0}, {"frequency": 5.0}
+    u = draw(trial("pendulum", "periodic", env=damped, policy=policy)).inputs
+    times = 0.02 * np.arange(50)
+    assert u[:, 0] == pytest.approx(2.0 * np.sin(5.0 * times), abs=1e-12)
+    with pytest.raises(IncompatibleError, match=r"set policy\.frequency, or choose another policy"):
+        trial("pendulum", "periodic", env=damped)
 
 
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm"])
