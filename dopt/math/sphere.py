@@ -131,8 +131,8 @@ def _largest(Q: Array) -> float:
 def _easy_case(rotated: Array, gaps: Array, top: float) -> Array:
     """Return the unit vector -ṽ/(δ + τ), with τ the root of the secular equation.
 
-    ``rotated`` is ṽ and ``gaps`` δ. The root lies between ``top``, the norm of ṽ in the eigenspace of
-    the largest eigenvalue, and ‖ṽ‖.
+    ``rotated`` is ṽ and ``gaps`` δ. The root lies between ``top``, the norm of ṽ in the eigenspace
+    of the largest eigenvalue, and ‖ṽ‖.
     """
     low, high = top, _norm(rotated)
     tau = low
