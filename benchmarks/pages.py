@@ -24,7 +24,7 @@ from orchestrate.store import NoDatabaseError, Reader
 SEEDS = 2_120
 """With 19 configurations of 500 steps, twenty million rows."""
 
-LISTS = ("/", "/trials", "/trials?env=cartpole&sort=final_loss", "/api/progress")
+LISTS = ("/", "/trials", "/trials?env=cartpole&sort=final_loss", "/api/grid")
 CURVES = ("/api/curves?env=pendulum", "/api/curves?env=quadrotor", "/compare?env=pendulum")
 LIST_SECONDS, CURVE_SECONDS = 1.0, 2.0
 STEPS = "SELECT count(*) FROM step"

@@ -16,6 +16,7 @@ COLUMNS = ["env", "model", "policy"]
 TABLE = pd.read_csv(DOCS / "yardsticks/flex_table1.csv")
 TRIALS = pd.read_csv(DOCS / "yardsticks/flex_table1_trials.csv")
 ROWS = TABLE.set_index(COLUMNS).sort_index()
+N = int(ROWS.n.iloc[0])
 PENDULUM, LINEAR, CARTPOLE = ("pendulum", "mlp"), ("pendulum", "linear"), ("cartpole", "mlp")
 TIMES = pd.read_csv(DOCS / "pareto/figure6_pareto.csv").set_index(["env", "label"]).us_per_step
 
@@ -42,10 +43,9 @@ def test_the_tables_of_the_page_are_those_of_the_command() -> None:
 def test_the_rows_follow_from_the_trials() -> None:
     found = tabulate(TRIALS).set_index(COLUMNS).sort_index()
     assert found.to_numpy(float) == pytest.approx(ROWS.to_numpy(float), rel=1e-9, nan_ok=True)
-    n = int(ROWS.n.iloc[0])
-    assert f"{n} paired seeds" in WORDS
+    assert f"{N} paired seeds" in WORDS
     for _, part in TRIALS.groupby(COLUMNS):
-        assert sorted(part.seed) == list(range(100, 100 + n))
+        assert sorted(part.seed) == list(range(100, 100 + N))
 
 
 def test_the_sentences_name_the_numbers_of_the_table() -> None:
@@ -59,16 +59,16 @@ def test_the_sentences_name_the_numbers_of_the_table() -> None:
     assert (
         f"does not hold: {shown(PENDULUM, 'random')}, and {solved(PENDULUM, 'random')} of" in WORDS
     )
-    assert f"up to 1,000: {20 - solved(CARTPOLE, 'random')} of 20 trials are not" in WORDS
+    assert f"up to 1,000: {N - solved(CARTPOLE, 'random')} of {N} trials are not" in WORDS
     assert f"| {shown(LINEAR, 'd_optimal')} with a model of its kind, and so do random" in WORDS
     best = f"{shown(PENDULUM, 'uniform')}, fewer on {beside_random(PENDULUM, 'uniform')}"
     assert f"random inputs: {best}." in WORDS
     held = (
-        f"{solved(CARTPOLE, 'random_held')} of 20 trials are solved at the end, fewer samples on "
+        f"{solved(CARTPOLE, 'random_held')} of {N} trials are solved at the end, fewer samples on "
     )
     assert held + beside_random(CARTPOLE, "random_held") in WORDS
-    first = 20 - ROWS.first_unsolved[(*CARTPOLE, "uniform")]
-    assert f"{first} of 20 models of `uniform`" in WORDS
+    first = N - ROWS.first_unsolved[(*CARTPOLE, "uniform")]
+    assert f"{first} of {N} models of `uniform`" in WORDS
     assert f"at some time, and {solved(CARTPOLE, 'uniform')} at the end" in WORDS
 
 
