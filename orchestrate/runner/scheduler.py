@@ -108,7 +108,7 @@ class Scheduler:
         while not self.ending and self.executor.pending < self._window:
             self.chunks.pending = self.executor.pending
             tasks = self.chunks.next() if len(self.chunks) else []
-            # A trial that was taken away and waits again may still run here: its result comes first.
+            # A trial that was taken away and waits again may still run here: first its result.
             tasks = [task for task in tasks if task.key not in self._running]
             if not tasks:
                 return
