@@ -113,14 +113,14 @@ class Misasking(CustomPolicy):
 
     name: ClassVar[str] = "misasking"
 
-    of_inputs: bool = False
+    of_inputs: int = 0
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
         return MisaskingPlanner(self.of_inputs)
 
 
 class MisaskingPlanner(Planner):
-    def __init__(self, of_inputs: bool) -> None:
+    def __init__(self, of_inputs: int) -> None:
         self._of_inputs = of_inputs
 
     def choose(self, view: TrialView) -> Array:

@@ -97,7 +97,7 @@ def test_what_the_model_is_asked_has_the_right_shape() -> None:
     """Compiled code would read beyond the end of an array."""
     expected = r"inputs of shape \(1, 2\), but \(N, 1\) is expected"
     with pytest.raises(SpecificationError, match=expected):
-        run_trial(specification(policy=own("Misasking", of_inputs=True)))
+        run_trial(specification(policy=own("Misasking", of_inputs=1)))
     with pytest.raises(SpecificationError, match=r"a state of shape \(1, 2\), but \(2,\) is expec"):
         run_trial(specification(policy=own("Misasking")))
 

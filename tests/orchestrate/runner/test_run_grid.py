@@ -158,13 +158,15 @@ def test_nothing_is_made_for_a_wrong_grid(launches: Launches) -> None:
         Reader.open(launches.url)
 
 
-@pytest.mark.parametrize(("policies", "prepared"), [(("coin",), 0), (("coin", "random"), 1)])
+@pytest.mark.parametrize(
+    ("policies", "prepared"), [(("in_torch",), 0), (("in_torch", "random"), 1)]
+)
 def test_the_kernel_is_made_ready_where_a_trial_needs_it(
     tmp_path: Path, policies: tuple[str, ...], prepared: int
 ) -> None:
     calls: list[None] = []
     sections = {
-        "coin": {"_target_": "tests.dopt.custom_plugins.Coin"},
+        "in_torch": {"_target_": "tests.dopt.custom_plugins.InTorch"},
         "random": {"name": "random"},
     }
     usual = specification().to_mapping()
