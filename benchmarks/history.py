@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 
-from benchmarks.machine import describe
+from benchmarks.machine import describe, processor
 from benchmarks.processes import ROOT
 from benchmarks.rows import Row
 
@@ -18,7 +18,10 @@ FEWEST = 3
 """Runs of a row before its median says anything."""
 
 SLOWER = 1.5
-"""Times the median at which a row counts as slower."""
+"""Times the median on the same kind of processor at which a row counts as slower."""
+
+SLOWER_ELSEWHERE = 3.0
+"""The same beside runs of other processors: vector units made rows differ by 1.7 beside the loop."""
 
 TIMES = frozenset({"µs", "ms", "s", "min"})
 
@@ -48,18 +51,22 @@ class Timing:
 
 @dataclass(frozen=True)
 class Run:
-    """Rows of one run of the benchmarks, by question and what was measured."""
+    """Rows of one run of the benchmarks, by question and what was measured.
+
+    ``processor`` is empty where it is not known.
+    """
 
     date: str
     commit: str
     machine: str
+    processor: str = ""
     rows: dict[str, Timing] = field(default_factory=dict)
 
     @classmethod
     def now(cls) -> Run:
         """Return a run that has no rows yet."""
         date = datetime.now(UTC).isoformat(timespec="seconds")
-        return cls(date, _commit(), " ".join(describe()))
+        return cls(date, _commit(), " ".join(describe()), processor())
 
     def add(self, question: str, rows: Sequence[Row], calibration: float) -> None:
         """Take in those rows of a question that are times or rates."""
@@ -76,9 +83,11 @@ class Slower:
     name: str
     times: float
     runs: int
+    elsewhere: bool
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.times:.2f} times the median of {self.runs} runs"
+        where = " on other processors" if self.elsewhere else ""
+        return f"{self.name}: {self.times:.2f} times the median of {self.runs} runs{where}"
 
 
 def append(path: Path, run: Run) -> None:
@@ -109,15 +118,22 @@ def costs(runs: Sequence[Run]) -> Mapping[str, list[float]]:
     return found
 
 
-def slower(runs: Sequence[Run], run: Run, limit: float = SLOWER) -> list[Slower]:
-    """Return the rows of a run that take so many times the median of earlier ones, or longer."""
-    known = {name: past for name, past in costs(runs).items() if len(past) >= FEWEST}
-    ratios = [
-        Slower(name, timing.cost / median(known[name]), len(known[name]))
-        for name, timing in run.rows.items()
-        if name in known
-    ]
-    return [row for row in ratios if row.times >= limit]
+def slower(runs: Sequence[Run], run: Run) -> list[Slower]:
+    """Return the rows of a run that take too many times the median of earlier ones.
+
+    A row is compared with runs on the same kind of processor, or with all where these are too few.
+    """
+    here = costs([past for past in runs if past.processor == run.processor])
+    anywhere, found = costs(runs), []
+    for name, timing in run.rows.items():
+        elsewhere = len(here.get(name, ())) < FEWEST
+        past = (anywhere if elsewhere else here).get(name, ())
+        if len(past) < FEWEST:
+            continue
+        row = Slower(name, timing.cost / median(past), len(past), elsewhere)
+        if row.times >= (SLOWER_ELSEWHERE if elsewhere else SLOWER):
+            found.append(row)
+    return found
 
 
 def _run(path: Path, number: int, line: str) -> Run:

@@ -16,20 +16,24 @@ def describe() -> list[str]:
     load = os.getloadavg()[0]
     found = [f"{name} {version}" for name in LIBRARIES if (version := _version(name))]
     return [
-        f"machine: {_processor()}, {cores} cores, {platform.system()} {platform.release()}, "
+        f"machine: {processor()}, {cores} cores, {platform.system()} {platform.release()}, "
         f"load {load:.1f} before the start",
         f"versions: Python {platform.python_version()}, {', '.join(found)}",
     ]
 
 
-def _processor() -> str:
-    """Return the name of the processor as the kernel knows it."""
+def processor() -> str:
+    """Return the name of the processor as the kernel knows it, with what tells generations apart."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.machine()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+    pairs = [line.partition(":") for line in lines]
+    known = {key.strip(): value.strip() for key, _, value in reversed(pairs)}
+    if "model name" not in known:
+        return platform.machine()
+    family, model = known.get("cpu family", "?"), known.get("model", "?")
+    return f"{known['model name']} (family {family}, model {model})"
 
 
 def _version(name: str) -> str | None:

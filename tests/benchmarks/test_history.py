@@ -8,15 +8,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks import calibration
+from benchmarks import calibration, history
 from benchmarks.cli import main
 from benchmarks.history import FEWEST, Run, append, costs, read, slower
 from benchmarks.rows import Row
 from tests.paths import ROOT
 
 
-def run(value: float, unit_seconds: float = 0.01, unit: str = "µs") -> Run:
-    made = Run("2026-01-01T00:00:00+00:00", "abc", "a machine")
+def run(
+    value: float, unit_seconds: float = 0.01, unit: str = "µs", processor: str = "usual"
+) -> Run:
+    made = Run("2026-01-01T00:00:00+00:00", "abc", "a machine", processor)
     made.add("step", [Row("D-optimal", value, unit)], unit_seconds)
     return made
 
@@ -63,6 +65,17 @@ def test_a_slow_machine_is_not_a_slow_row(past: Path) -> None:
     assert slower(read(past), run(100.0, unit_seconds=0.005))
 
 
+def test_another_processor_has_a_wider_limit_until_it_has_a_history(past: Path) -> None:
+    runs = read(past)
+    assert not slower(runs, run(290.0, processor="other"))
+    (found,) = slower(runs, run(310.0, processor="other"))
+    assert str(found) == "step: D-optimal: 3.10 times the median of 3 runs on other processors"
+    runs += [run(200.0, processor="other")] * FEWEST
+    assert not slower(runs, run(290.0, processor="other"))
+    assert slower(runs, run(310.0, processor="other"))
+    assert slower(runs, run(160.0))
+
+
 def test_two_runs_are_no_median(past: Path) -> None:
     assert not slower(read(past)[:2], run(1000.0))
 
@@ -79,6 +92,7 @@ def test_the_command_fails_where_a_row_became_slower(
     monkeypatch.setattr(calibration, "seconds", lambda: 0.01)
     arguments = ["--only", "step", "--history", str(tmp_path / "history.jsonl")]
     arguments += ["--against", str(past)]
+    monkeypatch.setattr(history, "processor", lambda: "usual")
     for value, status in ((101.0, 0), (170.0, 1)):
         rows = [Row("D-optimal", value, "µs")]
         module = SimpleNamespace(measure=lambda _, rows=rows: rows)
