@@ -21,7 +21,7 @@ SLOWER = 1.5
 """Times the median on the same kind of processor at which a row counts as slower."""
 
 SLOWER_ELSEWHERE = 3.0
-"""The same beside runs of other processors: vector units made rows differ by 1.7 beside the loop."""
+"""The same beside runs on other processors, whose vector units made a row differ by 1.7."""
 
 TIMES = frozenset({"µs", "ms", "s", "min"})
 

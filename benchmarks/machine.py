@@ -23,7 +23,7 @@ def describe() -> list[str]:
 
 
 def processor() -> str:
-    """Return the name of the processor as the kernel knows it, with what tells generations apart."""
+    """Return the name of the processor as the kernel knows it, with its generation."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
