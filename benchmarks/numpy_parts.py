@@ -28,7 +28,7 @@ class Directions(CustomPolicy):
 
     name: ClassVar[str] = "directions"
 
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002  # view.tie
         return DirectionPlanner()
 
 
@@ -43,7 +43,7 @@ class Gradient(CustomLearner):
 
     name: ClassVar[str] = "gradient_step"
 
-    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
+    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002  # not random
         return GradientUpdater()
 
 

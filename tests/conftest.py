@@ -22,15 +22,11 @@ import signal  # noqa: E402
 import uuid  # noqa: E402
 from collections.abc import Iterator  # noqa: E402
 from pathlib import Path  # noqa: E402
-from typing import TYPE_CHECKING  # noqa: E402
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 from sqlalchemy import Engine, create_engine, text  # noqa: E402
 from sqlalchemy.exc import OperationalError  # noqa: E402
-
-if TYPE_CHECKING:
-    from tests.orchestrate.faults.servers import Server
 
 # As from a terminal: a shell starts what runs in its background with Ctrl-C ignored, and programs
 # that the tests start and interrupt would inherit that.
@@ -54,10 +50,9 @@ if os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MEMORY_BYTES:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each file to one worker, and start first what takes minutes.
+    """Start first what one worker runs for minutes, so that none is left alone at the end.
 
-    What a file shares is then made once, and not by each worker. First comes what is marked as
-    long, then every group that files have named, so that no worker is left alone at the end.
+    That is what is marked as long, then every group that has to stay in one worker.
     """
     items.sort(
         key=lambda item: (
@@ -65,9 +60,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.get_closest_marker("xdist_group") is None,
         )
     )
-    for item in items:
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
 
 
 def pytest_collection_finish() -> None:
@@ -85,28 +77,21 @@ def sqlite_url(tmp_path: Path) -> str:
 
 
 @pytest.fixture(scope="session")
-def own_server() -> Iterator[Server | None]:
-    """Server that does not wait for the disk; None where one is named, or none can be started."""
+def server_url() -> Iterator[str]:
+    """URL of the server that is named, or of one of our own, which does not wait for the disk."""
     from tests.orchestrate.faults.servers import Server, binaries
 
+    named = os.environ.get("DOPT_TEST_POSTGRES")
     try:
         binaries()
     except FileNotFoundError:
-        yield None
-        return
-    if os.environ.get("DOPT_TEST_POSTGRES"):
-        yield None
+        named = named or RUNNING_SERVER
+    if named:
+        yield named
         return
     server = Server()
-    yield server
+    yield server.url
     server.remove()
-
-
-@pytest.fixture(scope="session")
-def server_url(own_server: Server | None) -> str:
-    if own_server:
-        return own_server.url
-    return os.environ.get("DOPT_TEST_POSTGRES") or RUNNING_SERVER
 
 
 @pytest.fixture(scope="session")
@@ -121,15 +106,14 @@ def server(server_url: str) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def postgresql_url(server: Engine, server_url: str, own_server: Server | None) -> Iterator[str]:
-    """URL of a new schema; our own server is deleted with all schemas."""
+def postgresql_url(server: Engine, server_url: str) -> Iterator[str]:
+    """URL of a new schema on the server, dropped afterwards."""
     schema = f"test_{uuid.uuid4().hex}"
     with server.begin() as connection:
         connection.execute(text(f"CREATE SCHEMA {schema}"))
     yield f"{server_url}?options=-csearch_path%3D{schema}"
-    if own_server is None:
-        with server.begin() as connection:
-            connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
+    with server.begin() as connection:
+        connection.execute(text(f"DROP SCHEMA {schema} CASCADE"))
 
 
 def _no_server(reason: str) -> None:

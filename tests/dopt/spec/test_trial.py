@@ -205,7 +205,10 @@ def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
     with pytest.raises(IncompatibleError) as caught:
         TrialSpec.from_mapping(mapping)
     assert isinstance(caught.value, SpecificationError)
-    assert str(caught.value).endswith((": change one of them.", " choose another policy."))
+    ends = (": change one of them.", ": choose another policy.")
+    if env == "pendulum" and policy == "periodic":
+        ends = (": set policy.frequency, or choose another policy.",)
+    assert str(caught.value).endswith(ends)
 
 
 @pytest.mark.parametrize(

@@ -78,9 +78,7 @@ class Server:
 
     def _options(self) -> str:
         # Without fsync a power failure would cost data, the death of the server does not.
-        off = ("fsync", "synchronous_commit", "full_page_writes", "autovacuum")
-        settings = {"listen_addresses": "127.0.0.1", "max_connections": "60"}
-        settings |= dict.fromkeys(off, "off")
+        settings = {"listen_addresses": "127.0.0.1", "fsync": "off", "max_connections": "60"}
         words = [f"-c {key}={value}" for key, value in settings.items()]
         return " ".join([f"-p {self.port}", f"-k {self.folder}", *words])
 
