@@ -49,8 +49,9 @@ class EvaluationSet:
 def evaluation_set(system: System) -> EvaluationSet:
     """Return the points of a system; a function of its parameters alone.
 
-    Of a black box they are held-out transitions: in place of the grid those under random inputs,
-    in place of the reachable set those under square waves and a chirp.
+    Of a black box they are held-out transitions: in place of the reachable set those under square
+    waves and a chirp, and in place of the grid those under random inputs, unless the black box
+    tells the truth there.
     """
     if isinstance(system, BlackBox):
         return _held_out(system)
@@ -70,9 +71,14 @@ def _in_ball(system: System, n: int) -> Array:
 
 
 def _held_out(system: BlackBox) -> EvaluationSet:
-    """Return transitions of runs that no trial sees, with fixed seeds."""
+    """Return transitions of runs that no trial sees, with fixed seeds, or the truth on the grid."""
     rng = np.random.default_rng(_SEED)
-    grid = random_transitions(system, math.prod(system.grid_points), rng)
+    states = system.grid()
+    inputs = _in_ball(system, len(states))
+    truth = system.true_accelerations(states, inputs)
+    grid = (
+        random_transitions(system, len(states), rng) if truth is None else (states, inputs, truth)
+    )
     waves = _sampled(system, _waves(system), REACHABLE_POINTS, rng)
     states, inputs, accelerations = (
         np.concatenate(parts) for parts in zip(grid, waves, strict=True)

@@ -44,20 +44,30 @@ def uniform_samples(spec: TrialSpec) -> Samples:
     State components without an axis in the grid are zero, as they are there. Of a system that
     changes, the accelerations are those of the last step, by which the final loss is judged.
 
-    A black box cannot be put into a state. Its samples are transitions under random inputs, as
-    those of its loss are, from runs of other inputs; there may be fewer.
+    Of a black box that tells the truth at any state, the samples are that, without noise. Of others
+    they are transitions under random inputs, as those of its loss are, from runs of other inputs;
+    there may be fewer.
     """
     system, rng = spec.system, stream(spec.seed, "uniform_states")
+    states, inputs = _uniform_points(system, rng)
     if isinstance(system, BlackBox):
+        truth = system.true_accelerations(states, inputs)
+        if truth is not None:
+            return Samples(states, inputs, truth)
+        rng = stream(spec.seed, "uniform_states")
         return Samples(*random_transitions(system, system.horizon, rng))
+    noise = process_noise(system, spec.seed)[:, list(system.learned_rows)] / system.dt
+    accelerations = system.learned(states, system.horizon - 1, inputs)
+    return Samples(states, inputs, accelerations + noise)
+
+
+def _uniform_points(system: System, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return as many states, (N, d), and inputs, (N, m), as a trial has steps."""
     states = np.zeros((system.horizon, system.n_states))
     for index, (low, high) in system.grid_box().items():
         states[:, index] = rng.uniform(low, high, system.horizon)
-    noise = process_noise(system, spec.seed)[:, list(system.learned_rows)] / system.dt
     draws = rng.standard_normal((system.horizon, system.n_inputs))
-    inputs = on_sphere(draws, system.gamma)
-    accelerations = system.learned(states, system.horizon - 1, inputs)
-    return Samples(states, inputs, accelerations + noise)
+    return states, on_sphere(draws, system.gamma)
 
 
 def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:

@@ -31,6 +31,7 @@ ONLY_IN = {
     "torch": ("dopt/reference/", "orchestrate/executors/lockstep.py"),
     "numba": ("dopt/kernel/",),
     "gymnasium": ("dopt/gymnasium/",),
+    "mujoco": ("dopt/systems/mujoco/",),
     "mlflow": ("orchestrate/export/trackers/",),
     "wandb": ("orchestrate/export/trackers/",),
     "matplotlib": (

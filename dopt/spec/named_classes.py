@@ -12,10 +12,10 @@ from dopt.learning import LEARNERS
 from dopt.limits import LIMITS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
-from dopt.systems import SYSTEMS
+from dopt.systems import NAMED_SYSTEMS
 
 REGISTRIES: Mapping[str, Mapping[str, type[Validated]]] = {
-    "env": SYSTEMS,
+    "env": NAMED_SYSTEMS,
     "policy": POLICIES,
     "model": MODELS,
     "learner": LEARNERS,

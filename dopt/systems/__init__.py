@@ -8,6 +8,7 @@ from dopt.declare.registry import TARGET, build
 from dopt.systems import plant
 from dopt.systems.arm import Arm
 from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
 from dopt.systems.car import Car
 from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
 from dopt.systems.chain import Chain
@@ -17,6 +18,12 @@ from dopt.systems.drone import Drone
 from dopt.systems.features import Feature
 from dopt.systems.mass_spring import MassSpring
 from dopt.systems.moving_star import MovingStar
+from dopt.systems.mujoco import (
+    MuJoCoAcrobot,
+    MuJoCoCartpole,
+    MuJoCoPendulum,
+    MuJoCoReacher,
+)
 from dopt.systems.pendulum import Pendulum, PendulumUnknownGain
 from dopt.systems.quadrotor import Quadrotor
 from dopt.systems.unbalanced_disk import UnbalancedDisk
@@ -42,16 +49,27 @@ SYSTEMS: dict[str, type[System]] = {
         Drone,
     )
 }
+"""Systems that are given by equations."""
+
+SIMULATORS: dict[str, type[BlackBox]] = {
+    system.name: system for system in (MuJoCoPendulum, MuJoCoCartpole, MuJoCoAcrobot, MuJoCoReacher)
+}
+"""Models of other simulators."""
+
+NAMED_SYSTEMS: dict[str, type[System]] = {**SYSTEMS, **SIMULATORS}
+"""Systems that a configuration section names."""
 
 
 def system_from_mapping(section: Mapping[str, object]) -> System:
     """Return the system that a configuration section describes: ``name`` plus its fields."""
     if section.get("name") == plant.NAME and TARGET not in section:
         return plant.Plant.from_section(section)
-    return build("env", SYSTEMS, section)
+    return build("env", NAMED_SYSTEMS, section)
 
 
 __all__ = [
+    "NAMED_SYSTEMS",
+    "SIMULATORS",
     "SYSTEMS",
     "Arm",
     "Car",

@@ -47,10 +47,12 @@ class BlackBox(System):
     with ``compiled = False`` the steps are those of the reference. Where ``measured`` is true it is
     explored by what somebody tells of it (:class:`dopt.Explorer`), and no episode of it is begun.
 
-    The truth at a state of one's choice is unknown, so that the loss is the root mean square error
+    Where the truth at a state of one's choice is unknown, the loss is the root mean square error
     of the modelled accelerations over transitions of runs of its own, which no trial sees: under
     random inputs for the loss, at most as many as the product of ``grid_points``, and under square
-    waves and a chirp for the reachable loss (:func:`dopt.evaluation.evaluation_set`).
+    waves and a chirp for the reachable loss (:func:`dopt.evaluation.evaluation_set`). A simulator
+    that can be put into a state tells the truth (:meth:`true_accelerations`), and the loss is that
+    over the grid.
     """
 
     compiled: ClassVar[bool] = True
@@ -83,6 +85,14 @@ class BlackBox(System):
     @abstractmethod
     def episode(self, seed: int) -> Episode:
         """Start a run; the seed decides about all that is random in it."""
+
+    def true_accelerations(self, states: Array, inputs: Array) -> Array | None:  # noqa: ARG002  # of most, nothing is known
+        """Return the accelerations, (N, r), at states (N, d) under inputs (N, m).
+
+        They are those that a step from there would show, less the known part; None if they cannot
+        be had.
+        """
+        return None
 
     @staticmethod
     def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:  # noqa: ARG004

@@ -1,0 +1,166 @@
+"""A model of the physics engine MuJoCo, explored as a black box whose truth is known."""
+
+from __future__ import annotations
+
+import functools
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from dopt.declare.validated_fields import parameter
+from dopt.errors import SpecificationError
+from dopt.systems.base import Array
+from dopt.systems.black_box import BlackBox, Episode
+
+if TYPE_CHECKING:
+    import mujoco
+
+MISSING = "needs MuJoCo, which is not installed: pip install 'dopt[mujoco]'."
+
+UNLIMITED = 1e10
+"""Range of an actuator that has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MuJoCo(BlackBox):
+    """A model of MuJoCo whose joints slide or turn about one axis.
+
+    State: the n positions of the joints, then their n velocities, in the units of the engine.
+    Input: the controls of the actuators, cut to their ranges. Learned: the n accelerations with all
+    effects of the inputs; known: that a position changes by its velocity.
+
+    An acceleration is the change of a velocity over one step of the engine, divided by dt. It is
+    what a trial observes, and the truth at a state of one's choice. The acceleration that
+    ``mj_forward`` gives is that at the beginning of the step: it differs where the engine's
+    integrator takes damping implicitly, and where a joint meets its limit within the step.
+
+    A subclass declares names, learned rows, features and the known part as every system does, the
+    positions at which a trial starts, and :meth:`load`. ``dt`` has to be the time step of the
+    model, and γ within the ranges of its actuators.
+
+    Attributes
+    ----------
+    start : tuple of float
+        Positions of the joints about which a trial starts, (n,).
+    rate_unit : float
+        Unit of the velocities in that of the engine, chosen so that the accelerations are of a size
+        that a network learns (:data:`dopt.spec.scale_check.LARGEST`).
+
+    Parameters
+    ----------
+    start_spread : float
+        Standard deviation of the positions at the start, which the seed draws; velocities are 0.
+    """
+
+    reads_inputs: ClassVar[bool] = True
+    start: ClassVar[tuple[float, ...]]
+    rate_unit: ClassVar[float] = 1.0
+
+    start_spread: float = parameter(0.01, bound="nonnegative")
+
+    @classmethod
+    @abstractmethod
+    def load(cls) -> mujoco.MjModel:
+        """Return the model."""
+
+    def episode(self, seed: int) -> Episode:
+        """Start a run; see :class:`BlackBox`.
+
+        Raises
+        ------
+        SpecificationError
+            If MuJoCo is not installed, or the model is not what was declared.
+        """
+        drawn = np.random.default_rng(seed).standard_normal(self.n_states // 2)
+        positions = np.array(self.start) + self.start_spread * drawn
+        return Run(_checked_model(self), positions, self.rate_unit)
+
+    def true_accelerations(self, states: Array, inputs: Array) -> Array:
+        run = Run(_checked_model(self), np.array(self.start), self.rate_unit)
+        rates = states[:, self.n_states // 2 :]
+        following = [run.step_from(x, u) for x, u in zip(states, inputs, strict=True)]
+        accelerations: Array = (np.array(following) - rates) / self.dt
+        return accelerations
+
+
+class Run:
+    """A run of a model from positions of its joints, (n,), at rest."""
+
+    def __init__(self, model: mujoco.MjModel, positions: Array, rate_unit: float) -> None:
+        import mujoco
+
+        self._model, self._data = model, mujoco.MjData(model)
+        self._advance, self._reset = mujoco.mj_step, mujoco.mj_resetData
+        low, high = _range_of_controls(model)
+        self._low, self._high = low, high
+        self._control, self._rate_unit = self._data.ctrl, rate_unit
+        self._positions, self._velocities = self._data.qpos, self._data.qvel
+        kinds = mujoco.mjtWarning
+        bad = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
+        self._warnings = [self._data.warning[kind] for kind in bad]
+        self._positions[:] = positions
+
+    @property
+    def state(self) -> Array:
+        """State, (2 n,); NaN once the engine has reset itself because of numbers that explode."""
+        if any(warning.number for warning in self._warnings):
+            return np.full(2 * len(self._velocities), np.nan)
+        return np.concatenate([self._positions, self._velocities / self._rate_unit])
+
+    def step(self, inputs: Array) -> Array:
+        """Apply an input, (m,), within the ranges of the actuators, and return it."""
+        applied: Array = np.clip(inputs, self._low, self._high)
+        self._control[:] = applied
+        self._advance(self._model, self._data)
+        return applied
+
+    def step_from(self, state: Array, inputs: Array) -> Array:
+        """Apply an input, (m,), at a state, (2 n,), and return the velocities that follow, (n,).
+
+        What happened before makes no difference.
+        """
+        self._reset(self._model, self._data)
+        n = len(self._velocities)
+        self._positions[:], self._velocities[:] = state[:n], self._rate_unit * state[n:]
+        self.step(inputs)
+        return self.state[n:]
+
+
+@functools.lru_cache(maxsize=16)
+def _checked_model(system: MuJoCo) -> mujoco.MjModel:
+    """Return the model of a system, or raise SpecificationError if it is not as declared."""
+    try:
+        model = type(system).load()
+    except ModuleNotFoundError as error:
+        raise SpecificationError(f"env '{system.name}' {MISSING}") from error
+    n, name = system.n_states // 2, system.name
+    if (model.nq, model.nv, model.nu) != (n, n, system.n_inputs) or system.n_states != 2 * n:
+        raise SpecificationError(
+            f"the model of env '{name}' has {model.nq} positions, {model.nv} velocities and "
+            f"{model.nu} actuators, but {system.n_states} states and {system.n_inputs} inputs are "
+            f"declared: declare each position, then each velocity, of joints that slide or turn "
+            f"about one axis."
+        )
+    if not math.isclose(model.opt.timestep, system.dt, rel_tol=1e-6):
+        raise SpecificationError(
+            f"env.dt is {system.dt:g} s, but a step of the model of '{name}' takes "
+            f"{model.opt.timestep:g} s: set env.dt to that."
+        )
+    low, high = _range_of_controls(model)
+    bound = float(np.min([-low, high]))
+    if system.gamma > bound * (1 + 1e-6):
+        raise SpecificationError(
+            f"env.gamma is {system.gamma:g}, but the actuators of '{name}' go to {bound:g} only: "
+            f"set env.gamma to that or less."
+        )
+    return model
+
+
+def _range_of_controls(model: mujoco.MjModel) -> tuple[Array, Array]:
+    """Return the least and the largest controls, (m,) each."""
+    limited = model.actuator_ctrllimited.astype(bool)
+    ranges = np.where(limited[:, None], model.actuator_ctrlrange, [-UNLIMITED, UNLIMITED])
+    return ranges[:, 0].copy(), ranges[:, 1].copy()
