@@ -60,6 +60,7 @@ _POLICIES: dict[str, tuple[str, Dashes, float]] = {
     "gaussian_process": (ORCHID, (0, (5, 1, 2, 1)), 1.2),
     "gradient": (INDIGO, (0, (7, 1)), 1.2),
     "linear": (MAROON, (0, (2, 1, 5, 1)), 1.2),
+    "space_filling": (WINE, (0, (7, 1, 2, 1)), 1.2),
 }
 
 SEQUENCE = (VERMILLION, BLUE, GREEN, BLACK, PURPLE, GOLD, INDIGO, PINK, OLIVE, SEA, WINE, TEAL)

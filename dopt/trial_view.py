@@ -51,6 +51,14 @@ class TrialView(ABC):
     tie: Array
 
     @abstractmethod
+    def points(self, states: Array, inputs: Array) -> Array:
+        """Return what the model depends on at states, (N, d), under inputs, (N, m).
+
+        They are the states, or with a model that reads inputs the states with the inputs behind
+        them, (N, d + m): :meth:`predict` and the Jacobians then take these in place of states.
+        """
+
+    @abstractmethod
     def predict(self, states: Array) -> Array:
         """Return the modelled accelerations a_θ(x), (N, r), of states, (N, d)."""
 

@@ -18,7 +18,7 @@ from dopt.policies.base import CustomPolicy, Planner, check_choice
 from dopt.randomness import stream
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
-from dopt.systems.base import System
+from dopt.systems.base import System, with_inputs
 from dopt.trial_view import TrialView
 from dopt.types import Array, CompiledFunction
 
@@ -124,6 +124,9 @@ class KernelTrialView(TrialView):
     def sampled(self) -> Array:  # type: ignore[override]  # computed where it is asked for
         """States at which the accelerations were observed, (t, d)."""
         return self.system.sampled_states(self.states)
+
+    def points(self, states: Array, inputs: Array) -> Array:
+        return with_inputs(states, inputs, self._point_size - self.system.n_states)
 
     def predict(self, states: Array) -> Array:
         points = _given("states", states, None, self._point_size)

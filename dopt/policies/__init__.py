@@ -21,6 +21,7 @@ from dopt.policies.periodic import Periodic, PeriodicSquare
 from dopt.policies.prbs import PRBS
 from dopt.policies.random import RandomGaussian, RandomHeld, RandomSphere
 from dopt.policies.search import Search
+from dopt.policies.space_filling import SpaceFilling
 from dopt.policies.task import TaskOptimal
 from dopt.policies.trace import Trace
 from dopt.policies.trace_linearized import TraceLinearized
@@ -53,6 +54,7 @@ POLICIES: dict[str, type[Policy]] = {
         GaussianProcessEntropy,
         GradientDOptimal,
         GreedyLinear,
+        SpaceFilling,
     )
 }
 
@@ -81,6 +83,7 @@ __all__ = [
     "RandomHeld",
     "RandomSphere",
     "Search",
+    "SpaceFilling",
     "TaskOptimal",
     "Trace",
     "TraceLinearized",

@@ -27,6 +27,7 @@ TITLES: dict[str, str] = {
     "a_optimal": "A-optimal",
     "e_optimal": "E-optimal",
     "task": "task-optimal",
+    "space_filling": "space filling",
 }
 """The policies of the paper come first; a user's own policy follows by its name."""
 

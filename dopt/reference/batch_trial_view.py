@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from dopt.reference.derivatives import gradients_and_changes
-from dopt.reference.dynamics import input_matrix, next_states
+from dopt.reference.dynamics import input_matrix
 from dopt.reference.state import BatchState
 from dopt.trial_view import Array, TrialView
 
@@ -38,6 +38,9 @@ class BatchTrialView(TrialView):
         """Return a_θ(x), (r,), for parameters (q,) and a state (d,), differentiable by torch."""
         return self._learned.model(theta[None], state[None, None])[0, 0]
 
+    def points(self, states: Array, inputs: Array) -> Array:
+        return _array(self._learned.points(self.tensor(states), self.tensor(inputs)))
+
     def predict(self, states: Array) -> Array:
         return _array(self._learned.model(self.theta[None], self.tensor(states)[None])[0])
 
@@ -58,13 +61,9 @@ class BatchTrialView(TrialView):
         return _array(changes.view(len(along), r, -1)[..., : self._size])
 
     def following(self, state: Array, inputs: Array) -> Array:
-        system, u = self.system, self.tensor(inputs)
-        x = self.tensor(state).expand(len(u), -1)
-
-        def accelerations(z: Tensor) -> Tensor:
-            return self._learned.model(self.theta[None], z[None])[0]
-
-        return _array(next_states(system, x, u, accelerations, system.dt))
+        u = self.tensor(inputs)
+        x, theta = (one.expand(len(u), -1) for one in (self.tensor(state), self.theta))
+        return _array(self._learned.next_states(theta, x, u, self.system.dt))
 
     def input_matrix(self, state: Array) -> Array:
         return _array(input_matrix(self.system, self.tensor(state)[None])[0])

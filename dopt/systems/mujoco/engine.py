@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from dopt.systems.black_box import BlackBox, Episode
 
 if TYPE_CHECKING:
     import mujoco
+
+_log = logging.getLogger(__name__)
 
 MISSING = "needs MuJoCo, which is not installed: pip install 'dopt[mujoco]'."
 
@@ -61,6 +64,14 @@ class MuJoCo(BlackBox):
 
     start_spread: float = parameter(0.01, bound="nonnegative")
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.integrator != "euler":
+            raise SpecificationError(
+                f"env.integrator is '{self.integrator}', but the accelerations of {self.name} are "
+                f"means over a step of MuJoCo: set it to euler."
+            )
+
     @classmethod
     @abstractmethod
     def load(cls) -> mujoco.MjModel:
@@ -80,10 +91,11 @@ class MuJoCo(BlackBox):
 
     def true_accelerations(self, states: Array, inputs: Array) -> Array:
         run = Run(_checked_model(self), np.array(self.start), self.rate_unit)
-        rates = states[:, self.n_states // 2 :]
         following = [run.step_from(x, u) for x, u in zip(states, inputs, strict=True)]
-        accelerations: Array = (np.array(following) - rates) / self.dt
-        return accelerations
+        known = self.known(tuple(states.T), tuple(inputs.T), self.parameters)
+        flow = np.stack(np.broadcast_arrays(*known), axis=-1)
+        accelerations: Array = (np.array(following) - states) / self.dt - flow
+        return accelerations[:, list(self.learned_rows)]
 
 
 class Run:
@@ -99,13 +111,16 @@ class Run:
         self._control, self._rate_unit = self._data.ctrl, rate_unit
         self._positions, self._velocities = self._data.qpos, self._data.qvel
         kinds = mujoco.mjtWarning
-        bad = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
+        bad = (
+            *(kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC),
+            kinds.mjWARN_BADCTRL,  # of an input that is NaN, in place of which it takes 0
+        )
         self._warnings = [self._data.warning[kind] for kind in bad]
         self._positions[:] = positions
 
     @property
     def state(self) -> Array:
-        """State, (2 n,); NaN once the engine has reset itself because of numbers that explode."""
+        """State, (2 n,); NaN once the engine has begun anew because numbers exploded."""
         if any(warning.number for warning in self._warnings):
             return np.full(2 * len(self._velocities), np.nan)
         return np.concatenate([self._positions, self._velocities / self._rate_unit])
@@ -118,7 +133,7 @@ class Run:
         return applied
 
     def step_from(self, state: Array, inputs: Array) -> Array:
-        """Apply an input, (m,), at a state, (2 n,), and return the velocities that follow, (n,).
+        """Apply an input, (m,), at a state, (2 n,), and return the state that follows, (2 n,).
 
         What happened before makes no difference.
         """
@@ -126,7 +141,7 @@ class Run:
         n = len(self._velocities)
         self._positions[:], self._velocities[:] = state[:n], self._rate_unit * state[n:]
         self.step(inputs)
-        return self.state[n:]
+        return self.state
 
 
 @functools.lru_cache(maxsize=16)
@@ -134,6 +149,7 @@ def _checked_model(system: MuJoCo) -> mujoco.MjModel:
     """Return the model of a system, or raise SpecificationError if it is not as declared."""
     try:
         model = type(system).load()
+        _log_warnings()
     except ModuleNotFoundError as error:
         raise SpecificationError(f"env '{system.name}' {MISSING}") from error
     n, name = system.n_states // 2, system.name
@@ -157,6 +173,14 @@ def _checked_model(system: MuJoCo) -> mujoco.MjModel:
             f"set env.gamma to that or less."
         )
     return model
+
+
+def _log_warnings() -> None:
+    """Have the engine's warnings logged: it would write a file into the working folder."""
+    import mujoco
+
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(lambda text: _log.info("MuJoCo warns: %s", text))
 
 
 def _range_of_controls(model: mujoco.MjModel) -> tuple[Array, Array]:

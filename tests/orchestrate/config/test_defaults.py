@@ -15,13 +15,13 @@ from dopt.declare.registry import build
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
-from dopt.systems import SYSTEMS
+from dopt.systems import NAMED_SYSTEMS
 from orchestrate.config.launch_settings import LaunchSettings
 from tests.paths import ROOT
 
 CONF = ROOT / "conf"
 CLASSES: Mapping[str, Mapping[str, Any]] = {
-    "env": SYSTEMS,
+    "env": NAMED_SYSTEMS,
     "policy": POLICIES,
     "model": MODELS,
     "learner": LEARNERS,
