@@ -19,7 +19,9 @@ GENERATED = (
     "docs/beyond/README.md",
     "docs/claims/README.md",
     "docs/claims_control/README.md",
+    "docs/mujoco/README.md",
     "docs/rivals/README.md",
+    "docs/space_filling/README.md",
 )
 """Pages that ``python -m analysis report`` writes."""
 
