@@ -57,7 +57,7 @@ class SpaceFilling(HeldCandidates, CustomPolicy):
     uses_full_amplitude: ClassVar[bool] = True
     reads_inputs: ClassVar[bool] = True
 
-    criterion: str = parameter("igs", choices=("gsx", "igs", "idw"))
+    criterion: str = parameter("idw", choices=("gsx", "igs", "idw"))
     weight: float = parameter(1.0, bound="nonnegative")
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002  # ties are broken by the trial's
