@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from scipy.special import logsumexp, softmax
 
 from dopt.declare.validated_fields import parameter
 from dopt.policies.base import Array, CustomPolicy, Planner
@@ -121,9 +120,12 @@ def _in_both(apart: Array, differing: Array, weight: float) -> Array:  # noqa: A
 def _by_inverse_distances(apart: Array, differing: Array, weight: float) -> Array:
     apart = np.maximum(apart, NEAREST)
     logarithms = -apart - np.log(apart)
-    total = np.exp(np.minimum(-logsumexp(logarithms, axis=1), LARGEST_EXPONENT))
-    spread = np.sum(softmax(logarithms, axis=1) * differing, axis=1)
-    values: Array = spread + weight * np.arctan(total) * 2.0 / math.pi
+    largest = logarithms.max(axis=1)
+    weights = np.exp(logarithms - largest[:, None])  # by the largest of them
+    total = weights.sum(axis=1)
+    inverse = np.exp(np.minimum(-largest - np.log(total), LARGEST_EXPONENT))
+    spread = np.sum(weights * differing, axis=1) / total
+    values: Array = spread + weight * np.arctan(inverse) * 2.0 / math.pi
     return values
 
 
