@@ -56,6 +56,7 @@ POSITIVE = {
 NONNEGATIVE = {
     *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
     *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
+    "weight",
     *(
         "dry_friction",
         "coupling",

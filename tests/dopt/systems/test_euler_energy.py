@@ -21,7 +21,8 @@ LEAST = 0.01
 
 
 def shipped(name: str) -> System:
-    (path,) = (CONF / "env").rglob(f"{name}.yaml")
+    files = (CONF / "env").rglob(f"{name}.yaml")
+    (path,) = (file for file in files if file.parent.name != "mujoco")
     section = OmegaConf.to_container(OmegaConf.load(path))
     assert isinstance(section, dict)
     return system_from_mapping(section)
