@@ -9,7 +9,7 @@ from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES
 from dopt.spec.prequential import is_prequential
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS
+from dopt.systems import NAMED_SYSTEMS
 from orchestrate.store import ConfigRow
 
 Compatible = Callable[[ConfigRow, ConfigRow], bool]
@@ -54,10 +54,10 @@ def is_possible(policy: ConfigRow, environment: ConfigRow) -> bool:
 
 def why_impossible(env: str, policy: str) -> str | None:
     """Return why an environment cannot have a policy, or None where it can for all we know."""
-    if env not in SYSTEMS or policy not in POLICIES:
+    if env not in NAMED_SYSTEMS or policy not in POLICIES:
         return None
     try:
-        POLICIES[policy]().check(SYSTEMS[env]())
+        POLICIES[policy]().check(NAMED_SYSTEMS[env]())
     except IncompatibleError as error:
         return str(error).partition(": ")[0]
     return None

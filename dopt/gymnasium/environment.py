@@ -15,7 +15,7 @@ from gymnasium.spaces import Box
 from dopt.declare.validated_fields import parameter
 from dopt.errors import SpecificationError
 from dopt.systems.base import Array
-from dopt.systems.black_box import BlackBox, Episode
+from dopt.systems.black_box import BlackBox, Episode, check_amplitude, check_step
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class Environment(BlackBox):
                 f"environment that is installed."
             ) from error
         _check_actions(self, environment)
-        _check_step(self, environment)
+        check_step(self, getattr(environment.unwrapped, "dt", self.dt), self.id)
         return _Episode(self, environment, seed)
 
 
@@ -114,18 +114,4 @@ def _check_actions(system: Environment, environment: gymnasium.Env) -> None:
             f"the actions of {system.id} are {box}, but a Box of {system.n_inputs} numbers is "
             f"expected: take an environment with continuous actions, and label each of them."
         )
-    bound = float(np.min([-box.low, box.high]))
-    if system.gamma > bound * (1 + 1e-6):
-        raise SpecificationError(
-            f"env.gamma is {system.gamma:g}, but the actions of {system.id} go to {bound:g} only: "
-            f"set env.gamma to that or less."
-        )
-
-
-def _check_step(system: Environment, environment: gymnasium.Env) -> None:
-    step = getattr(environment.unwrapped, "dt", system.dt)
-    if not math.isclose(step, system.dt, rel_tol=1e-6):
-        raise SpecificationError(
-            f"env.dt is {system.dt:g} s, but a step of {system.id} takes {step:g} s: set env.dt "
-            f"to that."
-        )
+    check_amplitude(system, box.low, box.high, f"actions of {system.id}")

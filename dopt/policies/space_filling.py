@@ -23,7 +23,7 @@ LARGEST_EXPONENT = 700.0
 
 @dataclass(frozen=True, kw_only=True)
 class SpaceFilling(HeldCandidates, CustomPolicy):
-    """Apply the input that leads where the samples so far say the least, without a model's errors.
+    """Apply the input that leads farthest from the samples, without an information matrix.
 
     Each candidate is held for ``lookahead`` predicted steps. With φ the features of the state
     that it leads to, and of u/γ where the model reads inputs, φ_s those of the samples, y and y_s
@@ -80,11 +80,14 @@ class SpaceFillingPlan(Planner):
         points = view.points(self._led_to(view, inputs), inputs)
         samples = view.points(view.sampled, view.sampled_inputs)
         apart = _squared_distances(self._features(points), self._features(samples))
+        if self._policy.criterion == "gsx":
+            return _root_of_least(apart)
         spread = view.accelerations.std(axis=0)
         scale = np.where(spread > 0, spread, 1.0)
         differing = _squared_distances(view.predict(points) / scale, view.accelerations / scale)
-        values: Array = VALUES[self._policy.criterion](apart, differing, self._policy.weight)
-        return values
+        if self._policy.criterion == "igs":
+            return _root_of_least(apart * differing)
+        return _by_inverse_distances(apart, differing, self._policy.weight)
 
     def _led_to(self, view: TrialView, inputs: Array) -> Array:
         """Return the states, (C, d), after ``lookahead`` predicted steps with inputs, (C, m)."""
@@ -107,17 +110,14 @@ def _squared_distances(these: Array, those: Array) -> Array:
     return distances
 
 
-def _in_features(apart: Array, differing: Array, weight: float) -> Array:  # noqa: ARG001
-    distances: Array = np.sqrt(apart.min(axis=1))
-    return distances
-
-
-def _in_both(apart: Array, differing: Array, weight: float) -> Array:  # noqa: ARG001
-    products: Array = np.sqrt((apart * differing).min(axis=1))
-    return products
+def _root_of_least(squares: Array) -> Array:
+    """Return the root of the least of each row, (C,)."""
+    least: Array = np.sqrt(squares.min(axis=1))
+    return least
 
 
 def _by_inverse_distances(apart: Array, differing: Array, weight: float) -> Array:
+    """Return ``idw``, (C,), from squared distances to samples, (C, N) each, and δ."""
     apart = np.maximum(apart, NEAREST)
     logarithms = -apart - np.log(apart)
     largest = logarithms.max(axis=1)
@@ -127,7 +127,3 @@ def _by_inverse_distances(apart: Array, differing: Array, weight: float) -> Arra
     spread = np.sum(weights * differing, axis=1) / total
     values: Array = spread + weight * np.arctan(inverse) * 2.0 / math.pi
     return values
-
-
-VALUES = {"gsx": _in_features, "igs": _in_both, "idw": _by_inverse_distances}
-"""Worth, (C,), from squared distances to samples, in features and accelerations (C, N), and δ."""

@@ -17,6 +17,9 @@ from dopt.errors import SpecificationError
 from dopt.systems.base import Array, System
 from dopt.types import Equation, Scalar
 
+ROUNDING = 1e-6
+"""Relative difference of two numbers that are the same in single precision."""
+
 
 class Episode(Protocol):
     """One run of a black box from its start."""
@@ -103,11 +106,33 @@ class BlackBox(System):
 
     def observed(self, states: Array, inputs: Array) -> Array:
         """Return the accelerations, (T, r), seen between states (T + 1, d) under (T, m)."""
-        at = self.sampled_states(states)
+        return self._less_known(states[1:] - states[:-1], self.sampled_states(states), inputs)
+
+    def _less_known(self, changes: Array, at: Array, inputs: Array) -> Array:
+        """Return the learned part, (N, r), of changes in a step, (N, d), at (N, d) and (N, m)."""
         known = self.known(tuple(at.T), tuple(inputs.T), self.parameters)
         flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-        difference: Array = np.diff(states, axis=0) / self.dt - flow
-        return difference[:, list(self.learned_rows)]
+        learned: Array = changes / self.dt - flow
+        return learned[:, list(self.learned_rows)]
+
+
+def check_step(system: BlackBox, seconds: float, model: str) -> None:
+    """Raise SpecificationError if a step of what runs, with some name, takes another time."""
+    if not math.isclose(seconds, system.dt, rel_tol=ROUNDING):
+        raise SpecificationError(
+            f"env.dt is {system.dt:g} s, but a step of {model} takes {seconds:g} s: set env.dt "
+            f"to that."
+        )
+
+
+def check_amplitude(system: BlackBox, low: Array, high: Array, inputs: str) -> None:
+    """Raise SpecificationError if γ is beyond the bounds, (m,) each, of inputs with some name."""
+    bound = float(np.min([-low, high]))
+    if system.gamma > bound * (1 + ROUNDING):
+        raise SpecificationError(
+            f"env.gamma is {system.gamma:g}, but the {inputs} go to {bound:g} only: set env.gamma "
+            f"to that or less."
+        )
 
 
 @functools.cache

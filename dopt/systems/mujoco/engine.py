@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -14,7 +13,7 @@ import numpy as np
 from dopt.declare.validated_fields import parameter
 from dopt.errors import SpecificationError
 from dopt.systems.base import Array
-from dopt.systems.black_box import BlackBox, Episode
+from dopt.systems.black_box import BlackBox, Episode, check_amplitude, check_step
 
 if TYPE_CHECKING:
     import mujoco
@@ -92,10 +91,7 @@ class MuJoCo(BlackBox):
     def true_accelerations(self, states: Array, inputs: Array) -> Array:
         run = Run(_checked_model(self), np.array(self.start), self.rate_unit)
         following = [run.step_from(x, u) for x, u in zip(states, inputs, strict=True)]
-        known = self.known(tuple(states.T), tuple(inputs.T), self.parameters)
-        flow = np.stack(np.broadcast_arrays(*known), axis=-1)
-        accelerations: Array = (np.array(following) - states) / self.dt - flow
-        return accelerations[:, list(self.learned_rows)]
+        return self._less_known(np.array(following) - states, states, inputs)
 
 
 class Run:
@@ -106,8 +102,7 @@ class Run:
 
         self._model, self._data = model, mujoco.MjData(model)
         self._advance, self._reset = mujoco.mj_step, mujoco.mj_resetData
-        low, high = _range_of_controls(model)
-        self._low, self._high = low, high
+        self._low, self._high = _range_of_controls(model)
         self._control, self._rate_unit = self._data.ctrl, rate_unit
         self._positions, self._velocities = self._data.qpos, self._data.qvel
         kinds = mujoco.mjtWarning
@@ -160,18 +155,8 @@ def _checked_model(system: MuJoCo) -> mujoco.MjModel:
             f"declared: declare each position, then each velocity, of joints that slide or turn "
             f"about one axis."
         )
-    if not math.isclose(model.opt.timestep, system.dt, rel_tol=1e-6):
-        raise SpecificationError(
-            f"env.dt is {system.dt:g} s, but a step of the model of '{name}' takes "
-            f"{model.opt.timestep:g} s: set env.dt to that."
-        )
-    low, high = _range_of_controls(model)
-    bound = float(np.min([-low, high]))
-    if system.gamma > bound * (1 + 1e-6):
-        raise SpecificationError(
-            f"env.gamma is {system.gamma:g}, but the actuators of '{name}' go to {bound:g} only: "
-            f"set env.gamma to that or less."
-        )
+    check_step(system, model.opt.timestep, f"the model of '{name}'")
+    check_amplitude(system, *_range_of_controls(model), f"actuators of '{name}'")
     return model
 
 

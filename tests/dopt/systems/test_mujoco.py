@@ -147,6 +147,23 @@ def test_the_loss_is_over_the_grid(env: str) -> None:
     assert result.loss[-1] == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.parametrize("env", SIMULATORS)
+def test_positions_change_by_the_known_rates(env: str) -> None:
+    """The unit of the velocities is the declared one, up to their change within a step."""
+    system: Any = SIMULATORS[env]()
+    run = system.episode(0)
+    n = system.n_states // 2
+    for u in np.repeat(np.eye(system.n_inputs)[:1] * system.gamma, 30, axis=0):
+        before = run.state
+        run.step(u)
+        mean = 0.5 * (before + run.state)
+        known = np.array(system.known(tuple(mean), tuple(u), ()))
+        departure = run.state[:n] - before[:n] - system.dt * known[:n]
+        largest = np.abs(run.state[n:] - before[n:]).max() * system.rate_unit * system.dt
+        assert np.abs(departure).max() <= 0.6 * largest + 1e-12
+        assert not known[n:].any()
+
+
 def test_planned_inputs_teach_the_pendulum_where_random_ones_do_not() -> None:
     for seed in range(2):
         planned, random = (
