@@ -20,7 +20,7 @@ shows the equations, units and defaults of one.
 ``fit_offline``         fit the model of a trial to samples, all at once
 ``TrialSpec``           one trial: system, policy, model, learner and seed
 ``TrialResult``         losses, states, inputs and model parameters of one trial
-``SYSTEMS``             physical systems by name
+``SYSTEMS``             systems with equations by name
 ``POLICIES``            exploration policies by name
 ``MODELS``              models of the learned accelerations by name
 ``LEARNERS``            learning rules by name
