@@ -89,7 +89,7 @@ def environment_title(env: str) -> str:
 
 
 class OfEnvironment(Protocol):
-    """What belongs to an environment."""
+    """Object that belongs to an environment."""
 
     @property
     def env(self) -> str: ...

@@ -12,7 +12,7 @@ from analysis.stats.tolerance import BandKind
 
 
 class Spread(StrEnum):
-    """How the interval of a loss curve is drawn: at every step, or as bars at a few."""
+    """Drawing of the interval of a loss curve: a band over all steps, or bars at a few."""
 
     BAND = "band"
     ERRORBAR = "errorbar"
@@ -20,7 +20,7 @@ class Spread(StrEnum):
 
 @dataclass(frozen=True)
 class PlotOptions:
-    """What a user asks for; ``epsilon`` is the loss of the comparison of steps, None the default's.
+    """Options of the plots; ``epsilon`` is the loss of the comparison of steps, None the default's.
 
     ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
     each, and ``band``, what the intervals are of, are those of the loss curves.

@@ -30,7 +30,7 @@ class Timing:
     Attributes
     ----------
     value, unit
-        What was measured: a time, or a rate in a unit that ends in ``/s``.
+        Measured quantity: a time, or a rate in a unit that ends in ``/s``.
     calibration
         Seconds that the fixed work took around it (:mod:`benchmarks.calibration`).
     """

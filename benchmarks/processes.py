@@ -27,7 +27,7 @@ class Finished:
     peak_mebibytes
         Largest resident memory of the process itself, without its children (Linux; else NaN).
     output
-        What it printed.
+        Its output.
     """
 
     started: float

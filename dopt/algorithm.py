@@ -23,7 +23,7 @@ class FeatureKind(IntEnum):
 
 
 class Form(IntEnum):
-    """How the information matrix is held (:class:`dopt.policies.d_optimal.DOptimal`)."""
+    """Representation of the information matrix (:class:`dopt.policies.d_optimal.DOptimal`)."""
 
     PRIMAL = 0
     DUAL = 1
@@ -31,7 +31,7 @@ class Form(IntEnum):
 
 
 class Score(IntEnum):
-    """What a searching policy judges a plan by (:mod:`dopt.policies.search`)."""
+    """Criterion of a plan of a searching policy (:mod:`dopt.policies.search`)."""
 
     JOINT = 0
     SUM = 1
@@ -42,7 +42,7 @@ class Score(IntEnum):
 
 
 class Integrator(IntEnum):
-    """How a state follows from the one before it."""
+    """Method that integrates the equation of motion over a time step."""
 
     EULER = 0
     RK4 = 1

@@ -43,7 +43,7 @@ _STEP = 1e-6
 
 
 class HeldOutFit(NamedTuple):
-    """How well a model fits accelerations, and how well its intervals hold them.
+    """Fit of a model to accelerations, and coverage of its intervals.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ def held_out_fit(spec: TrialSpec, parameters: Array, states: Array, inputs: Arra
     Parameters
     ----------
     parameters : (q,)
-        What the trial learned.
+        Learned parameters θ.
     states, inputs : (T + 1, d), (T, m)
         Of the trial: its samples give the covariance. There is none where the trial holds no
         information matrix, has several networks, no noise, or states that are measured with noise.

@@ -52,12 +52,12 @@ class TrialResult:
     wall_seconds, cpu_seconds : float
         Duration of the exploration [s].
     estimated_states : (T + 1, d) or None
-        What policy and learner took for the states, where these are measured with noise.
+        Estimates by which policy and learner went, where states are measured with noise.
     checkpoints : mapping of int to (q,)
         Parameters of the model after the numbers of steps at which the trial is to be assessed, up
         to a divergence.
     assessments : tuple of Assessment
-        What was measured there, and violations of limits; empty without a task and limits.
+        Assessments at those steps, and violations of limits; empty without a task and limits.
     """
 
     loss: Array

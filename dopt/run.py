@@ -18,7 +18,7 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     Parameters
     ----------
     spec : TrialSpec
-        What to run.
+        Trial to run.
     path : {"kernel", "reference"}, optional
         Compiled kernel or torch reference, in place of what the specification says.
 

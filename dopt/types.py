@@ -30,10 +30,10 @@ Complexes = npt.NDArray[np.complex128]
 """Complex numbers along one axis."""
 
 Integers = npt.NDArray[np.int64]
-"""Whole numbers."""
+"""Whole numbers along one axis."""
 
 Booleans = npt.NDArray[np.bool_]
-"""Truth values."""
+"""Truth values along one axis."""
 
 Scalar = Any  # one definition of an equation serves numbers, arrays, tensors and compiled code
 """Number, array or tensor."""

@@ -20,7 +20,7 @@ from tests.paths import ROOT, without_coverage
 PACKAGES = ("dopt", "orchestrate", "analysis", "hydra_plugins")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
 SAVES = {"orchestrate.runner.saving"}
-"""What the saves of an exploration import of the other packages."""
+"""Imports from other packages by the saves of an exploration."""
 
 ONLY_IN = {
     "hydra": ("orchestrate/config/", "hydra_plugins/"),

@@ -40,7 +40,7 @@ Estimate = Callable[[Array], Interval]
 
 @dataclass(frozen=True)
 class TrueModel:
-    """What the planner achieves in an environment with the true model: the ceiling of the others.
+    """Success of the planner with the true model in an environment: the ceiling of the others.
 
     ``n`` seeds, the share of successes with its Wilson interval of 95 %, and how many of the
     episodes have no finite cost. NaN where there is none.
@@ -55,7 +55,7 @@ class TrueModel:
 
 @dataclass(frozen=True)
 class ControlCurve:
-    """What the trials of one policy were worth in one environment, after k numbers of steps.
+    """Success and cost of the models of one policy in one environment, after k numbers of steps.
 
     Attributes
     ----------

@@ -34,7 +34,7 @@ FEWEST_BOOTSTRAP_VALUES = 30
 
 
 class Statistic(StrEnum):
-    """What a curve shows of its trials at each step."""
+    """Statistic of the trials that a curve shows at each step."""
 
     MEAN = "mean"
     MEDIAN = "median"

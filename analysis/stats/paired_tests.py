@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Comparison:
-    """How the losses of a variant compare with those of a reference over shared seeds.
+    """Comparison of the losses of a variant with those of a reference over shared seeds.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ def benjamini_hochberg(p_values: Sequence[float]) -> list[float]:
 
 @dataclass(frozen=True)
 class HittingTimes:
-    """Whether a variant reaches a loss in fewer steps than a reference, over shared seeds.
+    """Comparison of the steps in which a variant and a reference reach a loss, over shared seeds.
 
     A trial that never reaches it is censored at the end of the trial: it lost to any that did, and
     two such trials are a tie.

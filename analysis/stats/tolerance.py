@@ -26,7 +26,7 @@ FEWEST = 46
 
 
 class BandKind(StrEnum):
-    """What the band of a curve is about: the centre of the runs, or single runs."""
+    """Kind of interval around a curve: of the centre of the runs, or of single runs."""
 
     CONFIDENCE = "confidence"
     TOLERANCE = "tolerance"

@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 
 
 class Measure(StrEnum):
-    """What a trial is judged by.
+    """Measure by which a trial is judged.
 
     ``FINAL`` is the loss after the last step, ``AUC`` the geometric mean of the loss over all
     steps, whose logarithm is the area under the logarithmic loss curve by its length, and ``STEPS``

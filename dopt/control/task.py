@@ -143,7 +143,7 @@ class Control(Validated):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Goal:
-    """What depends on the system in a task; the fields are those of :class:`Control`.
+    """Settings of a task that depend on the system; the fields are those of :class:`Control`.
 
     The tasks of the shipped systems share the values that are given here.
     """

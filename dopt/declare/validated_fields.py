@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 from dopt.errors import SpecificationError, unknown_name
 
 LARGEST_WHOLE = 2**31 - 1
-"""Whole numbers of a specification fit into the columns of every database."""
+"""Largest whole number of a specification, the largest of a database's integer column."""
 
 Bound = Literal["any", "positive", "nonnegative", "fraction", "share"]
 
@@ -59,7 +59,7 @@ def parameter(
     unit : str
         Unit in the SI, ``"1"`` when dimensionless.
     bound : {"any", "positive", "nonnegative", "fraction", "share"}
-        What every number of the field has to satisfy.
+        Bound on every number of the field.
     size : int, optional
         Number of entries that a tuple has to have.
     choices : tuple of str
@@ -109,7 +109,7 @@ class Validated:
 
 
 class _Kind(NamedTuple):
-    """What a field holds: one value of a type or a tuple of such values, or None."""
+    """Type of a field: one value or a tuple of values, perhaps None."""
 
     type: type[int] | type[float] | type[str]
     listed: bool = False

@@ -23,7 +23,7 @@ KINDS = (
     "resets",
     "missed",
 )
-"""What :attr:`Explored.counts` counts."""
+"""Kinds of events in :attr:`Explored.counts`."""
 
 
 class Explored:
@@ -40,7 +40,7 @@ class Explored:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """How often what happened, by name, since the first step of the journal."""
+        """Number of events of each kind since the first step of the journal."""
         return {kind: self._state.counts[kind] for kind in KINDS}
 
     @property

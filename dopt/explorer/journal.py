@@ -37,7 +37,7 @@ class Journal:
     ----------
     path : Path
     events : list of mappings
-        What the file held when it was opened, the first with the specification.
+        Events in the file when it was opened, the first with the specification.
 
     Raises
     ------

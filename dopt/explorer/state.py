@@ -56,7 +56,7 @@ class Steps(Protocol):
 
 
 class ExplorerState:
-    """What was measured, and what was learned from it.
+    """Measurements of an exploration and the model that was learned from them.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class ExplorerState:
     excess : (T,)
         How far the state that each step led to, or its estimate, is beyond the limits, 0 without.
     counts : Counter of str
-        How often what happened (:class:`dopt.Explorer`).
+        Number of events of each kind (:class:`dopt.Explorer`).
     """
 
     def __init__(self, spec: TrialSpec) -> None:

@@ -34,7 +34,7 @@ class Environment(BlackBox):
     Parameters
     ----------
     id : str
-        What ``gymnasium.make`` calls it, such as ``Pendulum-v1``.
+        Its name for ``gymnasium.make``, such as ``Pendulum-v1``.
     """
 
     id: str = parameter("")

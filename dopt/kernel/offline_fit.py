@@ -51,7 +51,7 @@ ROUNDING = 1e-12
 
 
 class Problem(NamedTuple):
-    """What is fitted to what."""
+    """Network, prior and samples of a fit."""
 
     network: Network
     prior: Vector  # (q,) θ₀

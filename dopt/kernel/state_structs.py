@@ -85,7 +85,7 @@ class Members(NamedTuple):
 
 
 class PredictionError(NamedTuple):
-    """What limits remember of the model's errors and of the inputs; empty in other trials."""
+    """Errors of the model and last input, kept for the limits; empty in trials without limits."""
 
     scale: Vector  # (r,) mean of e²/(1 + h) over the newest samples
     variances: Matrix  # (2, r), h = g M⁻¹ gᵀ at the present and at the predicted state
@@ -93,7 +93,7 @@ class PredictionError(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """What is remembered to estimate states; empty where they are known, but for the inputs."""
+    """Outputs and filters that estimate states; all but the inputs empty where states are known."""
 
     starts: Matrix  # (T, d) states from which steps begin anew; NaN where they follow one another
     outputs: Matrix  # (T, n) measured after each step
@@ -136,7 +136,7 @@ class Scratch(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What a trial leaves behind."""
+    """Results of a trial, step by step."""
 
     states: Matrix  # (T + 1, d) known, or estimated
     true_states: Matrix  # (T + 1, d) of a simulation; the same array where all are known

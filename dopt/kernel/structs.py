@@ -114,7 +114,7 @@ class Limits(NamedTuple):
 
 
 class Sensors(NamedTuple):
-    """What is measured of the states (:mod:`dopt.kernel.sensors`); empty where all are known."""
+    """Measured states and their noise (:mod:`dopt.kernel.sensors`); empty where all are known."""
 
     measured: Integers  # (n,) indices of the measured states
     variances: Vector  # (n,) of their noise
@@ -177,7 +177,7 @@ class Information(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """All that the policy and the learner of a trial work on.
+    """Arguments of the policy and the learner of a trial.
 
     At step t a policy finds the states x_0 ... x_t, or their estimates, in
     ``record.states[: t + 1]`` and the inputs u_0 ... u_{t-1} in ``record.inputs[:t]``.

@@ -11,12 +11,12 @@ from dopt.types import Array
 
 
 class KernelState:
-    """What a trial in the compiled kernel has observed, and what its model has learned.
+    """Observations and learned parameters of a trial in the compiled kernel.
 
     Attributes
     ----------
     trial : Trial
-        All that compiled functions work on.
+        Arguments of the compiled functions.
     state, record : State, Record
         Its arrays that they write in place.
     """

@@ -16,7 +16,7 @@ from dopt.learning.base import Learner
 
 @dataclass(frozen=True, kw_only=True)
 class AdamRule(Learner):
-    """What all learners share that take Adam's steps.
+    """Base of the learners that take Adam's steps.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ from dopt.learning.information_learner import InformationLearner
 
 
 class Renewal(NamedTuple):
-    """What is given back of the prior at each step while M fades.
+    """Part of the prior that is added back to M at each step while M fades.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Renewal(NamedTuple):
         Diagonal entries of M that are renewed at a step, k of them in turn: at step t those at
         (k t, ..., k t + k - 1) mod q.
     weight : float
-        What is added to each of them.
+        Number that is added to each of them.
     """
 
     entries: int

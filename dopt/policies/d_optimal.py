@@ -33,7 +33,7 @@ class DOptimal(InformationPolicy):
     regularization : float
         λ.
     form : {"auto", "primal", "dual", "sketch"}
-        How the information matrix is held.
+        Representation of the information matrix.
     sketch_size : int
         Dimensions of the sketch.
     """

@@ -97,7 +97,7 @@ class ICEM(InformationPolicy):
 
     @property
     def score(self) -> Score:
-        """What a plan is judged by."""
+        """Criterion of a plan."""
         return Score.TRACE if self.criterion == "variance" else Score[self.criterion.upper()]
 
     @property

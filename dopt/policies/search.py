@@ -49,7 +49,7 @@ class Search(CandidatePolicy, InformationPolicy):
     @property
     @abstractmethod
     def score(self) -> str:
-        """What a plan is judged by, one of ``SCORES``."""
+        """Criterion of a plan, one of ``SCORES``."""
 
     def steps(self, system: System) -> int:  # noqa: ARG002  # a longer plan depends on the system
         """Return the number of steps H of a plan."""

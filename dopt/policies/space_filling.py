@@ -46,7 +46,7 @@ class SpaceFilling(HeldCandidates, CustomPolicy):
     Parameters
     ----------
     criterion : {"gsx", "igs", "idw"}
-        What a place is worth.
+        Worth of a place.
     weight : float
         δ of ``idw``.
     """

@@ -28,7 +28,7 @@ class TaskOptimal(Search):
         Where the states are drawn from: the box of the evaluation grid, or the states that the true
         system visits under strong inputs, which takes the true system to know.
     count : int
-        How many states.
+        Number of states.
     goal : tuple of float
         State of the task, in its d components; empty weighs all states alike.
     radius : float

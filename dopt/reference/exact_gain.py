@@ -27,11 +27,11 @@ WIDENING = 4.0
 """Largest factor from the angle of one ascent step to where the next one aims."""
 
 LEAST_ANGLE = 1e-9
-"""Of an ascent step [rad]."""
+"""Smallest angle of an ascent step [rad]."""
 
 
 class Situation(NamedTuple):
-    """What a gain depends on beside the input, for n trials."""
+    """Arguments of a gain beside the input, for n trials."""
 
     theta: Tensor  # (n, q)
     covariance: Tensor  # (n, s, s), M⁻¹

@@ -23,7 +23,7 @@ from dopt.reference.state import BatchState
 
 
 class Plan(Protocol):
-    """What chooses the inputs of a batch of n trials."""
+    """Planner that chooses the inputs of a batch of n trials."""
 
     def plan(self, t: int) -> Tensor:
         """Return the inputs u_t, (n, m), for t ≥ 1."""

@@ -16,7 +16,7 @@ from dopt.systems.sensors import delay, differentiated
 
 
 class BatchSensors:
-    """What is measured in a batch of n trials, and the states that are estimated of it.
+    """Outputs of a batch of n trials, and the states that are estimated from them.
 
     Attributes
     ----------

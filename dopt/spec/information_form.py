@@ -14,7 +14,7 @@ class Information(NamedTuple):
     Attributes
     ----------
     form : {"primal", "dual", "sketch"}
-        How it is held (:class:`dopt.policies.DOptimal`).
+        Its representation (:class:`dopt.policies.DOptimal`).
     regularization : float
         λ of M₀ = λI.
     noise_variance : float

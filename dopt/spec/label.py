@@ -44,7 +44,7 @@ _COLUMNS = {
 _LOSS = "env.loss"
 
 _ALWAYS = (_LOSS, "limits.name", "limits.enforced")
-"""What a label names wherever it is unusual: trials with it are not to be taken for others."""
+"""Settings that a label always names where they are unusual, so that trials are not confused."""
 
 _NAMED = ("limits.bounds.", "limits.rates.")
 """Settings that have no default: each stands under a name of the system."""
@@ -120,7 +120,7 @@ def _telling(paths: Sequence[str]) -> list[str]:
 
 
 def _is_unusual(path: str, flat: Flat, usual: Flat) -> bool:
-    """Whether a configuration has a setting other than the default, its versions apart."""
+    """Return whether a configuration has a setting other than the default, versions apart."""
     hidden = path.endswith("_version")
     return not hidden and path in flat and (path not in usual or flat[path] != usual[path])
 

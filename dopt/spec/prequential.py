@@ -19,7 +19,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems import System, system_from_mapping
 
 MARK = {"loss": "prequential"}
-"""What the section ``env`` of an exploration has in addition to the fields of its system."""
+"""Entry of the section ``env`` that marks an exploration, beside the fields of its system."""
 
 
 def is_prequential(config: Mapping[str, Any]) -> bool:

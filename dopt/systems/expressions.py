@@ -40,7 +40,7 @@ def compiled_text(
     Parameters
     ----------
     expressions : mapping of str to str
-        What each expression stands for, for messages, and its text, such as ``"-k * x + u / m"``.
+        Name of each expression in messages, and its text, such as ``"-k * x + u / m"``.
     arguments : mapping of str to sequence of str
         Arguments of the function, each a sequence of named quantities.
 

@@ -77,7 +77,7 @@ def launch_grid(
     Parameters
     ----------
     grid, settings
-        What to run, and how.
+        Trials to run, and the settings of the launch.
     record
         Provenance of the command.
     work

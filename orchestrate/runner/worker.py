@@ -108,7 +108,7 @@ class Leave:
 
     @property
     def at_once(self) -> bool:
-        """Whether what still runs is handed back now."""
+        """Whether running trials are handed back now."""
         now = time.monotonic()
         if self._interrupt.stop_requested:
             self._asked = min(self._asked, now)

@@ -148,7 +148,7 @@ class TorchPlanner(CoinPlanner):
 
 
 ANSWERS: list[dict[str, Array]] = []
-"""What views have answered to the plans of :class:`Asking`, step by step."""
+"""Answers of views to the plans of :class:`Asking`, step by step."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,4 +65,4 @@ ALL_PAIRS = [
     (env, policy) for env in KNOWN_EFFECT for policy in POLICIES if compatible(env, policy)
 ]
 PAIRS = [pair for pair in ALL_PAIRS if trial(*pair).config.path == "kernel"]
-"""What the kernel runs; the others run on the reference alone."""
+"""Pairs of a system and a policy that the kernel runs; the others run on the reference alone."""

@@ -15,7 +15,7 @@ from tests.machines.witness import PAUSE
 GRID = ("env=pendulum", "policy=d_optimal", "width=32")
 SEEDS = 24
 SECONDS_PER_TRIAL = 0.5
-"""What a witness adds to a trial at least, so that a fault meets a grid that is not done."""
+"""Least time that a witness adds to a trial, so that a fault meets an unfinished grid."""
 
 
 class Lab:

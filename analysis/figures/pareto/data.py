@@ -46,7 +46,7 @@ class Point:
     Attributes
     ----------
     label : str
-        What differs among the configurations of the environment.
+        Settings that differ among the configurations of the environment.
     policy, policy_words, learner_words : str
         Name of the policy; the policy and the learner with those of their settings that differ. The
         learner's are followed by the model, where it is another one than the network.

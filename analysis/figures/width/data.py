@@ -41,7 +41,7 @@ class Cost:
     Attributes
     ----------
     form : str
-        How the information matrix is held.
+        Representation of the information matrix.
     part : str
         One of :data:`PARTS`.
     widths, n : (W,)

@@ -31,7 +31,7 @@ from dopt.types import Booleans, Integers, Matrix, Vector
 
 
 class Problem(NamedTuple):
-    """All that the plans of one step share."""
+    """Model, covariance and state that all plans of a step share."""
 
     plant: Plant
     network: Network

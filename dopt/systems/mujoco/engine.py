@@ -130,7 +130,7 @@ class Run:
     def step_from(self, state: Array, inputs: Array) -> Array:
         """Apply an input, (m,), at a state, (2 n,), and return the state that follows, (2 n,).
 
-        What happened before makes no difference.
+        The steps before make no difference.
         """
         self._reset(self._model, self._data)
         n = len(self._velocities)

@@ -16,7 +16,7 @@ from orchestrate.executors.live import Live
 from orchestrate.records import Sample
 
 Channel = tuple[float, Any]
-"""What a worker is given: the time between two samples [s], and the actor."""
+"""Time between two samples [s] and the actor that collects them, as a worker gets them."""
 
 
 class Kept:

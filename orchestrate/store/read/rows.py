@@ -147,7 +147,7 @@ class LaunchRow:
 
     @property
     def kind(self) -> str:
-        """What it was: a "worker", the "registration" of a grid for workers, or a "launch"."""
+        """Kind of command: a "worker", the "registration" of a grid for workers, or a "launch"."""
         if "work" in self.argv[1:2]:
             return "worker"
         return "registration" if "launch.detach=true" in self.overrides else "launch"

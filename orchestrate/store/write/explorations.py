@@ -34,7 +34,7 @@ from orchestrate.store.write.results import PreparedRows, end_attempt, prepare
 
 @dataclass(frozen=True)
 class Saved:
-    """What a session has saved: its attempt at the trial, and the number of steps."""
+    """Attempt at a trial under which a session has saved, and the number of saved steps."""
 
     claim: Claim
     n_steps: int

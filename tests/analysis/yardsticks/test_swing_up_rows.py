@@ -24,7 +24,7 @@ SOLVED = {
     ("d_optimal", 1): (0, 1, 1, 1),
     ("d_optimal", 2): (1, 1, 1, 1),
 }
-"""Whether the episodes succeed after 0, 10, 20 and 30 steps, by policy and seed."""
+"""Success of the episodes after 0, 10, 20 and 30 steps, by policy and seed."""
 
 SAMPLES = {
     ("random", 0): (30, 10),

@@ -18,7 +18,7 @@ from tests.orchestrate.faults.servers import Server, binaries
 TRIALS = Order.trials
 
 TRIAL_SECONDS = 0.1
-"""What a trial that takes no time may take on a machine with much else to do."""
+"""Longest time of a trial without work on a machine with much else to do [s]."""
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from tests.orchestrate.faults.program import Order, carry_out, errors_beside
 from tests.orchestrate.store.processes import CLEAN
 
 PATIENCE_SECONDS = 120.0
-"""How long anything may take on a machine with much else to do."""
+"""Longest wait on a machine with much else to do [s]."""
 
 
 @dataclasses.dataclass

@@ -18,7 +18,7 @@ from tests.orchestrate.losses import lose
 from tests.orchestrate.standins import BROKEN_SEED, quick, raising
 
 Fate = Callable[[Sequence[Task], int], list[Event]]
-"""What becomes of a chunk, whose first trial is submitted for the given time: 1, 2 ..."""
+"""Fate of a chunk, whose first trial is submitted for the given time: 1, 2 ..."""
 
 
 class Scripted(Executor):

@@ -1,4 +1,4 @@
-"""Whatever is lost on the way to the database and back, each operation is done once."""
+"""Operations on a database that loses requests and answers: each is done once."""
 
 from __future__ import annotations
 
