@@ -15,7 +15,7 @@ from dopt.calibration import HeldOutFit, held_out_fit
 from dopt.types import Array
 from orchestrate.store import Reader
 
-HELP = "fit at held-out states, coverage of intervals of 90 %%, energy of the inputs"
+HELP = "fit at held-out states, coverage of their intervals, energy of the inputs"
 
 SETS = ("grid", "reachable")
 

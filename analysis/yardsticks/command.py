@@ -16,7 +16,7 @@ from analysis.data.trial_selection import Entry, Selection
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.outputs import publish
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks import pendulum_rows, star_rows, swing_up_rows
+from analysis.yardsticks import disk_rows, pendulum_rows, star_rows, swing_up_rows
 from orchestrate.store import Reader
 
 HELP = "published tables, run here, beside the published numbers"
@@ -35,7 +35,7 @@ class Yardstick:
 
 YARDSTICKS = tuple(
     Yardstick(rows.NAME, rows.entries, rows.measure, rows.tabulate, rows.tables)
-    for rows in (swing_up_rows, pendulum_rows, star_rows)
+    for rows in (swing_up_rows, pendulum_rows, star_rows, disk_rows)
 )
 
 

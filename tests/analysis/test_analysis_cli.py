@@ -138,6 +138,15 @@ def test_wrong_words_are_one_sentence(
     assert captured.out == ""
 
 
+@pytest.mark.parametrize("command", ["calibration", "figures", "floor", "summary", "yardsticks"])
+def test_help_shows_a_percent_sign_once(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    shown = capsys.readouterr().out
+    assert "%%" not in shown
+    assert "--where PATH=VALUE" in shown
+
+
 def test_no_database_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["summary", "--db", f"sqlite:///{tmp_path}/none.db"]) == 2
     assert capsys.readouterr().err.startswith("error: ")

@@ -14,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.bounded_states import bounded_states
+from analysis.data.bounded_states import bounded_states, violation_shares
 from analysis.data.config_matching import nearness
 from analysis.data.trial_selection import Entry, Selection, environment_rank, labelled, labels_of
 from analysis.data.variants import unfinished
 from analysis.stats.intervals import mean, standard_error
-from dopt.limits import VIOLATIONS
 from dopt.spec.label import flatten
 from dopt.spec.prequential import system_of
 from dopt.systems import System
@@ -150,7 +149,7 @@ def _row_panels(reader: Reader, pair: Pair, label: str) -> Iterator[Panel]:
     seeds = _drawn_seeds(pair)
     states = {key: _states(reader, entry, seeds, system) for key, entry in pair.items()}
     time: Array = system.dt * np.arange(system.horizon + 1, dtype=np.float64)
-    shares = {key: _shares(reader, entry) for key, entry in pair.items()}
+    shares = {key: np.array([*violation_shares(reader, one).values()]) for key, one in pair.items()}
     for place, bounds in _bounds(first).items():
         for enforced, entry in pair.items():
             yield Panel(
@@ -185,16 +184,6 @@ def _states(reader: Reader, entry: Entry, seeds: Sequence[int], system: System) 
             own = reader.trajectory(entry.config.config_key, seed).states
             states[place, : len(own)] = own
     return states
-
-
-def _shares(reader: Reader, entry: Entry) -> Array:
-    """Return the share of steps after which a bound is exceeded, of each finished trial, (n,)."""
-    found = reader.assessments(entry.config.config_key, VIOLATIONS)
-    own = np.isin(found.seeds, [trial.seed for trial in entry.finished])
-    values = found.values[own] / np.maximum(found.t, 1)
-    known = np.isfinite(values)
-    shares: Array = np.where(known, values, 0.0).sum(axis=1)[known.any(axis=1)]
-    return shares
 
 
 def tabulate_panels(panels: Panels) -> pd.DataFrame:

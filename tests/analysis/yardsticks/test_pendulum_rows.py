@@ -67,7 +67,10 @@ def test_databases_without_such_trials_and_with_two_kinds_are_refused(
     address = f"sqlite:///{tmp_path}/other.db"
     fill(address, [trial("pendulum", "random")], edit=simulated)
     assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
-    assert "experiment=flex_table1 or flex_table3 or flex_star" in capsys.readouterr().err
+    assert (
+        "experiment=flex_table1 or flex_table3 or flex_star or active_sysid"
+        in capsys.readouterr().err
+    )
     fill(address, [pendulums("random", 2, 0), pendulums("random", 2, 0, gamma=2.0)], edit=simulated)
     assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
     assert "choose by --where" in capsys.readouterr().err
