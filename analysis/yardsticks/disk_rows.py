@@ -112,7 +112,7 @@ def rate_error(spec: TrialSpec, parameters: Array) -> float:
     parameters : (q,)
         Learned parameters.
     """
-    inputs, outputs = _test_run(spec.system)
+    inputs, outputs = run_of_the_test(spec.system)
     forecast = forecast_by(
         spec.system, functools.partial(spec.model.predict, spec.system, parameters)
     )
@@ -123,7 +123,7 @@ def rate_error(spec: TrialSpec, parameters: Array) -> float:
 
 
 @functools.lru_cache(maxsize=4)
-def _test_run(system: System) -> tuple[Array, Array]:
+def run_of_the_test(system: System) -> tuple[Array, Array]:
     """Return the inputs, (1, N, 1), and the measured rates, (N,), of the test run."""
     rng = np.random.default_rng(_SEED)
     inputs = rng.choice(TEST_INPUTS, (1, TEST_SAMPLES, 1))

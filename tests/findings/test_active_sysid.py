@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from analysis.formatting import within
-from analysis.yardsticks.disk_rows import TARGET, tables, tabulate
+from analysis.yardsticks.disk_rows import TARGET, run_of_the_test, tables, tabulate
+from tests.dopt.trials import trial
 from tests.pages import DOCS, PAGES
 
 PAGE = PAGES["docs/yardsticks.md"]
@@ -32,3 +34,40 @@ def test_the_rows_follow_from_the_trials() -> None:
     assert (ROWS.n == 20).all()
     for _, part in TRIALS.groupby(["enforced", "policy"]):
         assert sorted(part.seed) == list(range(100, 120))
+
+
+def test_the_sentences_name_the_numbers_of_the_table() -> None:
+    free, bounded = ROWS.reached[False], ROWS.reached[True]
+    assert (free["d_optimal"], free["random_held"], free["random"]) == (20, 20, 19)
+    assert bounded.max() == bounded["random_held"] == 8
+    for policy in ("idw", "gsx"):
+        for enforced in (False, True):
+            assert shown(policy, "ratio", enforced=enforced) in WORDS
+    assert f"twice the noise, {shown('random', 'median', enforced=False)}" in WORDS
+    assert f"best**: {shown('random_held', 'ratio', enforced=True)} of" in WORDS
+    assert f"apart from them ({shown('d_optimal', 'ratio', enforced=False)})" in WORDS
+    assert f"to choose: {shown('d_optimal', 'ratio', enforced=True)} of" in WORDS
+    worst = 100 * ROWS.violations[True].max()
+    assert f"beyond the bound after at most {worst:.1f} % of the steps" in WORDS
+
+
+def test_the_claims_are_decided_by_the_intervals() -> None:
+    medians, ratios = ROWS["median"], ROWS.ratio
+    assert (ROWS.median_high[False][["d_optimal", "random", "random_held"]] < TARGET).all()
+    assert (medians[True] > TARGET).all()
+    assert ROWS.ratio_low[True, "idw"] < 1.0 < ROWS.ratio_high[True, "idw"]
+    assert ROWS.ratio_low[False, "idw"] > 1.0
+    assert (ROWS.ratio_low[:, "gsx"] > 1.0).all()
+    assert ROWS.ratio_high[True, "random_held"] < 1.0
+    assert medians[True].idxmin() == ratios[True].idxmin() == "random_held"
+    assert medians[False].idxmin() == "random"
+    assert ROWS.ratio_low[False, "d_optimal"] < 1.0 < ROWS.ratio_high[False, "d_optimal"]
+    assert ratios[True].idxmax() == "d_optimal"
+
+
+def test_the_test_run_is_as_fast_as_the_page_says() -> None:
+    env = {"dt": 0.025, "integrator": "rk4", "measured_states": [1], "measurement_noise": [0.045]}
+    system = trial("unbalanced_disk", "random", 0, env=env).system
+    _, rates = run_of_the_test(system)
+    assert f"In {100 * np.mean(np.abs(rates) > 4.5):.0f} % of the samples" in WORDS
+    assert f"{np.sqrt(np.mean(rates**2)):.1f} rad/s" in WORDS
