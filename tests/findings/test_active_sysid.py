@@ -67,7 +67,7 @@ def test_the_claims_are_decided_by_the_intervals() -> None:
 
 def test_the_test_run_is_as_fast_as_the_page_says() -> None:
     env = {"dt": 0.025, "integrator": "rk4", "measured_states": [1], "measurement_noise": [0.045]}
-    system = trial("unbalanced_disk", "random", 0, env=env).system
+    system = trial("unbalanced_disk", "random", 0, env=env, learner={"name": "joint_ekf"}).system
     _, rates = run_of_the_test(system)
     assert f"In {100 * np.mean(np.abs(rates) > 4.5):.0f} % of the samples" in WORDS
     assert f"{np.sqrt(np.mean(rates**2)):.1f} rad/s" in WORDS

@@ -26,11 +26,9 @@ def disk(
     policy: str, seed: int, *, enforced: bool = True, horizon: int = 12, **planned: Any
 ) -> TrialSpec:
     env = {"dt": 0.025, "integrator": "rk4", "horizon": horizon, **MEASURED}
-    limits = LIMITS | {"enforced": enforced}
-    learner = {"name": "joint_ekf"}
-    return trial(
-        "unbalanced_disk", policy, seed, env=env, learner=learner, limits=limits, policy=planned
-    )
+    parts = {"learner": {"name": "joint_ekf"}, "policy": planned}
+    free = trial("unbalanced_disk", policy, seed, env=env, **parts)
+    return TrialSpec.from_mapping(free.to_mapping() | {"limits": LIMITS | {"enforced": enforced}})
 
 
 SPECS = [
@@ -70,7 +68,8 @@ def test_rows_are_those_of_the_trials(small: str, tmp_path: Path) -> None:
 def test_the_true_model_is_left_with_the_noise_and_none_with_the_motion() -> None:
     """The noise of 2,000 samples is known to 1.6 % (one standard deviation)."""
     env = {"dt": 0.025, "integrator": "rk4", **MEASURED}
-    spec = trial("unbalanced_disk", "random", 0, env=env, model={"name": "linear"})
+    parts = {"model": {"name": "linear"}, "learner": {"name": "joint_ekf"}}
+    spec = trial("unbalanced_disk", "random", 0, env=env, **parts)
     truth = np.array([getattr(spec.system, name) for name in UnbalancedDisk.linear_parameters])
     assert rate_error(spec, truth) == pytest.approx(0.045, rel=4 * 0.016)
     other = rate_error(spec, 0.5 * truth)
