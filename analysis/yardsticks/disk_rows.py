@@ -20,7 +20,8 @@ from analysis.tables.rendering import TextTable
 from analysis.yardsticks.growth import median
 from analysis.yardsticks.published import ACTIVE_SYSID
 from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
-from dopt.control.prediction import forecast_by, forecast_by_equations
+from dopt.control.prediction import forecast_by_equations
+from dopt.forecasts import model_forecast
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System, UnbalancedDisk
 from dopt.types import Array
@@ -113,9 +114,7 @@ def rate_error(spec: TrialSpec, parameters: Array) -> float:
         Learned parameters.
     """
     inputs, outputs = run_of_the_test(spec.system)
-    forecast = forecast_by(
-        spec.system, functools.partial(spec.model.predict, spec.system, parameters)
-    )
+    forecast = model_forecast(spec.system, spec.model, parameters)
     predicted = forecast(np.zeros((1, spec.system.n_states)), inputs)[:, 0, RATE]
     with np.errstate(over="ignore", invalid="ignore"):
         error = float(np.sqrt(np.mean((predicted - outputs) ** 2)))
