@@ -52,8 +52,9 @@ class HeldOutFit(NamedTuple):
         fit, 0 that of the mean.
     covered : float
         Share of the true accelerations within their interval of 90 %, NaN without a covariance.
+        Accelerations that depend on no parameter, as those at rest may, do not count.
     log_loss : float
-        Mean negative log likelihood of a true acceleration, in nats; NaN without a covariance.
+        Mean negative log likelihood of the same accelerations, in nats; NaN without a covariance.
     """
 
     r_squared: float
@@ -140,6 +141,8 @@ def _fit(truth: Array, errors: Array, variances: Array) -> HeldOutFit:
     r_squared = 1.0 - float(np.mean(np.sum(errors**2, axis=0) / spread))
     if np.isnan(variances).any():
         return HeldOutFit(r_squared, np.nan, np.nan)
-    covered = float(np.mean(np.abs(errors) <= HALF_WIDTH * np.sqrt(variances)))
-    nats = 0.5 * (np.log(2.0 * np.pi * variances) + errors**2 / variances)
+    unsure = variances > 0.0
+    e, v = errors[unsure], variances[unsure]
+    covered = float(np.mean(np.abs(e) <= HALF_WIDTH * np.sqrt(v)))
+    nats = 0.5 * (np.log(2.0 * np.pi * v) + e**2 / v)
     return HeldOutFit(r_squared, covered, float(np.mean(nats)))

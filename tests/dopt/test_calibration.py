@@ -103,6 +103,17 @@ def test_what_has_no_covariance_has_a_fit_alone(policy: str, sections: dict[str,
         assert np.isnan(fit.log_loss)
 
 
+def test_accelerations_that_depend_on_no_parameter_do_not_count() -> None:
+    """As those of the quadrotor, whose drags are unknown, at rest: with them the mean is NaN."""
+    spec = trial("quadrotor", "random", **LINEAR)
+    result, points = run_trial(spec), evaluation_set(spec.system)
+    rows = jacobian(spec, result.parameters, evaluated(spec))
+    assert np.any(np.all(rows[points.n_grid :] == 0.0, axis=-1))
+    found = held_out_fit(spec, result.parameters, result.states, result.inputs)
+    assert np.isfinite(found.reachable.log_loss)
+    assert np.isfinite(found.grid.log_loss)
+
+
 def test_a_network_is_surer_of_states_that_it_was_taught() -> None:
     """Of samples around hanging: the intervals are wider far away, in proportion to the noise."""
     spec = trial("pendulum", "d_optimal", learner={"name": "gauss_newton"})
