@@ -10,7 +10,8 @@ from dopt.systems import SYSTEMS
 from tests.findings.report_columns import ALL, FINDINGS
 from tests.pages import DOCS
 
-TABLE = pd.read_csv(DOCS / "calibration.csv").set_index(["model", "learner", "policy", "env"]).sort_index()
+NAMES = ["model", "learner", "policy", "env"]
+TABLE = pd.read_csv(DOCS / "calibration.csv").set_index(NAMES).sort_index()
 SETS = ["grid_covered", "reachable_covered"]
 ROWS = [
     (model, learner, policy)
