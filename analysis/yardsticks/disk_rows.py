@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -13,10 +12,10 @@ import pandas as pd
 from analysis.data.bounded_states import violation_shares
 from analysis.data.config_matching import Filter
 from analysis.data.learned_model import learned_model
-from analysis.data.trial_selection import Entry, newest, policy_rank
-from analysis.errors import AnalysisError
+from analysis.data.trial_selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
+from analysis.yardsticks.distinct_entries import distinct_entries
 from analysis.yardsticks.growth import median
 from analysis.yardsticks.published import ACTIVE_SYSID
 from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
@@ -52,17 +51,9 @@ def entries(reader: Reader, wanted: Filter) -> list[Entry]:
     AnalysisError
         If two of them have the same policy and the same use of the limits.
     """
-    found = newest([one for one in reader.configs() if _is_asked_for(one, wanted)])
-    kept = [Entry(one, tuple(reader.trials(one.config_key))) for one in found]
-    kept.sort(key=lambda one: (_enforced(one), policy_rank(one.config.policy), _policy(one)))
-    for one, other in itertools.pairwise(kept):
-        if (_enforced(one), _policy(one)) == (_enforced(other), _policy(other)):
-            raise AnalysisError(
-                f"Two configurations of the disk {LIMITS[_enforced(one)]} have the policy "
-                f"'{_policy(one)}', but one is expected: choose by --where, such as "
-                f"--where env.horizon=1000."
-            )
-    return kept
+    return distinct_entries(
+        reader, lambda one: _is_asked_for(one, wanted), _place, _words, "env.horizon=1000"
+    )
 
 
 def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
@@ -78,6 +69,14 @@ def _policy(entry: Entry) -> str:
     """Return the name of a row: that of the policy, or of its criterion of space filling."""
     section = entry.config.config["policy"]
     return str(section["criterion"] if section["name"] == "space_filling" else section["name"])
+
+
+def _place(entry: Entry) -> tuple[object, ...]:
+    return _enforced(entry), policy_rank(entry.config.policy), _policy(entry)
+
+
+def _words(entry: Entry) -> str:
+    return f"of the disk {LIMITS[_enforced(entry)]} with the policy '{_policy(entry)}'"
 
 
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any
 
@@ -11,11 +10,11 @@ import pandas as pd
 
 from analysis.data.config_matching import Filter
 from analysis.data.curves import read_curves
-from analysis.data.trial_selection import Entry, newest, policy_rank
-from analysis.errors import AnalysisError
+from analysis.data.trial_selection import Entry, policy_rank
 from analysis.formatting import steps_text, within
 from analysis.stats.trial_scores import last_passage
 from analysis.tables.rendering import TextTable
+from analysis.yardsticks.distinct_entries import distinct_entries
 from analysis.yardsticks.growth import exponent, median, slopes
 from analysis.yardsticks.published import FLEX_LONGEST, FLEX_SAMPLES, FLEX_SIZES
 from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
@@ -40,17 +39,9 @@ def entries(reader: Reader, wanted: Filter) -> list[Entry]:
     AnalysisError
         If two of them have the same policy and number of pendulums.
     """
-    found = [one for one in reader.configs() if _is_asked_for(one, wanted)]
-    kept = [Entry(one, tuple(reader.trials(one.config_key))) for one in newest(found)]
-    kept.sort(key=lambda one: (policy_rank(one.config.policy), _size(one)))
-    for one, other in itertools.pairwise(kept):
-        if (one.config.policy, _size(one)) == (other.config.policy, _size(other)):
-            raise AnalysisError(
-                f"Two configurations with {_size(one)} pendulums have the policy "
-                f"'{one.config.policy}', but one is expected: choose by --where, such as "
-                f"--where env.horizon=1000."
-            )
-    return kept
+    return distinct_entries(
+        reader, lambda one: _is_asked_for(one, wanted), _place, _words, "env.horizon=1000"
+    )
 
 
 def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
@@ -60,6 +51,14 @@ def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
 
 def _size(entry: Entry) -> int:
     return int(entry.config.config["env"]["n_pendulums"])
+
+
+def _place(entry: Entry) -> tuple[object, ...]:
+    return policy_rank(entry.config.policy), _size(entry)
+
+
+def _words(entry: Entry) -> str:
+    return f"with {_size(entry)} pendulums and the policy '{entry.config.policy}'"
 
 
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:

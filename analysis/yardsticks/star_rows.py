@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -11,10 +10,10 @@ import pandas as pd
 
 from analysis.data.config_matching import Filter
 from analysis.data.learned_model import learned_model
-from analysis.data.trial_selection import Entry, newest, policy_rank
-from analysis.errors import AnalysisError
+from analysis.data.trial_selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
+from analysis.yardsticks.distinct_entries import distinct_entries
 from analysis.yardsticks.growth import median
 from analysis.yardsticks.published import FLEX_STAR
 from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
@@ -40,18 +39,9 @@ def entries(reader: Reader, wanted: Filter) -> list[Entry]:
     AnalysisError
         If two of them have the same policy and learner.
     """
-    found = newest([one for one in reader.configs() if _is_asked_for(one, wanted)])
-    kept = [Entry(one, tuple(reader.trials(one.config_key))) for one in found]
-    kept.sort(key=lambda one: (_learner(one), policy_rank(one.config.policy)))
-    for one, other in itertools.pairwise(kept):
-        if _names(one) == _names(other):
-            learner, policy = _names(one)
-            raise AnalysisError(
-                f"Two configurations of the moving star have the policy '{policy}' and the learner "
-                f"'{learner}', but one is expected: choose by --where, such as "
-                f"--where policy.regularization=1e-7."
-            )
-    return kept
+    return distinct_entries(
+        reader, lambda one: _is_asked_for(one, wanted), _place, _words, "policy.regularization=1e-7"
+    )
 
 
 def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
@@ -68,6 +58,15 @@ def _learner(entry: Entry) -> str:
     section = entry.config.config["learner"]
     rate = section.get("learning_rate")
     return str(section["name"]) if rate is None else f"{section['name']}, rate {rate:g}"
+
+
+def _place(entry: Entry) -> tuple[object, ...]:
+    return _learner(entry), policy_rank(entry.config.policy)
+
+
+def _words(entry: Entry) -> str:
+    learner, policy = _names(entry)
+    return f"of the moving star with the policy '{policy}' and the learner '{learner}'"
 
 
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any
 
@@ -10,13 +9,13 @@ import numpy as np
 import pandas as pd
 
 from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import Entry, environment_rank, newest, policy_rank
-from analysis.errors import AnalysisError
+from analysis.data.trial_selection import Entry, environment_rank, policy_rank
 from analysis.formatting import p_text, share, steps_text
 from analysis.stats.paired_tests import benjamini_hochberg, compare_hitting_times
 from analysis.stats.trial_scores import first_passage, last_passage
 from analysis.tables.comparisons import paired
 from analysis.tables.rendering import TextTable
+from analysis.yardsticks.distinct_entries import distinct_entries
 from analysis.yardsticks.growth import median
 from analysis.yardsticks.published import FLEX_SWING_UP, FLEX_SWING_UP_LONGEST
 from analysis.yardsticks.ratios import REFERENCE, interval_columns
@@ -42,18 +41,9 @@ def entries(reader: Reader, wanted: Filter) -> list[Entry]:
     AnalysisError
         If two of them have the same system, model and policy.
     """
-    found = newest([one for one in reader.configs() if _is_asked_for(one, wanted)])
-    kept = [Entry(one, tuple(reader.trials(one.config_key))) for one in found]
-    kept.sort(key=_rank)
-    for one, other in itertools.pairwise(kept):
-        if _rank(one) == _rank(other):
-            config = one.config
-            raise AnalysisError(
-                f"Two configurations of a swing-up have the system '{config.env}', the model "
-                f"'{config.model}' and the policy '{config.policy}', but one is expected: choose "
-                f"by --where, such as --where learner.name=gauss_newton."
-            )
-    return kept
+    return distinct_entries(
+        reader, lambda one: _is_asked_for(one, wanted), _place, _words, "learner.name=gauss_newton"
+    )
 
 
 def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
@@ -61,11 +51,19 @@ def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
     return swung and bool(config.config.get("task")) and wanted.accepts(config)
 
 
-def _rank(entry: Entry) -> tuple[object, ...]:
+def _place(entry: Entry) -> tuple[object, ...]:
     """Return the place of an entry: by system, networks before the linear model, by policy."""
     config = entry.config
     linear = config.model == "linear"
     return environment_rank(config.env), linear, config.model, policy_rank(config.policy)
+
+
+def _words(entry: Entry) -> str:
+    config = entry.config
+    return (
+        f"of a swing-up with the system '{config.env}', the model '{config.model}' and the policy "
+        f"'{config.policy}'"
+    )
 
 
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:

@@ -101,5 +101,5 @@ def test_two_kinds_of_one_policy_are_refused(
     fill(address, [disk("random", 0), disk("random", 0, horizon=10)], edit=simulated)
     assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert "rate within 4.5 rad/s have the policy 'random'" in said
+    assert "rate within 4.5 rad/s with the policy 'random'" in said
     assert "choose by --where" in said
