@@ -27,8 +27,8 @@ from dopt.types import Array
 from orchestrate.store import ConfigRow, Reader
 
 NAME = "active_sysid"
-RATE = 1
-"""Place of the measured rate among the states."""
+ANGLE, RATE = 0, 1
+"""Places among the states; the rate is measured."""
 
 TARGET = min(ACTIVE_SYSID.values())
 """Lowest published error [rad/s]."""
@@ -82,19 +82,23 @@ def _words(entry: Entry) -> str:
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
     """Return one row for each finished trial: the error of the rate in the test run [rad/s].
 
-    The error is infinite where the trial or the prediction diverged. ``violations`` is the share of
-    the trial's steps after which the rate was beyond its bounds.
+    The error is infinite where the trial or the prediction diverged. ``turned`` is the largest
+    angle from hanging that the learner estimated [rad], and ``violations`` the share of the trial's
+    steps after which the rate was beyond its bounds.
     """
     rows: list[dict[str, object]] = []
     for entry in found:
         shares = violation_shares(reader, entry)
         for trial in entry.finished:
-            error = np.inf
+            error, turned = np.inf, np.nan
             if trial.status == "done":
                 model = learned_model(reader, entry.config, trial.seed)
                 error = rate_error(model.spec, model.parameters)
+                states = reader.trajectory(entry.config.config_key, trial.seed).states
+                turned = float(np.abs(states[:, ANGLE]).max())
             row = {"enforced": _enforced(entry), "policy": _policy(entry), "seed": trial.seed}
-            rows.append(row | {"error": error, "violations": shares[trial.seed]})
+            row |= {"error": error, "turned": turned, "violations": shares[trial.seed]}
+            rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -134,14 +138,15 @@ def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
     """Return medians and ratios to random inputs, with intervals of 95 %, for each policy.
 
     ``ratio`` is the geometric mean of the errors by those of random inputs of the same seed,
-    ``reached`` the number of trials with at most the lowest published error, and ``violations`` the
-    mean share of steps beyond the bounds.
+    ``reached`` the number of trials with at most the lowest published error, ``turned`` the median
+    of the largest angles, and ``violations`` the mean share of steps beyond the bounds.
     """
     rows = []
     for (enforced, policy), own in trials.groupby(["enforced", "policy"], sort=False):
         values = own.error.to_numpy(float)
         row: dict[str, object] = {"enforced": enforced, "policy": policy, "n": len(values)}
         row["reached"] = int(np.sum(values <= TARGET))
+        row["turned"] = float(own.turned.median())
         row["violations"] = float(own.violations.mean())
         row |= interval_columns("median", median(values, np.random.default_rng(_SEED)))
         alike = trials[trials.enforced == enforced]

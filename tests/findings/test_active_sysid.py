@@ -8,6 +8,7 @@ import pytest
 
 from analysis.formatting import within
 from analysis.yardsticks.disk_rows import TARGET, run_of_the_test, tables, tabulate
+from dopt.forecasts import true_forecast
 from tests.dopt.trials import trial
 from tests.pages import DOCS, PAGES
 
@@ -44,9 +45,13 @@ def test_the_sentences_name_the_numbers_of_the_table() -> None:
         for enforced in (False, True):
             assert shown(policy, "ratio", enforced=enforced) in WORDS
     assert f"twice the noise, {shown('random', 'median', enforced=False)}" in WORDS
-    assert f"best**: {shown('random_held', 'ratio', enforced=True)} of" in WORDS
+    assert f"and end at {shown('random_held', 'ratio', enforced=True)} of" in WORDS
     assert f"apart from them ({shown('d_optimal', 'ratio', enforced=False)})" in WORDS
-    assert f"to choose: {shown('d_optimal', 'ratio', enforced=True)} of" in WORDS
+    assert f"largest error, {shown('d_optimal', 'ratio', enforced=True)} times" in WORDS
+    held, white, planned = (ROWS.turned[True, p] for p in ("random_held", "random", "d_optimal"))
+    assert f"turn it by {held:.1f} rad (median" in WORDS
+    assert f"which turn it by {white:.2f} rad" in WORDS
+    assert f"turn it least, {planned:.2f} rad" in WORDS
     worst = 100 * ROWS.violations[True].max()
     assert f"beyond the bound after at most {worst:.1f} % of the steps" in WORDS
 
@@ -62,12 +67,17 @@ def test_the_claims_are_decided_by_the_intervals() -> None:
     assert medians[True].idxmin() == ratios[True].idxmin() == "random_held"
     assert medians[False].idxmin() == "random"
     assert ROWS.ratio_low[False, "d_optimal"] < 1.0 < ROWS.ratio_high[False, "d_optimal"]
-    assert ratios[True].idxmax() == "d_optimal"
+    assert ratios[True].idxmax() == medians[True].idxmax() == "d_optimal"
+    assert ROWS.turned[True].idxmax() == "random_held"
+    assert ROWS.turned[True].idxmin() == "d_optimal"
 
 
 def test_the_test_run_is_as_fast_as_the_page_says() -> None:
     env = {"dt": 0.025, "integrator": "rk4", "measured_states": [1], "measurement_noise": [0.045]}
+    env["initial_state"] = [0.0, 0.0]
     system = trial("unbalanced_disk", "random", 0, env=env, learner={"name": "joint_ekf"}).system
-    _, rates = run_of_the_test(system)
+    inputs, rates = run_of_the_test(system)
+    angles = true_forecast(system)(np.zeros((1, 2)), inputs)[:, 0, 0]
+    assert f"turns by up to {np.abs(angles).max():.1f} rad" in WORDS
     assert f"In {100 * np.mean(np.abs(rates) > 4.5):.0f} % of the samples" in WORDS
     assert f"{np.sqrt(np.mean(rates**2)):.1f} rad/s" in WORDS

@@ -59,6 +59,7 @@ def test_rows_are_those_of_the_trials(small: str, tmp_path: Path) -> None:
     for spec in SPECS:
         result, row = run_trial(spec), table.loc[named(spec)]
         assert row.error == pytest.approx(rate_error(spec, result.parameters), rel=1e-12)
+        assert row.turned == pytest.approx(np.abs(result.states[:, 0]).max())
         counted = [one.value for one in result.assessments if one.measure == "violations"]
         assert row.violations == pytest.approx(sum(counted) / 12)
         if not spec.limits.enforced:  # type: ignore[union-attr]
