@@ -18,7 +18,7 @@ from analysis.tables.rendering import TextTable
 from analysis.yardsticks.distinct_entries import distinct_entries
 from analysis.yardsticks.growth import median
 from analysis.yardsticks.published import ACTIVE_SYSID
-from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
+from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_text, ratio_to_random
 from dopt.control.prediction import forecast_by_equations
 from dopt.forecasts import model_forecast
 from dopt.spec.trial import TrialSpec
@@ -37,14 +37,17 @@ TEST_SAMPLES = 2000
 TEST_INPUTS = 0.05 * np.arange(-60, 60)
 """Voltages of the test run [V], of which each sample draws one."""
 
-LIMITS = {False: "without limits", True: "rate within 4.5 rad/s"}
+BOUND = 4.5
+"""Largest rate [rad/s]."""
+
+LIMITS = {False: "without limits", True: f"rate within {BOUND:g} rad/s"}
 """Names of the columns, by whether inputs heed the limits."""
 
 _SEED = 20_250_626
 
 
 def entries(reader: Reader, wanted: Filter) -> list[Entry]:
-    """Return the configurations with the disk whose rate alone is measured, and their trials.
+    """Return the configurations with the disk whose bounded rate alone is measured, with trials.
 
     Raises
     ------
@@ -57,8 +60,11 @@ def entries(reader: Reader, wanted: Filter) -> list[Entry]:
 
 
 def _is_asked_for(config: ConfigRow, wanted: Filter) -> bool:
-    fits = config.env == UnbalancedDisk.name and bool(config.config.get("limits"))
-    return fits and config.config["env"].get("measured_states") == [RATE] and wanted.accepts(config)
+    sections = config.config
+    measured = sections["env"].get("measured_states") == [RATE]
+    bounds = (sections.get("limits") or {}).get("bounds", {})
+    fits = config.env == UnbalancedDisk.name and measured and bounds.get("ω") == [-BOUND, BOUND]
+    return fits and wanted.accepts(config)
 
 
 def _enforced(entry: Entry) -> bool:
@@ -169,14 +175,14 @@ def _error_table(table: pd.DataFrame) -> TextTable:
     note = (
         f"Root mean square error of the rate in the test run [rad/s]: median over the trials "
         f"[interval of 95 %]; trials with at most {TARGET:g} rad/s; steps of the exploration after "
-        f"which the rate was beyond 4.5 rad/s. Published: mean after twice as many samples."
+        f"which the rate was beyond {BOUND:g} rad/s. Published: mean after twice as many samples."
     )
     return TextTable(["policy", *map(LIMITS.__getitem__, kinds)], rows, note)
 
 
 def _ratio_table(table: pd.DataFrame) -> TextTable:
     kinds = _kinds(table)
-    rows = _rows(table[table.policy != REFERENCE], kinds, _ratio_text)
+    rows = _rows(table[table.policy != REFERENCE], kinds, ratio_text)
     note = "Errors by those of random inputs: paired geometric mean [interval of 95 %]."
     return TextTable(["policy", *map(LIMITS.__getitem__, kinds)], rows, note)
 
@@ -199,7 +205,3 @@ def _rows(
 def _error_text(row: Mapping[Hashable, Any]) -> str:
     shown = within(row["median"], row["median_low"], row["median_high"])
     return f"{shown}; {row['reached']} of {row['n']}; {100 * row['violations']:.1f} %"
-
-
-def _ratio_text(row: Mapping[Hashable, Any]) -> str:
-    return within(row["ratio"], row["ratio_low"], row["ratio_high"])

@@ -17,7 +17,7 @@ from analysis.tables.rendering import TextTable
 from analysis.yardsticks.distinct_entries import distinct_entries
 from analysis.yardsticks.growth import exponent, median, slopes
 from analysis.yardsticks.published import FLEX_LONGEST, FLEX_SAMPLES, FLEX_SIZES
-from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
+from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_text, ratio_to_random
 from dopt.parameter_error import loss_by_parameter_error
 from dopt.spec.prequential import system_of
 from dopt.systems import CoupledPendulums
@@ -139,7 +139,7 @@ def ratio_table(table: pd.DataFrame) -> TextTable:
     """Return the samples by those of random inputs, beside the published ratios."""
     sizes = sorted(set(table.n_pendulums))
     rows = [
-        [policy, *(_cell(own, size, _ratio_text) for size in sizes)]
+        [policy, *(_cell(own, size, ratio_text) for size in sizes)]
         for policy, own in table.groupby("policy", sort=False)
         if policy != REFERENCE
     ]
@@ -171,10 +171,6 @@ def _median_text(row: Mapping[Hashable, Any]) -> str:
     names = ("median", "median_low", "median_high")
     texts = [steps_text(row[name], int(row["horizon"])) for name in names]
     return f"{texts[0]} [{texts[1]}, {texts[2]}]"
-
-
-def _ratio_text(row: Mapping[Hashable, Any]) -> str:
-    return within(row["ratio"], row["ratio_low"], row["ratio_high"])
 
 
 def _exponent_text(own: pd.DataFrame) -> str:

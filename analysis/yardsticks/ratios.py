@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping
+from typing import Any
+
 import numpy as np
 import pandas as pd
 
+from analysis.formatting import within
 from analysis.tables.comparisons import against_reference
 from analysis.yardsticks.growth import Interval
 
@@ -30,3 +34,8 @@ def ratio_to_random(trials: pd.DataFrame, policy: str, measure: str, question: s
         return np.nan, np.nan, np.nan
     found = against_reference(own, reference, question, policy, measure)
     return found.ratio, found.low, found.high
+
+
+def ratio_text(row: Mapping[Hashable, Any]) -> str:
+    """Return the ratio of a row with its interval."""
+    return within(row["ratio"], row["ratio_low"], row["ratio_high"])

@@ -16,7 +16,7 @@ from analysis.tables.rendering import TextTable
 from analysis.yardsticks.distinct_entries import distinct_entries
 from analysis.yardsticks.growth import median
 from analysis.yardsticks.published import FLEX_STAR
-from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_to_random
+from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_text, ratio_to_random
 from dopt.models import GreyBox
 from dopt.parameter_error import parameter_error
 from dopt.systems import MovingStar, System
@@ -146,7 +146,7 @@ def _beside(learners: Sequence[str], published: str) -> list[str]:
 def _ratio_table(table: pd.DataFrame) -> TextTable:
     learners = list(dict.fromkeys(table.learner))
     rows = [
-        [policy, *(_cell(own, learner, _ratio_text) for learner in learners)]
+        [policy, *(_cell(own, learner, ratio_text) for learner in learners)]
         for policy, own in table.groupby("policy", sort=False)
         if policy != REFERENCE
     ]
@@ -162,7 +162,3 @@ def _cell(own: pd.DataFrame, learner: str, text: Callable[[Mapping[Hashable, Any
 def _error_texts(row: Mapping[Hashable, Any]) -> str:
     shown = within(row["median"], row["median_low"], row["median_high"])
     return f"{shown}; {row['lost']}"
-
-
-def _ratio_text(row: Mapping[Hashable, Any]) -> str:
-    return within(row["ratio"], row["ratio_low"], row["ratio_high"])

@@ -26,7 +26,7 @@ from orchestrate.store import Assessments, ConfigRow, Reader
 NAME = "flex_table1"
 
 COLUMN = ["env", "model"]
-"""What the trials of one column of the tables have in common."""
+"""Settings that the trials of one column of the tables share."""
 
 _SEED = 20_230_426
 

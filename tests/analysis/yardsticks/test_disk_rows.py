@@ -19,11 +19,11 @@ from tests.analysis.yardsticks.small_grid import simulated
 from tests.dopt.trials import trial
 
 MEASURED = {"measured_states": [1], "measurement_noise": [0.045], "initial_state": [0.0, 0.0]}
-LIMITS = {"name": "box", "bounds": {"ω": [-0.5, 0.5]}, "steps": 1, "margin": 1.0}
+LIMITS = {"name": "box", "bounds": {"ω": [-4.5, 4.5]}, "steps": 1, "margin": 1.0}
 
 
 def disk(
-    policy: str, seed: int, *, enforced: bool = True, horizon: int = 12, **planned: Any
+    policy: str, seed: int, *, enforced: bool = True, horizon: int = 60, **planned: Any
 ) -> TrialSpec:
     env = {"dt": 0.025, "integrator": "rk4", "horizon": horizon, **MEASURED}
     parts = {"learner": {"name": "joint_ekf"}, "policy": planned}
@@ -61,7 +61,7 @@ def test_rows_are_those_of_the_trials(small: str, tmp_path: Path) -> None:
         assert row.error == pytest.approx(rate_error(spec, result.parameters), rel=1e-12)
         assert row.turned == pytest.approx(np.abs(result.states[:, 0]).max())
         counted = [one.value for one in result.assessments if one.measure == "violations"]
-        assert row.violations == pytest.approx(sum(counted) / 12)
+        assert row.violations == pytest.approx(sum(counted) / 60)
         if not spec.limits.enforced:  # type: ignore[union-attr]
             assert row.violations > 0.0
 
@@ -93,6 +93,30 @@ def test_medians_counts_and_ratios_are_those_of_the_trials(
     assert (table.reached == (by_seed <= 0.83).sum()[table.index]).all()
     logs = np.log(by_seed[True, "gsx"] / by_seed[True, "random"])
     assert table.ratio[True, "gsx"] == pytest.approx(np.exp(logs.mean()))
+
+
+def test_a_trial_that_diverged_counts_with_an_infinite_error(tmp_path: Path) -> None:
+    address = f"sqlite:///{tmp_path}/diverged.db"
+    whole = disk("random", 0, enforced=False).to_mapping()
+    env = whole["env"] | {"state_limit": 5.0}  # type: ignore[operator]
+    spec = TrialSpec.from_mapping(whole | {"env": env})
+    assert run_trial(spec).diverged
+    fill(address, [spec], edit=simulated)
+    assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 0
+    row = pd.read_csv(tmp_path / "active_sysid_trials.csv").iloc[0]
+    assert row.error == np.inf
+    assert np.isnan(row.turned)
+    assert 0.0 <= row.violations < 1.0
+
+
+def test_other_bounds_are_another_question(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    address = f"sqlite:///{tmp_path}/other.db"
+    narrow = disk("random", 0).to_mapping() | {"limits": LIMITS | {"bounds": {"ω": [-2.0, 2.0]}}}
+    fill(address, [TrialSpec.from_mapping(narrow)], edit=simulated)
+    assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
+    assert "holds no trials of a published table" in capsys.readouterr().err
 
 
 def test_two_kinds_of_one_policy_are_refused(
