@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.episode import run_episode
+from dopt.control.episode import run_episode, run_feedback
+from dopt.control.feedback import Feedback
 from dopt.control.free_run import free_run_error
 from dopt.control.prediction import Forecast
 from dopt.control.task import Control
@@ -31,6 +32,8 @@ KEPT_OUTCOMES = 4096
 MEASURES = {
     "control_success": "1 if the episode that the learned model plans succeeds, otherwise 0",
     "control_cost": "its cost",
+    "feedback_success": "1 if the episode succeeds that the policy's own feedback controls, or 0",
+    "feedback_cost": "its cost",
     "true_model_success": "the same with the true model under the same planner, at t = 0",
     "true_model_cost": "its cost, at t = 0",
     "free_run_error": "relative root mean square error of predictions over n steps",
@@ -42,7 +45,11 @@ MEASURES = {
 
 
 def assess(
-    spec: TrialSpec, task: Control, parameters: Mapping[int, Array], states: Array
+    spec: TrialSpec,
+    task: Control,
+    parameters: Mapping[int, Array],
+    states: Array,
+    feedbacks: Mapping[int, Feedback] | None = None,
 ) -> tuple[Assessment, ...]:
     """Return the measures of a trial.
 
@@ -52,6 +59,8 @@ def assess(
         Parameters (q,) of the model after each number of steps that is to be assessed.
     states : (T + 1, d)
         States of the trial.
+    feedbacks
+        Laws of feedback that the policy has learned, after the same numbers of steps.
     """
     rows: list[Assessment] = []
     if parameters:
@@ -64,6 +73,8 @@ def assess(
         else:
             outcome = _controlled(spec.system, task, spec.seed, forecast)
         rows += _measured(t, "control", outcome)
+        if feedbacks and t in feedbacks:
+            rows += _measured(t, "feedback", _fed_back(spec.system, task, spec.seed, feedbacks[t]))
         error = free_run_error(spec.system, forecast, task.free_run_steps)
         rows.append(Assessment(t, "free_run_error", error))
         rows.append(Assessment(t, "coverage", plane.coverage(states[: t + 1])))
@@ -79,12 +90,24 @@ class Outcome(NamedTuple):
 
 def _controlled(system: System, task: Control, seed: int, forecast: Forecast) -> Outcome:
     """Run an episode; all of a seed share the noise and the planner's draws."""
-    steps = task.on(system).steps
-    noise = stream(seed, "control_noise").standard_normal((steps, system.n_states))
-    noise *= np.sqrt(system.dt) * system.noise
-    plans = stream(seed, "control_plans")
+    noise, plans = _control_noise(system, task, seed), stream(seed, "control_plans")
     episode = run_episode(system, task, true_forecast(system), forecast, noise, plans)
     return Outcome(episode.success, episode.cost)
+
+
+def _fed_back(system: System, task: Control, seed: int, feedback: Feedback) -> Outcome:
+    """Run an episode under a law of feedback, with the noise of the other episodes of its seed."""
+    noise = _control_noise(system, task, seed)
+    episode = run_feedback(system, task.on(system), true_forecast(system), feedback, noise)
+    return Outcome(episode.success, episode.cost)
+
+
+def _control_noise(system: System, task: Control, seed: int) -> Array:
+    """Return w_t of an episode, (steps, d)."""
+    steps = task.on(system).steps
+    noise = stream(seed, "control_noise").standard_normal((steps, system.n_states))
+    scaled: Array = np.sqrt(system.dt) * system.noise * noise
+    return scaled
 
 
 @functools.lru_cache(maxsize=KEPT_OUTCOMES)
@@ -111,7 +134,7 @@ def assessed(spec: TrialSpec, result: TrialResult) -> TrialResult:
     """Return the result with its assessments, where the trial asks for them."""
     rows: tuple[Assessment, ...] = ()
     if spec.task is not None:
-        rows += assess(spec, spec.task, result.checkpoints, result.states)
+        rows += assess(spec, spec.task, result.checkpoints, result.states, result.feedbacks)
     if spec.limits is not None:
         reached = result.states[1:]
         finite = np.isfinite(reached).all(axis=1)

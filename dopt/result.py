@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from dopt.control.feedback import Feedback
+
 Array = npt.NDArray[np.float64]
 
 
@@ -56,6 +58,8 @@ class TrialResult:
     checkpoints : mapping of int to (q,)
         Parameters of the model after the numbers of steps at which the trial is to be assessed, up
         to a divergence.
+    feedbacks : mapping of int to Feedback
+        At those steps, the law of feedback of a policy that learns a task.
     assessments : tuple of Assessment
         Assessments at those steps, and violations of limits; empty without a task and limits.
     """
@@ -73,6 +77,7 @@ class TrialResult:
     cpu_seconds: float
     estimated_states: Array | None = None
     checkpoints: Mapping[int, Array] = field(default_factory=dict)
+    feedbacks: Mapping[int, Feedback] = field(default_factory=dict)
     assessments: tuple[Assessment, ...] = ()
 
     @property

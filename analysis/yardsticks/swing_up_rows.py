@@ -28,6 +28,9 @@ NAME = "flex_table1"
 COLUMN = ["env", "model"]
 """Settings that the trials of one column of the tables share."""
 
+_SOLVERS = {"control_success": "", "feedback_success": ", its own feedback"}
+"""What solves the task: a planner with the learned model, or what the policy itself has learned."""
+
 _SEED = 20_230_426
 
 Text = Callable[[Mapping[Hashable, Any]], str]
@@ -69,21 +72,29 @@ def _words(entry: Entry) -> str:
 def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
     """Return one row for each finished trial: the explored samples that solve the swing-up.
 
+    A trial whose policy learns the task itself has another one, for its own feedback.
+
     ``samples`` is the first assessed number of samples at which, and at all later ones, the episode
     succeeds; ``first`` the first one at which it succeeds. They are inf where there is none, and
     where the trial diverged before. ``horizon`` is the last assessed number.
     """
     parts = []
     for entry in (one for one in found if one.finished):
-        config = entry.config
-        solved = reader.assessments(config.config_key, "control_success")
-        facts: dict[str, str | int] = {"env": config.env, "model": config.model}
-        facts |= {"policy": config.policy, "horizon": config.horizon}
-        own = pd.DataFrame(_samples(solved), index=solved.seeds)
-        own = own.reindex([trial.seed for trial in entry.finished], fill_value=np.inf)
-        parts.append(own.rename_axis("seed").reset_index().assign(**facts))
+        for measure, ending in _SOLVERS.items():
+            solved = reader.assessments(entry.config.config_key, measure)
+            if len(solved.t):
+                parts.append(_measured(entry, solved, entry.config.policy + ending))
     table = pd.concat(parts, ignore_index=True)
     return table[[*COLUMN, "policy", "horizon", "seed", "samples", "first"]]
+
+
+def _measured(entry: Entry, solved: Assessments, policy: str) -> pd.DataFrame:
+    config = entry.config
+    facts: dict[str, str | int] = {"env": config.env, "model": config.model}
+    facts |= {"policy": policy, "horizon": config.horizon}
+    own = pd.DataFrame(_samples(solved), index=solved.seeds)
+    own = own.reindex([trial.seed for trial in entry.finished], fill_value=np.inf)
+    return own.rename_axis("seed").reset_index().assign(**facts)
 
 
 def _samples(solved: Assessments) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-"""Control episodes by model-predictive control: the plant is the true system with its noise."""
+"""Control episodes, by model-predictive control or feedback, on the true system with its noise."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from dopt.control.feedback import Feedback
 from dopt.control.planner import CrossEntropy, Objective
 from dopt.control.prediction import Forecast
 from dopt.control.task import Control, Goal
@@ -73,6 +74,31 @@ def run_episode(
             plan = planner.plan(_objective(system, goal, forecast, states[t]), plan, rng)
         inputs[t] = plan[0]
         states[t + 1] = plant(states[t : t + 1], plan[None, :1])[0, 0] + noise[t]
+    return _judged(system, goal, states, inputs)
+
+
+def run_feedback(
+    system: System, goal: Goal, plant: Forecast, feedback: Feedback, noise: Array
+) -> Episode:
+    """Control the true system by a law of feedback.
+
+    Parameters
+    ----------
+    plant
+        Of the true system.
+    noise : (steps, d)
+        w_t of the plant.
+    """
+    states = np.empty((goal.steps + 1, system.n_states))
+    states[0] = goal.initial_state
+    inputs = np.empty((goal.steps, system.n_inputs))
+    for t in range(goal.steps):
+        inputs[t] = feedback(states[t]) if t % feedback.hold == 0 else inputs[t - 1]
+        states[t + 1] = plant(states[t : t + 1], inputs[None, t : t + 1])[0, 0] + noise[t]
+    return _judged(system, goal, states, inputs)
+
+
+def _judged(system: System, goal: Goal, states: Array, inputs: Array) -> Episode:
     cost = float(np.sum(costs(system, goal, states[1:], inputs)))
     if not np.all(np.abs(states) <= system.state_limit):
         return Episode(states, inputs, math.inf, success=False)

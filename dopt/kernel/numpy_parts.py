@@ -8,13 +8,15 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dopt.control.feedback import Feedback
+from dopt.custom_planner import custom_planner
 from dopt.errors import SpecificationError
 from dopt.kernel import model_queries
 from dopt.kernel.held_trial import HeldTrial
 from dopt.kernel.pointers import compiled_step
 from dopt.kernel.structs import Trial
 from dopt.learning.base import CustomLearner, Updater, check_update
-from dopt.policies.base import CustomPolicy, Planner, check_choice
+from dopt.policies.base import Planner, check_choice
 from dopt.randomness import stream
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
@@ -38,8 +40,8 @@ class NumpyParts:
         policy, learner, system = spec.policy, spec.learner, spec.system
         self._planner: Planner | None = None
         self._updater: Updater | None = None
-        if policy.is_in_numpy() and isinstance(policy, CustomPolicy):
-            self._planner = policy.planner(system, stream(spec.seed, "planner"))
+        if policy.is_in_numpy():
+            self._planner = custom_planner(spec)
         if learner.is_in_numpy() and isinstance(learner, CustomLearner):
             self._updater = learner.updater(system, stream(spec.seed, "updater"))
         self.targets = np.full((system.horizon, system.n_learned), np.nan)
@@ -48,6 +50,11 @@ class NumpyParts:
     def needed_by(config: TrialConfig) -> bool:
         """Return whether the policy or the learner is written in numpy."""
         return config.policy.is_in_numpy() or config.learner.is_in_numpy()
+
+    @property
+    def feedback(self) -> Feedback | None:
+        """The law of feedback that the plan has learned; None where it learns none."""
+        return self._planner.feedback() if self._planner else None
 
     def choose(self, t: int, u: Array) -> float:
         """Write the input, (m,), that the plan chooses at x_t, and return its time [µs].

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from dopt.control.feedback import Feedback
 from dopt.errors import SpecificationError
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
@@ -44,6 +45,8 @@ class KernelTrial(KernelState):
         Number of steps done.
     diverged_at : int or None
         Step at which the trial diverged.
+    feedback : Feedback or None
+        The law of feedback that the policy has learned.
     """
 
     def __init__(self, spec: TrialSpec) -> None:
@@ -52,6 +55,7 @@ class KernelTrial(KernelState):
         self.points = points_of_trial(shared, self.trial.network, spec.system.horizon)
         self.done = 0
         self.diverged_at: int | None = None
+        self.feedback: Feedback | None = None  # no compiled policy learns one
 
     @functools.cached_property
     def _code(self) -> Compiled:
@@ -94,11 +98,14 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
     """Run a whole trial in compiled code."""
     wall, cpu = time.perf_counter(), time.process_time()
     trial = trial_in_kernel(spec)
-    checkpoints = {}
+    checkpoints: dict[int, Array] = {}
+    feedbacks: dict[int, Feedback] = {}
     for step in spec.assessed_steps:
         _advance_in_pieces(trial, step)
         if trial.diverged_at is None:
             checkpoints[step] = trial.parameters
+            if (feedback := trial.feedback) is not None:
+                feedbacks[step] = feedback
     _advance_in_pieces(trial, spec.system.horizon)
     record, end = trial.record, trial.diverged_at
     if end is not None:
@@ -115,6 +122,7 @@ def run_trial_in_kernel(spec: TrialSpec) -> TrialResult:
         wall_seconds=time.perf_counter() - wall,
         cpu_seconds=time.process_time() - cpu,
         checkpoints=checkpoints,
+        feedbacks=feedbacks,
     )
 
 

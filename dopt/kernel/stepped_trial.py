@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from dopt.control.feedback import Feedback
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
 from dopt.kernel.loop import act_next, evaluate_next
@@ -43,6 +44,11 @@ class SteppedTrial(KernelSteps):
             self.begin(0, self._episode.state)
         else:
             self._act = compiled_step(self.trial, act_next)
+
+    @property
+    def feedback(self) -> Feedback | None:
+        """The law of feedback that the policy has learned; None where it learns none."""
+        return self._parts.feedback if self._parts else None
 
     def advance(self, last: int) -> None:
         """Run the steps up to ``last``, unless they are done or the trial has diverged."""

@@ -14,6 +14,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from dopt.control.feedback import Feedback
+from dopt.control.task import Control, Goal
 from dopt.declare.kernel_support import PLAN_IN_NUMPY, KernelPart
 from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError, SpecificationError
@@ -125,6 +127,13 @@ class Planner(ABC):
     def observe(self, view: TrialView) -> None:  # noqa: B027  # most plans keep nothing
         """Take in a step that was just done and learned from, t ≥ 1: x_{t-1}, u_{t-1} and x_t."""
 
+    def feedback(self) -> Feedback | None:
+        """Return the law by which the plan would solve the trial's task, as learned so far.
+
+        It does not change afterwards. None where the plan learns no task.
+        """
+        return None
+
 
 @dataclass(frozen=True, kw_only=True)
 class CustomPolicy(ClosedLoop):
@@ -142,6 +151,21 @@ class CustomPolicy(ClosedLoop):
     @abstractmethod
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
         """Return the plan of a new trial; all that is random in it comes from ``rng``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskPolicy(CustomPolicy):
+    """A policy that learns the control task of the trial, or that of the system where it has none.
+
+    Its plan has a law of feedback (:meth:`Planner.feedback`), which is assessed beside the model.
+    """
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:
+        return self.task_planner(system, Control().on(system), rng)
+
+    @abstractmethod
+    def task_planner(self, system: System, goal: Goal, rng: np.random.Generator) -> Planner:
+        """Return the plan of a new trial with a goal; all that is random comes from ``rng``."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from dopt.control.feedback import Feedback
 from dopt.evaluation import evaluation_set
 from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.dynamics import next_states, true_accelerations
@@ -43,6 +44,8 @@ class Lockstep(BatchSteps):
         self.truth, self.n_grid = self.tensor(points.accelerations), points.n_grid
         self.evaluated = self.points(self.visited, self.applied)
         self.prepare(self.evaluated)
+        self.checkpoints: dict[int, Array] = {}
+        self.feedbacks: dict[int, list[Feedback | None]] = {}
 
     def act(self, t: int, u: Tensor) -> None:
         """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""
@@ -102,6 +105,11 @@ class Lockstep(BatchSteps):
         self.columns["learn_us"][:, t] = learned
         self.columns["evaluate_us"][:, t] = evaluated
 
+    def note_checkpoint(self, t: int) -> None:
+        """Keep what has been learned after t steps, which is to be assessed."""
+        self.checkpoints[t] = self.parameters_of_model.cpu().numpy().copy()
+        self.feedbacks[t] = [planner.feedback() for planner in self.planners]
+
     def _clock(self) -> float:
         if self.device != "cpu":
             torch.cuda.synchronize()
@@ -119,22 +127,20 @@ def run_trials(
     """
     wall, cpu = time.perf_counter(), time.process_time()
     batch = Lockstep(specs, device, module)
-    checkpoints, watch = {}, current_watch()
+    watch = current_watch()
     for t in range(batch.system.horizon + 1):
         if t in specs[0].assessed_steps:
-            checkpoints[t] = batch.parameters_of_model.cpu().numpy().copy()
+            batch.note_checkpoint(t)
         if t < batch.system.horizon:
             batch.step(t)
             if watch is not None:
                 watch.look(t, *(batch.columns[name][:, t] for name in ("loss", "reachable_loss")))
     n = len(specs)
     seconds = ((time.perf_counter() - wall) / n, (time.process_time() - cpu) / n)
-    return [_result(batch, i, checkpoints, *seconds) for i in range(n)]
+    return [_result(batch, i, *seconds) for i in range(n)]
 
 
-def _result(
-    batch: Lockstep, i: int, checkpoints: Mapping[int, Array], wall: float, cpu: float
-) -> TrialResult:
+def _result(batch: Lockstep, i: int, wall: float, cpu: float) -> TrialResult:
     """Cut trial i out of the batch; its rows end where it diverged."""
     states, inputs = batch.true_states[i].cpu().numpy(), batch.inputs[i].cpu().numpy()
     columns = {name: rows[i].copy() for name, rows in batch.columns.items()}
@@ -145,6 +151,8 @@ def _result(
         for rows in (*columns.values(), inputs):
             rows[end:] = np.nan
         states[end:] = np.nan
+    reached = [t for t in batch.checkpoints if end is None or t <= end]
+    learned = {t: batch.feedbacks[t][i] for t in reached if batch.planners}
     estimated = batch.states[i].cpu().numpy() if batch.sensors else None
     if estimated is not None and end is not None:
         estimated[end:] = np.nan
@@ -157,5 +165,6 @@ def _result(
         diverged_at=end,
         wall_seconds=wall,
         cpu_seconds=cpu,
-        checkpoints={t: theta[i] for t, theta in checkpoints.items() if end is None or t <= end},
+        checkpoints={t: batch.checkpoints[t][i] for t in reached},
+        feedbacks={t: feedback for t, feedback in learned.items() if feedback is not None},
     )

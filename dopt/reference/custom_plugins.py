@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dopt.custom_planner import custom_planner
 from dopt.learning.base import CustomLearner, check_update
-from dopt.policies.base import CustomPolicy, Planner, check_choice
+from dopt.policies.base import Planner, check_choice
 from dopt.randomness import stream
 from dopt.reference.batch_trial_view import BatchTrialView
 from dopt.reference.state import BatchState
@@ -18,10 +19,8 @@ from dopt.spec.trial import TrialSpec
 
 def planners_for(specs: Sequence[TrialSpec]) -> list[Planner]:
     """Return the plan of each trial; none for a policy that this package plans in lockstep."""
-    policy = specs[0].policy
-    if not isinstance(policy, CustomPolicy):
-        return []
-    return [policy.planner(spec.system, stream(spec.seed, "planner")) for spec in specs]
+    plans = (custom_planner(spec) for spec in specs)
+    return [plan for plan in plans if plan is not None]
 
 
 def planned_inputs(batch: BatchState, planners: Sequence[Planner], t: int) -> Tensor:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from dopt.control import Control
+from dopt.control.task import GOALS, Goal
 from dopt.declare.registry import identifying_section, section_of
 from dopt.declare.validated_fields import Validated
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
@@ -18,7 +19,7 @@ from dopt.learning.base import CompiledLearner, CustomLearner
 from dopt.limits import Limits
 from dopt.models import Model
 from dopt.policies import POLICIES, GradientDOptimal, Policy, Search
-from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop
+from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, TaskPolicy
 from dopt.spec.compatibility import check_together, mismatch
 from dopt.spec.custom_system_check import check_system
 from dopt.spec.memory_estimate import memory_by_setting
@@ -84,6 +85,10 @@ class TrialConfig:
             check_system(self.system)
             warn_of_scale(self.system, self.model)
         self.policy.check(self.system)
+        if isinstance(self.policy, TaskPolicy) and not self.task and self.system.name not in GOALS:
+            expected = "a section task with a goal, or a system with a control task of its own"
+            given = f"env '{self.system.name}' without a task"
+            raise mismatch(f"policy '{self.policy.name}'", expected, given)
         self._check_size()
         if isinstance(self.policy, Search) and self.policy.budget_us and self.path != "kernel":
             raise IncompatibleError(
@@ -137,6 +142,11 @@ class TrialConfig:
                     f"function alone: choose parts that the kernel runs too, or derive it from "
                     f"{custom.__name__} as well."
                 )
+
+    @functools.cached_property
+    def goal(self) -> Goal:
+        """Goal of a policy that learns a task: that of the section, or else the system's own."""
+        return (self.task or Control()).on(self.system)
 
     @property
     def _parts(self) -> tuple[System, Policy, Model, Learner]:

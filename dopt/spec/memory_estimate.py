@@ -14,6 +14,7 @@ from dopt.learning import Adam, AdamReplay, GaussNewton, JointKalman, Learner
 from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
     ICEM,
+    ActiveExploration,
     Disagreement,
     DOptimal,
     EOptimal,
@@ -21,8 +22,10 @@ from dopt.policies import (
     Lookahead,
     Policy,
     Search,
+    SoftActorCritic,
     TaskOptimal,
 )
+from dopt.policies.active_exploration import AGENT_UNITS
 from dopt.policies.icem import BLOCKS
 from dopt.spec.information_form import held_information, is_fresh
 from dopt.systems import System
@@ -215,12 +218,37 @@ def _beyond(policy: Policy, system: System, model: Model) -> dict[str, int]:
             "policy.ensemble": policy.ensemble * per_network,
             "policy.candidates": policy.candidates * policy.ensemble * (r + units),
         }
+    if isinstance(policy, (SoftActorCritic, ActiveExploration)):
+        return _agent(policy, system)
     if isinstance(policy, GradientDOptimal):
         return {"policy.candidates": policy.candidates * 2 * r * q, _size_of(model): q**2}
     if isinstance(model, GaussianProcess):
         # the factor, and the kernel between all samples and all evaluation points
         return {"env.horizon": 2 * T**2 + OTHER_POINTS * T, "env.grid_points": 2 * N * T}
     return {}
+
+
+def _agent(policy: SoftActorCritic | ActiveExploration, system: System) -> dict[str, int]:
+    """Return the numbers of an agent: five networks in training, a minibatch, the transitions.
+
+    For MAX also those of the ensemble in training, and what it says of each run.
+    """
+    d, batch = system.n_states, policy.batch
+    observed = 2 * d + system.n_inputs
+    if isinstance(policy, SoftActorCritic):
+        networks = policy.units * (20 * (policy.units + observed) + 12 * batch)
+        kept = {"env.horizon": (system.horizon // policy.hold + 1) * 2 * observed}
+        return {"policy.units": networks, **kept}
+    networks = AGENT_UNITS * (20 * (AGENT_UNITS + observed) + 12 * batch)
+    decisions = -(-policy.lookahead // policy.hold)
+    ensemble = policy.units * (6 * policy.units + 4 * (batch + policy.actors))
+    pairs = 4 * policy.ensemble**2 * policy.actors * system.n_learned
+    return {
+        "policy.batch": networks,
+        "policy.units": policy.ensemble * ensemble,
+        "policy.ensemble": pairs,
+        "policy.actors": policy.actors * decisions * policy.episodes * 2 * observed,
+    }
 
 
 def _task(task: Control, system: System, q: int) -> dict[str, int]:

@@ -116,3 +116,24 @@ def test_two_learners_of_one_policy_are_refused(
     assert "choose by --where" in capsys.readouterr().err
     asked = ["--where", "learner.name=gauss_newton", "--out", str(tmp_path)]
     assert main(["yardsticks", "--db", address, *asked]) == 0
+
+
+def test_a_policy_that_learns_the_task_has_a_row_for_its_own_feedback(tmp_path: Path) -> None:
+    def edit(spec: TrialSpec, result: TrialResult) -> TrialResult:
+        result = solved_as_listed(spec, result)
+        if spec.policy.name == "random":
+            return result
+        own = (Assessment(t, "feedback_success", float(t == 30)) for t in (0, 10, 20, 30))
+        return dataclasses.replace(result, assessments=(*result.assessments, *own))
+
+    address = f"sqlite:///{tmp_path}/agent.db"
+    fill(address, SPECS, edit=edit)
+    main(["yardsticks", "--db", address, "--out", str(tmp_path)])
+    trials = pd.read_csv(tmp_path / "flex_table1_trials.csv").set_index(["policy", "seed"])
+    for seed in range(3):
+        assert trials.samples["d_optimal, its own feedback", seed] == 30
+    for key, expected in SAMPLES.items():
+        assert tuple(trials.loc[key, ["samples", "first"]]) == expected
+    table = pd.read_csv(tmp_path / "flex_table1.csv").set_index("policy")
+    assert set(table.index) == {"random", "d_optimal", "d_optimal, its own feedback"}
+    assert table.samples_unsolved["d_optimal, its own feedback"] == 0

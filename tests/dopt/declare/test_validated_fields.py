@@ -51,6 +51,7 @@ POSITIVE = {
         *("inertia_z", "propeller_torque", "slow_speed", "slow_rate"),
         "core",
         "period",
+        *("warm_up", "updates", "units", "fit_updates", "actors", "episodes", "entropy_weight"),
     ),
 }
 NONNEGATIVE = {
@@ -68,8 +69,9 @@ NONNEGATIVE = {
         "turn_drag",
     ),
     "measured_states",
+    "discount",
 }
-FRACTIONS = {"beta_1", "beta_2"}
+FRACTIONS = {"beta_1", "beta_2", "discount"}
 SHARES = {"forgetting", "band"}
 TEXTS = {"form", "criterion", "states", "information", "domain", "integrator"}
 LISTED_TEXTS = {"unknown"}

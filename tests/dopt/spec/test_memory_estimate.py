@@ -78,6 +78,19 @@ def test_what_no_machine_can_hold_is_refused_by_name(changes: dict[str, Any], se
 
 
 @pytest.mark.parametrize(
+    ("policy", "field"),
+    [
+        ("sac", "units"),
+        *(("max_agent", name) for name in ("units", "ensemble", "actors", "batch")),
+    ],
+)
+def test_an_agent_that_no_machine_can_hold_is_refused_by_name(policy: str, field: str) -> None:
+    message = rf"GiB .* because of policy\.{field}, .* smaller\.$"
+    with pytest.raises(SpecificationError, match=message):
+        trial("cartpole", policy, policy={field: 10**9})
+
+
+@pytest.mark.parametrize(
     ("policy", "changes", "setting"),
     [
         ("max", {"policy": {"ensemble": 2**31 - 1}}, "policy.ensemble"),
