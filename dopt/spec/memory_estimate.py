@@ -241,13 +241,12 @@ def _agent(policy: SoftActorCritic | ActiveExploration, system: System) -> dict[
         return {"policy.units": networks, **kept}
     networks = AGENT_UNITS * (20 * (AGENT_UNITS + observed) + 12 * batch)
     decisions = -(-policy.lookahead // policy.hold)
-    ensemble = policy.units * (6 * policy.units + 4 * (batch + policy.actors))
-    pairs = 4 * policy.ensemble**2 * policy.actors * system.n_learned
+    each = 4 * policy.ensemble * policy.units + decisions * policy.episodes * 2 * observed
     return {
-        "policy.batch": networks,
-        "policy.units": policy.ensemble * ensemble,
-        "policy.ensemble": pairs,
-        "policy.actors": policy.actors * decisions * policy.episodes * 2 * observed,
+        "policy.batch": networks + 4 * policy.ensemble * policy.units * batch,
+        "policy.units": 6 * policy.ensemble * policy.units**2,
+        "policy.ensemble": 4 * policy.ensemble**2 * policy.actors * system.n_learned,
+        "policy.actors": policy.actors * each,
     }
 
 

@@ -36,9 +36,7 @@ def test_any_model_and_learner_go_with_it() -> None:
         assert np.isfinite(result.loss).all()
 
 
-def test_imagined_steps_are_those_of_the_system_with_the_networks_in_place_of_what_is_learned() -> (
-    None
-):
+def test_imagined_steps_are_those_of_the_system_with_the_networks_accelerations() -> None:
     spec = trial("cartpole", "max_agent")
     system = spec.system
     agent = ImaginingAgent(ActiveExploration(**QUICK), system, np.random.default_rng(0))
