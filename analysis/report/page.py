@@ -10,7 +10,7 @@ import pandas as pd
 from analysis.formatting import but_lost, number, p_text, plus_minus, share, steps_text, within
 from analysis.line_styles import environment_title
 from analysis.report.variant_table import SAME, SIGNIFICANCE, verdict
-from analysis.stats.intervals import FEWEST_BOOTSTRAP_VALUES
+from analysis.stats.intervals import STUDENT_RANGE
 from analysis.tables.rendering import TextTable
 from dopt.policies import POLICIES
 
@@ -37,8 +37,8 @@ EXPLAINED = (
     "after the last step, in their units, mean ± 2 standard errors.",
     "Ratio: variant / reference (the first row of a table), below 1 the variant is better: the "
     "geometric mean over shared seeds, of losses and of control costs alike, with its unadjusted "
-    "95 % interval: paired BCa bootstrap of the log ratio, Student's below "
-    f"{FEWEST_BOOTSTRAP_VALUES} pairs. Reachable set: of the final loss over states that the true "
+    f"95 % interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
+    "pairs. Reachable set: of the final loss over states that the true "
     "system visits under strong inputs; where it and the grid disagree, the order of two variants "
     "depends on where a model is judged. Curve: "
     "of the loss over all steps (geometric mean).",

@@ -6,7 +6,7 @@ import pandas as pd
 
 from analysis.figures.error_budget.data import PARTS
 from analysis.formatting import within
-from analysis.stats.intervals import FEWEST_BOOTSTRAP_VALUES
+from analysis.stats.intervals import STUDENT_RANGE
 from analysis.tables.rendering import TextTable
 
 
@@ -28,7 +28,7 @@ def budget_table(table: pd.DataFrame) -> TextTable:
     ]  # fmt: skip
     note = (
         "Losses on the grid, geometric means over n trials with 95 % intervals (BCa bootstrap of "
-        f"the mean logarithm, Student's below {FEWEST_BOOTSTRAP_VALUES} trials). Floor: offline "
+        f"the mean logarithm, {STUDENT_RANGE} trials). Floor: offline "
         "fit to samples spread uniformly over the evaluation box. Offline fit: of the recorded "
         "samples."
     )

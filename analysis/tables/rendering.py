@@ -21,7 +21,7 @@ from analysis.formatting import (
     steps_text,
     within,
 )
-from analysis.stats.intervals import FEWEST_BOOTSTRAP_VALUES
+from analysis.stats.intervals import STUDENT_RANGE
 from analysis.stats.trial_scores import Measure
 
 
@@ -136,9 +136,8 @@ def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.
     ]  # fmt: skip
     note = (
         f"Ratio: {_RATIO}; geometric mean over seeds of the "
-        f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, Student's below "
-        f"{FEWEST_BOOTSTRAP_VALUES} pairs. P(improvement): share of seeds with the lower loss, "
-        "ties half. "
+        f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
+        "pairs. P(improvement): share of seeds with the lower loss, ties half. "
         f"p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
         f"Diverged trials: {rule}."
     )
@@ -190,7 +189,7 @@ def control_table(table: pd.DataFrame) -> TextTable:
         "Success: share of the episodes of the variant and of the reference that succeed, planned "
         f"by the model learned so far. Cost ratio: {_RATIO}; geometric mean over seeds of the "
         "episode's cost; interval: paired BCa bootstrap of the log ratio, "
-        f"Student's below {FEWEST_BOOTSTRAP_VALUES} pairs. P(improvement): share of seeds with the "
+        f"{STUDENT_RANGE} pairs. P(improvement): share of seeds with the "
         f"lower cost, ties half. p: two-sided Wilcoxon signed-rank test of the log ratio, "
         f"{_TESTED}. Lost: pairs in no ratio, as one of the two episodes or the true model's has "
         "no finite cost; a lost episode counts as the worst in P(improvement) and p, one "

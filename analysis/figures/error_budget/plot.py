@@ -16,10 +16,11 @@ from analysis.figures.style import TEXT_WIDTH
 from analysis.formatting import count_text, number
 from analysis.line_styles import BLUE, VERMILLION, environment_title, text_by_environment
 from analysis.stats.geometric_means import Estimate
+from analysis.stats.intervals import STUDENT_RANGE
 
 TITLE = "Error budget"
 STATISTIC = "geometric mean over trials of the losses and of their quotients"
-BAND = "95 % interval of the mean logarithm (BCa bootstrap, Student's below 30 trials)"
+BAND = f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)"
 
 COLOURS = {"exploration_factor": BLUE, "learner_factor": VERMILLION}
 WORDS = {
@@ -128,6 +129,6 @@ def caption(budgets: Sequence[Budget], ridge: float) -> str:
         "the factor by which an offline fit of the samples that the policy recorded is worse. "
         "Below, orange: the factor by which the loss of the online learner is worse than that. "
         "Factors multiply to online / floor; one below 1 points to the left. Geometric means over "
-        f"trials with 95 % intervals (BCa bootstrap, Student's below 30 trials).{fits} "
+        f"trials with 95 % intervals (BCa bootstrap, {STUDENT_RANGE} trials).{fits} "
         f"{numbers}."
     )

@@ -36,6 +36,7 @@ from analysis.line_styles import (
     policy_style,
     text_by_environment,
 )
+from analysis.stats.intervals import STUDENT_RANGE
 
 PANEL_HEIGHT = 3.2
 INNER = (TEXT_WIDTH / 2 - 0.6, PANEL_HEIGHT - 0.6)
@@ -65,7 +66,7 @@ def pareto_plot(name: str) -> Plot[Numbers]:
         title="Final loss against the time of a step",
         statistic="geometric mean over trials of the final loss; median over trials of the mean "
         "microseconds of planning and learning in a step",
-        band="95 % interval of the mean logarithm (BCa bootstrap, Student's below 30 trials)",
+        band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
         part=pareto_part,
         measure=lambda reader, selection, options: (
             options.rule,
@@ -247,7 +248,7 @@ def caption(numbers: Numbers) -> str:
         "Root mean square error of the model over the evaluation grid after the last step, against "
         "the time that planning and learning take in a step, both on logarithmic axes. A point is "
         "a configuration; colours are policies, markers learners; the oracle is left out. Loss: "
-        "geometric mean over trials with its 95 % interval (BCa bootstrap, Student's below 30 "
+        f"geometric mean over trials with its 95 % interval (BCa bootstrap, {STUDENT_RANGE} "
         "trials). Time: mean over the steps of a trial, median over trials. Line: Pareto front; "
         "no configuration is both as good and as fast as one on it, and better in one of the two. "
         "Its members are numbered by their time; a label leaves out what is usual, such as the "

@@ -22,6 +22,7 @@ from analysis.figures.sensitivity.data import (
 from analysis.figures.style import GUIDE, TEXT_WIDTH
 from analysis.formatting import count_text
 from analysis.line_styles import environment_title, policy_style, text_by_environment
+from analysis.stats.intervals import STUDENT_RANGE
 from dopt.policies.titles import policy_title
 from dopt.spec.label import value_label
 
@@ -41,7 +42,7 @@ def sensitivity_plot(name: str) -> Plot[Lines]:
         name=name,
         title="Final loss against single settings",
         statistic="geometric mean over trials of the loss after the last step",
-        band="95 % interval of the mean logarithm (BCa bootstrap, Student's below 30 trials)",
+        band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
         part=sensitivity_part,
         measure=lambda reader, selection, options: measure_lines(reader, selection, options.rule),
         tabulate=tabulate_lines,
@@ -106,7 +107,7 @@ def caption(lines: Lines) -> str:
     return (
         "Root mean square error of the model over the evaluation grid after the last step, against "
         "one setting at a time; all others are as in the configuration whose value is dashed. "
-        "Geometric mean over trials with its 95 % interval (BCa bootstrap, Student's below 30 "
+        f"Geometric mean over trials with its 95 % interval (BCa bootstrap, {STUDENT_RANGE} "
         f"trials). {level}A value of which no trial has a positive final loss has no point. "
         f"Trials: {counts}."
     )

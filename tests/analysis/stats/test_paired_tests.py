@@ -5,7 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from analysis.stats.intervals import interval_of_mean
+from analysis.stats.intervals import (
+    MOST_BOOTSTRAP_VALUES,
+    interval_of_mean,
+    standard_error,
+    student_quantile,
+)
 from analysis.stats.paired_tests import (
     benjamini_hochberg,
     compare,
@@ -101,6 +106,18 @@ def test_the_bootstrap_covers_the_mean_about_as_often_as_it_says() -> None:
     intervals = [interval_of_mean(values, np.random.default_rng(2)) for values in draws]
     covered = np.mean([low <= -0.5 <= high for low, high in intervals])
     assert 0.89 < covered < 0.985
+
+
+@pytest.mark.parametrize("family", ["normal", "exponential"])
+def test_the_interval_of_many_values_is_near_the_bootstrap(family: str) -> None:
+    draw = getattr(np.random.default_rng(3), family)
+    values = draw(size=MOST_BOOTSTRAP_VALUES + 1)
+    half = student_quantile(MOST_BOOTSTRAP_VALUES) * float(standard_error(values))
+    found = interval_of_mean(values, rng())
+    assert found == pytest.approx((values.mean() - half, values.mean() + half), abs=1e-12)
+    bootstrap = interval_of_mean(values[:-1], rng())
+    np.testing.assert_allclose(found, bootstrap, atol=0.07 * half)
+    assert found != pytest.approx(bootstrap, abs=1e-9)
 
 
 def test_benjamini_hochberg_by_hand() -> None:

@@ -140,7 +140,7 @@ def test_markdown_shows_counts_and_dashes() -> None:
         **nothing,
     }
     table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
-    assert "Student's below 30 pairs" in comparison_table(table, "exclude").note
+    assert "Student's below 30 and above 2000 pairs" in comparison_table(table, "exclude").note
     line = comparison_table(table, "exclude").markdown().splitlines()[2]
     assert [field.strip() for field in line.strip("|").split("|")] == [
         "arm", "random", "D-optimal", "–", "–", "–", "–", "0, 3 diverged",
