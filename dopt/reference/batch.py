@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Sequence
 
@@ -12,8 +13,9 @@ from torch import Tensor, nn
 from dopt.control.feedback import Feedback
 from dopt.evaluation import evaluation_set
 from dopt.reference.black_box import episodes_for, initial_states, stepped
-from dopt.reference.dynamics import next_states, true_accelerations
+from dopt.reference.dynamics import true_accelerations, true_next_states
 from dopt.reference.gaussian_process import Posterior
+from dopt.reference.recorded import recorded
 from dopt.reference.steps import BatchSteps
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
@@ -44,6 +46,8 @@ class Lockstep(BatchSteps):
         self.truth, self.n_grid = self.tensor(points.accelerations), points.n_grid
         self.evaluated = self.points(self.visited, self.applied)
         self.prepare(self.evaluated)
+        constant = functools.partial(true_next_states, self.system, 0)
+        self._true_next_states = recorded(constant, self.theta)
         self.checkpoints: dict[int, Array] = {}
         self.feedbacks: dict[int, list[Feedback | None]] = {}
 
@@ -53,16 +57,19 @@ class Lockstep(BatchSteps):
         if self.episodes:
             u, following = stepped(self.episodes, u)
         else:
-            system = self.system
-            following = next_states(
-                system, x, u, lambda z: true_accelerations(system, z, u, t), system.dt
-            )
-            following = following + self.noise[:, t]
+            following = self._following(t, x, u) + self.noise[:, t]
         self.inputs[:, t] = u
         self.true_states[:, t + 1] = following
         if self.sensors:
             self.sensors.measure(t)
         self.observe(t, self.system.dt)
+
+    def _following(self, t: int, x: Tensor, u: Tensor) -> Tensor:
+        """Return the states that follow (n, d) under inputs (n, m), without noise."""
+        if len(self.system.history) > 1:
+            return true_next_states(self.system, t, x, u)
+        following: Tensor = self._true_next_states(x, u)
+        return following
 
     def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
         """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""

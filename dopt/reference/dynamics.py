@@ -47,6 +47,11 @@ def next_states(
     return following
 
 
+def true_next_states(system: System, step: int, x: Tensor, u: Tensor) -> Tensor:
+    """Return the states, (n, d), after (n, d) under inputs (n, m) at a step, without noise."""
+    return next_states(system, x, u, lambda z: true_accelerations(system, z, u, step), system.dt)
+
+
 def input_matrix(system: System, x: Tensor) -> Tensor:
     """Return B = dt ∂known/∂u, (n, d, m), at states (n, d)."""
     n, d = x.shape

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Protocol
 
 import torch
@@ -13,6 +14,7 @@ from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, GaussNewto
 from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.information import BatchInformation
 from dopt.reference.models import BatchModel
+from dopt.reference.recorded import recorded
 
 
 class BatchLearner(Protocol):
@@ -36,7 +38,7 @@ class AdamLearner:
             eps=learner.epsilon,
         )
         self._theta = theta
-        self._model = model
+        self._gradient = recorded(functools.partial(loss_gradient, model), theta)
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Take one step on states (n, t + 1, d) and observed accelerations (n, t + 1, r)."""
@@ -44,12 +46,18 @@ class AdamLearner:
         self._step(states[:, newest], targets[:, newest])
 
     def _step(self, states: Tensor, targets: Tensor) -> None:
-        with torch.enable_grad():
-            theta = self._theta.detach().requires_grad_()
-            squares = (self._model(theta, states) - targets).square().sum(dim=-1)
-            # The gradient of a sum over trials holds that of each.
-            (self._theta.grad,) = torch.autograd.grad(squares.mean(dim=1).sum(), theta)
+        self._theta.grad = self._gradient(self._theta, states, targets)
         self.optimizer.step()
+
+
+def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Tensor) -> Tensor:
+    """Return the gradient of mean_N ‖a_θ(x) - y‖² by θ, (n, q), at (n, N, ·) and (n, N, r)."""
+    with torch.enable_grad():
+        at = theta.detach().requires_grad_()
+        squares = (model(at, states) - targets).square().sum(dim=-1)
+        # The gradient of a sum over trials holds that of each.
+        (gradient,) = torch.autograd.grad(squares.mean(dim=1).sum(), at)
+    return gradient
 
 
 class ReplayLearner(AdamLearner):
@@ -98,6 +106,11 @@ class LeastSquaresLearner:
         self._theta.copy_(torch.linalg.solve(self._normal, self._moment))
 
 
+def linearized(learned: LearnedDynamics, theta: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return J, (n, r, q), and the values of the model, (n, r), for (n, q) at points (n, 1, ·)."""
+    return learned.jacobian(theta, x).squeeze(1), learned.model(theta, x).squeeze(1)
+
+
 class KalmanLearner:
     """The extended Kalman filter in information form.
 
@@ -114,13 +127,14 @@ class KalmanLearner:
     ) -> None:
         self._learner, self._learned, self._theta = learner, learned, theta
         self._information = information
+        self._linearized = recorded(functools.partial(linearized, learned), theta)
         self._renewal = learner.renewal(theta.shape[1], regularization)
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Absorb the newest of the states (n, t + 1, d) and targets (n, t + 1, r)."""
         x, y = states[:, -1:], targets[:, -1]
-        J = self._learned.jacobian(self._theta, x).squeeze(1)
-        e = (y - self._learned.model(self._theta, x).squeeze(1)).unsqueeze(-1)
+        J, values = self._linearized(self._theta, x)
+        e = (y - values).unsqueeze(-1)
         self._information.scale(self._learner.forgetting)
         self._information.add(self._given_back(states.shape[1] - 1))
         noise = self._learner.noise_variance

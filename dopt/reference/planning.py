@@ -40,23 +40,26 @@ def predicted_states(learned: LearnedDynamics, theta: Tensor, x: Tensor) -> Tens
     return learned.next_states(theta, x, zero, system.dt)
 
 
-def quadratic_problem(
+def planning_columns(
     learned: LearnedDynamics,
+    project: Callable[[Tensor], Tensor],
     theta: Tensor,
-    information: BatchInformation,
     x: Tensor,
     components: Tensor,
     next_inputs: Tensor,
-    project: Callable[[Tensor], Tensor],
-) -> QuadraticProblem:
-    """Return the sum of Q and of v over components k, (n, c).
+) -> Tensor:
+    """Return g and the columns of D B in the space of M, (n, c, 1 + m, s), for components (n, c).
 
-    Given are parameters (n, q), M of s dimensions and states (n, d). ``next_inputs`` (n, m) are
-    those of the next sample, for a model that reads inputs. ``project`` maps gradients, (..., q),
-    to the space of M, (..., s): the identity, or a sketch.
+    Given are parameters (n, q) and states (n, d). ``next_inputs`` (n, m) are those of the next
+    sample, for a model that reads inputs. ``project`` maps gradients, (..., q), to the space of M,
+    (..., s): the identity, or a sketch.
     """
     g, DB = gradient_and_changes(learned, theta, x, components, next_inputs)
-    columns = project(torch.cat([g.unsqueeze(2), DB], dim=2))  # (n, c, 1 + m, s)
+    return project(torch.cat([g.unsqueeze(2), DB], dim=2))
+
+
+def quadratic_problem(information: BatchInformation, columns: Tensor) -> QuadraticProblem:
+    """Return the sum of Q and of v over components k, from their :func:`planning_columns`."""
     solved = information.solve(columns.flatten(1, 2).mT).mT.view_as(columns)
     Q = (columns[:, :, 1:] @ solved[:, :, 1:].mT).sum(dim=1)
     v = -(columns[:, :, 1:] @ solved[:, :, :1].mT).sum(dim=1).squeeze(-1)

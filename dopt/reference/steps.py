@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -15,7 +17,13 @@ from dopt.reference.learner_registry import batch_learner
 from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.limits import BatchLimits
 from dopt.reference.planner_registry import plan_for
-from dopt.reference.planning import d_optimal_inputs, quadratic_problem, uniform_inputs
+from dopt.reference.planning import (
+    d_optimal_inputs,
+    planning_columns,
+    quadratic_problem,
+    uniform_inputs,
+)
+from dopt.reference.recorded import recorded
 from dopt.reference.search import searched_inputs
 from dopt.reference.sensors import BatchSensors
 from dopt.reference.state import BatchState
@@ -34,6 +42,9 @@ class BatchSteps(BatchState):
         self.sensors = BatchSensors(self) if self.system.n_measured else None
         self.learner = batch_learner(self, points, self.sensors)
         self.own_plan = plan_for(self, self.learner)
+        columns = functools.partial(planning_columns, self.learned, self.project)
+        self._columns = recorded(columns, self.theta)
+        self._rows = recorded(self.learned.jacobian, self.theta)
         limits, self.limits = self.config.limits, None
         if limits and limits.enforced:
             self.limits = BatchLimits(self, limits, self.learner)
@@ -62,16 +73,17 @@ class BatchSteps(BatchState):
                 f"the reference has no plan for policy '{policy.name}': derive its class from "
                 f"CustomPolicy, or enter a plan in dopt.reference.planner_registry."
             )
-        given = (self.learned, self.theta, self.information, x)
         if isinstance(policy, Search):
             assert self.held is not None
+            given = (self.learned, self.theta, self.information, x)
             return searched_inputs(policy, *given, self.ties[:, t], self.held.noise_variance)
         components = self.components[:, t : t + 1]
         if isinstance(policy, TraceLinearized):
             components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)
         ties = self.ties[:, t]
         v = ties * (self.system.gamma / torch.linalg.vector_norm(ties, dim=1, keepdim=True))
-        problem = quadratic_problem(*given, components, v, self.project)
+        columns = self._columns(self.theta, x, components, v)
+        problem = quadratic_problem(self.information, columns)
         return d_optimal_inputs(problem, self.system.gamma, self.ties[:, t])
 
     def observe(self, t: int, dt: float) -> None:
@@ -139,7 +151,7 @@ class BatchSteps(BatchState):
 
         They are those in the space of M.
         """
-        return self.project(self.learned.jacobian(self.theta, self.sampled(steps)))
+        return self.project(self._rows(self.theta, self.sampled(steps)))
 
     def inform(self, t: int) -> None:
         """Add JᵀJ at (x_t, u_t) and the parameters after the learning step of time t.

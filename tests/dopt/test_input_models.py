@@ -17,7 +17,7 @@ from dopt.models import MODELS
 from dopt.offline_fit import fit_offline
 from dopt.randomness import draw
 from dopt.reference.information import BatchInformation
-from dopt.reference.planning import predicted_states, quadratic_problem
+from dopt.reference.planning import planning_columns, predicted_states, quadratic_problem
 from dopt.reference.state import BatchState
 from dopt.run import run_trial
 from dopt.samples import uniform_samples
@@ -125,8 +125,8 @@ def test_the_plan_is_for_the_change_of_the_gradient_with_the_state(model: str) -
     M = (torch.eye(q) + root @ root.mT / q)[None]
     information = BatchInformation(M)
     v, learned = torch.tensor([[-gamma]], dtype=torch.float64), batch.learned
-    given = learned, theta, information, x, torch.tensor([[1]]), v
-    problem = quadratic_problem(*given, lambda rows: rows)
+    columns = planning_columns(learned, lambda rows: rows, theta, x, torch.tensor([[1]]), v)
+    problem = quadratic_problem(information, columns)
     bar = predicted_states(learned, theta, x)[0]
     B = learned.input_matrix(theta, bar[None])[0, :, 0]
 

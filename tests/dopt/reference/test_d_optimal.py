@@ -13,7 +13,7 @@ from torch.func import jacrev, vmap
 from dopt.math.sphere import maximize_on_sphere
 from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.information import BatchInformation
-from dopt.reference.planning import d_optimal_inputs, quadratic_problem
+from dopt.reference.planning import d_optimal_inputs, planning_columns, quadratic_problem
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from tests.dopt.reference.batch import Situation, situation, sphere, step_from
@@ -55,15 +55,15 @@ def whole(rows: Tensor) -> Tensor:
 
 def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return Q, v and the chosen input of the reference."""
-    problem = quadratic_problem(
+    columns = planning_columns(
         LearnedDynamics(spec.system, now.model),
+        whole,
         now.theta[None],
-        BatchInformation(now.information[None]),
         now.state[None],
         torch.tensor([[component]]),
         torch.zeros(1, spec.system.n_inputs, dtype=torch.float64),
-        whole,
     )
+    problem = quadratic_problem(BatchInformation(now.information[None]), columns)
     ties = torch.ones(1, spec.system.n_inputs, dtype=torch.float64)
     u = d_optimal_inputs(problem, spec.system.gamma, ties)
     return problem.Q[0], problem.v[0], u[0]
@@ -140,15 +140,16 @@ def _gap_and_effect(env: str, dt: float) -> tuple[float, float]:
 def test_each_trial_of_a_batch_has_its_own_problem() -> None:
     spec = trial("arm", "d_optimal")
     several = [situation(spec, seed) for seed in range(3)]
-    problem = quadratic_problem(
+    columns = planning_columns(
         LearnedDynamics(spec.system, several[0].model),
+        whole,
         torch.stack([now.theta for now in several]),
-        BatchInformation(torch.stack([now.information for now in several])),
         torch.stack([now.state for now in several]),
         torch.tensor([[0], [1], [1]]),
         torch.zeros(3, 2, dtype=torch.float64),
-        whole,
     )
+    information = BatchInformation(torch.stack([now.information for now in several]))
+    problem = quadratic_problem(information, columns)
     ties = torch.ones(3, 2, dtype=torch.float64)
     inputs = d_optimal_inputs(problem, spec.system.gamma, ties)
     for i, component in enumerate((0, 1, 1)):

@@ -1,0 +1,199 @@
+"""Functions of tensors whose operations are recorded once and repeated into the same memory.
+
+A step of one trial is made of hundreds of operations on small tensors. Most of the time goes into
+deciding what to call: views, and the graph of automatic differentiation. A recording keeps what was
+called, below automatic differentiation, with the tensors that it was called with. Views need not be
+made again, as the memory that they look at is the same. What a repetition computes is what the
+function would compute, bit for bit.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+Function = Callable[..., Any]
+Call = tuple[Function, Sequence[Any], Mapping[str, Any]]
+
+FILLS = {"new_zeros", "new_ones", "zeros_like", "ones_like"}
+"""Operations that read the shape of a tensor alone."""
+
+UNREPEATABLE = {
+    torch.Tag.data_dependent_output,
+    torch.Tag.dynamic_output_shape,
+    torch.Tag.nondeterministic_seeded,
+}
+"""Marks of operations that give numbers to the interpreter, or draw some."""
+
+LARGEST = 2**17
+"""Largest number of parameters of a batch whose functions are recorded: larger tensors take longer
+to compute with than to call, and a recording keeps them all."""
+
+
+def recorded(function: Function, theta: Tensor) -> Function:
+    """Return a function of a batch with parameters (n, q), recorded where that pays."""
+    pays = theta.numel() <= LARGEST and theta.device.type == "cpu"
+    return Recorded(function) if pays else function
+
+
+class Recorded:
+    """A function from tensors to tensors, recorded when it is called twice with the same shapes.
+
+    It may read no other tensors that change. One that looks at numbers, to decide what to call, or
+    that draws them, is called as it is. What a recorded one returns is overwritten by its next
+    call.
+
+    Parameters
+    ----------
+    function : callable
+        Takes tensors, returns tensors or nested tuples of them.
+    """
+
+    def __init__(self, function: Function) -> None:
+        self._function = function
+        self._shapes: tuple[torch.Size, ...] = ()
+        self._recording: Recording | None = None
+
+    def __call__(self, *arguments: Tensor) -> Any:
+        shapes = tuple(argument.shape for argument in arguments)
+        if shapes != self._shapes:
+            self._shapes, self._recording = shapes, None
+            return self._function(*arguments)
+        if self._recording is None:
+            self._recording = Recording(self._function, arguments)
+        if not self._recording.can_be_repeated:
+            return self._function(*arguments)
+        return self._recording.repeat(arguments)
+
+
+class Recording:
+    """The operations of one call.
+
+    Attributes
+    ----------
+    can_be_repeated : bool
+        Whether other numbers need the same operations.
+    """
+
+    def __init__(self, function: Function, arguments: Sequence[Tensor]) -> None:
+        self._inputs = [argument.clone() for argument in arguments]
+        recorder = _Recorder(self._inputs)
+        with recorder:
+            result = function(*self._inputs)
+        self._result = _detached(result)
+        self._calls = recorder.calls_for(self._result)
+        self.can_be_repeated = recorder.can_be_repeated
+
+    @torch.no_grad()
+    def repeat(self, arguments: Sequence[Tensor]) -> Any:
+        """Return what the function returns for other arguments of the same shapes."""
+        for own, argument in zip(self._inputs, arguments, strict=True):
+            own.copy_(argument)
+        for operation, given, named in self._calls:
+            operation(*given, **named)
+        return self._result
+
+
+class _Operation(NamedTuple):
+    """An operation that was called, and the memory that it reads and writes."""
+
+    call: Call
+    reads: set[int]
+    writes: set[int]
+
+
+class _Recorder(TorchDispatchMode):
+    """Keeps the operations that were called, but for views."""
+
+    def __init__(self, inputs: Sequence[Tensor]) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]  # of torch
+        self._inputs = {_memory(one) for one in inputs}
+        self._operations: list[_Operation] = []
+        self.can_be_repeated = True
+
+    def __torch_dispatch__(
+        self,
+        operation: Any,
+        types: Sequence[type],  # one signature
+        arguments: Sequence[Any] = (),
+        named: Mapping[str, Any] | None = None,
+    ) -> Any:
+        named = named or {}
+        result = operation(*arguments, **named)
+        if UNREPEATABLE & set(operation.tags):
+            self.can_be_repeated = False
+        call = _again(operation, _detached(arguments), _detached(named), _detached(result))
+        reads, writes = _memories((arguments, named)), _memories(result)
+        if operation.overloadpacket.__name__ in FILLS:
+            reads = set()
+        if operation._schema.is_mutable or not writes <= reads:  # otherwise it is a view
+            self._operations.append(_Operation(call, reads, writes))
+        return result
+
+    def calls_for(self, result: Any) -> list[Call]:
+        """Return the calls that depend on the inputs, and on which the result depends."""
+        varying, constant = set(self._inputs), []
+        for one in self._operations:
+            constant.append(not one.reads & varying)
+            if not constant[-1]:
+                varying |= one.writes
+        needed, calls = _memories(result), []
+        for one, fixed in zip(reversed(self._operations), reversed(constant), strict=True):
+            # What is changed in place has to be made anew each time, even if it is a constant.
+            if one.writes & needed and not (fixed and not one.writes & varying):
+                needed |= one.reads
+                calls.append(one.call)
+        return calls[::-1]
+
+
+def _detached(values: Any) -> Any:
+    """Return nested values with tensors that share memory and belong to no graph."""
+    return tree_map_only(Tensor, lambda one: one.detach(), values)
+
+
+def _again(operation: Any, arguments: Sequence[Any], named: Mapping[str, Any], result: Any) -> Call:
+    """Return the call that makes the result anew in its memory."""
+    results = [one for one in tree_leaves(result) if isinstance(one, Tensor)]
+    writing = _writing(operation)
+    if operation._schema.is_mutable:
+        return operation._op, arguments, named
+    if writing is not None and len(results) == 1:
+        overload, name = writing
+        return overload._op, arguments, {**named, name: result}
+    return functools.partial(_copy, operation, results), (arguments, named), {}
+
+
+def _memories(values: Any) -> set[int]:
+    """Return where the tensors in nested values have their numbers."""
+    return {_memory(one) for one in tree_leaves(values) if isinstance(one, Tensor)}
+
+
+def _memory(tensor: Tensor) -> int:
+    return tensor.untyped_storage().data_ptr()
+
+
+def _copy(operation: Any, results: Sequence[Tensor], arguments: Any, named: Any) -> None:
+    found = tree_leaves(operation(*arguments, **named))
+    for own, one in zip(results, (one for one in found if isinstance(one, Tensor)), strict=True):
+        own.copy_(one)
+
+
+@functools.cache
+def _writing(operation: Any) -> tuple[Any, str] | None:
+    """Return the overload that writes its result into a tensor, and the name of that argument."""
+    asked = [(one.name, str(one.type)) for one in operation._schema.arguments]
+    packet = operation.overloadpacket
+    for name in packet.overloads():
+        overload = getattr(packet, name)
+        arguments = overload._schema.arguments
+        outputs = [one.name for one in arguments if one.is_out]
+        others = [(one.name, str(one.type)) for one in arguments if not one.is_out]
+        if len(outputs) == 1 and others == asked:
+            return overload, outputs[0]
+    return None
