@@ -47,7 +47,7 @@ class Lockstep(BatchSteps):
         self.evaluated = self.points(self.visited, self.applied)
         self.prepare(self.evaluated)
         constant = functools.partial(true_next_states, self.system, 0)
-        self._true_next_states = recorded(constant, self.theta)
+        self._true_next_states = recorded(constant, self.device)
         self.checkpoints: dict[int, Array] = {}
         self.feedbacks: dict[int, list[Feedback | None]] = {}
 

@@ -38,7 +38,7 @@ class AdamLearner:
             eps=learner.epsilon,
         )
         self._theta = theta
-        self._gradient = recorded(functools.partial(loss_gradient, model), theta)
+        self._gradient = recorded(functools.partial(loss_gradient, model), theta.device.type)
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Take one step on states (n, t + 1, d) and observed accelerations (n, t + 1, r)."""
@@ -127,7 +127,7 @@ class KalmanLearner:
     ) -> None:
         self._learner, self._learned, self._theta = learner, learned, theta
         self._information = information
-        self._linearized = recorded(functools.partial(linearized, learned), theta)
+        self._linearized = recorded(functools.partial(linearized, learned), theta.device.type)
         self._renewal = learner.renewal(theta.shape[1], regularization)
 
     def learn(self, states: Tensor, targets: Tensor) -> None:

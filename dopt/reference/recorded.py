@@ -31,23 +31,22 @@ UNREPEATABLE = {
 }
 """Marks of operations that give numbers to the interpreter, or draw some."""
 
-LARGEST = 2**17
-"""Largest number of parameters of a batch whose functions are recorded: larger tensors take longer
-to compute with than to call, and a recording keeps them all."""
+LARGEST = 2**26
+"""Bytes of results up to which a function is recorded: larger tensors take longer to compute with
+than to call, and a recording keeps them all."""
 
 
-def recorded(function: Function, theta: Tensor) -> Function:
-    """Return a function of a batch with parameters (n, q), recorded where that pays."""
-    pays = theta.numel() <= LARGEST and theta.device.type == "cpu"
-    return Recorded(function) if pays else function
+def recorded(function: Function, device: str) -> Function:
+    """Return a function of a batch on a device, recorded where that pays."""
+    return Recorded(function) if device == "cpu" else function
 
 
 class Recorded:
     """A function from tensors to tensors, recorded when it is called twice with the same shapes.
 
-    It may read no other tensors that change. One that looks at numbers, to decide what to call, or
-    that draws them, is called as it is. What a recorded one returns is overwritten by its next
-    call.
+    It may read no other tensors that change. One that looks at numbers, to decide what to call,
+    that draws them, or that is too large (:data:`LARGEST`) is called as it is. What a recorded one
+    returns is overwritten by its next call.
 
     Parameters
     ----------
@@ -78,7 +77,7 @@ class Recording:
     Attributes
     ----------
     can_be_repeated : bool
-        Whether other numbers need the same operations.
+        Whether other numbers need the same operations, and these were kept.
     """
 
     def __init__(self, function: Function, arguments: Sequence[Tensor]) -> None:
@@ -115,6 +114,7 @@ class _Recorder(TorchDispatchMode):
         super().__init__()  # type: ignore[no-untyped-call]  # of torch
         self._inputs = {_memory(one) for one in inputs}
         self._operations: list[_Operation] = []
+        self._size = 0
         self.can_be_repeated = True
 
     def __torch_dispatch__(
@@ -126,8 +126,12 @@ class _Recorder(TorchDispatchMode):
     ) -> Any:
         named = named or {}
         result = operation(*arguments, **named)
-        if UNREPEATABLE & set(operation.tags):
+        self._size += sum(one.nbytes for one in tree_leaves(result) if isinstance(one, Tensor))
+        if self._size > LARGEST or UNREPEATABLE & set(operation.tags):
             self.can_be_repeated = False
+            self._operations.clear()
+        if not self.can_be_repeated:
+            return result
         call = _again(operation, _detached(arguments), _detached(named), _detached(result))
         reads, writes = _memories((arguments, named)), _memories(result)
         if operation.overloadpacket.__name__ in FILLS:

@@ -23,22 +23,21 @@ from dopt.policies import EOptimal, Lookahead, Search, TaskOptimal
 from dopt.policies.search import score_code
 from dopt.policies.task_states import task_states
 from dopt.reference.dynamics import LearnedDynamics
-from dopt.reference.information import BatchInformation
 from dopt.systems.base import System
 
 
 def searched_inputs(
     policy: Search,
     learned: LearnedDynamics,
+    noise_variance: float,
     theta: Tensor,
-    information: BatchInformation,
+    covariance: Tensor,
     x: Tensor,
     ties: Tensor,
-    noise_variance: float = 1.0,
 ) -> Tensor:
     """Return the first inputs of the best plans, (n, m).
 
-    Given are parameters (n, q), M, states (n, d) and tie-breaking directions (n, m). A
+    Given are parameters (n, q), M⁻¹ (n, s, s), states (n, d) and tie-breaking directions (n, m). A
     sample adds JᵀJ/ρ to M, with ρ the ``noise_variance``.
     """
     system = learned.system
@@ -49,14 +48,14 @@ def searched_inputs(
     stride = policy.stride_of(system) if isinstance(policy, Lookahead) else 1
     seen = states[:, :, stride - 1 :: stride]
     rows = learned.rows_at(theta, seen.flatten(1, 2)).unflatten(1, seen.shape[1:3])
-    rows = rows[..., : information.size] * noise_variance**-0.5
+    rows = rows[..., : covariance.shape[1]] * noise_variance**-0.5
     if score_code(policy) == Score.JOINT:
         rows = rows * stride**0.5
     score, G = score_function(policy, learned.system), rows[:, 0, 0, :0]
     if isinstance(policy, TaskOptimal):
         wanted = torch.tensor(task_states(system, policy)).to(theta).expand(len(theta), -1, -1)
-        G = learned.rows_at(theta, wanted).flatten(1, 2)[..., : information.size]
-    values = vmap(vmap(score, (0, None, None)))(rows, G, information.covariance())
+        G = learned.rows_at(theta, wanted).flatten(1, 2)[..., : covariance.shape[1]]
+    values = vmap(vmap(score, (0, None, None)))(rows, G, covariance)
     inside = (states.abs() <= system.state_limit).flatten(2).all(dim=2)
     values = torch.where(inside & values.isfinite(), values, -torch.inf)
     return chosen(values, inputs[:, 0], ties)

@@ -42,9 +42,12 @@ class BatchSteps(BatchState):
         self.sensors = BatchSensors(self) if self.system.n_measured else None
         self.learner = batch_learner(self, points, self.sensors)
         self.own_plan = plan_for(self, self.learner)
+        if isinstance(self.config.policy, Search) and self.held is not None:
+            given = self.config.policy, self.learned, self.held.noise_variance
+            self._searched = recorded(functools.partial(searched_inputs, *given), self.device)
         columns = functools.partial(planning_columns, self.learned, self.project)
-        self._columns = recorded(columns, self.theta)
-        self._rows = recorded(self.learned.jacobian, self.theta)
+        self._columns = recorded(columns, self.device)
+        self._rows = recorded(self.learned.jacobian, self.device)
         limits, self.limits = self.config.limits, None
         if limits and limits.enforced:
             self.limits = BatchLimits(self, limits, self.learner)
@@ -74,9 +77,9 @@ class BatchSteps(BatchState):
                 f"CustomPolicy, or enter a plan in dopt.reference.planner_registry."
             )
         if isinstance(policy, Search):
-            assert self.held is not None
-            given = (self.learned, self.theta, self.information, x)
-            return searched_inputs(policy, *given, self.ties[:, t], self.held.noise_variance)
+            covariance = self.information.covariance()
+            searched: Tensor = self._searched(self.theta, covariance, x, self.ties[:, t])
+            return searched
         components = self.components[:, t : t + 1]
         if isinstance(policy, TraceLinearized):
             components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)

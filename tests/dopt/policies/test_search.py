@@ -181,7 +181,7 @@ def test_a_state_counts_stride_times_in_the_joint_determinant_alone(
     ties = torch.ones(1, 1, dtype=torch.float64)
     values: list[torch.Tensor] = []
     monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
-    search.searched_inputs(spec.policy, learned, theta, information, x, ties)
+    search.searched_inputs(spec.policy, learned, 1.0, theta, information.covariance(), x, ties)
     inputs = torch.tensor(spec.policy.compared_inputs(spec.system))[[0, 0]][None]
     path = search.paths(spec.policy, learned, theta[:1], x[:1], inputs)[0, 0, 2::3]
     rows = vmap(jacrev(for_one(model)), (None, 0))(theta[0], path)

@@ -133,9 +133,28 @@ def test_a_function_that_draws_numbers_is_called_as_it_is() -> None:
     assert len({float(one(x)[0]) for _ in range(6)}) == 6
 
 
-def test_functions_of_large_batches_are_not_recorded() -> None:
-    assert recorded(slopes, torch.zeros(1000, 386)) is slopes
-    assert isinstance(recorded(slopes, torch.zeros(100, 386)), Recorded)
+@torch.no_grad()
+def test_a_function_with_large_results_is_called_as_it_is() -> None:
+    sizes = []
+
+    def function(x: Tensor) -> Tensor:
+        sizes.append(len(x))
+        return (x[:, None] * x).sum(dim=1)
+
+    one = Recorded(function)
+    large = int(module.LARGEST**0.5 / 8) * 3 + 1
+    for n in (10, large):
+        for seed in range(4):
+            x = torch.full((n,), float(seed), dtype=torch.float64)
+            assert torch.equal(one(x), n * x**2)
+    assert sizes == [10] * 2 + [large] * 5  # once to try
+    assert one._recording is not None
+    assert not one._recording._calls
+
+
+def test_functions_on_another_device_are_not_recorded() -> None:
+    assert recorded(slopes, "cuda") is slopes
+    assert isinstance(recorded(slopes, "cpu"), Recorded)
 
 
 def small(env: str, policy: str, /, **fields: Any) -> TrialSpec:
