@@ -261,6 +261,16 @@ def kind_of(value: object) -> NumbaType:
     """Return the type of an argument for numba; of a compiled function, that of a pointer to it."""
     if not isinstance(value, tuple):
         return numba.typeof(value)
+    layout = layout_of(value)
+    if layout not in _kinds:
+        _kinds[layout] = _kind_of_fields(value)
+    return _kinds[layout]
+
+
+_kinds: dict[Hashable, NumbaType] = {}
+
+
+def _kind_of_fields(value: tuple[object, ...]) -> NumbaType:
     if isinstance(value, Plant):
         equations = (KNOWN, ACCELERATIONS, COMPLEX_ACCELERATIONS)
         kinds = [*map(pointer, equations), *map(kind_of, value[len(equations) :])]

@@ -31,6 +31,9 @@ UNREPEATABLE = {
 }
 """Marks of operations that give numbers to the interpreter, or draw some."""
 
+FIRST_CALLS = 10
+"""Calls with the same shapes after which a function is recorded, which takes as long as some."""
+
 LARGEST = 2**26
 """Bytes of results up to which a function is recorded: larger tensors take longer to compute with
 than to call, and a recording keeps them all."""
@@ -42,7 +45,7 @@ def recorded(function: Function, device: str) -> Function:
 
 
 class Recorded:
-    """A function from tensors to tensors, recorded when it is called twice with the same shapes.
+    """A function from tensors to tensors, recorded once it is called often with the same shapes.
 
     It may read no other tensors that change. One that looks at numbers, to decide what to call,
     that draws them, or that is too large (:data:`LARGEST`) is called as it is. What a recorded one
@@ -57,18 +60,19 @@ class Recorded:
     def __init__(self, function: Function) -> None:
         self._function = function
         self._shapes: tuple[torch.Size, ...] = ()
+        self._calls = 0
         self._recording: Recording | None = None
 
     def __call__(self, *arguments: Tensor) -> Any:
         shapes = tuple(argument.shape for argument in arguments)
         if shapes != self._shapes:
-            self._shapes, self._recording = shapes, None
-            return self._function(*arguments)
-        if self._recording is None:
+            self._shapes, self._calls, self._recording = shapes, 0, None
+        self._calls += 1
+        if self._calls > FIRST_CALLS and self._recording is None:
             self._recording = Recording(self._function, arguments)
-        if not self._recording.can_be_repeated:
-            return self._function(*arguments)
-        return self._recording.repeat(arguments)
+        if self._recording is not None and self._recording.can_be_repeated:
+            return self._recording.repeat(arguments)
+        return self._function(*arguments)
 
 
 class Recording:

@@ -19,6 +19,12 @@ from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import trial
 
 
+@pytest.fixture(autouse=True)
+def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Record at the second call."""
+    monkeypatch.setattr(module, "FIRST_CALLS", 1)
+
+
 def slopes(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Return a gradient and a gradient of a gradient."""
     with torch.enable_grad():
@@ -150,6 +156,16 @@ def test_a_function_with_large_results_is_called_as_it_is() -> None:
     assert sizes == [10] * 2 + [large] * 5  # once to try
     assert one._recording is not None
     assert not one._recording._calls
+
+
+@torch.no_grad()
+def test_a_function_is_recorded_once_it_is_called_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "FIRST_CALLS", 4)
+    calls = []
+    one = Recorded(lambda x: calls.append(x) or x + 1.0)  # type: ignore[func-returns-value]
+    for expected in (1, 2, 3, 4, 5, 5, 5):
+        one(torch.zeros(3))
+        assert len(calls) == expected
 
 
 def test_functions_on_another_device_are_not_recorded() -> None:
