@@ -12,7 +12,6 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numba
-import numpy as np
 from numba import float64, int64, types
 from numba.core.errors import NumbaError
 
@@ -23,6 +22,7 @@ from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compilation import compile_missing
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
 from dopt.kernel.held_trial import HeldTrial
+from dopt.kernel.layout import layout_of
 from dopt.kernel.state_structs import State
 from dopt.kernel.struct_pointers import pointer_to
 from dopt.kernel.structs import Evaluation, Information, Network, Plant, Steps, Trial
@@ -110,15 +110,6 @@ def _compiled_parts(
         compiled_at(path_of(function), getattr(kinds, name))
     plan, learn = function_of(policy, kinds.plan), function_of(learner, kinds.learn)
     return Steps(plan, learn, **others)
-
-
-def layout_of(value: object) -> Hashable:
-    """Return what the type of an argument for Numba depends on, which takes longer to find out."""
-    if isinstance(value, tuple):
-        return (type(value), *map(layout_of, value))
-    if isinstance(value, np.ndarray):
-        return value.dtype.char, value.ndim, value.flags.num
-    return type(value) if isinstance(value, (int, float)) else value
 
 
 def _names(policy: Policy, learner: Learner, functions: list[CompiledFunction]) -> list[str]:
