@@ -25,19 +25,23 @@ class BatchLearner(Protocol):
 
 
 class AdamLearner:
-    """Adam on the newest samples; one optimiser for the whole batch, as Adam is elementwise."""
+    """Adam on the newest samples, for the whole batch at once, as Adam is elementwise.
+
+    Attributes
+    ----------
+    moments : pair of (n, q) tensors
+        Running means of the gradient and of its square.
+    n_steps : int
+        Steps that were taken.
+    """
 
     def __init__(
         self, learner: AdamRule, model: BatchModel, theta: Tensor, window: int = 1
     ) -> None:
         self.window = window
-        self.optimizer = torch.optim.Adam(
-            [theta],
-            lr=learner.learning_rate,
-            betas=(learner.beta_1, learner.beta_2),
-            eps=learner.epsilon,
-        )
-        self._theta = theta
+        self.moments = torch.zeros_like(theta), torch.zeros_like(theta)
+        self.n_steps = 0
+        self._rule, self._theta = learner, theta
         self._gradient = recorded(functools.partial(loss_gradient, model), theta.device.type)
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
@@ -46,8 +50,15 @@ class AdamLearner:
         self._step(states[:, newest], targets[:, newest])
 
     def _step(self, states: Tensor, targets: Tensor) -> None:
-        self._theta.grad = self._gradient(self._theta, states, targets)
-        self.optimizer.step()
+        """Take one step: what torch.optim.Adam computes, whose own calls take longer than that."""
+        gradient, rule = self._gradient(self._theta, states, targets), self._rule
+        first, second = self.moments
+        self.n_steps += 1
+        first.lerp_(gradient, 1.0 - rule.beta_1)
+        second.mul_(rule.beta_2).addcmul_(gradient, gradient, value=1.0 - rule.beta_2)
+        unbiased = second.sqrt() / (1.0 - rule.beta_2**self.n_steps) ** 0.5
+        rate = rule.learning_rate / (1.0 - rule.beta_1**self.n_steps)
+        self._theta.addcdiv_(first, unbiased.add_(rule.epsilon), value=-rate)
 
 
 def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Tensor) -> Tensor:

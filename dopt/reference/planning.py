@@ -22,7 +22,6 @@ from torch import Tensor
 from dopt.algorithm import TIE_MARGIN
 from dopt.reference.derivatives import gradients_and_changes
 from dopt.reference.dynamics import LearnedDynamics
-from dopt.reference.information import BatchInformation
 from dopt.reference.sphere import maximize_on_spheres
 
 
@@ -58,9 +57,12 @@ def planning_columns(
     return project(torch.cat([g.unsqueeze(2), DB], dim=2))
 
 
-def quadratic_problem(information: BatchInformation, columns: Tensor) -> QuadraticProblem:
-    """Return the sum of Q and of v over components k, from their :func:`planning_columns`."""
-    solved = information.solve(columns.flatten(1, 2).mT).mT.view_as(columns)
+def quadratic_problem(columns: Tensor, solved: Tensor) -> QuadraticProblem:
+    """Return the sum of Q and of v over components k, from their :func:`planning_columns`.
+
+    ``solved`` (n, s, c (1 + m)) are M⁻¹ times these columns.
+    """
+    solved = solved.mT.view_as(columns)
     Q = (columns[:, :, 1:] @ solved[:, :, 1:].mT).sum(dim=1)
     v = -(columns[:, :, 1:] @ solved[:, :, :1].mT).sum(dim=1).squeeze(-1)
     return QuadraticProblem(Q, v)
@@ -88,6 +90,11 @@ def gradient_and_changes(
         columns.unsqueeze(1).expand(*shape, -1).flatten(0, 2),
     )
     return g.view(*shape, -1)[:, :, 0], DB.view(*shape, -1)
+
+
+def best_inputs(gamma: float, columns: Tensor, solved: Tensor, ties: Tensor) -> Tensor:
+    """Return the inputs, (n, m), from the :func:`planning_columns` and M⁻¹ times them."""
+    return d_optimal_inputs(quadratic_problem(columns, solved), gamma, ties)
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:

@@ -17,12 +17,7 @@ from dopt.reference.learner_registry import batch_learner
 from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.limits import BatchLimits
 from dopt.reference.planner_registry import plan_for
-from dopt.reference.planning import (
-    d_optimal_inputs,
-    planning_columns,
-    quadratic_problem,
-    uniform_inputs,
-)
+from dopt.reference.planning import best_inputs, planning_columns, uniform_inputs
 from dopt.reference.recorded import recorded
 from dopt.reference.search import searched_inputs
 from dopt.reference.sensors import BatchSensors
@@ -47,6 +42,8 @@ class BatchSteps(BatchState):
             self._searched = recorded(functools.partial(searched_inputs, *given), self.device)
         columns = functools.partial(planning_columns, self.learned, self.project)
         self._columns = recorded(columns, self.device)
+        best = functools.partial(best_inputs, self.system.gamma)
+        self._best = recorded(best, self.device)
         self._rows = recorded(self.learned.jacobian, self.device)
         limits, self.limits = self.config.limits, None
         if limits and limits.enforced:
@@ -86,8 +83,9 @@ class BatchSteps(BatchState):
         ties = self.ties[:, t]
         v = ties * (self.system.gamma / torch.linalg.vector_norm(ties, dim=1, keepdim=True))
         columns = self._columns(self.theta, x, components, v)
-        problem = quadratic_problem(self.information, columns)
-        return d_optimal_inputs(problem, self.system.gamma, self.ties[:, t])
+        solved = self.information.solve(columns.flatten(1, 2).mT)
+        best: Tensor = self._best(columns, solved, ties)
+        return best
 
     def observe(self, t: int, dt: float) -> None:
         """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later.

@@ -126,7 +126,7 @@ def test_the_plan_is_for_the_change_of_the_gradient_with_the_state(model: str) -
     information = BatchInformation(M)
     v, learned = torch.tensor([[-gamma]], dtype=torch.float64), batch.learned
     columns = planning_columns(learned, lambda rows: rows, theta, x, torch.tensor([[1]]), v)
-    problem = quadratic_problem(information, columns)
+    problem = quadratic_problem(columns, information.solve(columns.flatten(1, 2).mT))
     bar = predicted_states(learned, theta, x)[0]
     B = learned.input_matrix(theta, bar[None])[0, :, 0]
 

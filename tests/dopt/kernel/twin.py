@@ -28,11 +28,10 @@ def transplant(trial: KernelTrial, parameters: np.ndarray | None = None) -> Lock
         J = twin.learned.jacobian(torch.tensor(parameters), twin.states[0, :t].unsqueeze(1))
         twin.information.add(J.flatten(0, 2)[None])
     if isinstance(twin.learner, AdamLearner):
-        twin.learner.optimizer.state[twin.theta] = {
-            "step": torch.tensor(float(t)),
-            "exp_avg": torch.tensor(state.moment_1)[None],
-            "exp_avg_sq": torch.tensor(state.moment_2)[None],
-        }
+        twin.learner.n_steps = t
+        twin.learner.moments = tuple(
+            torch.tensor(moment)[None] for moment in (state.moment_1, state.moment_2)
+        )
     return twin
 
 

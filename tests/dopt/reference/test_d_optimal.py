@@ -63,7 +63,8 @@ def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tens
         torch.tensor([[component]]),
         torch.zeros(1, spec.system.n_inputs, dtype=torch.float64),
     )
-    problem = quadratic_problem(BatchInformation(now.information[None]), columns)
+    information = BatchInformation(now.information[None])
+    problem = quadratic_problem(columns, information.solve(columns.flatten(1, 2).mT))
     ties = torch.ones(1, spec.system.n_inputs, dtype=torch.float64)
     u = d_optimal_inputs(problem, spec.system.gamma, ties)
     return problem.Q[0], problem.v[0], u[0]
@@ -149,7 +150,7 @@ def test_each_trial_of_a_batch_has_its_own_problem() -> None:
         torch.zeros(3, 2, dtype=torch.float64),
     )
     information = BatchInformation(torch.stack([now.information for now in several]))
-    problem = quadratic_problem(information, columns)
+    problem = quadratic_problem(columns, information.solve(columns.flatten(1, 2).mT))
     ties = torch.ones(3, 2, dtype=torch.float64)
     inputs = d_optimal_inputs(problem, spec.system.gamma, ties)
     for i, component in enumerate((0, 1, 1)):
