@@ -45,7 +45,8 @@ def done() -> TrialResult:
 def test_every_measure_is_there_at_every_step(done: TrialResult) -> None:
     found = [(row.t, row.measure) for row in done.assessments]
     once = ("true_model_success", "true_model_cost")
-    often = [name for name in MEASURES if name not in (*once, VIOLATIONS, WORST)]
+    others = (*once, "feedback_success", "feedback_cost", VIOLATIONS, WORST)
+    often = [name for name in MEASURES if name not in others]
     expected = {(0, name) for name in once} | set(itertools.product((0, 10, 30), often))
     assert len(found) == len(set(found))
     assert set(found) == expected
