@@ -6,7 +6,7 @@ import numpy as np
 
 from dopt.agents.normal_ensemble import NormalEnsemble, jensen_renyi_divergence
 from dopt.agents.observation import Observation
-from dopt.agents.soft_actor_critic import Settings, SoftActorCritic
+from dopt.agents.soft_actor_critic import Agent, Settings
 from dopt.control.planner import within_ball
 from dopt.policies.active_exploration import AGENT_UNITS, ActiveExploration
 from dopt.policies.base import Planner
@@ -23,17 +23,17 @@ class ImaginingAgent(Planner):
         self._observation = Observation(system)
         sizes = policy.ensemble, len(system.features), policy.units, system.n_learned
         self._ensemble = NormalEnsemble(sizes, policy.learning_rate, rng)
-        decisions = -(-policy.lookahead // policy.hold)
+        self._decisions = -(-policy.lookahead // policy.hold)
         settings = Settings(
-            AGENT_UNITS,
-            policy.learning_rate,
-            policy.batch,
-            policy.discount,
-            policy.entropy_weight,
-            decisions * policy.episodes * policy.actors,
+            units=AGENT_UNITS,
+            learning_rate=policy.learning_rate,
+            batch_size=policy.batch,
+            gamma=policy.discount,
+            ent_coef=policy.entropy_weight,
+            buffer_size=self._decisions * policy.episodes * policy.actors,
         )
         size, m = self._observation.size, system.n_inputs
-        self._agent = SoftActorCritic(size, m, settings, rng, policy.actors)
+        self._agent = Agent(size, m, settings, rng, policy.actors)
         self._action = np.zeros(system.n_inputs)
         self._decided_at = -policy.hold
 
@@ -69,7 +69,7 @@ class ImaginingAgent(Planner):
         states = np.tile(start, (policy.actors, 1))
         observed = self._observation(states)
         mean, variance = self._predicted(states)
-        for _ in range(-(-policy.lookahead // policy.hold)):
+        for _ in range(self._decisions):
             actions = self._agent.act(observed)
             rewards = np.zeros(policy.actors)
             for _ in range(policy.hold):

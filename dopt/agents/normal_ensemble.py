@@ -91,7 +91,7 @@ def jensen_renyi_divergence(mean: Array, variance: Array) -> Array:
     """Return the divergence of normal distributions of equal weight, (N,), from μ and v.
 
     It is the quadratic Rényi entropy of their mixture less the mean of theirs: 0 where all are the
-    same, log E where none overlap.
+    same, and log E where none overlap, if all have the same variances.
     """
     E = len(mean)
     between = variance[:, None] + variance[None]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 
 from dopt.agents.actor import Actor
 from dopt.agents.global_randomness import GlobalRandomness
@@ -15,6 +13,8 @@ from dopt.errors import SpecificationError
 from dopt.types import Array
 
 try:
+    import gymnasium
+    from gymnasium.spaces import Box
     from stable_baselines3 import SAC
     from stable_baselines3.common.buffers import ReplayBuffer
     from stable_baselines3.common.logger import Logger
@@ -45,7 +45,7 @@ class Settings:
     buffer_size: int
 
 
-class SoftActorCritic:
+class Agent:
     """Actor and critics, and the transitions that they learn from.
 
     Parameters

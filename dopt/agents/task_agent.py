@@ -8,12 +8,12 @@ import numpy as np
 
 from dopt.agents.actor import Actor
 from dopt.agents.observation import Observation
-from dopt.agents.soft_actor_critic import Settings, SoftActorCritic
+from dopt.agents.soft_actor_critic import Agent, Settings
 from dopt.control.episode import costs
 from dopt.control.planner import within_ball
 from dopt.control.task import Goal
 from dopt.policies.base import Planner
-from dopt.policies.soft_actor_critic import SoftActorCritic as Specification
+from dopt.policies.soft_actor_critic import SoftActorCritic
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 from dopt.types import Array
@@ -36,19 +36,19 @@ class TaskAgent(Planner):
     """The agent of one trial."""
 
     def __init__(
-        self, policy: Specification, system: System, goal: Goal, rng: np.random.Generator
+        self, policy: SoftActorCritic, system: System, goal: Goal, rng: np.random.Generator
     ) -> None:
         self._policy, self._system, self._goal, self._rng = policy, system, goal, rng
         self._observation = Observation(system)
         settings = Settings(
-            policy.units,
-            policy.learning_rate,
-            policy.batch,
-            policy.discount,
-            "auto",
-            system.horizon // policy.hold + 1,
+            units=policy.units,
+            learning_rate=policy.learning_rate,
+            batch_size=policy.batch,
+            gamma=policy.discount,
+            ent_coef="auto",
+            buffer_size=system.horizon // policy.hold + 1,
         )
-        self._agent = SoftActorCritic(self._observation.size, system.n_inputs, settings, rng)
+        self._agent = Agent(self._observation.size, system.n_inputs, settings, rng)
         self._action = np.zeros(system.n_inputs)
         self._decided_at = 0
 

@@ -9,8 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.declare.validated_fields import parameter
-from dopt.errors import SpecificationError
-from dopt.policies.base import CustomPolicy, Planner, check_length
+from dopt.policies.base import CustomPolicy, Planner, check_ensemble, check_length
 from dopt.systems.base import System
 
 AGENT_UNITS = 64
@@ -84,11 +83,7 @@ class ActiveExploration(CustomPolicy):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ensemble < 2:
-            raise SpecificationError(
-                f"policy.ensemble is {self.ensemble}, but at least 2 networks are expected, as "
-                f"one network cannot disagree with itself: set policy.ensemble to 2 or more."
-            )
+        check_ensemble(self.ensemble)
 
     def check(self, system: System) -> None:
         check_length("policy.lookahead", self.lookahead, system)

@@ -37,6 +37,15 @@ def check_length(key: str, steps: int, system: System) -> None:
         )
 
 
+def check_ensemble(networks: int) -> None:
+    """Raise SpecificationError if a policy has fewer than two networks that could disagree."""
+    if networks < 2:
+        raise SpecificationError(
+            f"policy.ensemble is {networks}, but at least 2 networks are expected, as one network "
+            f"cannot disagree with itself: set policy.ensemble to 2 or more."
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Policy(KernelPart):
     """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dopt.declare.validated_fields import parameter
-from dopt.errors import SpecificationError
+from dopt.policies.base import check_ensemble
 from dopt.policies.held_candidates import HeldCandidates
 
 
@@ -43,8 +43,4 @@ class Disagreement(HeldCandidates):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.ensemble < 2:
-            raise SpecificationError(
-                f"policy.ensemble is {self.ensemble}, but at least 2 networks are expected, as "
-                f"one network cannot disagree with itself: set policy.ensemble to 2 or more."
-            )
+        check_ensemble(self.ensemble)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dopt.agents.soft_actor_critic import Settings, SoftActorCritic
+from dopt.agents.soft_actor_critic import Agent, Settings
 
 pytestmark = pytest.mark.xdist_group("agents")  # one process loads the library
 
@@ -17,11 +17,11 @@ SETTINGS = Settings(
 )
 
 
-def agent(seed: int = 0, n_actors: int = 1) -> SoftActorCritic:
-    return SoftActorCritic(2, 1, SETTINGS, np.random.default_rng(seed), n_actors)
+def agent(seed: int = 0, n_actors: int = 1) -> Agent:
+    return Agent(2, 1, SETTINGS, np.random.default_rng(seed), n_actors)
 
 
-def fed(one: SoftActorCritic, steps: int, n_actors: int = 1) -> SoftActorCritic:
+def fed(one: Agent, steps: int, n_actors: int = 1) -> Agent:
     """Give it transitions whose best action is half the first observed number."""
     rng = np.random.default_rng(1)
     for _ in range(steps):

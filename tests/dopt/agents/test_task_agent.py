@@ -49,10 +49,10 @@ def test_an_input_is_held_between_two_decisions() -> None:
 def test_the_transitions_are_those_of_the_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     kept: list[tuple[np.ndarray, ...]] = []
     monkeypatch.setattr(
-        "dopt.agents.soft_actor_critic.SoftActorCritic.remember",
+        "dopt.agents.soft_actor_critic.Agent.remember",
         lambda _, *parts: kept.append(parts),
     )
-    monkeypatch.setattr("dopt.agents.soft_actor_critic.SoftActorCritic.learn", lambda *_: None)
+    monkeypatch.setattr("dopt.agents.soft_actor_critic.Agent.learn", lambda *_: None)
     spec = trial("pendulum", "sac")
     result, goal = run_trial(spec), GOALS["pendulum"]
     assert len(kept) == 9
@@ -103,14 +103,15 @@ def test_a_system_without_a_task_is_refused() -> None:
         trial("van_der_pol", "sac")
 
 
-def test_a_missing_library_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("missing", ["stable_baselines3", "gymnasium"])
+def test_a_missing_library_is_said(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.startswith("dopt.agents")]:
         monkeypatch.delitem(sys.modules, name)
     real = builtins.__import__
 
     def without(name: str, *rest: Any, **more: Any) -> Any:
-        if name.startswith("stable_baselines3"):
-            raise ImportError("No module named 'stable_baselines3'")
+        if name.startswith(missing):
+            raise ImportError(f"No module named '{missing}'")
         return real(name, *rest, **more)
 
     monkeypatch.setattr(builtins, "__import__", without)
