@@ -9,15 +9,17 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import called_from_python
+from dopt.kernel.held_plant import HeldPlant
 from dopt.kernel.integration import add_stage, n_stages, next_true_state, write_rate
 from dopt.kernel.model import write_point_features
-from dopt.kernel.structs import Network, Plant
+from dopt.kernel.structs import Network
 from dopt.types import Matrix, Stack, Vector
 
 
 @called_from_python
-def follow_equations(plant: Plant, parameters: Vector, inputs: Stack, states: Stack) -> None:
+def follow_equations(held: HeldPlant, parameters: Vector, inputs: Stack, states: Stack) -> None:
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m)."""
+    plant = held.plant
     for t in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
             next_true_state(plant, parameters, states[t, i], inputs[t, i], states[t + 1, i])
@@ -25,12 +27,13 @@ def follow_equations(plant: Plant, parameters: Vector, inputs: Stack, states: St
 
 @called_from_python
 def follow_network(
-    plant: Plant, network: Network, thetas: Matrix, inputs: Stack, states: Stack
+    held: HeldPlant, network: Network, thetas: Matrix, inputs: Stack, states: Stack
 ) -> None:
     """Write the states, (H + 1, n, d), that follow the first under inputs (H, n, m).
 
     They follow the mean of the networks with parameters ``thetas``, (E, q).
     """
+    plant = held.plant
     n, d, r = inputs.shape[1], states.shape[2], plant.learned_rows.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     rate, value, total = np.empty(d), np.empty(r), np.empty((n, d))
