@@ -48,8 +48,9 @@ class Recorded:
     """A function from tensors to tensors, recorded once it is called often with the same shapes.
 
     It may read no other tensors that change. One that looks at numbers, to decide what to call,
-    that draws them, or that is too large (:data:`LARGEST`) is called as it is. What a recorded one
-    returns is overwritten by its next call.
+    that draws them, or that is too large (:data:`LARGEST`) is called as it is, and so is one that
+    gives other numbers than its recording at the call after it: it computes outside of torch. What
+    a recorded one returns is overwritten by its next call.
 
     Parameters
     ----------
@@ -68,8 +69,10 @@ class Recorded:
         if shapes != self._shapes:
             self._shapes, self._calls, self._recording = shapes, 0, None
         self._calls += 1
-        if self._calls > FIRST_CALLS and self._recording is None:
+        if self._recording is None and self._calls > FIRST_CALLS:
             self._recording = Recording(self._function, arguments)
+        elif self._recording is not None and self._calls == FIRST_CALLS + 2:
+            self._recording.compare(self._function, arguments)
         if self._recording is not None and self._recording.can_be_repeated:
             return self._recording.repeat(arguments)
         return self._function(*arguments)
@@ -101,6 +104,17 @@ class Recording:
         for operation, given, named in self._calls:
             operation(*given, **named)
         return self._result
+
+    def compare(self, function: Function, arguments: Sequence[Tensor]) -> None:
+        """Give up where the function gives other numbers: it computes outside of torch."""
+        if self.can_be_repeated:
+            pairs = zip(
+                tree_leaves(function(*arguments)), tree_leaves(self.repeat(arguments)), strict=True
+            )
+            self.can_be_repeated = all(
+                torch.allclose(one, other, rtol=0.0, atol=0.0, equal_nan=True)
+                for one, other in pairs
+            )
 
 
 class _Operation(NamedTuple):
