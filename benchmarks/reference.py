@@ -10,17 +10,20 @@ from benchmarks.trials import cartpole
 from dopt.result import TrialResult
 
 BATCH = 100
-SKIPPED = 4
-"""First steps of a batch, in which torch allocates and traces."""
+SKIPPED = 14
+"""First steps of a batch, in which torch allocates and operations are recorded."""
+
+SETTLED = 160
+"""Steps of one trial: the window is full after 100, and its gradient recorded soon after."""
 
 
 def measure(quick: bool) -> list[Row]:
     """Return the cost of a step for each trial of a batch, and trial-steps per second."""
     import torch
 
-    rows = _rows(1, 120)
+    rows = _rows(1, SETTLED)
     if not quick:
-        rows += _rows(BATCH, SKIPPED + 8)
+        rows += _rows(BATCH, SKIPPED + 10)
     if not quick and torch.cuda.is_available():
         rows += _rows(BATCH, 120, "cuda")
     return rows
