@@ -66,6 +66,8 @@ class ActiveExploration(CustomPolicy):
 
     name: ClassVar[str] = "max_agent"
     reads_inputs: ClassVar[bool] = False
+    library: ClassVar[str] = "stable_baselines3"
+    extra: ClassVar[str] = "agents"
 
     ensemble: int = parameter(8, "networks", "positive")
     units: int = parameter(32, "units", "positive")

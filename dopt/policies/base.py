@@ -52,12 +52,16 @@ class Policy(KernelPart):
 
     ``uses_full_amplitude`` says whether every input has the norm γ; without it inputs may have
     other norms. ``reads_inputs`` says whether it goes with models that depend on the inputs.
+    ``library`` is a module that it cannot do without, and ``extra`` the extra of this package that
+    installs it.
     """
 
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
     uses_full_amplitude: ClassVar[bool] = True
     reads_inputs: ClassVar[bool] = False
+    library: ClassVar[str] = ""
+    extra: ClassVar[str] = ""
 
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""

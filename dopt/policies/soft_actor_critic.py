@@ -46,6 +46,8 @@ class SoftActorCritic(TaskPolicy):
 
     name: ClassVar[str] = "sac"
     reads_inputs: ClassVar[bool] = True
+    library: ClassVar[str] = "stable_baselines3"
+    extra: ClassVar[str] = "agents"
 
     hold: int = parameter(5, "steps", "positive")
     warm_up: int = parameter(100, "steps", "positive")
