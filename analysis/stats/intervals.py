@@ -38,7 +38,7 @@ square. The ends differ by less than 5 % of a half-width there, of normal and of
 where the draws of the bootstrap alone make 3 %."""
 
 STUDENT_RANGE = f"Student's below {FEWEST_BOOTSTRAP_VALUES} and above {MOST_BOOTSTRAP_VALUES}"
-"""Where :func:`interval_of_mean` is Student's, for the notes of tables and figures."""
+"""Numbers of values whose interval is Student's, for the notes of tables and figures."""
 
 
 class Statistic(StrEnum):

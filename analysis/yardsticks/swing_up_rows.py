@@ -29,7 +29,7 @@ COLUMN = ["env", "model"]
 """Settings that the trials of one column of the tables share."""
 
 _SOLVERS = {"control_success": "", "feedback_success": ", its own feedback"}
-"""What solves the task: a planner with the learned model, or what the policy itself has learned."""
+"""Solvers of the task: a planner with the learned model, and what the policy itself has learned."""
 
 _SEED = 20_230_426
 

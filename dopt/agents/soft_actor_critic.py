@@ -4,25 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium.spaces import Box
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
 
 from dopt.agents.actor import Actor
 from dopt.agents.global_randomness import GlobalRandomness
-from dopt.errors import SpecificationError
 from dopt.types import Array
-
-try:
-    import gymnasium
-    from gymnasium.spaces import Box
-    from stable_baselines3 import SAC
-    from stable_baselines3.common.buffers import ReplayBuffer
-    from stable_baselines3.common.logger import Logger
-except ImportError as error:
-    raise SpecificationError(
-        f"policies 'sac' and 'max_agent' need stable-baselines3, which cannot be imported "
-        f"({error}): pip install 'dopt[agents]'."
-    ) from error
 
 
 @dataclass(frozen=True)

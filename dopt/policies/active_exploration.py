@@ -91,6 +91,7 @@ class ActiveExploration(CustomPolicy):
         check_length("policy.lookahead", self.lookahead, system)
 
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
+        self.check_library()
         agents = importlib.import_module("dopt.agents.imagining_agent")  # which loads torch
         agent: Planner = agents.ImaginingAgent(self, system, rng)
         return agent

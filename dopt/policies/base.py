@@ -7,6 +7,7 @@ kernel does not know brings its plan along, a :class:`Planner`.
 
 from __future__ import annotations
 
+import importlib.util
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -65,6 +66,14 @@ class Policy(KernelPart):
 
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
+
+    def check_library(self) -> None:
+        """Raise SpecificationError if the library of the policy is not installed."""
+        if self.library and importlib.util.find_spec(self.library) is None:
+            raise SpecificationError(
+                f"policy '{self.name}' needs the library {self.library}, but it is not installed: "
+                f"pip install 'dopt[{self.extra}]', or choose another policy."
+            )
 
     def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of policies that keep nothing
         """Return how many numbers the policy keeps from step to step; they start at zero."""

@@ -58,6 +58,7 @@ class SoftActorCritic(TaskPolicy):
     discount: float = parameter(0.98, bound="fraction")
 
     def task_planner(self, system: System, goal: Goal, rng: np.random.Generator) -> Planner:
+        self.check_library()
         agents = importlib.import_module("dopt.agents.task_agent")  # which loads torch
         agent: Planner = agents.TaskAgent(self, system, goal, rng)
         return agent

@@ -71,11 +71,12 @@ class Recorded:
         self._calls += 1
         if self._recording is None and self._calls > FIRST_CALLS:
             self._recording = Recording(self._function, arguments)
-        elif self._recording is not None and self._calls == FIRST_CALLS + 2:
-            self._recording.compare(self._function, arguments)
-        if self._recording is not None and self._recording.can_be_repeated:
-            return self._recording.repeat(arguments)
-        return self._function(*arguments)
+            return self._recording.result
+        if self._recording is None or not self._recording.can_be_repeated:
+            return self._function(*arguments)
+        if self._calls == FIRST_CALLS + 2:
+            return self._recording.compared(self._function, arguments)
+        return self._recording.repeat(arguments)
 
 
 class Recording:
@@ -83,6 +84,8 @@ class Recording:
 
     Attributes
     ----------
+    result : tensor or nested tuples of tensors
+        What the function returned, or the last repetition.
     can_be_repeated : bool
         Whether other numbers need the same operations, and these were kept.
     """
@@ -92,8 +95,8 @@ class Recording:
         recorder = _Recorder(self._inputs)
         with recorder:
             result = function(*self._inputs)
-        self._result = _detached(result)
-        self._calls = recorder.calls_for(self._result)
+        self.result = _detached(result)
+        self._calls = recorder.calls_for(self.result)
         self.can_be_repeated = recorder.can_be_repeated
 
     @torch.no_grad()
@@ -103,18 +106,19 @@ class Recording:
             own.copy_(argument)
         for operation, given, named in self._calls:
             operation(*given, **named)
-        return self._result
+        return self.result
 
-    def compare(self, function: Function, arguments: Sequence[Tensor]) -> None:
-        """Give up where the function gives other numbers: it computes outside of torch."""
-        if self.can_be_repeated:
-            pairs = zip(
-                tree_leaves(function(*arguments)), tree_leaves(self.repeat(arguments)), strict=True
-            )
-            self.can_be_repeated = all(
-                torch.allclose(one, other, rtol=0.0, atol=0.0, equal_nan=True)
-                for one, other in pairs
-            )
+    def compared(self, function: Function, arguments: Sequence[Tensor]) -> Any:
+        """Return what the function returns, and give up if a repetition gives other numbers.
+
+        The function then computes outside of torch, or changes a tensor that it did not make there.
+        """
+        result = _detached(function(*arguments))
+        pairs = zip(tree_leaves(result), tree_leaves(self.repeat(arguments)), strict=True)
+        self.can_be_repeated = all(
+            torch.allclose(one, other, rtol=0.0, atol=0.0, equal_nan=True) for one, other in pairs
+        )
+        return result
 
 
 class _Operation(NamedTuple):
@@ -138,7 +142,7 @@ class _Recorder(TorchDispatchMode):
     def __torch_dispatch__(
         self,
         operation: Any,
-        types: Sequence[type],  # one signature
+        types: Sequence[type],
         arguments: Sequence[Any] = (),
         named: Mapping[str, Any] | None = None,
     ) -> Any:

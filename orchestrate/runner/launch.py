@@ -20,7 +20,6 @@ from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
 from orchestrate.executors.registry import executor_factory, make_job
 from orchestrate.redaction import without_password
 from orchestrate.runner.dry_run import preview
-from orchestrate.runner.library_check import check_libraries
 from orchestrate.runner.memory_check import check_memory
 from orchestrate.runner.provenance import launch_record
 from orchestrate.runner.run_grid import Work, launch_grid
@@ -65,7 +64,7 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
         grid = grid.only(settings.share.holds)
     if not settings.detach:  # workers may run on other machines
         check_memory(grid, settings)
-        check_libraries(grid)
+        grid.check_libraries()
     _check_kind(settings, single=request.single)
     SeedPlan(grid, settings)  # refuses a rule that does not apply to the grid
     return grid, settings

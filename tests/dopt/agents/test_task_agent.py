@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import builtins
 import dataclasses
-import sys
-from typing import Any
+import importlib.util
 
 import numpy as np
 import pytest
@@ -16,7 +14,8 @@ from dopt.control.episode import costs, run_feedback
 from dopt.control.task import GOALS
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.forecasts import true_forecast
-from dopt.policies import SoftActorCritic
+from dopt.policies import ActiveExploration, SoftActorCritic
+from dopt.policies.base import CustomPolicy
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import Pendulum
@@ -103,20 +102,12 @@ def test_a_system_without_a_task_is_refused() -> None:
         trial("van_der_pol", "sac")
 
 
-@pytest.mark.parametrize("missing", ["stable_baselines3", "gymnasium"])
-def test_a_missing_library_is_said(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith("dopt.agents")]:
-        monkeypatch.delitem(sys.modules, name)
-    real = builtins.__import__
-
-    def without(name: str, *rest: Any, **more: Any) -> Any:
-        if name.startswith(missing):
-            raise ImportError(f"No module named '{missing}'")
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(SpecificationError, match=r"pip install 'dopt\[agents\]'"):
-        SoftActorCritic().planner(Pendulum(), np.random.default_rng(0))
+@pytest.mark.parametrize("policy", [SoftActorCritic(), ActiveExploration()])
+def test_a_missing_library_is_said(policy: CustomPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda *_: None)
+    message = r"needs the library stable_baselines3.*pip install 'dopt\[agents\]'"
+    with pytest.raises(SpecificationError, match=message):
+        policy.planner(Pendulum(), np.random.default_rng(0))
 
 
 def test_the_agent_learns_to_hold_a_point() -> None:

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
+from dopt.errors import SpecificationError
 from orchestrate.config.grid import Combination, Grid, build_grid
-from orchestrate.errors import LaunchError
-from orchestrate.runner.library_check import check_libraries
 
 
 def grid(*policies: str) -> Grid:
@@ -36,14 +35,14 @@ def test_a_missing_library_is_refused_with_the_extra(
     def without(name: str, *rest: Any) -> Any:
         return None if name == "stable_baselines3" else real(name, *rest)
 
-    check_libraries(grid("random", policy))
+    grid("random", policy).check_libraries()
     monkeypatch.setattr(importlib.util, "find_spec", without)
-    check_libraries(grid("random", "d_optimal"))
+    grid("random", "d_optimal").check_libraries()
     message = (
         rf"policy '{policy}' needs the library stable_baselines3.*pip install 'dopt\[agents\]'"
     )
-    with pytest.raises(LaunchError, match=message):
-        check_libraries(grid("random", policy))
+    with pytest.raises(SpecificationError, match=message):
+        grid("random", policy).check_libraries()
 
 
 def test_each_extra_is_one_of_the_package() -> None:
