@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import io
-import os
 import sys
 from collections.abc import Sequence
 
 from dopt.errors import DoptError, unknown_name
+from orchestrate.cli_parser import discard_output
 from orchestrate.commands import COMMANDS
 from orchestrate.commands.command import PROGRAM
 from orchestrate.commands.output import say
@@ -33,8 +33,7 @@ def main(words: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except BrokenPipeError:
-        # The reader of the output has closed it; the interpreter must not flush the rest.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_output()
         return ExitCode.DONE
 
 

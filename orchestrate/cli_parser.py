@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NoReturn
 
@@ -47,6 +49,11 @@ class Parser(argparse.ArgumentParser):
             name = max(action.option_strings, key=len, default=action.metavar or action.dest)
             names = [str(choice) for choice in action.choices]
             raise UsageError(f"{unknown_name(str(name).lower(), value, names)}")
+
+
+def discard_output() -> None:
+    """Leave out the rest of the output, whose reader, such as ``head``, has closed it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _options(parser: argparse.ArgumentParser, words: Sequence[str]) -> Iterator[str]:

@@ -10,9 +10,10 @@ checksum, as neither database notices a change within one.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 
 import numpy as np
-from sqlalchemy import Connection, Select, and_, delete, insert, inspect, select
+from sqlalchemy import Connection, Select, and_, bindparam, delete, insert, inspect, select
 
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Array
@@ -23,6 +24,7 @@ PAGE = 200
 """Trials in one transaction, so that a launch waits for less than a second."""
 
 _CHECK_BYTES = 4
+_DELETE = delete(curve).where(curve.c.trial_id == bindparam("earlier"))
 _INSERT = insert(curve)
 _STEPS = select(*(step.c[name] for name in STEP_VALUES)).order_by(step.c.t)
 CURRENT = and_(curve.c.trial_id == trial.c.trial_id, curve.c.attempt == trial.c.attempt)
@@ -39,11 +41,19 @@ def create(connection: Connection) -> None:
     derived.create_all(connection)
 
 
-def write(connection: Connection, trial_id: int, attempt: int, steps: Array) -> None:
-    """Write the curve of an attempt, (T, number of STEP_VALUES), in place of an earlier one."""
-    connection.execute(delete(curve).where(curve.c.trial_id == trial_id))
-    arrays = {name: _packed(steps[:, i]) for i, name in enumerate(STEP_VALUES)}
-    connection.execute(_INSERT, {"trial_id": trial_id, "attempt": attempt, **arrays})
+def write(connection: Connection, curves: Iterable[tuple[int, int, Array]]) -> None:
+    """Write curves in place of earlier ones: trial_id, attempt, (T, number of STEP_VALUES)."""
+    rows = [
+        {
+            "trial_id": trial_id,
+            "attempt": attempt,
+            **{name: _packed(steps[:, i]) for i, name in enumerate(STEP_VALUES)},
+        }
+        for trial_id, attempt, steps in curves
+    ]
+    if rows:
+        connection.execute(_DELETE, [{"earlier": row["trial_id"]} for row in rows])
+        connection.execute(_INSERT, rows)
 
 
 def write_missing(backend: Backend) -> int:
@@ -52,10 +62,10 @@ def write_missing(backend: Backend) -> int:
     while True:
         with backend.transaction() as connection:
             rows = connection.execute(_missing(last)).all()
-            for row in rows:
+            for row in rows:  # one by one, as a curve may be long
                 steps = connection.execute(_STEPS.where(step.c.trial_id == row.trial_id)).all()
                 numbers = np.array(list(map(tuple, steps)), np.float64)
-                write(connection, row.trial_id, row.attempt, numbers)
+                write(connection, [(row.trial_id, row.attempt, numbers)])
         if not rows:
             return written
         written, last = written + len(rows), rows[-1].trial_id

@@ -16,7 +16,7 @@ from sqlalchemy import Row
 from orchestrate.store import database_url
 from orchestrate.store.backends import sqlite
 from orchestrate.store.errors import StoreError
-from orchestrate.store.merging.source import Source
+from orchestrate.store.merging.source import Page, Source
 from orchestrate.store.merging.target import Target, add_launches
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.schema import FINISHED
@@ -94,7 +94,7 @@ def merge(url: str, other_url: str) -> Merged:
             with store._backend.transaction() as connection:
                 store._backend.exclusive(connection)
                 target = Target(connection, store._backend, source, launches, configs)
-                found = _merge_page(target, source, page)
+                found = _merge_page(target, page)
             _count(merged, found)
     return merged
 
@@ -102,19 +102,23 @@ def merge(url: str, other_url: str) -> Merged:
 Found = list[tuple[str, dict[str, Any]]]
 
 
-def _merge_page(target: Target, source: Source, page: list[dict[str, Any]]) -> Found:
-    known = target.known([row["trial_key"] for row in page])
-    return [(_merge_trial(target, source, row, known.get(row["trial_key"])), row) for row in page]
+def _merge_page(target: Target, page: Page) -> Found:
+    known = target.known([row["trial_key"] for row in page.trials])
+    found = [
+        (_merge_trial(target, page, row, known.get(row["trial_key"])), row) for row in page.trials
+    ]
+    target.write()
+    return found
 
 
-def _merge_trial(target: Target, source: Source, row: dict[str, Any], here: Row[Any] | None) -> str:
+def _merge_trial(target: Target, page: Page, row: dict[str, Any], here: Row[Any] | None) -> str:
     """Copy one trial if it is new here; return the outcome as a field of :class:`Merged`."""
     finished = row["status"] in FINISHED
     if here is not None and here.status == "running":
         return "running"
     if here is not None and not finished and here.status != "pending":
         return "kept"
-    curve = source.curve(row) if finished else None
+    curve = page.curves.get(row["trial_id"])
     if finished and curve is None:
         return "incomplete"
     if curve is not None and here is not None and here.status in FINISHED:
@@ -126,7 +130,7 @@ def _merge_trial(target: Target, source: Source, row: dict[str, Any], here: Row[
         if ahead > 0:
             return "kept"
         target.clear(here)
-    attempts = target.new_attempts(row, here)
+    attempts = target.new_attempts(page.attempts[row["trial_id"]], here)
     if here is not None and not finished and not attempts:
         return "kept"  # it was merged before, and a new run was requested here since
     target.add(row, here, attempts, curve)

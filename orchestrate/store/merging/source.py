@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,9 @@ from orchestrate.store.schema import N_ROWS, PREQUENTIAL, STEP_VALUES
 PAGE = 50
 """Trials in one transaction, so that a concurrent launch waits for less than a second."""
 
+PAGE_STEPS = 5_000
+"""Steps in one transaction, unless its only trial has more, which bounds the memory."""
+
 _TRIALS = (
     f"SELECT r.*, c.config_key, {N_ROWS} AS n_rows, c.env, c.policy, e.hash AS error_hash, "
     f"CASE WHEN c.config_json LIKE '{PREQUENTIAL}' THEN 1 ELSE 0 END AS grows FROM trial r "
@@ -25,13 +31,20 @@ _TRIALS = (
 _ATTEMPTS = (
     "SELECT a.*, e.hash AS error_hash FROM attempt a "
     "LEFT JOIN error e ON e.error_id = a.error_id "
-    "WHERE a.trial_id = :trial_id AND a.outcome IS NOT NULL ORDER BY a.attempt"
+    "WHERE a.trial_id BETWEEN :first AND :last AND a.outcome IS NOT NULL "
+    "ORDER BY a.trial_id, a.attempt"
 )
-_STEPS = f"SELECT t, {', '.join(STEP_VALUES)} FROM step WHERE trial_id = :trial_id ORDER BY t"
-
-
+_FINISHED = (
+    "trial_id IN (SELECT trial_id FROM trial WHERE trial_id BETWEEN :first AND :last "
+    "AND status IN ('done', 'diverged'))"
+)
+_STEPS = (
+    f"SELECT trial_id, t, {', '.join(STEP_VALUES)} FROM step WHERE {_FINISHED} ORDER BY trial_id, t"
+)
+_TRAJECTORIES = f"SELECT * FROM trajectory WHERE {_FINISHED}"
 _ASSESSMENTS = (
-    "SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure"
+    f"SELECT trial_id, t, measure, value FROM assessment WHERE {_FINISHED} "
+    "ORDER BY trial_id, t, measure"
 )
 # All trials of a configuration have the same number of assessments, but for explorations.
 _EXPECTED = (
@@ -60,6 +73,25 @@ class Curve:
     assessments: list[tuple[int, str, float | None]]
 
 
+@dataclass(frozen=True)
+class Page:
+    """Trials of one transaction, and their rows in other tables, by trial_id.
+
+    Attributes
+    ----------
+    trials
+        Trials that have an outcome.
+    attempts
+        Finished attempts at a trial, the oldest first.
+    curves
+        Rows of the finished trials; none for a trial of which some are missing.
+    """
+
+    trials: list[dict[str, Any]]
+    attempts: Mapping[int, list[dict[str, Any]]]
+    curves: Mapping[int, Curve]
+
+
 class Source:
     """Queries to a snapshot of the source database."""
 
@@ -70,12 +102,15 @@ class Source:
     def launches(self) -> list[dict[str, Any]]:
         return self._dicts("SELECT * FROM launch ORDER BY launch_id")
 
-    def pages(self) -> Iterator[list[dict[str, Any]]]:
-        """Yield the trials that have an outcome."""
+    def pages(self) -> Iterator[Page]:
+        """Yield the trials that have an outcome, with their rows."""
         last = 0
-        while page := self._dicts(_TRIALS, last=last, size=PAGE):
-            last = page[-1]["trial_id"]
-            yield page
+        while trials := _first(self._dicts(_TRIALS, last=last, size=PAGE)):
+            first, last = trials[0]["trial_id"], trials[-1]["trial_id"]
+            attempts = defaultdict(list)
+            for row in self._dicts(_ATTEMPTS, first=first, last=last):
+                attempts[row["trial_id"]].append(row)
+            yield Page(trials, attempts, self._curves(trials))
 
     def config(self, config_id: int) -> dict[str, Any]:
         (row,) = self._dicts("SELECT * FROM config WHERE config_id = :id", id=config_id)
@@ -85,38 +120,43 @@ class Source:
         (row,) = self._dicts("SELECT * FROM error WHERE hash = :hash", hash=digest)
         return row
 
-    def attempts(self, trial_id: int) -> list[dict[str, Any]]:
-        """Return the finished attempts, the oldest first."""
-        return self._dicts(_ATTEMPTS, trial_id=trial_id)
-
-    def curve(self, row: dict[str, Any]) -> Curve | None:
-        """Return the rows of a trial, or None if some are missing."""
-        found = curve(self._moment, row["trial_id"], row["n_rows"])
-        expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
-        if found is None or expected not in (None, len(found.assessments)):
-            return None
-        return found
+    def _curves(self, trials: Sequence[dict[str, Any]]) -> dict[int, Curve]:
+        ends = {"first": trials[0]["trial_id"], "last": trials[-1]["trial_id"]}
+        steps = _by_trial(self._moment.rows(_STEPS, **ends))
+        assessments = _by_trial(self._moment.rows(_ASSESSMENTS, **ends))
+        trajectories = {row.pop("trial_id"): row for row in self._dicts(_TRAJECTORIES, **ends)}
+        curves = {}
+        for row in trials:
+            trial_id = row["trial_id"]
+            values = np.array(steps.get(trial_id, []), np.float64).reshape(-1, 1 + len(STEP_VALUES))
+            assessed = assessments.get(trial_id, [])
+            expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
+            if (
+                trial_id in trajectories
+                and len(values) == row["n_rows"]
+                and np.array_equal(values[:, 0], np.arange(len(values)))
+                and expected in (None, len(assessed))
+            ):
+                packed = {name: _bytes(one) for name, one in trajectories[trial_id].items()}
+                curves[trial_id] = Curve(values[:, 1:], packed, assessed)
+        return curves
 
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
         table = self._moment.rows(sql, **values)
         return [dict(zip(table.columns, row, strict=True)) for row in table]
 
 
-def curve(moment: Reader, trial_id: int, n_rows: int) -> Curve | None:
-    """Return the rows of a finished trial, or None if steps or the trajectory are missing."""
-    steps = np.array(list(moment.rows(_STEPS, trial_id=trial_id)), dtype=np.float64)
-    arrays = moment.rows("SELECT * FROM trajectory WHERE trial_id = :id", id=trial_id)
-    if (
-        len(arrays) != 1
-        or len(steps) != n_rows
-        or not np.array_equal(steps[:, 0], np.arange(n_rows))
-    ):
-        return None
-    assessments = [tuple(row) for row in moment.rows(_ASSESSMENTS, trial_id=trial_id)]
-    row = dict(zip(arrays.columns, arrays[0], strict=True))
-    del row["trial_id"]
-    packed = {key: _bytes(value) for key, value in row.items()}
-    return Curve(steps[:, 1:], packed, assessments)
+def _first(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the trials that fit into one transaction by their steps, and at least one."""
+    steps = accumulate(row["n_rows"] or 0 for row in trials)
+    fitting = sum(n <= PAGE_STEPS for n in steps)
+    return trials[: max(fitting, 1)]
+
+
+def _by_trial(rows: Iterable[tuple[Any, ...]]) -> dict[int, list[tuple[Any, ...]]]:
+    """Return the rows without their trial_id, the first column, by which they are sorted."""
+    groups = groupby(rows, key=itemgetter(0))
+    return {trial_id: [row[1:] for row in group] for trial_id, group in groups}
 
 
 def _bytes(value: Any) -> Any:

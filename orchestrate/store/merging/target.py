@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,11 +31,24 @@ _NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
 _ASSESSMENTS = select(assessment.c.t, assessment.c.measure, assessment.c.value).order_by(
     assessment.c.t, assessment.c.measure
 )
-_INSERT_TRIAL = insert(trial).returning(trial.c.trial_id)
+_INSERT_TRIALS = insert(trial).returning(trial.c.trial_key, trial.c.trial_id)
 _UPDATE_TRIAL = update(trial).where(trial.c.trial_id == bindparam("here"))
-_INSERT_ATTEMPT = insert(attempt)
-_INSERT_TRAJECTORY = insert(trajectory_table)
 _STEPS = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
+
+
+@dataclass(frozen=True)
+class _Added:
+    """Trial of the source, its row in this database, and what is new here."""
+
+    row: Mapping[str, Any]
+    here: Row[Any] | None
+    attempts: Sequence[Mapping[str, Any]]
+    curve: Curve | None
+
+    @property
+    def attempt(self) -> int:
+        """Number of its last attempt in this database."""
+        return (0 if self.here is None else int(self.here.attempt)) + len(self.attempts)
 
 
 class Target:
@@ -53,6 +67,7 @@ class Target:
         self._source = source
         self._launches = launches
         self._configs = configs  # config_id here by key, filled on the way
+        self._added: list[_Added] = []
 
     def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
         """Return the trials with these keys, locked until the end of the transaction."""
@@ -62,9 +77,10 @@ class Target:
         rows = self._connection.execute(statement)
         return {row.trial_key: row for row in rows}
 
-    def new_attempts(self, row: Mapping[str, Any], here: Row[Any] | None) -> list[dict[str, Any]]:
+    def new_attempts(
+        self, there: list[dict[str, Any]], here: Row[Any] | None
+    ) -> list[dict[str, Any]]:
         """Return the attempts at a trial of the source that are new in this database."""
-        there = self._source.attempts(row["trial_id"])
         if here is None:
             return there
         statement = select(attempt.c.launch_id, attempt.c.claimed)
@@ -83,17 +99,34 @@ class Target:
         attempts: Sequence[Mapping[str, Any]],
         curve: Curve | None,
     ) -> None:
-        """Write a trial with its outcome."""
-        trial_id = self._write_trial(row, here, attempts)
-        before = 0 if here is None else here.attempt
-        self._write_attempts(trial_id, before, attempts)
-        if curve is not None:
-            self._backend.insert_steps(self._connection, trial_id, curve.steps)
-            if self._backend.has_curves:
-                last = before + len(attempts)
-                packed_curves.write(self._connection, trial_id, last, curve.steps)
-            self._connection.execute(_INSERT_TRAJECTORY, {"trial_id": trial_id, **curve.trajectory})
-            self._write_assessments(trial_id, curve)
+        """Note a trial with its outcome, for :meth:`write`."""
+        self._added.append(_Added(row, here, attempts, curve))
+
+    def write(self) -> None:
+        """Write the noted trials, with one statement for each table."""
+        ids = self._write_trials()
+        attempts: list[dict[str, Any]] = []
+        curves, trajectories, assessments = [], [], []
+        for one in self._added:
+            trial_id = ids[one.row["trial_key"]]
+            attempts += self._attempt_rows(trial_id, one)
+            if one.curve is not None:
+                self._backend.insert_steps(self._connection, trial_id, one.curve.steps)
+                curves.append((trial_id, one.attempt, one.curve.steps))
+                trajectories.append({"trial_id": trial_id, **one.curve.trajectory})
+                assessments += [
+                    {"trial_id": trial_id, "t": t, "measure": measure, "value": value}
+                    for t, measure, value in one.curve.assessments
+                ]
+        if self._backend.has_curves:
+            packed_curves.write(self._connection, curves)
+        for table, rows in (
+            (attempt, attempts),
+            (trajectory_table, trajectories),
+            (assessment, assessments),
+        ):
+            if rows:
+                self._connection.execute(insert(table), rows)
 
     def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
         """Return whether both databases hold equal numbers; times may differ."""
@@ -127,38 +160,35 @@ class Target:
         for table in (step_table, trajectory_table, assessment):
             self._connection.execute(delete(table).where(table.c.trial_id == here.trial_id))
 
-    def _write_assessments(self, trial_id: int, curve: Curve) -> None:
-        names = ("t", "measure", "value")
-        rows = [
-            {"trial_id": trial_id, **dict(zip(names, row, strict=True))}
-            for row in curve.assessments
-        ]
-        if rows:
-            self._connection.execute(insert(assessment), rows)
-
-    def _write_trial(
-        self, row: Mapping[str, Any], here: Row[Any] | None, attempts: Sequence[Mapping[str, Any]]
-    ) -> int:
-        values = {name: row[name] for name in _COPIED}
-        values["attempt"] = (0 if here is None else here.attempt) + len(attempts)
-        values["launch_id"] = self._launches.get(row["launch_id"])
-        values["error_id"] = self._error(row["error_hash"])
-        if here is not None:
-            self._connection.execute(_UPDATE_TRIAL, {"here": here.trial_id, **values})
-            return int(here.trial_id)
-        values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
-        values["config_id"] = self._config(row["config_key"], row["config_id"])
-        return int(self._connection.execute(_INSERT_TRIAL, values).scalar_one())
-
-    def _write_attempts(
-        self, trial_id: int, before: int, attempts: Sequence[Mapping[str, Any]]
-    ) -> None:
-        for number, row in enumerate(attempts, start=before + 1):
-            values = {name: row[name] for name in attempt.c.keys()}  # noqa: SIM118  not a dict
-            values |= {"trial_id": trial_id, "attempt": number}
-            values["launch_id"] = self._launches[row["launch_id"]]
+    def _write_trials(self) -> dict[str, int]:
+        """Return the ids of the noted trials by their keys."""
+        ids, new = {}, []
+        for one in self._added:
+            row = one.row
+            values = {name: row[name] for name in _COPIED} | {"attempt": one.attempt}
+            values["launch_id"] = self._launches.get(row["launch_id"])
             values["error_id"] = self._error(row["error_hash"])
-            self._connection.execute(_INSERT_ATTEMPT, values)
+            if one.here is None:
+                values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
+                new.append(
+                    values | {"config_id": self._config(row["config_key"], row["config_id"])}
+                )
+            else:
+                ids[row["trial_key"]] = one.here.trial_id
+                self._connection.execute(_UPDATE_TRIAL, {"here": one.here.trial_id, **values})
+        if new:
+            ids |= dict(map(tuple, self._connection.execute(_INSERT_TRIALS, new)))
+        return ids
+
+    def _attempt_rows(self, trial_id: int, one: _Added) -> Iterator[dict[str, Any]]:
+        for number, row in enumerate(one.attempts, start=one.attempt - len(one.attempts) + 1):
+            values = {name: row[name] for name in attempt.c.keys()}  # noqa: SIM118  not a dict
+            yield values | {
+                "trial_id": trial_id,
+                "attempt": number,
+                "launch_id": self._launches[row["launch_id"]],
+                "error_id": self._error(row["error_hash"]),
+            }
 
     def _config(self, config_key: str, there: int) -> int:
         if config_key not in self._configs:

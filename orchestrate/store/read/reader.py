@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import URL, Connection, Engine, select, text
+from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 
 from dopt.errors import suggestion
 from dopt.spec.added_fields import completed
@@ -55,6 +55,18 @@ _TRIALS = text(
 _MEASURES = (
     "SELECT DISTINCT measure FROM v_assessment WHERE config_key = :config_key ORDER BY measure"
 )
+_ARRAYS = ("states", "inputs", "parameters")
+_TRAJECTORY = (
+    select(
+        trajectory.c.dtype,
+        *chain.from_iterable(
+            (trajectory.c[f"{name}_shape"], trajectory.c[name]) for name in _ARRAYS
+        ),
+    )
+    .join(trial, trial.c.trial_id == trajectory.c.trial_id)
+    .join(config, config.c.config_id == trial.c.config_id)
+    .where(config.c.config_key == bindparam("config_key"), trial.c.seed == bindparam("seed"))
+)
 
 
 class Reader:
@@ -91,6 +103,11 @@ class Reader:
     def close(self) -> None:
         """Close the connections."""
         self._engine.dispose()
+
+    @property
+    def url(self) -> str:
+        """URL of the database, with its password."""
+        return self._url.render_as_string(hide_password=False)
 
     @contextmanager
     def moment(self) -> Iterator[Self]:
@@ -164,16 +181,9 @@ class Reader:
 
     def trajectory(self, config_key: str, seed: int) -> Trajectory:
         """Return the arrays of one trial; raise ``QueryError`` if it has none."""
-        names = ("states", "inputs", "parameters")
-        columns = chain.from_iterable((trajectory.c[f"{n}_shape"], trajectory.c[n]) for n in names)
-        statement = (
-            select(trajectory.c.dtype, *columns)
-            .join(trial, trial.c.trial_id == trajectory.c.trial_id)
-            .join(config, config.c.config_id == trial.c.config_id)
-            .where(config.c.config_key == config_key, trial.c.seed == int(seed))
-        )
+        values = {"config_key": config_key, "seed": int(seed)}
         with self._snapshot() as connection:
-            row = connection.execute(statement).one_or_none()
+            row = connection.execute(_TRAJECTORY, values).one_or_none()
         if row is None:
             raise QueryError(
                 f"There is no trajectory of seed {seed} of configuration {config_key[:12]} in "

@@ -1,4 +1,4 @@
-"""A small grid with every status in it, and commands run in this process."""
+"""A small grid with every status in it, its bundle, and commands run in this process."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from orchestrate.__main__ import main
 from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
+from orchestrate.store.bundles import cached
+from orchestrate.store.bundles.tables import TABLES
 from tests.orchestrate.store.conftest import (  # noqa: F401  the same ones
     launch,
     open_store,
@@ -19,7 +23,7 @@ from tests.orchestrate.store.conftest import (  # noqa: F401  the same ones
     store,
     take,
 )
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
 
 SECRET = "hunter2"
 RECORD: LaunchRecord = replace(
@@ -31,6 +35,14 @@ TRACEBACK = (
     "    raise ZeroDivisionError\n"
     "ZeroDivisionError: seed {seed} is broken\n"
 )
+BUNDLE_FILES = [
+    *(f"{name}.parquet" for name in TABLES),
+    "README.md",
+    "provenance.json",
+    "views.sql",
+]
+ODD = np.array([-0.0, 5e-324, np.nextafter(1, 2), -1.7976931348623157e308])
+"""Numbers that a conversion to text or to another type would change."""
 
 
 @dataclass
@@ -92,3 +104,39 @@ def grid(store: Store) -> int:  # noqa: F811
         store.fail(claim, failure(spec.seed), run_now())
     store.commit(claims[5], diverged(3, seed=BAD.seed), run_now())
     return number
+
+
+@pytest.fixture
+def copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Keep the SQLite copies of bundles in a folder of the test."""
+    folder = tmp_path / "copies"
+    folder.mkdir()
+    monkeypatch.setattr(cached, "copies_folder", lambda: folder)
+    return folder
+
+
+@pytest.fixture
+def bundle(
+    grid: int,
+    store: Store,  # noqa: F811
+    command: Callable[..., Answer],
+    copies: Path,  # noqa: ARG001
+    tmp_path: Path,
+) -> Path:
+    """Return a bundle of the grid with every status, of assessments and of odd numbers."""
+    odd = result(20)
+    odd.states[:4, 0] = ODD
+    odd.inputs[:4, 1] = ODD
+    odd.loss[:3] = ODD[1:]  # SQLite itself stores -0.0 in a column of numbers as 0.0
+    odd.parameters[:4] = ODD
+    lost = diverged(3, seed=21)
+    lost.states[4:] = np.nan
+    specs = [Spec(20), Spec(21), Spec(22, width=8)]
+    claims = store.claim(grid, store.register(grid, specs).todo)
+    found = [replace(odd, best_loss=float(odd.loss.min())), lost, assessed(22)]
+    for claim, one in zip(claims, found, strict=True):
+        assert store.commit(claim, one, run_now())
+    out = tmp_path / "bundle"
+    answer = command("export", "bundle", str(out))
+    assert (answer.code, answer.err) == (0, "")
+    return out
