@@ -1,7 +1,7 @@
 """Command line of the analysis: arguments, selection of trials, outputs and exit codes.
 
 0: made; 1: something of the request has no data; 2: the request cannot be answered; 3: trials are
-missing and ``--allow-partial`` was not given.
+missing and ``--allow-partial`` was not given; 130: interrupted.
 """
 
 from __future__ import annotations
@@ -30,9 +30,10 @@ from analysis.stats.trial_scores import Measure
 from analysis.tables import calibration
 from analysis.tables.registry import TABLES, TableKind, comparison
 from analysis.tables.rendering import TextTable, gaps_table
+from analysis.workers_option import add_workers
 from analysis.yardsticks import command as yardsticks
 from dopt.errors import DoptError
-from orchestrate.cli_parser import Parser
+from orchestrate.cli_parser import Parser, discard_output
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
 COLUMNS = ("loss", "reachable_loss")
@@ -43,23 +44,34 @@ def main(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code."""
     try:
         options = parser().read(arguments)
-        if "alone" in options:
-            return int(options.alone(options))
-        with Reader.open(options.db) as reader:
-            selection = select(reader, _filter(options))
-            _check_complete(selection, options.allow_partial)
-            for note in selection.notes:
-                sys.stderr.write(f"note: {note}\n")  # the output may be a CSV
-            return int(options.run(reader, selection, options))
+        code = _run(options)
+        sys.stdout.flush()
+        return code
     except IncompleteError as error:
         sys.stderr.write(f"{error}\n")
         return 3
     except (AnalysisError, DoptError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2
+    except BrokenPipeError:
+        discard_output()
+        return 0
+    except KeyboardInterrupt:
+        return 130
     except OSError as error:
         sys.stderr.write(f"error: {error.filename}: {error.strerror}: choose another --out.\n")
         return 2
+
+
+def _run(options: argparse.Namespace) -> int:
+    if "alone" in options:
+        return int(options.alone(options))
+    with Reader.open(options.db) as reader:
+        selection = select(reader, _filter(options))
+        _check_complete(selection, options.allow_partial)
+        for note in selection.notes:
+            sys.stderr.write(f"note: {note}\n")  # the output may be a CSV
+        return int(options.run(reader, selection, options))
 
 
 def parser() -> Parser:
@@ -83,6 +95,7 @@ def parser() -> Parser:
         help="intervals of figure 1: of the centre, or what holds 90 %% of the runs",
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
+    add_workers(figures, "outputs")
     summary = _command(commands, "summary", _summary, "mean final losses ± 2 SE, n")
     compare = _command(commands, "compare", _compare, "every variant against the reference, paired")
     compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
@@ -211,8 +224,17 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
         BandKind(options.band),
     )
     names = tuple(options.only or NAMES)
+    outcomes = build(
+        reader,
+        selection,
+        plot_options,
+        options.out,
+        names,
+        force=options.force,
+        workers=options.workers,
+    )
     empty = 0
-    for outcome in build(reader, selection, plot_options, options.out, names, force=options.force):
+    for outcome in outcomes:
         say(f"{options.out / outcome.name}: {outcome.state}")
         empty += bool(options.only) and outcome.state.startswith("not drawn")
     return 1 if empty else 0

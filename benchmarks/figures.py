@@ -33,8 +33,7 @@ def measure(quick: bool) -> list[Row]:
         rows = fill(url, seeds)
         done = run("-m", "analysis", "figures", "--db", url, "--out", f"{folder}/figures")
     what = "all figures and tables"
-    peak = f"{rows:,} rows; {done.peak_mebibytes:.0f} MiB"
-    return [Row(what, done.seconds, "s", Target(5, 30), note=peak)]
+    return [Row(what, done.seconds, "s", Target(5, 30), note=f"{rows:,} rows")]
 
 
 def fill(url: str, seeds: int) -> int:

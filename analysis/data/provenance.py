@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib.metadata
 import platform
@@ -17,6 +18,7 @@ PACKAGE = Path(__file__).parents[1]
 """The folder of the analysis."""
 
 
+@functools.cache
 def versions() -> dict[str, str | None]:
     """Return the versions of Python and the libraries; None where one is not installed."""
     found: dict[str, str | None] = {"python": platform.python_version()}
@@ -28,8 +30,12 @@ def versions() -> dict[str, str | None]:
     return found
 
 
+@functools.cache
 def git_state() -> dict[str, str | bool | None]:
-    """Return commit and dirty flag of the code; None outside a repository."""
+    """Return commit and dirty flag of the code; None outside a repository.
+
+    As at the first call: code that changes later does not run in this process.
+    """
     commit = _git("rev-parse", "HEAD")
     changes = _git("status", "--porcelain", "--untracked-files=no")
     return {"commit": commit, "dirty": bool(changes) if commit else None}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from analysis.outputs.names import partial_warning
 from analysis.tables.error_budget import budget_table
 from analysis.tables.rendering import TextTable
 from analysis.units import loss_unit
+from analysis.workers_option import add_workers
 from dopt.offline_fit import RIDGE
 from dopt.spec.prequential import system_of
 from orchestrate.store import Reader
@@ -39,23 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=RIDGE,
         help=f"weight that draws a fit to the initial parameters ({RIDGE:g})",
     )
-    parser.add_argument(
-        "--workers", type=int, default=_cores(), help="fits at a time (one for each core)"
-    )
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
+    add_workers(parser, "fits")
 
 
 def run(
     reader: Reader, selection: Selection, options: argparse.Namespace
 ) -> tuple[TextTable, pd.DataFrame]:
     """Fit, write the picture, the CSV files and the provenance; return the table of budgets."""
-    if options.workers < 1:
-        raise AnalysisError(
-            f"--workers is {options.workers}, but at least 1 is expected: raise it."
-        )
     fitted = with_offline_fit(selection)
     for note in fitted.notes[len(selection.notes) :]:
         _progress(f"note: {note}")

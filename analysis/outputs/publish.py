@@ -38,8 +38,10 @@ def write_pictures(figure: Figure, folder: Path, name: str, title: str, mark: st
 
     The layout is computed once, so that all formats show the same picture and none is drawn twice.
     """
-    figure.draw_without_rendering()
-    figure.set_layout_engine(None)
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        layout.execute(figure)
+        figure.set_layout_engine(None)
     for ending in PICTURES:
         target = folder / f"{name}.{ending}"
         part = folder / f".{name}.part.{ending}"

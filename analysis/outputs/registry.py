@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from analysis.figures.profiles.plot import profiles_plot
 from analysis.figures.sensitivity.plot import sensitivity_plot
 from analysis.figures.style import styled
 from analysis.figures.width.plot import cost_plot, loss_against_width_plot
-from analysis.outputs import publish
+from analysis.outputs import processes, publish
 from analysis.outputs.names import NAMES, partial_warning
 from analysis.outputs.page import NAME as PAGE
 from analysis.outputs.page import write_page
@@ -59,6 +59,18 @@ class Outcome:
     state: str
 
 
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """An output that is to be written: its trials, its provenance and its fingerprint."""
+
+    name: str
+    selection: Selection
+    options: PlotOptions
+    folder: Path
+    facts: Mapping[str, Any]
+    mark: str
+
+
 def build(
     reader: Reader,
     selection: Selection,
@@ -67,28 +79,53 @@ def build(
     names: tuple[str, ...] = NAMES,
     *,
     force: bool = False,
+    workers: int = 1,
 ) -> Iterator[Outcome]:
-    """Write the named outputs and the page of all into a folder; say of each what happened."""
+    """Write the named outputs and the page of all into a folder; say of each what happened.
+
+    ``workers`` outputs are written at a time, each in a process of its own if there are several.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        part = _part(name, selection, options)
-        if not part.entries:
-            yield Outcome(name, "not drawn, nothing is stored for it")
-            continue
-        facts = provenance.describe(reader, part) | {"request": options.as_dict(), "name": name}
-        mark = _mark(facts)
-        endings = (*publish.PICTURES, "csv", "txt") if name in PLOTS else TABLE_FILES
-        if not force and publish.is_current(folder, name, endings, mark):
-            yield Outcome(name, "unchanged")
-            continue
-        if name in PLOTS:
-            facts |= _draw(PLOTS[name], reader, part, options, folder, mark)
-        else:
-            facts |= _tabulate(name, TABLES[name], reader, part, options, folder)
-        publish.write_provenance(facts | {"fingerprint": mark}, folder, name)
-        yield Outcome(name, "written")
+    planned = {name: _plan(name, reader, selection, options, folder, force) for name in names}
+    tasks = {name: one for name, one in planned.items() if isinstance(one, Task)}
+    with processes.written(_write, reader, tasks, workers) as write:
+        for name, one in planned.items():
+            if isinstance(one, str):
+                yield Outcome(name, one)
+            else:
+                write(name)
+                yield Outcome(name, "written")
     if write_page(folder, PLOTS, TABLES):
         yield Outcome(PAGE, "written")
+
+
+def _plan(
+    name: str,
+    reader: Reader,
+    selection: Selection,
+    options: PlotOptions,
+    folder: Path,
+    force: bool,
+) -> Task | str:
+    """Return what is to be written, or why nothing is."""
+    part = _part(name, selection, options)
+    if not part.entries:
+        return "not drawn, nothing is stored for it"
+    facts = provenance.describe(reader, part) | {"request": options.as_dict(), "name": name}
+    mark = _mark(facts)
+    endings = (*publish.PICTURES, "csv", "txt") if name in PLOTS else TABLE_FILES
+    if not force and publish.is_current(folder, name, endings, mark):
+        return "unchanged"
+    return Task(name, part, options, folder, facts, mark)
+
+
+def _write(reader: Reader, task: Task) -> None:
+    if task.name in PLOTS:
+        words = _draw(PLOTS[task.name], reader, task)
+    else:
+        words = _tabulate(TABLES[task.name], reader, task)
+    facts = {**task.facts, **words, "fingerprint": task.mark}
+    publish.write_provenance(facts, task.folder, task.name)
 
 
 def _part(name: str, selection: Selection, options: PlotOptions) -> Selection:
@@ -106,38 +143,26 @@ def _mark(facts: dict[str, Any]) -> str:
     return publish.fingerprint(content)
 
 
-def _draw(
-    plot: Plot[Any],
-    reader: Reader,
-    selection: Selection,
-    options: PlotOptions,
-    folder: Path,
-    mark: str,
-) -> dict[str, str]:
+def _draw(plot: Plot[Any], reader: Reader, task: Task) -> dict[str, str]:
+    folder = task.folder
     with styled():
-        drawing = plot.make(reader, selection, options)
+        drawing = plot.make(reader, task.selection, task.options)
         caption = drawing.caption
-        if selection.gaps:
-            warning = partial_warning(selection)
+        if task.selection.gaps:
+            warning = partial_warning(task.selection)
             caption = f"{warning} {caption}"
             drawing.figure.suptitle(warning, fontsize=8, color="#b00020", weight="bold")
-        publish.write_pictures(drawing.figure, folder, plot.name, plot.title, mark)
+        publish.write_pictures(drawing.figure, folder, plot.name, plot.title, task.mark)
     publish.write_table(drawing.table, folder, plot.name)
     publish.write_text(caption + "\n", folder / f"{plot.name}.txt")
-    return plot.words(options) | {"caption": caption}
+    return plot.words(task.options) | {"caption": caption}
 
 
-def _tabulate(
-    name: str,
-    kind: TableKind,
-    reader: Reader,
-    selection: Selection,
-    options: PlotOptions,
-    folder: Path,
-) -> dict[str, str]:
-    table = kind.measure(reader, selection, options)
-    text_table = kind.render(table, options)
-    warning = f"{partial_warning(selection)}\n\n" if selection.gaps else ""
+def _tabulate(kind: TableKind, reader: Reader, task: Task) -> dict[str, str]:
+    name, folder = task.name, task.folder
+    table = kind.measure(reader, task.selection, task.options)
+    text_table = kind.render(table, task.options)
+    warning = f"{partial_warning(task.selection)}\n\n" if task.selection.gaps else ""
     publish.write_table(table, folder, name)
     publish.write_text(warning + text_table.markdown(), folder / f"{name}.md")
     publish.write_text(_commented(warning) + text_table.latex(), folder / f"{name}.tex")

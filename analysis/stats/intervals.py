@@ -37,6 +37,9 @@ MOST_BOOTSTRAP_VALUES = 2000
 square. The ends differ by less than 5 % of a half-width there, of normal and of exponential values,
 where the draws of the bootstrap alone make 3 %."""
 
+_ROUNDING = 1e-14
+"""Spread of values that differ by rounding alone, relative to the largest."""
+
 STUDENT_RANGE = f"Student's below {FEWEST_BOOTSTRAP_VALUES} and above {MOST_BOOTSTRAP_VALUES}"
 """Numbers of values whose interval is Student's, for the notes of tables and figures."""
 
@@ -116,7 +119,7 @@ def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, fl
     """Return the interval of the mean of (n,): a BCa bootstrap, Student's for few and many."""
     if len(values) < 2:
         return float("nan"), float("nan")
-    if np.ptp(values) == 0:
+    if np.ptp(values) <= _ROUNDING * np.abs(values).max():
         return float(values[0]), float(values[0])
     if not FEWEST_BOOTSTRAP_VALUES <= len(values) <= MOST_BOOTSTRAP_VALUES:
         half = student_quantile(len(values) - 1) * float(standard_error(values))

@@ -3,6 +3,8 @@ from __future__ import annotations
 import csv
 import io
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -126,6 +128,8 @@ def test_a_wrong_request_is_one_sentence(
         (["summary", "--formt", "csv"], "'--formt' is unknown.* did you mean '--format'"),
         (["summary", "--format", "cvs"], "--format 'cvs' is unknown.* did you mean 'csv'"),
         (["summary", "--db"], "--db: expected one argument: see python -m analysis summary --help"),
+        (["figures", "--workers", "0"], "--workers is 0, but at least 1 is expected"),
+        (["figures", "--workers", "two"], "--workers is two, but at least 1 is expected"),
         (["summary", "more"], "unexpected argument 'more'"),
     ],
 )
@@ -145,6 +149,18 @@ def test_help_shows_a_percent_sign_once(command: str, capsys: pytest.CaptureFixt
     shown = capsys.readouterr().out
     assert "%%" not in shown
     assert "--where PATH=VALUE" in shown
+
+
+def test_a_reader_that_closes_the_output_ends_the_command(url: str) -> None:
+    command = [sys.executable, "-m", "analysis", "summary", "--db", url]
+    with subprocess.Popen(
+        command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert "rror" not in process.stderr.read()
+    assert process.returncode == 0
 
 
 def test_no_database_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +19,19 @@ import pytest
 from analysis.data import provenance
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Selection, select
+from analysis.errors import AnalysisError
 from analysis.figures.input_spectrum.plot import spectrum_plot
 from analysis.figures.loss_curves.plot import _title, loss_plot
 from analysis.figures.phase_portraits.data import Portrait
 from analysis.figures.phase_portraits.plot import coverage_text, phase_plot
+from analysis.outputs import processes, registry
 from analysis.outputs.names import FIGURES, NAMES
-from analysis.outputs.registry import PLOTS, build
+from analysis.outputs.registry import PLOTS, Task, build
 from analysis.plot_options import PlotOptions
 from orchestrate.store import Reader
 from tests.analysis.conftest import limited
 from tests.analysis.synthetic import fill
+from tests.paths import ROOT
 
 QUICK = ("figure2_spectrum", "comparison")
 
@@ -46,7 +52,7 @@ def folder(url: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def make(reader: Reader, selection: Selection, target: Path, **options: bool) -> list[str]:
+def make(reader: Reader, selection: Selection, target: Path, **options: int) -> list[str]:
     return [
         outcome.state
         for outcome in build(reader, selection, PlotOptions(), target, QUICK, **options)
@@ -167,6 +173,70 @@ def test_bytes_are_the_same_each_time(
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
     pdf = (tmp_path / "a" / "figure2_spectrum.pdf").read_bytes()
     assert (b"/CreationDate (D:20231114" in pdf) == bool(epoch)
+
+
+def test_several_processes_write_the_same_bytes(reader: Reader, tmp_path: Path) -> None:
+    selection = select(reader, Filter())
+    make(reader, selection, tmp_path / "one")
+    states = make(reader, selection, tmp_path / "two", workers=2)
+    assert states == ["written", "written"]
+    names = {path.name for path in (tmp_path / "one").iterdir()}
+    assert names == {path.name for path in (tmp_path / "two").iterdir()}
+    for name in names:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def kill_itself(_: Reader, task: Task) -> None:
+    if task.name == QUICK[1]:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_that_is_killed_is_said(
+    reader: Reader, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry, "_write", kill_itself)
+    with pytest.raises(AnalysisError, match=r"was killed before .* was written, .* --workers 1"):
+        make(reader, select(reader, Filter()), tmp_path, workers=2)
+
+
+def test_an_interruption_ends_all_processes(url: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "analysis", "figures", "--db", url, "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [*command, "--workers", "2"],
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()  # the first output has been written, and others are being
+        os.killpg(process.pid, signal.SIGINT)
+        said, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in said + errors
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+
+
+def write_nothing(*_: object) -> None: ...
+
+
+def test_an_interruption_comes_whole_at_any_moment(reader: Reader) -> None:
+    """Ctrl-C within a wait for a result must not leave a lock of the pool in disorder."""
+    tasks = {str(number): number for number in range(100)}
+    for delay in np.random.default_rng(0).uniform(0, 0.02, size=30):
+        interruption = threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
+        with (
+            pytest.raises(KeyboardInterrupt),
+            processes.written(write_nothing, reader, tasks, 2) as wait,
+        ):
+            interruption.start()
+            try:
+                for name in tasks:
+                    wait(name)
+            finally:
+                interruption.join()  # within the wait, not in the next test
 
 
 def test_what_is_unchanged_is_not_drawn_again(reader: Reader, tmp_path: Path) -> None:

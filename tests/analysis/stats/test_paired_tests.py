@@ -39,6 +39,12 @@ def test_a_constant_factor_is_found_without_spread() -> None:
     assert found.p_value == pytest.approx(2 / 2**5)  # exact: all five signs agree
 
 
+def test_values_that_differ_by_rounding_have_no_spread() -> None:
+    values = np.full(100, -1.0)
+    values[:50] = np.nextafter(-1.0, 0.0)
+    assert interval_of_mean(values, rng()) == pytest.approx((-1.0, -1.0), rel=1e-12)
+
+
 def test_what_was_lost_is_the_worst_in_the_test_and_in_no_ratio() -> None:
     ours = np.array([1.0, 2.0, np.inf, 4.0, np.inf, np.nan, 1.0])
     theirs = np.array([2.0, 4.0, 1.0, 1.0, np.inf, 1.0, np.nan])
