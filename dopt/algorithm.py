@@ -70,6 +70,12 @@ SMALLEST_SHARE = 1.0 / 64.0
 NO_GROWTH = 1.0 + 1e-10
 """Growth of a sum of squares that counts as none: at its minimum rounding must not decide."""
 
+NOISE_FACTORS = (10.0**0.25, 10.0**-0.25)
+"""Factors by which a fit moves the variance of the accelerations as long as that is likelier."""
+
+MOST_NOISE_FACTORS = 8
+"""Moves of one fit by each factor, two decades in all."""
+
 DOMAIN_MARGIN = 0.25
 """Half-widths beyond the box at which a row of a state counts e^(-1/2) times."""
 

@@ -98,7 +98,7 @@ def held_out_fit(spec: TrialSpec, parameters: Array, states: Array, inputs: Arra
 def _information(spec: TrialSpec) -> Information | None:
     """Return λ and ρ of a trial whose model has a covariance, None of another."""
     system, model = spec.system, spec.model
-    if model.n_members > 1 or model.structure == "conditioning" or system.measured_states:
+    if model.n_members > 1 or model.structure == "conditioning" or system.n_measured:
         return None
     found = held_information(
         spec.policy, spec.learner, model.n_parameters(system), system.n_learned

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dopt.policies.base import on_sphere
+from dopt.policies.base import ball_norms, on_sphere
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox, transitions
 from dopt.systems.equilibrium import eigenmode
@@ -18,6 +18,9 @@ from dopt.systems.integration import next_state
 Array = npt.NDArray[np.float64]
 
 REACHABLE_POINTS = 512
+LONGEST_RUN = 2_000
+"""Steps of the runs from which the reachable set is drawn, if the horizon is longer than that."""
+
 HELD_STEPS = (5, 10, 20, 40)
 FREQUENCY_RATIOS = (0.8, 1.0, 1.2)
 CHIRP_RANGE = (0.2, 2.0)
@@ -66,7 +69,7 @@ def _in_ball(system: System, n: int) -> Array:
     """Return inputs, (n, m), uniform in the ball ‖u‖ ≤ γ; always the same."""
     rng, m = np.random.default_rng(_SEED), system.n_inputs
     directions = on_sphere(rng.standard_normal((n, m)), system.gamma)
-    inputs: Array = directions * rng.uniform(size=(n, 1)) ** (1.0 / m)
+    inputs: Array = directions * ball_norms(rng, (n, 1), m)
     return inputs
 
 
@@ -93,7 +96,7 @@ def random_transitions(
 
     They are drawn without replacement from runs under random inputs of the strength of a trial's.
     """
-    rounds = math.ceil(2 * wanted / (len(HELD_STEPS) * system.horizon))
+    rounds = math.ceil(2 * wanted / (len(HELD_STEPS) * run_steps(system)))
     held = [sequence for _ in range(rounds) for sequence in _held(system, rng)]
     return _sampled(system, held, wanted, rng)
 
@@ -121,16 +124,21 @@ def reachable_points(system: System) -> tuple[Array, Array]:
 
     With them come the inputs that are applied there, (512, m), 0 after the last step of a run. The
     inputs are random ones held for 5, 10, 20 and 40 steps, square waves at and around the
-    eigenfrequency and one of rising frequency, each over the whole horizon without process noise.
-    They are of the kind of two baselines, ``random_held`` and ``periodic_square``, which visit
-    states like those of the set.
-    The sample is drawn without replacement from all states visited, with a fixed seed.
+    eigenfrequency and one of rising frequency, each over the horizon, at most
+    :data:`LONGEST_RUN` steps, without process noise. They are of the kind of two baselines,
+    ``random_held`` and ``periodic_square``, which visit states like those of the set. The sample
+    is drawn without replacement from all states visited, with a fixed seed.
     """
     rng = np.random.default_rng(_SEED)
     states, inputs = visited_points(system, rng)
     found = rng.choice(len(states), min(REACHABLE_POINTS, len(states)), replace=False)
     chosen = np.sort(found)
     return states[chosen], inputs[chosen]
+
+
+def run_steps(system: System) -> int:
+    """Return the number of steps T of a run from which the reachable set is drawn."""
+    return min(system.horizon, LONGEST_RUN)
 
 
 def visited_points(system: System, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -170,24 +178,24 @@ def _flows(system: System, states: Array, inputs: Array, step: int) -> Array:
 
 def _held(system: System, rng: np.random.Generator) -> list[Array]:
     """Return random inputs on the sphere, held for several spans: each (T, m)."""
-    sequences = []
+    sequences, steps = [], run_steps(system)
     for hold in HELD_STEPS:
-        draws = rng.standard_normal((-(-system.horizon // hold), system.n_inputs))
+        draws = rng.standard_normal((-(-steps // hold), system.n_inputs))
         held = np.repeat(on_sphere(draws, system.gamma), hold, axis=0)
-        sequences.append(held[: system.horizon])
+        sequences.append(held[:steps])
     return sequences
 
 
 def _waves(system: System) -> list[Array]:
     """Return square waves about the eigenfrequency and one of rising frequency: each (T, m).
 
-    A system without a mode is excited at ten periods in the horizon, along the first input.
+    A system without a mode is excited at ten periods in a run, along the first input.
     """
-    mode = eigenmode(system)
-    duration = system.dt * system.horizon
+    mode, steps = eigenmode(system), run_steps(system)
+    duration = system.dt * steps
     frequency = mode.frequency if mode else 20.0 * math.pi / duration
     direction = mode.direction if mode else np.eye(system.n_inputs)[0]
-    times = system.dt * np.arange(system.horizon)
+    times = system.dt * np.arange(steps)
     low, high = (ratio * frequency for ratio in CHIRP_RANGE)
     phases = [ratio * frequency * times for ratio in FREQUENCY_RATIOS]
     phases.append(low * times + 0.5 * (high - low) / duration * times**2)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from dopt.errors import SpecificationError
 from dopt.learning import AdamReplay, Learner
 from dopt.policies import ICEM
-from dopt.policies.base import ROUNDING, OpenLoop, Policy, on_sphere
+from dopt.policies.base import ROUNDING, OpenLoop, Policy, ball_norms, on_sphere
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 
@@ -37,7 +37,11 @@ _STREAMS = {
     "sampled_plans": 12,
     "sampled_parameters": 13,
     "measurement_noise": 14,
+    "radii": 15,
 }
+
+PLANNED_DIMENSIONS = 4
+"""Norms of planned inputs are those of points drawn uniformly from a ball of 4 m dimensions."""
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
@@ -69,6 +73,11 @@ class Draws:
         Index among the r learned accelerations of the component k of Algorithm 2.
     ties : (T, m)
         Unit vectors that decide between inputs of equal value.
+    radii : (T, 2)
+        Norm in γ of the planned input, and of the next sample's input in the criterion of that
+        plan. They are 1 but for a model that is not affine in the inputs, which learns of the ball
+        ‖u‖ ≤ γ only what it has seen: the first is that of a uniform point of a ball of 4 m
+        dimensions, the second of a ball of m.
     replay : (T, steps, batch)
         Places of the buffer that make the minibatches of a learner with replay; otherwise empty.
     plans, parameters : (blocks, ·), (q, s)
@@ -82,6 +91,7 @@ class Draws:
     inputs: Array
     components: npt.NDArray[np.int64]
     ties: Array
+    radii: Array
     replay: npt.NDArray[np.int64]
     plans: Array
     parameters: Array
@@ -102,6 +112,7 @@ def draw(spec: TrialSpec) -> Draws:
         inputs=np.ascontiguousarray(inputs),
         components=stream(seed, "components").integers(system.n_learned, size=system.horizon),
         ties=on_sphere(stream(seed, "ties").standard_normal(sphere), 1.0),
+        radii=_radii(spec),
         replay=_replay(spec.learner, system.horizon, seed),
         plans=_plans(policy, system, seed),
         parameters=_parameters(spec),
@@ -120,6 +131,13 @@ def _parameters(spec: TrialSpec) -> Array:
         q = spec.model.n_member_parameters(spec.system)
         return spec.policy.draw_parameters(q, stream(spec.seed, "sampled_parameters"))
     return np.zeros((0, 0))
+
+
+def _radii(spec: TrialSpec) -> Array:
+    T, m = spec.system.horizon, spec.system.n_inputs
+    if spec.model.affine_in_inputs:
+        return np.ones((T, 2))
+    return ball_norms(stream(spec.seed, "radii"), (T, 2), np.array([PLANNED_DIMENSIONS * m, m]))
 
 
 def process_noise(system: System, seed: int) -> Array:

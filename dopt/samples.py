@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.evaluation import random_transitions
-from dopt.policies.base import on_sphere
+from dopt.policies.base import ball_norms, on_sphere
 from dopt.randomness import process_noise, stream
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
@@ -40,7 +40,8 @@ def uniform_samples(spec: TrialSpec) -> Samples:
 
     The noise is that of the trial, w_t of equation 2. One step from a state x under any input is
     observed as y = a(x) + w/dt in the learned rows: the known part, and with it the input, cancels.
-    Where the effect of the inputs is learned, they are drawn uniformly from the sphere ‖u‖ = γ.
+    Where the effect of the inputs is learned, they are drawn uniformly from the sphere ‖u‖ = γ, or
+    from the ball within for a model that is not affine in them.
     State components without an axis in the grid are zero, as they are there. Of a system that
     changes, the accelerations are those of the last step, by which the final loss is judged.
 
@@ -50,6 +51,8 @@ def uniform_samples(spec: TrialSpec) -> Samples:
     """
     system, rng = spec.system, stream(spec.seed, "uniform_states")
     states, inputs = _uniform_points(system, rng)
+    if not spec.model.affine_in_inputs:
+        inputs *= ball_norms(rng, (len(inputs), 1), system.n_inputs)
     if isinstance(system, BlackBox):
         truth = system.true_accelerations(states, inputs)
         if truth is not None:

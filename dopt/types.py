@@ -32,6 +32,12 @@ Complexes = npt.NDArray[np.complex128]
 Integers = npt.NDArray[np.int64]
 """Whole numbers along one axis."""
 
+Buckets = npt.NDArray[np.uint32]
+"""Places among the entries of a sketch along one axis."""
+
+Signs = npt.NDArray[np.int8]
+"""1 or -1, along one axis."""
+
 Booleans = npt.NDArray[np.bool_]
 """Truth values along one axis."""
 

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from dopt.declare.registry import section_of
+from dopt.errors import SpecificationError
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
 
@@ -15,7 +16,17 @@ def measured(system: System) -> System:
 
     A black box, such as an environment of Gymnasium, is not started: its known part is compiled,
     and its states are those that the explorer is told.
+
+    Raises
+    ------
+    SpecificationError
+        If its outputs mix states: those that begin an exploration would be unknown.
     """
+    if system.output_matrix:
+        raise SpecificationError(
+            f"env.output_matrix is {list(system.output_matrix)}, but an explorer is told states, "
+            f"all of them or some: set env.measured_states, or take the outputs for states."
+        )
     if not isinstance(system, BlackBox) or system.measured:
         return system
     kind, section = type(system), section_of(system)

@@ -173,9 +173,10 @@ def sensors_of(config: TrialConfig) -> args.Sensors:
     """Return what is measured of the states of a configuration; nothing where all are known."""
     system, estimates = config.system, config.learner.estimates_states
     return args.Sensors(
+        system.output_rows,
         np.array(system.measured_states, dtype=np.int64),
         np.array(system.measurement_noise, dtype=float) ** 2,
-        np.array(differentiated(system) if system.n_measured else [], dtype=np.int64),
+        np.array(differentiated(system) if system.measured_states else [], dtype=np.int64),
         0.0 if estimates else system.velocity_cutoff,
         delay(system) if system.n_measured and not estimates else 0.0,
         np.zeros(system.n_states),  # the initial state of a simulation is known

@@ -67,7 +67,7 @@ def act_and_measure(trial: Trial, t: int) -> bool:
     act(plant, record.true_states[t], record.inputs[t], noise, t, following)
     if has_sensors(trial.sensors):
         noise = trial.randomness.measurement_noise[t]
-        measure(trial.sensors, noise, following, record.states[t + 1])
+        measure(trial.sensors, noise, following, trial.state.estimate.outputs[t])
     return within(following, plant.state_limit)
 
 
@@ -75,8 +75,7 @@ def act_and_measure(trial: Trial, t: int) -> bool:
 def observe(trial: Trial, steps: Steps, t: int, dt: float, target: Vector) -> None:
     """Write the accelerations observed from x_t to x_{t+1}, (r,), which came dt seconds later.
 
-    Where states are measured with noise, an estimate takes the place of what was measured of
-    x_{t+1}.
+    Where states are measured with noise, x_{t+1} is estimated first.
     """
     steps.estimate_state(trial, t, dt)
     steps.observe(trial, t, dt, target)

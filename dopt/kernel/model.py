@@ -12,9 +12,9 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel import gaussian_process, random_features
 from dopt.kernel import network as nn
+from dopt.kernel import network_backward as backward
 from dopt.kernel import network_tangents as tangents
 from dopt.kernel.compiler import compiled
-from dopt.kernel.points import model_point
 from dopt.kernel.state_structs import Linearization
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
@@ -98,23 +98,21 @@ def model_accelerations(
 
 @compiled
 def write_point_features(
-    network: Network, x: Vector, u: Vector, features: Matrix, column: int
+    network: Network, states: Matrix, inputs: Matrix, features: Matrix
 ) -> None:
-    """Write the features of a state and an input into a column of a matrix, (p, N)."""
-    phi = np.empty(features.shape[0])
-    nn.features_at(network, model_point(network, x, u), phi)
-    for j in range(phi.shape[0]):
-        features[j, column] = phi[j]
+    """Write the features of states, (N, d), with inputs, (N, m), one point to a column, (p, N)."""
+    d = states.shape[1]
+    for j in range(features.shape[0]):
+        index = network.feature_indices[j]
+        values = states[:, index] if index < d else inputs[:, index - d]
+        nn.write_feature(network, j, values, features[j])
 
 
 @compiled
-def write_features(network: Network, states: Matrix, features: Matrix) -> None:
+def write_features(network: Network, points: Matrix, features: Matrix) -> None:
     """Write the features of points, (N, ·), one point to a column, (p, N)."""
-    phi = np.empty(features.shape[0])
-    for n in range(states.shape[0]):
-        nn.features_at(network, states[n], phi)
-        for j in range(phi.shape[0]):
-            features[j, n] = phi[j]
+    for j in range(features.shape[0]):
+        nn.write_feature(network, j, points[:, network.feature_indices[j]], features[j])
 
 
 @compiled
@@ -158,30 +156,35 @@ def linearization_at(
     """
     m, p = directions.shape[0], network.feature_kinds.shape[0]
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
+    signals = np.empty((1 + m, depth, width))
     point = Linearization(
         np.empty(p),
         np.empty((depth, width)),
-        np.empty((depth, width)),
+        signals[0],
         np.empty((m, p)),
         np.empty((m, depth, width)),
-        np.empty((m, depth, width)),
+        signals[1:],
     )
     nn.features_at(network, x, point.phi)
     nn.activations_at(network, theta, point.phi, point.hidden, out)
-    nn.back_signals(network, theta, point.phi, point.hidden, component, point.deltas)
+    backward.output_signal(
+        network, theta, point.phi, point.hidden, component, signals[0, depth - 1]
+    )
     for j in range(m):
-        tangents.features_along(network, x, directions[j], point.phi_dots[j])
-        tangents.tangents_at(
+        phi_dot, hidden_dot = point.phi_dots[j], point.hidden_dots[j]
+        tangents.features_along(network, x, directions[j], phi_dot)
+        tangents.activations_along(network, theta, phi_dot, point.hidden, hidden_dot)
+        tangents.output_signal_along(
             network,
             theta,
             point.phi,
-            point.phi_dots[j],
+            phi_dot,
             point.hidden,
+            hidden_dot,
             component,
-            point.deltas,
-            point.hidden_dots[j],
-            point.deltas_dots[j],
+            signals[1 + j, depth - 1],
         )
+    tangents.signals_below(network, theta, point.hidden, point.hidden_dots, signals)
     return point
 
 
@@ -198,8 +201,7 @@ def all_components(
     deltas = np.empty((out.shape[0], depth, width))
     nn.features_at(network, x, phi)
     nn.activations_at(network, theta, phi, hidden, out)
-    for k in range(out.shape[0]):
-        nn.back_signals(network, theta, phi, hidden, k, deltas[k])
+    backward.back_signals(network, theta, phi, hidden, deltas)
     return phi, hidden, deltas
 
 
@@ -208,7 +210,7 @@ def network_gradients(network: Network, point: Linearization, component: int, q:
     """Return g and the columns of D B as rows, (1 + m, q)."""
     m = point.phi_dots.shape[0]
     out = np.empty((1 + m, q))
-    nn.parameter_gradient(network, point.phi, point.hidden, point.deltas, component, out[0])
+    backward.parameter_gradient(network, point.phi, point.hidden, point.deltas, component, out[0])
     for j in range(m):
         tangents.gradient_along(
             network,
@@ -229,7 +231,7 @@ def network_rows(network: Network, phi: Vector, hidden: Matrix, deltas: Stack, q
     """Return the learned rows of J, (r, q)."""
     rows = np.empty((deltas.shape[0], q))
     for k in range(deltas.shape[0]):
-        nn.parameter_gradient(network, phi, hidden, deltas[k], k, rows[k])
+        backward.parameter_gradient(network, phi, hidden, deltas[k], k, rows[k])
     return rows
 
 

@@ -13,16 +13,15 @@ import math
 import numpy as np
 
 from dopt.algorithm import FeatureKind
-from dopt.kernel.compiler import compiled, contracted, squared, vectorized
+from dopt.kernel.compiler import compiled, contracted, copy_into, vectorized
 from dopt.kernel.output_layer import (
     output_inputs,
     output_inputs_at,
-    output_slope,
     sum_over_factors,
 )
 from dopt.kernel.structs import Network
 from dopt.kernel.tanh import tanh
-from dopt.types import Matrix, Real, Stack, Vector
+from dopt.types import Matrix, Real, Vector
 
 
 @compiled
@@ -36,6 +35,19 @@ def features_at(network: Network, x: Vector, out: Vector) -> None:
         elif kind == FeatureKind.SIN:
             value = math.sin(value)
         out[i] = value / network.feature_scales[i]
+
+
+@compiled
+def write_feature(network: Network, index: int, values: Vector, out: Vector) -> None:
+    """Write one feature of points, (N,), given the component that it is made of, (N,)."""
+    kind, scale = network.feature_kinds[index], network.feature_scales[index]
+    for n in range(values.shape[0]):
+        value = values[n]
+        if kind == FeatureKind.COS:
+            value = math.cos(value)
+        elif kind == FeatureKind.SIN:
+            value = math.sin(value)
+        out[n] = value / scale
 
 
 @compiled
@@ -176,95 +188,31 @@ def activations_at(
     for index in range(depth):
         W, b = layer(network, theta, index)
         values = hidden[index]
-        _affine(W, b, below, values)
+        copy_into(b, values)
+        add_product(W, below, values)
         for i in range(values.shape[0]):
             values[i] = tanh(values[i])
         below = values
     W, b = layer(network, theta, depth)
-    _affine(W, b, output_inputs_at(network, below, phi), output)
+    copy_into(b, output)
+    add_product(W, output_inputs_at(network, below, phi), output)
 
 
 @contracted
-def _affine(W: Matrix, b: Vector, x: Vector, out: Vector) -> None:
-    for i in range(out.shape[0]):
-        total = b[i]
-        for j in range(W.shape[1]):
-            total += W[i, j] * x[j]
-        out[i] = total
+def add_product(W: Matrix, x: Vector, out: Vector) -> None:
+    """Add W x, each sum in the order of x.
 
-
-@contracted
-def transposed_product(W: Matrix, delta: Vector, out: Vector) -> None:
-    for j in range(out.shape[0]):
-        out[j] = 0.0
-    for i in range(delta.shape[0]):
-        for j in range(out.shape[0]):
-            out[j] += delta[i] * W[i, j]
-
-
-@contracted
-def back_signals(
-    network: Network, theta: Vector, phi: Vector, hidden: Matrix, component: int, deltas: Matrix
-) -> None:
-    """Write δ, (L, w): the derivative of output k with respect to every pre-activation."""
-    depth = network.offsets.shape[0] - 1
-    W, _ = layer(network, theta, depth)
-    for i in range(deltas.shape[1]):
-        slope = output_slope(network, W, phi, component, i)
-        deltas[depth - 1, i] = slope * (1.0 - squared(hidden[depth - 1, i]))
-    for index in range(depth - 1, 0, -1):
-        W, _ = layer(network, theta, index)
-        transposed_product(W, deltas[index], deltas[index - 1])
-        for i in range(deltas.shape[1]):
-            deltas[index - 1, i] *= 1.0 - squared(hidden[index - 1, i])
-
-
-@compiled
-def batch_back_signals(
-    network: Network, theta: Vector, inputs: Matrix, hidden: Matrix, r: int
-) -> Stack:
-    """Return δ of every output and hidden layer, (r L, w, N), layer by layer of an output.
-
-    ``inputs`` (p, N) are features, ``hidden`` (L, w N) the activations there.
+    Four sums are taken at once, as the next term of one has to wait for the last.
     """
-    n, m, p = inputs.shape[1], network.n_factors, inputs.shape[0]
-    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
-    out = np.empty((r * depth, width, n))
-    last, _ = layer(network, theta, depth)
-    for k in range(r):
-        for index in range(depth - 1, -1, -1):
-            h = units_by_points(hidden[index], width, n)
-            signal = out[k * depth + index]
-            if index == depth - 1:
-                for i in range(width):
-                    signal[i] = last[k, i]
-                    for j in range(m):
-                        signal[i] += inputs[p - m + j] * last[k, (1 + j) * width + i]
-            else:
-                W, _ = layer(network, theta, index + 1)
-                np.dot(W.T, out[k * depth + index + 1], signal)
-            through_tanh(signal, h)
-    return out
-
-
-@contracted
-def parameter_gradient(
-    network: Network, phi: Vector, hidden: Matrix, deltas: Matrix, component: int, out: Vector
-) -> None:
-    """Write g = ∂a_k/∂θ, (q,): in each layer δ ⊗ (activations below, 1)."""
-    depth = network.offsets.shape[0] - 1
-    for index in range(depth):
-        below = phi if index == 0 else hidden[index - 1]
-        dW, db = layer(network, out, index)
-        for i in range(db.shape[0]):
-            delta = deltas[index, i]
-            db[i] = delta
-            for j in range(dW.shape[1]):
-                dW[i, j] = delta * below[j]
-    dW, db = layer(network, out, depth)
-    top = output_inputs_at(network, hidden[depth - 1], phi)
-    for k in range(db.shape[0]):
-        chosen = 1.0 if k == component else 0.0
-        db[k] = chosen
-        for j in range(dW.shape[1]):
-            dW[k, j] = chosen * top[j]
+    whole = out.shape[0] - out.shape[0] % 4
+    for i in range(0, whole, 4):
+        sum_0, sum_1, sum_2, sum_3 = out[i], out[i + 1], out[i + 2], out[i + 3]
+        for j in range(W.shape[1]):
+            sum_0 += W[i, j] * x[j]
+            sum_1 += W[i + 1, j] * x[j]
+            sum_2 += W[i + 2, j] * x[j]
+            sum_3 += W[i + 3, j] * x[j]
+        out[i], out[i + 1], out[i + 2], out[i + 3] = sum_0, sum_1, sum_2, sum_3
+    for i in range(whole, out.shape[0]):
+        for j in range(W.shape[1]):
+            out[i] += W[i, j] * x[j]

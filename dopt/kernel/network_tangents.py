@@ -10,10 +10,11 @@ import math
 
 from dopt.algorithm import FeatureKind
 from dopt.kernel.compiler import compiled, contracted, squared
-from dopt.kernel.network import layer, transposed_product
+from dopt.kernel.network import add_product, layer
+from dopt.kernel.network_backward import signals_through
 from dopt.kernel.output_layer import output_inputs_along, output_slope
 from dopt.kernel.structs import Network
-from dopt.types import Matrix, Vector
+from dopt.types import Matrix, Stack, Vector
 
 
 @compiled
@@ -31,46 +32,64 @@ def features_along(network: Network, x: Vector, direction: Vector, out: Vector) 
 
 
 @contracted
-def tangents_at(
+def activations_along(
+    network: Network, theta: Vector, phi_dot: Vector, hidden: Matrix, hidden_dot: Matrix
+) -> None:
+    """Write the derivative of the activations, (L, w), along a direction."""
+    below = phi_dot
+    for index in range(hidden.shape[0]):
+        W, _ = layer(network, theta, index)
+        for i in range(hidden.shape[1]):
+            hidden_dot[index, i] = 0.0
+        add_product(W, below, hidden_dot[index])
+        for i in range(hidden.shape[1]):
+            hidden_dot[index, i] *= 1.0 - squared(hidden[index, i])
+        below = hidden_dot[index]
+
+
+@contracted
+def output_signal_along(
     network: Network,
     theta: Vector,
     phi: Vector,
     phi_dot: Vector,
     hidden: Matrix,
-    component: int,
-    deltas: Matrix,
     hidden_dot: Matrix,
-    deltas_dot: Matrix,
+    component: int,
+    delta_dot: Vector,
 ) -> None:
-    """Write the derivatives of the activations and of δ, (L, w) each, along a direction."""
+    """Write the derivative of δ, (w,), of the last hidden layer along a direction."""
     depth, width, m = network.offsets.shape[0] - 1, hidden.shape[1], network.n_factors
-    below = phi_dot
-    for index in range(depth):
-        W, _ = layer(network, theta, index)
-        for i in range(width):
-            total = 0.0
-            for j in range(W.shape[1]):
-                total += W[i, j] * below[j]
-            hidden_dot[index, i] = (1.0 - squared(hidden[index, i])) * total
-        below = hidden_dot[index]
     W, _ = layer(network, theta, depth)
     for i in range(width):
         h = hidden[depth - 1, i]
         bend = -2.0 * h * hidden_dot[depth - 1, i]
-        deltas_dot[depth - 1, i] = output_slope(network, W, phi, component, i) * bend
+        delta_dot[i] = output_slope(network, W, phi, component, i) * bend
         for j in range(m):
             slope = phi_dot[phi_dot.shape[0] - m + j] * W[component, (1 + j) * width + i]
-            deltas_dot[depth - 1, i] += slope * (1.0 - h * h)
-    for index in range(depth - 1, 0, -1):
-        W, _ = layer(network, theta, index)
-        transposed_product(W, deltas_dot[index], deltas_dot[index - 1])
-        for j in range(width):
-            back = 0.0
-            for i in range(width):
-                back += W[i, j] * deltas[index, i]
-            h = hidden[index - 1, j]
-            bend = -2.0 * h * hidden_dot[index - 1, j]
-            deltas_dot[index - 1, j] = deltas_dot[index - 1, j] * (1.0 - h * h) + back * bend
+            delta_dot[i] += slope * (1.0 - h * h)
+
+
+@contracted
+def signals_below(
+    network: Network,
+    theta: Vector,
+    hidden: Matrix,
+    hidden_dots: Stack,
+    signals: Stack,
+) -> None:
+    """Write δ and its derivatives along m directions, (1 + m, L, w), given the last layer's."""
+    for index in range(hidden.shape[0] - 1, 0, -1):
+        signals_through(network, theta, index, signals)
+        back = signals[0, index - 1]
+        for k in range(hidden_dots.shape[0]):
+            delta_dot, hidden_dot = signals[1 + k, index - 1], hidden_dots[k, index - 1]
+            for j in range(back.shape[0]):
+                h = hidden[index - 1, j]
+                bend = -2.0 * h * hidden_dot[j]
+                delta_dot[j] = delta_dot[j] * (1.0 - h * h) + back[j] * bend
+        for j in range(back.shape[0]):
+            back[j] *= 1.0 - squared(hidden[index - 1, j])
 
 
 @contracted

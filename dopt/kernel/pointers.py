@@ -90,7 +90,7 @@ OTHER_STEPS = {
 
 def other_steps(trial: Trial) -> dict[str, CompiledFunction]:
     """Return which of :data:`OTHER_STEPS` a trial calls."""
-    limited, measured = trial.limits.enforced, len(trial.sensors.measured) > 0
+    limited, measured = trial.limits.enforced, len(trial.sensors.output_matrix) > 0
     others = (limited, limited, measured, trial.plant.integrator != Integrator.EULER)
     return {
         name: choices[other]

@@ -43,8 +43,7 @@ def follow_network(
     for t in range(inputs.shape[0]):
         states[t + 1] = states[t]
         for stage in range(n_stages(plant)):
-            for i in range(n):
-                write_point_features(network, states[t + 1, i], inputs[t, i], features, i)
+            write_point_features(network, states[t + 1], inputs[t], features)
             nn.mean_forward(network, thetas, features, hidden, outputs, one)
             for i in range(n):
                 x, following = states[t, i], states[t + 1, i]

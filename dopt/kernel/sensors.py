@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled
+from dopt.kernel.information.primal import inner
 from dopt.kernel.integration import next_model_state
 from dopt.kernel.structs import Sensors, Trial
 from dopt.types import Vector
@@ -18,29 +19,25 @@ from dopt.types import Vector
 @compiled
 def has_sensors(sensors: Sensors) -> bool:
     """Tell whether the states are measured with noise."""
-    n: int = sensors.measured.shape[0]
+    n: int = sensors.output_matrix.shape[0]
     return n > 0
 
 
 @compiled
-def measure(sensors: Sensors, noise: Vector, truth: Vector, following: Vector) -> None:
-    """Write the measured states of x_{t+1}, (d,), with their noise, (n,)."""
-    for i in range(sensors.measured.shape[0]):
-        row = sensors.measured[i]
-        following[row] = truth[row] + noise[i]
+def measure(sensors: Sensors, noise: Vector, truth: Vector, outputs: Vector) -> None:
+    """Write the outputs at a state, (n,), given it, (d,), and their noise."""
+    for i in range(outputs.shape[0]):
+        outputs[i] = inner(sensors.output_matrix[i], truth) + noise[i]
 
 
 @compiled
 def estimate_state(trial: Trial, t: int, dt: float) -> None:
-    """Put an estimate of x_{t+1} in the place of what was measured of it dt seconds after x_t.
+    """Write an estimate of x_{t+1}, dt seconds after x_t; row t of ``outputs`` was measured of it.
 
-    A learner that estimates states finds the prediction of its model there, and what was measured
-    in the row t of ``outputs``.
+    A learner that estimates states finds the prediction of its model there.
     """
     sensors, record, estimate = trial.sensors, trial.record, trial.state.estimate
     x, following, u = record.states[t], record.states[t + 1], record.inputs[t]
-    for i in range(sensors.measured.shape[0]):
-        estimate.outputs[t, i] = following[sensors.measured[i]]
     estimate.durations[t] = dt
     if sensors.cutoff == 0.0:
         next_model_state(trial.plant, trial.network, trial.state.theta, x, u, dt, following)
@@ -88,13 +85,13 @@ def start_filters(trial: Trial, x: Vector) -> None:
 def output_error(trial: Trial, t: int, dt: float) -> float:
     """Return how far what was measured of x_{t+1} is from what the model predicts.
 
-    It is the Euclidean norm, each state in standard deviations of its noise.
+    It is the Euclidean norm, each output in standard deviations of its noise.
     """
+    sensors, outputs = trial.sensors, trial.state.estimate.outputs[t]
     following, square = np.empty(trial.record.states.shape[1]), 0.0
     x, u, network = trial.record.states[t], trial.record.inputs[t], trial.network
     next_model_state(trial.plant, network, trial.state.theta, x, u, dt, following)
-    for i in range(trial.sensors.measured.shape[0]):
-        row = trial.sensors.measured[i]
-        error = trial.record.states[t + 1, row] - following[row]
-        square += error * error / trial.sensors.variances[i]
+    for i in range(outputs.shape[0]):
+        error = outputs[i] - inner(sensors.output_matrix[i], following)
+        square += error * error / sensors.variances[i]
     return float(np.sqrt(square))

@@ -9,7 +9,7 @@ from dopt.kernel import state_structs as args
 from dopt.kernel.information.primal import PENDING_ROWS, SMALL
 from dopt.kernel.model_from_spec import members_of
 from dopt.kernel.structs import Network
-from dopt.learning import GaussNewton, Learner
+from dopt.learning import GaussNewton, JointKalman, Learner
 from dopt.models import MLP, GaussianProcess
 from dopt.policies import ICEM, DOptimal, InformationPolicy
 from dopt.policies.d_optimal import count_sketch
@@ -109,6 +109,7 @@ def _estimate(spec: TrialSpec, q: int, applied: Matrix) -> args.Estimate:
     system, estimates = spec.system, spec.learner.estimates_states
     steps = system.horizon if system.n_measured else 0
     d = system.n_states if system.n_measured and estimates else 0
+    noise = spec.learner.noise_variance if isinstance(spec.learner, JointKalman) else np.nan
     starts = np.full((steps, system.n_states), np.nan)
     if steps and not isinstance(system, BlackBox):
         starts[0] = system.initial_state
@@ -121,6 +122,7 @@ def _estimate(spec: TrialSpec, q: int, applied: Matrix) -> args.Estimate:
         np.zeros(system.n_inputs),
         np.zeros((d, d)),
         np.zeros((d, q)),
+        np.array([noise]),
     )
 
 

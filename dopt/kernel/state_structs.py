@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from dopt.types import Integers, Matrix, Stack, Vector
+from dopt.types import Buckets, Integers, Matrix, Signs, Stack, Vector
 
 
 class Covariance(NamedTuple):
@@ -38,8 +38,8 @@ class Sketch(NamedTuple):
     Empty in other forms.
     """
 
-    buckets: Integers  # (q,)
-    signs: Vector  # (q,)
+    buckets: Buckets  # (q,)
+    signs: Signs  # (q,)
     size: int
 
 
@@ -103,6 +103,7 @@ class Estimate(NamedTuple):
     filtered_input: Vector  # (m,)
     covariance: Matrix  # (d, d) of the state, given the parameters
     sensitivity: Matrix  # (d, q) of the estimated state to the parameters
+    noise_variance: Vector  # (1,) ρ of the accelerations, which a fit may change
 
 
 class State(NamedTuple):

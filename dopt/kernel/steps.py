@@ -56,6 +56,12 @@ class KernelSteps(KernelState):
         if len(self.state.estimate.starts):
             self.state.estimate.starts[t] = state
 
+    def measure(self, t: int, measured: Array) -> None:
+        """Write what was measured after step t: x_{t+1}, (d,), or the outputs, (n,)."""
+        known = not self.spec.system.n_measured
+        into = self.record.states[t + 1] if known else self.state.estimate.outputs[t]
+        into[:] = measured
+
     def plan_input(self, t: int) -> None:
         """Write the input u_t that the policy chooses at x_t."""
         chosen_in = self._parts.choose(t, self.record.inputs[t]) if self._parts else 0.0

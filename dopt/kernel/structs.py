@@ -114,9 +114,10 @@ class Limits(NamedTuple):
 
 
 class Sensors(NamedTuple):
-    """Measured states and their noise (:mod:`dopt.kernel.sensors`); empty where all are known."""
+    """Outputs y = C x + v (:mod:`dopt.kernel.sensors`); empty where all states are known."""
 
-    measured: Integers  # (n,) indices of the measured states
+    output_matrix: Matrix  # C, (n, d)
+    measured: Integers  # (n,) indices of the measured states; empty where outputs mix states
     variances: Vector  # (n,) of their noise
     positions: Integers  # (d,) whose difference estimates a state; itself where it is measured
     cutoff: float  # of the low-pass filter, in Hz; 0 where a learner estimates
@@ -132,6 +133,7 @@ class Randomness(NamedTuple):
     inputs: Matrix  # (T, m)
     components: Integers  # (T,)
     ties: Matrix  # (T, m)
+    radii: Matrix  # (T, 2) norms in γ of the planned input and of the next one in its criterion
     replay: Integers  # (T, steps, batch), empty without replay
     plans: Matrix  # (blocks, numbers) of the sampling planner
     parameters: Matrix  # (q, s) of its draws of the parameters; both empty in other policies

@@ -51,7 +51,9 @@ class JointKalman(InformationLearner):
     Every ``refit_every`` steps θ is fitted anew to all that was measured: with the filter over x̂
     alone, damped Gauss-Newton steps lead to the minimum of Σ (e²/s + log s) + λ‖θ - θ₀‖², and x̂,
     P, Ψ and M are those of the whole run at the θ that is found. The time of a fit grows with the
-    number of steps.
+    number of steps. With ``noise="fitted"`` it then moves ρ by factors of 10^(1/4), two decades at
+    most, as long as Σ (e²/s + log s) falls: to what is likeliest. One ρ stands for all
+    accelerations.
 
     Units: 1/λ is the variance of an initial parameter; M has no other unit, as e has its variance.
 
@@ -63,6 +65,8 @@ class JointKalman(InformationLearner):
         Steps from one fit to the next; with more than a trial has there is none.
     steps : int
         Gauss-Newton steps of a fit.
+    noise : str
+        Whether ρ stays as "given", or is "fitted" too, from ``noise_variance`` on.
     """
 
     name: ClassVar[str] = "joint_ekf"
@@ -76,7 +80,13 @@ class JointKalman(InformationLearner):
     underweighting: float = parameter(2.0, bound="nonnegative")
     refit_every: int = parameter(100, "steps", "positive")
     steps: int = parameter(4, "steps", "positive")
+    noise: str = parameter("given", choices=("given", "fitted"), added=True)
+
+    @property
+    def fits_noise(self) -> bool:
+        """Whether a fit estimates ρ."""
+        return self.noise == "fitted"
 
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
-        fit = float(self.refit_every), float(self.steps)
+        fit = float(self.refit_every), float(self.steps), float(self.fits_noise)
         return regularization, self.noise_variance, self.underweighting, *fit

@@ -22,12 +22,15 @@ class Model(KernelSupport):
 
     ``structure`` says how its parameters can be learned: by gradient, by least squares because the
     model is linear in them, by conditioning on all samples, or by fits of one network of an
-    ensemble after the other. A learner names the one it teaches.
+    ensemble after the other. A learner names the one it teaches. ``affine_in_inputs`` says whether
+    the accelerations are affine in the inputs for any parameters; a model that does not read inputs
+    is.
     """
 
     section: ClassVar[str] = "model"
     name: ClassVar[str]
     structure: ClassVar[str] = "gradient"
+    affine_in_inputs: ClassVar[bool] = True
 
     @abstractmethod
     def n_parameters(self, system: System) -> int:

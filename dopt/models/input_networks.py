@@ -21,6 +21,7 @@ class BlackBoxMLP(MLP):
 
     name: ClassVar[str] = "black_box"
     compiled: ClassVar[bool] = True
+    affine_in_inputs: ClassVar[bool] = False
 
     def n_inputs_read(self, system: System) -> int:
         return system.n_inputs
@@ -37,6 +38,7 @@ class AffineMLP(BlackBoxMLP):
 
     name: ClassVar[str] = "affine"
     compiled: ClassVar[bool] = True
+    affine_in_inputs: ClassVar[bool] = True
 
     def n_first_inputs(self, system: System) -> int:
         return len(system.features)

@@ -51,10 +51,10 @@ def check_ensemble(networks: int) -> None:
 class Policy(KernelPart):
     """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.
 
-    ``uses_full_amplitude`` says whether every input has the norm γ; without it inputs may have
-    other norms. ``reads_inputs`` says whether it goes with models that depend on the inputs.
-    ``library`` is a module that it cannot do without, and ``extra`` the extra of this package that
-    installs it.
+    ``uses_full_amplitude`` says whether every input has the norm γ, with a model that is affine in
+    the inputs; without it inputs may have other norms. ``reads_inputs`` says whether it goes with
+    models that depend on the inputs. ``library`` is a module that it cannot do without, and
+    ``extra`` the extra of this package that installs it.
     """
 
     section: ClassVar[str] = "policy"
@@ -250,6 +250,12 @@ def check_norms(name: str, inputs: Array, first: int, gamma: float) -> None:
             f"policy '{name}' chose an input of norm {norms[wrong[0]]:.6g} at step "
             f"{first + wrong[0]}, but env.gamma is {gamma:g}: scale it down."
         )
+
+
+def ball_norms(rng: np.random.Generator, size: tuple[int, int], dimensions: int | Array) -> Array:
+    """Return norms of points that are drawn uniformly from the unit ball of some dimensions."""
+    norms: Array = rng.uniform(size=size) ** (1.0 / dimensions)
+    return norms
 
 
 def on_sphere(vectors: Array, radius: float) -> Array:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from dopt.declare.validated_fields import parameter
 from dopt.policies.base import InformationPolicy
+from dopt.types import Buckets, Signs
 
 SMALL_PRIMAL = 600
 LARGE_DUAL = 4000
@@ -63,10 +63,8 @@ class DOptimal(InformationPolicy):
         return "dual" if n_rows <= LARGE_DUAL else "sketch"
 
 
-def count_sketch(
-    n_parameters: int, size: int
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+def count_sketch(n_parameters: int, size: int) -> tuple[Buckets, Signs]:
     """Return the bucket, (q,), and the sign, (q,), of every parameter; the same for all trials."""
     rng = np.random.default_rng(_SKETCH_SEED)
-    buckets = rng.integers(size, size=n_parameters)
-    return buckets, rng.choice([-1.0, 1.0], size=n_parameters)
+    buckets = rng.integers(size, size=n_parameters).astype(np.uint32)
+    return buckets, rng.choice([-1.0, 1.0], size=n_parameters).astype(np.int8)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
+from dopt.algorithm import MOST_NOISE_FACTORS, NO_GROWTH, NOISE_FACTORS, SMALLEST_SHARE
 from dopt.learning import JointKalman
 from dopt.reference.derivatives import jacobian
 from dopt.reference.information import BatchInformation
@@ -24,6 +24,7 @@ class JointKalmanLearner:
     ) -> None:
         self._learner, self._batch, self._sensors = learner, batch, sensors
         self._ridge, self._prior = regularization, batch.theta.clone()
+        self._noise = torch.full_like(batch.theta[:, 0], learner.noise_variance)  # ρ, (n,)
         n, d, q = len(batch.specs), batch.system.n_states, batch.n_learned
         self._P, self._psi = batch.theta.new_zeros(n, d, d), batch.theta.new_zeros(n, d, q)
         self._E = batch.theta.new_zeros(d, batch.system.n_learned)
@@ -42,16 +43,16 @@ class JointKalmanLearner:
         theta, dt = batch.theta, self._sensors.durations[t]
         J = self._rows(theta, batch.points(self._learned_at(x, following), u))
         spread = J @ information.solve(J.mT)
-        noise = learner.noise_variance * torch.eye(J.shape[1]).to(J)
+        noise = self._noise[:, None, None] * torch.eye(J.shape[1]).to(J)
         noise = noise + learner.underweighting * spread
         A = self._state_jacobian(theta, x, u, dt)
         self._P, self._psi = self._begun(t, self._P, self._psi)
         P = A @ self._P @ A.mT + dt**2 * self._E @ noise @ self._E.T
         psi = A @ self._psi + dt * self._E @ J
-        for i, row in enumerate(self._sensors.rows):
-            error = self._sensors.outputs[:, t, i] - following[:, row]
-            variance = P[:, row, row] + self._sensors.variances[i]
-            h, K = psi[:, row], P[:, :, row] / variance[:, None]
+        for i, c in enumerate(self._sensors.C):
+            error = self._sensors.outputs[:, t, i] - following @ c
+            variance = P @ c @ c + self._sensors.variances[i]
+            h, K = c @ psi, P @ c / variance[:, None]
             information.add((h * variance.rsqrt()[:, None]).unsqueeze(1))
             change = information.solve((h * (error / variance)[:, None]).unsqueeze(-1))
             P = P - variance[:, None, None] * K[:, :, None] * K[:, None, :]
@@ -66,7 +67,7 @@ class JointKalmanLearner:
         """Return the variances ρ + g M⁻¹ gᵀ of accelerations at states without input, (n, r)."""
         zero = torch.zeros_like(self._batch.inputs[:, 0])
         J = self._rows(self._batch.theta, self._batch.points(x, zero))
-        return self._spread(J) + self._learner.noise_variance
+        return self._spread(J) + self._noise[:, None]
 
     def state_variances(self, t: int) -> Tensor:
         """Return the diagonals of P + Ψ M⁻¹ Ψᵀ, the variances of the estimates x̂_t, (n, d)."""
@@ -96,7 +97,7 @@ class JointKalmanLearner:
         return jacobian(lambda at: self._batch.learned.next_states(theta, at, u, dt), x)
 
     def _fit(self, n: int) -> None:
-        """Fit θ to what was measured in n steps; M is that of the fit."""
+        """Fit θ, and ρ if asked to, to what was measured in n steps; M is that of the fit."""
         theta = self._batch.theta
         for _ in range(self._learner.steps):
             before, J, e = self._run(n)
@@ -112,8 +113,24 @@ class JointKalmanLearner:
                     break
                 smaller = torch.where(share > SMALLEST_SHARE, share / 2, 0.0)
                 share = torch.where(worse, smaller, share)
+        if self._learner.fits_noise:
+            self._fit_noise(n)
         _, J, _ = self._run(n, keep=True)
         self._information.replace(self._normal(J))
+
+    def _fit_noise(self, n: int) -> None:
+        """Move ρ by factors as long as the errors of n steps become likelier, at the present θ."""
+        lowest = self._run(n)[0]
+        for factor in NOISE_FACTORS:
+            moving = torch.ones_like(lowest, dtype=torch.bool)
+            for _ in range(MOST_NOISE_FACTORS):
+                held, self._noise = self._noise, torch.where(moving, factor, 1.0) * self._noise
+                found = self._run(n)[0]
+                moving = moving & (found < lowest)
+                self._noise = torch.where(moving, self._noise, held)
+                lowest = torch.where(moving, found, lowest)
+                if not moving.any():
+                    break
 
     def _normal(self, J: Tensor) -> Tensor:
         total: Tensor = J.mT @ J + self._ridge * torch.eye(J.shape[-1]).to(J)
@@ -127,7 +144,7 @@ class JointKalmanLearner:
         """
         batch, sensors, theta = self._batch, self._sensors, self._batch.theta
         x, P, psi = batch.states[:, 0], torch.zeros_like(self._P), torch.zeros_like(self._psi)
-        noise = self._learner.noise_variance * self._E @ self._E.T
+        noise = self._noise[:, None, None] * (self._E @ self._E.T)
         total = self._ridge * (theta - self._prior).square().sum(dim=1)
         rows, errors = [], []
         for t in range(n):
@@ -138,15 +155,15 @@ class JointKalmanLearner:
             A = self._state_jacobian(theta, x, u, dt)
             J = self._rows(theta, batch.points(self._learned_at(x, following), u))
             P, psi, x = A @ P @ A.mT + dt**2 * noise, A @ psi + dt * self._E @ J, following
-            for i, row in enumerate(sensors.rows):
-                error = sensors.outputs[:, t, i] - x[:, row]
-                variance = P[:, row, row] + sensors.variances[i]
+            for i, c in enumerate(sensors.C):
+                error = sensors.outputs[:, t, i] - x @ c
+                variance = P @ c @ c + sensors.variances[i]
                 total = total + error**2 / variance + variance.log()
-                K, scale = P[:, :, row] / variance[:, None], variance.rsqrt()
-                rows.append(psi[:, row] * scale[:, None])
+                K, scale, h = P @ c / variance[:, None], variance.rsqrt(), c @ psi
+                rows.append(h * scale[:, None])
                 errors.append(error * scale)
                 P = P - variance[:, None, None] * K[:, :, None] * K[:, None, :]
-                psi = psi - K[:, :, None] * psi[:, None, row]
+                psi = psi - K[:, :, None] * h[:, None, :]
                 x = x + K * error[:, None]
         if keep:
             batch.states[:, n], self._P, self._psi = x, P, psi

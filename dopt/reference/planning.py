@@ -92,9 +92,17 @@ def gradient_and_changes(
     return g.view(*shape, -1)[:, :, 0], DB.view(*shape, -1)
 
 
-def best_inputs(gamma: float, columns: Tensor, solved: Tensor, ties: Tensor) -> Tensor:
-    """Return the inputs, (n, m), from the :func:`planning_columns` and M⁻¹ times them."""
-    return d_optimal_inputs(quadratic_problem(columns, solved), gamma, ties)
+def best_inputs(
+    gamma: float, columns: Tensor, solved: Tensor, ties: Tensor, radii: Tensor
+) -> Tensor:
+    """Return the inputs, (n, m), from the :func:`planning_columns` and M⁻¹ times them.
+
+    Their norms are ``radii`` (n,) in γ.
+    """
+    Q, v = quadratic_problem(columns, solved)
+    scale = radii.unsqueeze(-1)  # on the sphere of radius γ, the problem in u / scale has scale Q
+    problem = QuadraticProblem(scale.unsqueeze(-1) * Q, v)
+    return scale * d_optimal_inputs(problem, gamma, ties)
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:

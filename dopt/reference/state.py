@@ -57,8 +57,10 @@ class BatchState:
         Form and λ of M.
     diverged : (n, 1) tensor
         Whether a trial has ended.
-    noise, measurement_noise, open_loop, ties, components, replay, plans, parameters : tensors
+    noise, measurement_noise, open_loop, ties, radii : tensors
         Numbers of :class:`dopt.randomness.Draws` with the trials along the first axis.
+    components, replay, plans, parameters : tensors
+        More of them.
 
     Raises
     ------
@@ -115,6 +117,7 @@ class BatchState:
         self.measurement_noise = self.tensor(np.stack([d.measurement_noise for d in draws]))
         self.open_loop = self.tensor(np.stack([d.inputs for d in draws]))
         self.ties = self.tensor(np.stack([d.ties for d in draws]))
+        self.radii = self.tensor(np.stack([d.radii for d in draws]))
         self.plans = self.tensor(np.stack([d.plans for d in draws]))
         self.parameters = self.tensor(np.stack([d.parameters for d in draws]))
         self.theta = self.tensor(np.stack([d.weights for d in draws]))
@@ -163,5 +166,6 @@ class BatchState:
             assert isinstance(policy, DOptimal)
             buckets, signs = count_sketch(q, policy.sketch_size)
             matrix = torch.zeros(q, policy.sketch_size).to(self.theta)
-            matrix[torch.arange(q), torch.tensor(buckets)] = torch.tensor(signs).to(self.theta)
+            signed = torch.tensor(signs).to(self.theta)
+            matrix[torch.arange(q), torch.tensor(buckets.astype(np.int64))] = signed
             self.project = lambda rows: rows @ matrix

@@ -95,6 +95,13 @@ class ReferenceSteps:
         if self._batch.sensors:
             self._batch.sensors.starts[:, t] = self._batch.tensor(state)
 
+    def measure(self, t: int, measured: Array) -> None:
+        """Write what was measured after step t: x_{t+1}, (d,), or the outputs, (n,)."""
+        if self._batch.sensors:
+            self._batch.sensors.outputs[:, t] = self._batch.tensor(measured)
+        else:
+            self.states[t + 1] = measured
+
     @torch.no_grad()
     def plan_input(self, t: int) -> None:
         """Write the input u_t that the policy chooses at x_t."""

@@ -80,19 +80,19 @@ class BatchSteps(BatchState):
         components = self.components[:, t : t + 1]
         if isinstance(policy, TraceLinearized):
             components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)
-        ties = self.ties[:, t]
-        v = ties * (self.system.gamma / torch.linalg.vector_norm(ties, dim=1, keepdim=True))
+        ties, radii = self.ties[:, t], self.radii[:, t]
+        norms = self.system.gamma * radii[:, 1:]
+        v = ties * (norms / torch.linalg.vector_norm(ties, dim=1, keepdim=True))
         columns = self._columns(self.theta, x, components, v)
         solved = self.information.solve(columns.flatten(1, 2).mT)
-        best: Tensor = self._best(columns, solved, ties)
+        best: Tensor = self._best(columns, solved, ties, radii[:, 0])
         return best
 
     def observe(self, t: int, dt: float) -> None:
         """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later.
 
-        Where states are measured with noise, an estimate first takes the place of what was measured
-        of x_{t+1}. With the integrator of Runge and Kutta, the accelerations are those of
-        :func:`dopt.kernel.loop.observe`.
+        Where states are measured with noise, x_{t+1} is estimated first. With the integrator of
+        Runge and Kutta, the accelerations are those of :func:`dopt.kernel.loop.observe`.
         """
         if self.sensors:
             self.sensors.estimate(t, dt)

@@ -74,7 +74,12 @@ def _check_sensors(system: System, learner: Learner) -> None:
             raise mismatch(f"learner '{learner.name}'", expected, given)
         return
     if isinstance(system, BlackBox) and not isinstance(system, ExploredPlant):
-        raise mismatch("env.measured_states", "a system with equations", f"env '{system.name}'")
+        field = "env.output_matrix" if system.output_matrix else "env.measured_states"
+        raise mismatch(field, "a system with equations", f"env '{system.name}'")
+    if system.output_matrix:
+        if not learner.estimates_states:
+            raise mismatch("env.output_matrix", "learner 'joint_ekf'", f"learner '{learner.name}'")
+        return
     unknown = [i for i, position in enumerate(differentiated(system)) if position < 0]
     if unknown and not learner.estimates_states:
         names = ", ".join(system.state_labels[i] for i in unknown)

@@ -14,11 +14,12 @@ from dopt.control.task import GOALS, Goal
 from dopt.declare.registry import identifying_section, section_of
 from dopt.declare.validated_fields import Validated
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
+from dopt.evaluation import LONGEST_RUN
 from dopt.learning import LEARNERS, InformationLearner, JointKalman, Learner
 from dopt.learning.base import CompiledLearner, CustomLearner
 from dopt.limits import Limits
 from dopt.models import Model
-from dopt.policies import POLICIES, GradientDOptimal, Policy, Search
+from dopt.policies import POLICIES, DOptimal, GradientDOptimal, Policy, Search
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, TaskPolicy
 from dopt.spec.compatibility import check_together, mismatch
 from dopt.spec.custom_system_check import check_system
@@ -36,7 +37,19 @@ ASSESSMENT_VERSION = 2
 CRITERION_VERSION = 2
 """Version of the plans of searches with a noise variance ρ ≠ 1, part of the keys of such trials."""
 
-_VERSIONS = ("code_version", "assessment_version", "criterion_version")
+REACHABLE_VERSION = 2
+"""Version of the reachable set of trials that are longer than the runs from which it is drawn."""
+
+PLAN_VERSION = 2
+"""Version of linearized D-optimal plans for a model that is not affine in the inputs."""
+
+_VERSIONS = (
+    "code_version",
+    "assessment_version",
+    "criterion_version",
+    "reachable_version",
+    "plan_version",
+)
 
 LARGEST_HORIZON = 10_000_000
 """A trial is committed whole, one row for each step."""
@@ -204,6 +217,10 @@ class TrialConfig:
             content["limits"] = written(self.limits)
         if self._scales_criterion():
             content["criterion_version"] = CRITERION_VERSION
+        if self.system.horizon > LONGEST_RUN:
+            content["reachable_version"] = REACHABLE_VERSION
+        if isinstance(self.policy, DOptimal) and not self.model.affine_in_inputs:
+            content["plan_version"] = PLAN_VERSION
         return content
 
     def _scales_criterion(self) -> bool:

@@ -10,6 +10,7 @@ import math
 
 from dopt.control import Control
 from dopt.control.free_run import STARTS
+from dopt.evaluation import run_steps
 from dopt.learning import Adam, AdamReplay, GaussNewton, JointKalman, Learner
 from dopt.models import MLP, RFF, GaussianProcess, Model
 from dopt.policies import (
@@ -54,14 +55,16 @@ def memory_by_setting(
     interpreter and its libraries, some 0.2 GiB, come on top.
     """
     T, d, m, r = system.horizon, system.n_states, system.n_inputs, system.n_learned
+    steps = run_steps(system)
     p, q = len(model.features(system)), model.n_member_parameters(system)
     N = math.prod(system.grid_points)
     w, L = (model.width, model.depth) if isinstance(model, MLP) else (1, 1)
     window = learner.window if isinstance(learner, Adam) else 0
     changing = T * len(system.physical) + N * (d + r) if len(system.history) > 1 else 0
     numbers = {
-        # states, noise, inputs as drawn and applied, ties, five columns, components
-        "env.horizon": T * (2 * d + 3 * m + 6 + STRONG_INPUTS * (d + m)) + changing,
+        # states, noise, inputs as drawn and applied, ties, radii, five columns, components; strong
+        # inputs
+        "env.horizon": T * (2 * d + 3 * m + 8) + changing + STRONG_INPUTS * steps * (d + m),
         # states and their mesh, targets, and features in both precisions
         "env.grid_points": N * (2 * d + 2 * r + 2 * p),
         # parameters, two moments, gradient, and the copies for the evaluation

@@ -53,7 +53,8 @@ class System(Validated):
     y = C x + v in the place of x, these states with noise of the standard deviations
     ``measurement_noise``, in their units. The states are then estimated: by a learner that does so
     (:class:`dopt.learning.JointKalman`), or else by a low-pass filter of ``velocity_cutoff`` [Hz]
-    and differences (:mod:`dopt.systems.sensors`).
+    and differences (:mod:`dopt.systems.sensors`). Outputs that mix states are given by
+    ``output_matrix``, the numbers of C row by row; then a learner has to estimate the states.
     """
 
     section: ClassVar[str] = "env"
@@ -83,6 +84,7 @@ class System(Validated):
     integrator: str = parameter("euler", choices=INTEGRATORS, added=True)
     measured_states: tuple[int, ...] = parameter((), bound="nonnegative", added=True)
     measurement_noise: tuple[float, ...] = parameter((), bound="positive", added=True)
+    output_matrix: tuple[float, ...] = parameter((), added=True)
     velocity_cutoff: float = parameter(2.0, "Hz", "positive", added=True)
 
     def __post_init__(self) -> None:
@@ -112,7 +114,28 @@ class System(Validated):
                 f"are expected, none twice: the states of {self.name} are "
                 f"{', '.join(self.state_labels)}."
             )
-        self._check_size("measurement_noise", len(given))
+        self._check_output_matrix()
+        self._check_size("measurement_noise", self.n_measured)
+
+    def _check_output_matrix(self) -> None:
+        """Refuse a C without whole rows, with one of zeros, and one beside measured states."""
+        given, d = self.output_matrix, self.n_states
+        if given and self.measured_states:
+            raise SpecificationError(
+                f"env.output_matrix is {list(given)} and env.measured_states is "
+                f"{list(self.measured_states)}, but one of the two is expected: a row of the "
+                f"matrix with a single 1 measures a state."
+            )
+        if len(given) % d:
+            raise SpecificationError(
+                f"env.output_matrix has {len(given)} entries, but {self.name} needs {d} for each "
+                f"output, one for each state: {', '.join(self.state_labels)}."
+            )
+        if not self.output_rows.any(axis=1).all():
+            raise SpecificationError(
+                f"env.output_matrix is {list(given)}, but no row of {d} zeros is expected: it "
+                f"measures nothing, so leave it out."
+            )
 
     @staticmethod
     @abstractmethod
@@ -139,8 +162,15 @@ class System(Validated):
 
     @property
     def n_measured(self) -> int:
-        """Number of states that are measured with noise; 0 where all are known without."""
-        return len(self.measured_states)
+        """Number n of outputs, measured with noise; 0 where all states are known without."""
+        return len(self.measured_states) + len(self.output_matrix) // self.n_states
+
+    @property
+    def output_rows(self) -> Array:
+        """Matrix C of the outputs y = C x + v, (n, d)."""
+        if self.output_matrix:
+            return np.array(self.output_matrix).reshape(-1, self.n_states)
+        return np.eye(self.n_states)[list(self.measured_states)]
 
     @property
     def n_learned(self) -> int:

@@ -211,13 +211,8 @@ class Plant:
         names = list(self.states)
         groups = {"states": names, "inputs": [*self.inputs], "constants": [*self.constants]}
         known = {f"known['{name}'] of a plant": self.known.get(name, "0.0") for name in names}
-        features = [
-            feature
-            for i, name in enumerate(names)
-            if name in self.angles or name in self.box
-            for feature in _features(i, name in self.angles)
-        ]
         axes = [i for i, name in enumerate(names) if name in self.angles or name in self.box]
+        features = [one for i in axes for one in _features(i, names[i] in self.angles)]
         declared: dict[str, Any] = {
             "plant": self,
             "_constants": tuple(float(value) for value in self.constants.values()),

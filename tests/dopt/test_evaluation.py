@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections import Counter
 
@@ -9,6 +10,7 @@ import pytest
 
 from dopt.evaluation import (
     _SEED,
+    LONGEST_RUN,
     evaluation_set,
     reachable_states,
     simulate,
@@ -16,6 +18,7 @@ from dopt.evaluation import (
 )
 from dopt.policies import PeriodicSquare
 from dopt.randomness import draw
+from dopt.spec.config import REACHABLE_VERSION
 from dopt.systems import SYSTEMS, Pendulum, Quadrotor
 from dopt.systems.equilibrium import eigenmode
 from tests.dopt.trials import trial
@@ -32,6 +35,14 @@ def test_reachable_states_are_a_function_of_the_system_alone(name: str) -> None:
     quiet = dataclasses.replace(system, noise=0.0, grid_points=(1,) * len(system.grid_points))
     assert np.array_equal(first, reachable_states(quiet))
     assert first.shape == (512, system.n_states)
+
+
+def test_a_long_horizon_adds_no_runs_and_is_part_of_the_key_of_a_trial() -> None:
+    longest, longer = Pendulum(horizon=LONGEST_RUN), Pendulum(horizon=50 * LONGEST_RUN)
+    assert np.array_equal(reachable_states(longest), reachable_states(longer))
+    keys = [trial("pendulum", "random", env={"horizon": s.horizon}) for s in (longest, longer)]
+    versions = [json.loads(spec.config_json).get("reachable_version") for spec in keys]
+    assert versions == [None, REACHABLE_VERSION]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy.stats import kstest
 from torch.func import jacrev
 
 from dopt.errors import IncompatibleError, SpecificationError
@@ -15,12 +17,13 @@ from dopt.kernel.model import model_accelerations, network_jacobian
 from dopt.kernel.run import KernelTrial
 from dopt.models import MODELS
 from dopt.offline_fit import fit_offline
-from dopt.randomness import draw
+from dopt.randomness import PLANNED_DIMENSIONS, draw
 from dopt.reference.information import BatchInformation
 from dopt.reference.planning import planning_columns, predicted_states, quadratic_problem
 from dopt.reference.state import BatchState
 from dopt.run import run_trial
 from dopt.samples import uniform_samples
+from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.kernel.calls import call
@@ -51,6 +54,8 @@ PATH_CASES = [
     *[("cartpole_unknown_gain", "affine", "d_optimal", name)
       for name in ("adam", "adam_replay", "ekf", "gauss_newton")],
     ("arm", "black_box", "d_optimal", "gauss_newton"),
+    ("cartpole_unknown_gain", "black_box", "d_optimal", "adam_window"),
+    ("cartpole_unknown_gain", "black_box", "trace_linearized", "ekf"),
     ("arm", "affine", "d_optimal", "gauss_newton"),
     *[("cartpole_unknown_gain", "affine", name, "adam_window")
       for name in ("random", "uniform", "exact", "lookahead", "task", "trace_linearized")],
@@ -201,18 +206,48 @@ def test_samples_of_states_and_inputs_are_fitted_offline() -> None:
         fit_offline(*given, inputs=samples.inputs[1:])
 
 
-def test_d_optimal_inputs_teach_more_than_random_ones() -> None:
+@pytest.mark.parametrize(("model", "width"), [("affine", 6), ("black_box", 16)])
+def test_d_optimal_inputs_teach_more_than_random_ones(model: str, width: int) -> None:
     """On the pendulum with an unknown gain, in the median of ten seeds."""
 
     def paper(policy: str, seed: int) -> TrialSpec:
         env = {"horizon": 500, "grid_points": [16, 16]}
-        return small("pendulum_unknown_gain", "affine", policy, seed=seed, env=env)
+        sections = {"env": env, "model": {"width": width}}
+        return small("pendulum_unknown_gain", model, policy, seed=seed, **sections)
 
     losses = [
         [run_trial(paper(policy, seed)).loss[-1] for seed in range(10)]
         for policy in ("d_optimal", "random")
     ]
     assert np.median(np.array(losses[0]) / np.array(losses[1])) < 0.5
+
+
+@pytest.mark.parametrize("env", ["cartpole_unknown_gain", "arm"])
+def test_inputs_fill_the_ball_where_their_effect_is_not_affine(env: str) -> None:
+    spec = small(env, "black_box", env={"horizon": 300})
+    gamma, m, drawn = spec.system.gamma, spec.system.n_inputs, draw(spec)
+    norms = np.linalg.norm(run_trial(spec).inputs, axis=1) / gamma
+    assert norms[1:] == pytest.approx(drawn.radii[1:, 0], rel=1e-9)
+    assert np.linalg.norm(run_trial(small(env)).inputs, axis=1) == pytest.approx(gamma, rel=1e-12)
+    # Of n dimensions, the n-th power of a uniform point's norm is uniform between 0 and 1.
+    for radii, dimensions in zip(drawn.radii.T, (PLANNED_DIMENSIONS * m, m), strict=True):
+        assert kstest(radii**dimensions, "uniform").pvalue > 0.01
+    assert abs(np.corrcoef(drawn.radii.T)[0, 1]) < 0.2
+    uniform = np.linalg.norm(uniform_samples(spec).inputs, axis=1) / gamma
+    assert kstest(uniform**m, "uniform").pvalue > 0.01
+
+
+def test_trials_with_other_plans_have_other_keys() -> None:
+    """Those of an earlier version took inputs of norm γ alone."""
+
+    def version(model: str, policy: str) -> object:
+        return json.loads(small("arm", model, policy).config_json).get("plan_version")
+
+    assert version("black_box", "d_optimal") == PLAN_VERSION
+    assert version("black_box", "trace_linearized") == PLAN_VERSION
+    assert version("black_box", "random") is None
+    assert version("affine", "d_optimal") is None
+    assert version("mlp", "d_optimal") is None
 
 
 def test_what_reads_no_inputs_is_refused() -> None:

@@ -21,7 +21,7 @@ from tests.dopt.trials import SMALL_GRIDS
 DEGREE = math.pi / 180
 ANGLE = {"measured_states": [0], "measurement_noise": [DEGREE]}
 CART = {"measured_states": [2, 0], "measurement_noise": [DEGREE, 0.01]}
-JOINTS = {"measured_states": [0, 1], "measurement_noise": [DEGREE, DEGREE]}
+JOINTS = {"measured_states": [0, 2], "measurement_noise": [DEGREE, DEGREE]}
 
 
 def sensed(
@@ -42,12 +42,20 @@ def sensed(
     )
 
 
+TIP = {"output_matrix": [1, 0, 1, 0, 0, 0.05, 1, 0], "measurement_noise": [0.02, 0.01]}
+"""Of a cartpole x + φ, about the position of its tip, and φ + 0.05 ẋ."""
+
+ABSOLUTE = {"output_matrix": [1, 0, 0, 0, 1, 0, 1, 0], "measurement_noise": [DEGREE, DEGREE]}
+"""Of an arm the angles of both links against the base."""
+
 BOTH_PATHS = [
     ("pendulum", ANGLE, "joint_ekf", "mlp"),
     ("pendulum", ANGLE | {"integrator": "rk4"}, "joint_ekf", "mlp"),
     ("pendulum_unknown_gain", ANGLE, "joint_ekf", "affine"),
     ("cartpole", CART, "joint_ekf", "mlp"),
     ("arm", JOINTS, "joint_ekf", "mlp"),
+    ("arm", ABSOLUTE, "joint_ekf", "mlp"),
+    ("cartpole", TIP, "joint_ekf", "mlp"),
     ("mass_spring", {"measured_states": [1], "measurement_noise": [0.01]}, "joint_ekf", "linear"),
     ("pendulum", ANGLE, "adam_window", "mlp"),
     ("pendulum", ANGLE | {"integrator": "rk4"}, "gauss_newton", "mlp"),
@@ -111,8 +119,8 @@ def augmented_filter(spec: TrialSpec) -> Filtered:
         whole = F @ whole @ F.T
         whole[np.ix_(rows, rows)] += dt**2 * noise
         z = following(z, u)
-        C = np.eye(len(z))[list(system.measured_states)]
-        y = result.states[t + 1, list(system.measured_states)] + drawn.measurement_noise[t]
+        C = np.hstack([system.output_rows, np.zeros((system.n_measured, len(theta)))])
+        y = system.output_rows @ result.states[t + 1] + drawn.measurement_noise[t]
         S = C @ whole @ C.T + np.diag(np.square(system.measurement_noise))
         gain = whole @ C.T @ np.linalg.inv(S)
         z = z + gain @ (y - C @ z)
@@ -121,7 +129,9 @@ def augmented_filter(spec: TrialSpec) -> Filtered:
     return Filtered(x, theta, np.diag(whole))
 
 
-@pytest.mark.parametrize(("env", "sensors"), [("pendulum", ANGLE), ("cartpole", CART)])
+@pytest.mark.parametrize(
+    ("env", "sensors"), [("pendulum", ANGLE), ("cartpole", CART), ("cartpole", TIP)]
+)
 def test_it_is_the_filter_of_state_and_parameters_in_one(env: str, sensors: dict[str, Any]) -> None:
     spec = sensed(env, sensors, horizon=12, refit_every=1000)
     result = run_trial(spec)

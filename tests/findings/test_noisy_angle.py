@@ -19,6 +19,11 @@ ROWS = [
     ("angle", "gauss_newton"),
     ("angle", "joint_ekf without fits"),
     ("angle", "joint_ekf"),
+    ("angle", "joint_ekf with ρ fitted"),
+    ("angle", "joint_ekf with ρ fitted from 0.001"),
+    ("angle", "joint_ekf with ρ fitted from 100"),
+    ("angle", "joint_ekf with ρ of 0.001"),
+    ("angle", "joint_ekf with ρ of 100"),
 ]
 
 
@@ -47,7 +52,8 @@ def test_d_optimal_inputs_are_below_random_ones() -> None:
         found = losses(known, learner)
         gaps = np.log(found.d_optimal / found.random)
         assert gaps.mean() < 0
-        assert stats.ttest_1samp(gaps, 0.0).pvalue < 1e-40
+        bound = 1e-34 if "ρ" in learner else 1e-40
+        assert stats.ttest_1samp(gaps, 0.0).pvalue < bound
 
 
 def test_it_is_beside_learners_that_know_the_state() -> None:
@@ -64,3 +70,19 @@ def test_filtered_differences_end_above_the_filter() -> None:
     found = geometric_mean(losses("angle", "joint_ekf").d_optimal)
     for learner in ("adam_window", "gauss_newton"):
         assert geometric_mean(losses("angle", learner).d_optimal) > 3 * found
+
+
+def test_a_fitted_noise_need_not_be_known() -> None:
+    chosen = geometric_mean(losses("angle", "joint_ekf").d_optimal)
+    kinds = ("fitted", "fitted from 0.001", "fitted from 100", "of 0.001", "of 100")
+    found = {
+        kind: geometric_mean(losses("angle", f"joint_ekf with ρ {kind}").d_optimal) / chosen
+        for kind in kinds
+    }
+    same, low, high, low_given, high_given = (f"{ratio:.3g}" for ratio in found.values())
+    words = " ".join(FINDINGS.split())
+    assert f"D-optimal inputs end at {same} times the loss from the same start" in words
+    assert f"and at {low} and {high} times from ρ of 0.001 and 100" in words
+    assert f"where these stay, at {low_given} and {high_given} times" in words
+    for start in ("0.001", "100"):
+        assert found[f"fitted from {start}"] < 0.8 * found[f"of {start}"]

@@ -12,6 +12,8 @@ from tests.pages import DOCS
 
 TABLE = pd.read_csv(DOCS / "unknown_gain.csv")
 
+LEARNERS = ("adam_window", "adam_replay", "gauss_newton")
+
 
 def losses(env: str, model: str, learner: str) -> pd.DataFrame:
     """Return the final losses of a system by seed, one column for each policy."""
@@ -23,7 +25,7 @@ def geometric_mean(values: pd.Series[float]) -> float:
     return float(np.exp(np.log(values).mean()))
 
 
-@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton"])
+@pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("model", ["affine", "black_box"])
 @pytest.mark.parametrize("env", ["pendulum", "cartpole"])
 def test_rows_are_those_of_the_table(env: str, model: str, learner: str) -> None:
@@ -35,11 +37,14 @@ def test_rows_are_those_of_the_table(env: str, model: str, learner: str) -> None
     assert f"| {env} | `{model}` | `{learner}` | {len(found)} | {cells} |" in FINDINGS
 
 
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("model", ["affine", "black_box"])
 @pytest.mark.parametrize("env", ["pendulum", "cartpole"])
-def test_d_optimal_inputs_are_below_random_ones(env: str) -> None:
-    """As the page says: under the model that is affine in the input, each with p < 1e-38."""
-    found = losses(f"{env}_unknown_gain", "affine", "adam_window")
+def test_d_optimal_inputs_are_below_random_ones(env: str, model: str, learner: str) -> None:
+    """As the page says: each with p < 1e-34, with affine under adam_window p < 1e-38."""
+    found = losses(f"{env}_unknown_gain", model, learner)
     gaps = np.log(found.d_optimal / found.random)
     assert len(gaps) == 100
     assert gaps.mean() < 0
-    assert stats.ttest_1samp(gaps, 0.0).pvalue < 1e-38
+    default = (model, learner) == ("affine", "adam_window")
+    assert stats.ttest_1samp(gaps, 0.0).pvalue < (1e-38 if default else 1e-34)

@@ -25,6 +25,9 @@ from dopt.kernel.state_structs import Dual, Linearization, State
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
 
+BLOCK_BYTES = 2**18
+"""Bytes of a block of stored activations, which all products with it find in the cache."""
+
 
 @compiled
 def add_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
@@ -45,9 +48,9 @@ def planning_forms(
 
 
 @compiled
-def below(point: Linearization, index: int) -> Vector:
+def below(phi: Vector, hidden: Matrix, index: int) -> Vector:
     """Return the activations below a layer."""
-    activations: Vector = point.phi if index == 0 else point.hidden[index - 1]
+    activations: Vector = phi if index == 0 else hidden[index - 1]
     return activations
 
 
@@ -59,17 +62,22 @@ def below_along(point: Linearization, j: int, index: int) -> Vector:
 
 
 @compiled
-def stored_below(dual: Dual, n: int, index: int) -> Matrix:
-    """Return the activations below a layer at the n states seen."""
-    stored: Matrix = dual.features[:n] if index == 0 else dual.hidden[index - 1, :n]
-    return stored
+def stored_below(dual: Dual, start: int, stop: int, index: int) -> Matrix:
+    """Return the activations below a layer at some of the states seen."""
+    if index == 0:
+        return dual.features[start:stop]
+    return dual.hidden[index - 1, start:stop]
 
 
 @compiled
 def _forms(dual: Dual, point: Linearization, component: int) -> Matrix:
     """Return xᵀM⁻¹y, (1 + m, 1 + m), for x and y among g and the columns of D B."""
     n, r = dual.n_states[0], dual.deltas.shape[0]
-    products = _products(dual, n, point, component)
+    products = np.zeros((1 + point.phi_dots.shape[0], n * r))
+    step = _block(dual)
+    for start in range(0, n, step):
+        values = _values(dual, start, min(start + step, n), point.phi, point.hidden)
+        _add_products(dual, start, values, point, component, products)
     solve_lower(dual.factor, n * r, products)
     out = _own_products(point)
     for i in range(out.shape[0]):
@@ -84,13 +92,14 @@ def _rank_update(dual: Dual, phi: Vector, hidden: Matrix, deltas: Stack) -> None
     n, r = dual.n_states[0], deltas.shape[0]
     _store(dual, n, phi, hidden, deltas)
     N = n * r
-    rows = np.empty((r, N + r))
+    rows = np.zeros((r, N + r))
     no_phi, no_hidden = np.empty((0, 0)), np.empty((0, 0, 0))
-    for k in range(r):
-        point = Linearization(phi, hidden, deltas[k], no_phi, no_hidden, no_hidden)
-        products = _products(dual, n + 1, point, k)
-        for i in range(N + r):
-            rows[k, i] = products[0, i]
+    step = _block(dual)
+    for start in range(0, n + 1, step):
+        values = _values(dual, start, min(start + step, n + 1), phi, hidden)
+        for k in range(r):
+            point = Linearization(phi, hidden, deltas[k], no_phi, no_hidden, no_hidden)
+            _add_products(dual, start, values, point, k, rows[k : k + 1])
     solve_lower(dual.factor, N, rows)
     for k in range(r):
         R = N + k
@@ -118,46 +127,66 @@ def _store(dual: Dual, n: int, phi: Vector, hidden: Matrix, deltas: Stack) -> No
 
 
 @compiled
-def _products(dual: Dual, n: int, point: Linearization, component: int) -> Matrix:
-    """Return the products of g and of each column of D B with all rows seen, (1 + m, n r)."""
-    r, depth, m = dual.deltas.shape[0], dual.deltas.shape[1], point.phi_dots.shape[0]
-    out = np.zeros((1 + m, n * r))
-    slopes = np.empty((m, n))
-    for index in range(depth + 1):
-        stored = stored_below(dual, n, index)
-        values = np.dot(stored, below(point, index))
-        for j in range(m):
-            slopes[j] = np.dot(stored, below_along(point, j, index))
-        if index == depth:
-            _add_output_layer(out, values, slopes, component, r)
-            continue
-        for k in range(r):
-            signals = dual.deltas[k, index, :n]
-            back = np.dot(signals, point.deltas[index])
-            _add_products(out[0], back, values, 1.0, k, r)
-            for j in range(m):
-                _add_products(out[1 + j], back, slopes[j], 0.0, k, r)
-                back_dot = np.dot(signals, point.deltas_dots[j, index])
-                _add_products(out[1 + j], back_dot, values, 1.0, k, r)
+def _block(dual: Dual) -> int:
+    """Return the number of states in a block; BLAS takes four at a time."""
+    states: int = BLOCK_BYTES // (8 * dual.hidden.shape[2])
+    return max(4, states // 4 * 4)
+
+
+@compiled
+def _values(dual: Dual, start: int, stop: int, phi: Vector, hidden: Matrix) -> Matrix:
+    """Return h · h' of each layer, (L + 1, n), of a state with n of those seen."""
+    out = np.empty((hidden.shape[0] + 1, stop - start))
+    for index in range(out.shape[0]):
+        out[index] = np.dot(stored_below(dual, start, stop, index), below(phi, hidden, index))
     return out
 
 
-@vectorized
+@compiled
 def _add_products(
-    out: Vector, a: Vector, b: Vector, one: float, component: int, stride: int
+    dual: Dual, start: int, values: Matrix, point: Linearization, component: int, out: Matrix
 ) -> None:
-    for s in range(a.shape[0]):
-        out[s * stride + component] += a[s] * (b[s] + one)
+    """Add the products of g and of each column of D B with all rows of n of the states seen.
+
+    ``values`` (L + 1, n) are those of :func:`_values`; ``out`` (1 + m, ·) has a column for each row
+    of J.
+    """
+    r, depth, m = dual.deltas.shape[0], dual.deltas.shape[1], point.phi_dots.shape[0]
+    stop = start + values.shape[1]
+    slopes = np.empty((m, values.shape[1]))
+    for index in range(depth + 1):
+        stored = stored_below(dual, start, stop, index)
+        for j in range(m):
+            slopes[j] = np.dot(stored, below_along(point, j, index))
+        if index == depth:
+            first = start * r + component
+            _add_spread(values[index], 1.0, first, r, out[0])
+            for j in range(m):
+                _add_spread(slopes[j], 0.0, first, r, out[1 + j])
+            continue
+        for k in range(r):
+            first = start * r + k
+            signals = dual.deltas[k, index, start:stop]
+            back = np.dot(signals, point.deltas[index])
+            _add_layer(back, values[index], 1.0, first, r, out[0])
+            for j in range(m):
+                _add_layer(back, slopes[j], 0.0, first, r, out[1 + j])
+                back_dot = np.dot(signals, point.deltas_dots[j, index])
+                _add_layer(back_dot, values[index], 1.0, first, r, out[1 + j])
 
 
 @vectorized
-def _add_output_layer(
-    out: Matrix, values: Vector, slopes: Matrix, component: int, stride: int
-) -> None:
+def _add_layer(a: Vector, b: Vector, one: float, first: int, stride: int, out: Vector) -> None:
+    """Add a (b + one) to every ``stride``-th entry."""
+    for s in range(a.shape[0]):
+        out[first + s * stride] += a[s] * (b[s] + one)
+
+
+@vectorized
+def _add_spread(values: Vector, one: float, first: int, stride: int, out: Vector) -> None:
+    """Add values + one to every ``stride``-th entry."""
     for s in range(values.shape[0]):
-        out[0, s * stride + component] += values[s] + 1.0
-        for j in range(slopes.shape[0]):
-            out[1 + j, s * stride + component] += slopes[j, s]
+        out[first + s * stride] += values[s] + one
 
 
 @compiled
@@ -166,7 +195,7 @@ def _own_products(point: Linearization) -> Matrix:
     depth, m = point.hidden.shape[0], point.phi_dots.shape[0]
     out = np.zeros((1 + m, 1 + m))
     for index in range(depth + 1):
-        h = below(point, index)
+        h = below(point.phi, point.hidden, index)
         last = index == depth
         # In the output layer δ is the unit vector of the component and does not change.
         delta = point.deltas[0 if last else index]

@@ -17,6 +17,7 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, contracted, squared
+from dopt.kernel.network_backward import batch_back_signals
 from dopt.kernel.output_layer import output_inputs
 from dopt.kernel.structs import Network
 from dopt.types import Matrix, Stack, Vector
@@ -31,7 +32,7 @@ def normal_equations(
     ``inputs`` (p, N) are features, ``targets`` (r, N) accelerations, and e = y - a_θ(x).
     """
     total, errors, hidden = errors_of(network, theta, inputs, targets)
-    signals = nn.batch_back_signals(network, theta, inputs, hidden, targets.shape[0])
+    signals = batch_back_signals(network, theta, inputs, hidden, targets.shape[0])
     below = _completed(network, inputs, hidden)
     _write_slope(network, below, signals, errors, slope)
     _write_normal(network, below, signals, normal)
@@ -45,7 +46,7 @@ def normal_matrix(network: Network, theta: Vector, inputs: Matrix, r: int, norma
     hidden = np.empty((network.offsets.shape[0] - 1, network.sizes[1] * n))
     outputs = np.empty((r, n))
     nn.forward(network, theta, inputs, hidden, outputs)
-    signals = nn.batch_back_signals(network, theta, inputs, hidden, r)
+    signals = batch_back_signals(network, theta, inputs, hidden, r)
     _write_normal(network, _completed(network, inputs, hidden), signals, normal)
 
 
@@ -84,7 +85,7 @@ def write_products(
     network: Network, theta: Vector, inputs: Matrix, hidden: Matrix, weights: Matrix, out: Vector
 ) -> None:
     """Write Jᵀv, (q,), for v (r, N), given the activations of :func:`errors_of`."""
-    signals = nn.batch_back_signals(network, theta, inputs, hidden, weights.shape[0])
+    signals = batch_back_signals(network, theta, inputs, hidden, weights.shape[0])
     _write_slope(network, _completed(network, inputs, hidden), signals, weights, out)
 
 

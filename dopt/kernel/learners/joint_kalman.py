@@ -1,6 +1,7 @@
 """Kalman filter over state and parameters in compiled code (:mod:`dopt.learning.joint_kalman`).
 
-Its numbers are λ, ρ, ζ, the steps from one fit to the next and the Gauss-Newton steps of a fit.
+Its numbers are λ, the ρ of the beginning, ζ, the steps from one fit to the next, the Gauss-Newton
+steps of a fit, and whether it estimates ρ.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ from dopt.kernel.learners.state_filter import (
     begin,
     correct_covariance,
     correct_sensitivity,
+    covariances,
     move_covariance,
     move_sensitivity,
+    output_sensitivity,
     state_jacobian,
 )
 from dopt.kernel.points import model_point
@@ -30,14 +33,14 @@ def learn(trial: Trial, t: int, target: Vector) -> None:  # noqa: ARG001  # it l
     """Filter what was measured of x_{t+1}, and fit all that was measured every k steps."""
     numbers = trial.algorithm.learner
     refit_every, steps = int(numbers[3]), int(numbers[4])
-    predict(trial, t, numbers[1], numbers[2])
+    predict(trial, t, numbers[2])
     update(trial, t)
     if (t + 1) % refit_every == 0:
-        fit(trial, t + 1, numbers[0], numbers[1], steps)
+        fit(trial, t + 1, numbers[0], steps, numbers[5] != 0.0)
 
 
 @compiled
-def predict(trial: Trial, t: int, noise_variance: float, underweighting: float) -> None:
+def predict(trial: Trial, t: int, underweighting: float) -> None:
     """Move P and Ψ from x_t to x_{t+1}, of which the estimate is the prediction already."""
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     estimate, rows = trial.state.estimate, plant.learned_rows
@@ -47,7 +50,7 @@ def predict(trial: Trial, t: int, noise_variance: float, underweighting: float) 
     if underweighting > 0.0:
         noise[:] = underweighting * quadratic_forms(trial.state.covariance, J, J)
     for k in range(r):
-        noise[k, k] += noise_variance
+        noise[k, k] += estimate.noise_variance[0]
     x, u = trial.record.states[t], trial.record.inputs[t]
     begin(trial, t, estimate.covariance, estimate.sensitivity)
     A = state_jacobian(plant, network, theta, x, u, dt)
@@ -57,21 +60,26 @@ def predict(trial: Trial, t: int, noise_variance: float, underweighting: float) 
 
 @compiled
 def update(trial: Trial, t: int) -> None:
-    """Correct x̂_{t+1} and θ, P, Ψ and M by what was measured, one state after the other."""
+    """Correct x̂_{t+1} and θ, P, Ψ and M by what was measured, one output after the other."""
     state, sensors = trial.state, trial.sensors
     estimate, x = state.estimate, trial.record.states[t + 1]
     P, sensitivity, q = estimate.covariance, estimate.sensitivity, state.theta.shape[0]
     rows, residual, change = np.empty((1, q)), np.empty(1), np.empty(q)
-    for i in range(sensors.measured.shape[0]):
-        row = sensors.measured[i]
-        error, variance = estimate.outputs[t, i] - x[row], P[row, row] + sensors.variances[i]
+    row = np.empty(q)
+    for i in range(sensors.output_matrix.shape[0]):
+        output = sensors.output_matrix[i]
+        gain = covariances(P, output)
+        error = estimate.outputs[t, i] - inner(output, x)
+        variance = inner(output, gain) + sensors.variances[i]
+        gain /= variance
+        output_sensitivity(sensitivity, output, row)
         scale = 1.0 / np.sqrt(variance)
-        rows[0] = scale * sensitivity[row]
+        rows[0] = scale * row
         residual[0] = scale * error
         change[:] = -state.theta
         filter_step(state.covariance, state.theta, rows, residual)
         change += state.theta
-        gain = correct_covariance(P, row, variance)
+        correct_covariance(P, gain, variance)
         correct_sensitivity(gain, row, sensitivity)
         for j in range(x.shape[0]):
             x[j] += gain[j] * error + inner(sensitivity[j], change)
@@ -84,7 +92,7 @@ def acceleration_variances(trial: Trial, x: Vector) -> Vector:
     point = model_point(network, x, np.zeros(plant.n_inputs))
     J = model_rows(plant, network, state.theta, point, np.empty(plant.learned_rows.shape[0]))
     variances: Vector = np.diag(quadratic_forms(state.covariance, J, J)).copy()
-    variances += trial.algorithm.learner[1]
+    variances += state.estimate.noise_variance[0]
     return variances
 
 

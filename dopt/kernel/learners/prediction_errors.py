@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
+from dopt.algorithm import MOST_NOISE_FACTORS, NO_GROWTH, NOISE_FACTORS, SMALLEST_SHARE
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.cholesky import factorize, solve, write_inverse
+from dopt.kernel.information.primal import inner
 from dopt.kernel.information.update import model_rows
 from dopt.kernel.integration import next_model_state
 from dopt.kernel.learners.gauss_newton import squared_distance
@@ -19,8 +20,10 @@ from dopt.kernel.learners.state_filter import (
     begin,
     correct_covariance,
     correct_sensitivity,
+    covariances,
     move_covariance,
     move_sensitivity,
+    output_sensitivity,
     state_jacobian,
 )
 from dopt.kernel.points import model_point, state_between
@@ -29,18 +32,20 @@ from dopt.types import Matrix, Vector
 
 
 @compiled
-def fit(trial: Trial, n: int, regularization: float, noise_variance: float, steps: int) -> None:
-    """Fit θ to what was measured in n steps, and write M⁻¹, x̂_n, P and Ψ anew.
+def fit(trial: Trial, n: int, regularization: float, steps: int, fits_noise: bool) -> None:
+    """Fit θ, and ρ if asked to, to what was measured in n steps; write M⁻¹, x̂_n, P and Ψ anew.
 
     θ is NaN afterwards, which ends the trial as diverged, where rounding has left M indefinite.
     """
     state = trial.state
     theta, prior, q = state.theta, state.prior, state.theta.shape[0]
-    n_errors = n * trial.sensors.measured.shape[0]
+    n_errors = n * trial.sensors.output_matrix.shape[0]
     rows, errors, step = np.empty((n_errors, q)), np.empty(n_errors), np.empty(q)
     normal, definite = np.empty((q, q)), True
     for turn in range(steps + 1):
-        before = run_filter(trial, n, noise_variance, rows, errors)
+        if turn == steps and fits_noise:
+            _fit_noise(trial, n)
+        before = run_filter(trial, n, rows, errors)
         before += regularization * squared_distance(theta, prior)
         normal[:] = np.dot(rows.T, rows)
         for i in range(q):
@@ -51,27 +56,36 @@ def fit(trial: Trial, n: int, regularization: float, noise_variance: float, step
         if turn < steps:
             step[:] = np.dot(errors, rows) + regularization * (prior - theta)
             solve(normal, step)
-            _take_step(trial, n, regularization, noise_variance, before, step)
+            _take_step(trial, n, regularization, before, step)
     if not (definite and write_inverse(normal, state.covariance.upper)):
         theta[:] = np.nan
     state.covariance.n_pending[0] = 0
 
 
 @compiled
-def _take_step(
-    trial: Trial,
-    n: int,
-    regularization: float,
-    noise_variance: float,
-    before: float,
-    step: Vector,
-) -> None:
+def _fit_noise(trial: Trial, n: int) -> None:
+    """Move ρ by factors as long as the errors of n steps become likelier, at the present θ."""
+    noise, none = trial.state.estimate.noise_variance, np.empty((0, trial.state.theta.shape[0]))
+    lowest = run_filter(trial, n, none, np.empty(0))
+    for factor in NOISE_FACTORS:
+        for _ in range(MOST_NOISE_FACTORS):
+            held = noise[0]
+            noise[0] = held * factor
+            found = run_filter(trial, n, none, np.empty(0))
+            if not found < lowest:
+                noise[0] = held
+                break
+            lowest = found
+
+
+@compiled
+def _take_step(trial: Trial, n: int, regularization: float, before: float, step: Vector) -> None:
     """Move θ along a step, (q,), as far as the objective does not grow from ``before``."""
     theta, prior, share = trial.state.theta, trial.state.prior, 1.0
     start, none = theta.copy(), np.empty((0, theta.shape[0]))
     while share >= SMALLEST_SHARE:
         theta[:] = start + share * step
-        after = run_filter(trial, n, noise_variance, none, np.empty(0))
+        after = run_filter(trial, n, none, np.empty(0))
         after += regularization * squared_distance(theta, prior)
         if after <= before + (NO_GROWTH - 1.0) * abs(before):
             return
@@ -80,18 +94,18 @@ def _take_step(
 
 
 @compiled
-def run_filter(trial: Trial, n: int, noise_variance: float, rows: Matrix, errors: Vector) -> float:
-    """Filter what was measured in n steps at the present θ; return Σ (e²/s + log s).
+def run_filter(trial: Trial, n: int, rows: Matrix, errors: Vector) -> float:
+    """Filter what was measured in n steps at the present θ and ρ; return Σ (e²/s + log s).
 
     Writes C Ψ/√s, (n outputs, q), and e/√s, if there is room for them, and then also x̂_n, P and Ψ.
     """
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     sensors, estimate, with_rows = trial.sensors, trial.state.estimate, rows.shape[0] > 0
-    n_measured, r = sensors.measured.shape[0], plant.learned_rows.shape[0]
+    n_measured, r = sensors.output_matrix.shape[0], plant.learned_rows.shape[0]
     x = trial.record.states[0].copy()
-    d, noise, following = x.shape[0], noise_variance * np.eye(r), np.empty(x.shape[0])
+    d, noise, following = x.shape[0], estimate.noise_variance[0] * np.eye(r), np.empty(x.shape[0])
     P, sensitivity = np.zeros((d, d)), np.zeros((d, theta.shape[0]))
-    total = 0.0
+    row, total = np.empty(theta.shape[0]), 0.0
     for t in range(n):
         u, dt = trial.record.inputs[t], estimate.durations[t]
         if begin(trial, t, P, sensitivity):
@@ -105,13 +119,17 @@ def run_filter(trial: Trial, n: int, noise_variance: float, rows: Matrix, errors
         move_covariance(A, noise, plant.learned_rows, dt, P)
         x[:] = following
         for i in range(n_measured):
-            row = sensors.measured[i]
-            error, variance = estimate.outputs[t, i] - x[row], P[row, row] + sensors.variances[i]
+            output = sensors.output_matrix[i]
+            gain = covariances(P, output)
+            error = estimate.outputs[t, i] - inner(output, x)
+            variance = inner(output, gain) + sensors.variances[i]
+            gain /= variance
             total += error * error / variance + np.log(variance)
-            gain = correct_covariance(P, row, variance)
+            correct_covariance(P, gain, variance)
             if with_rows:
                 scale = 1.0 / np.sqrt(variance)
-                rows[t * n_measured + i] = scale * sensitivity[row]
+                output_sensitivity(sensitivity, output, row)
+                rows[t * n_measured + i] = scale * row
                 errors[t * n_measured + i] = scale * error
                 correct_sensitivity(gain, row, sensitivity)
             for j in range(d):

@@ -6,7 +6,8 @@ symbol  meaning                                                    shape
 A       ∂x_{t+1}/∂x_t of the model's step                          d × d
 P       covariance of the estimated state, given the parameters    d × d
 Ψ       derivative of the estimated state by the parameters        d × q
-K, s    gain and variance of the innovation of a measured state    d, 1
+c       row of C                                                   d
+K, s    gain and variance of the innovation of an output           d, 1
 ======  =========================================================  =======
 """
 
@@ -15,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel.compiler import compiled
-from dopt.kernel.information.primal import add_multiple
+from dopt.kernel.information.primal import add_multiple, inner
 from dopt.kernel.integration import next_model_state
 from dopt.kernel.structs import Network, Plant, Trial
 from dopt.types import Integers, Matrix, Vector
@@ -71,21 +72,34 @@ def move_sensitivity(A: Matrix, J: Matrix, rows: Integers, dt: float, sensitivit
 
 
 @compiled
-def correct_covariance(P: Matrix, row: int, variance: float) -> Vector:
-    """Return K, (d,), of one measured state, and write P - K Kᵀ s."""
-    d = P.shape[0]
-    gain = np.empty(d)
-    for i in range(d):
-        gain[i] = P[i, row] / variance
-    for i in range(d):
-        for j in range(d):
-            P[i, j] -= gain[i] * gain[j] * variance
-    return gain
+def covariances(P: Matrix, output: Vector) -> Vector:
+    """Return P c, (d,), the covariances of the state with an output, given its row c of C, (d,)."""
+    found = np.empty(P.shape[0])
+    for i in range(P.shape[0]):
+        found[i] = inner(P[i], output)
+    return found
 
 
 @compiled
-def correct_sensitivity(gain: Vector, row: int, sensitivity: Matrix) -> None:
-    """Write Ψ - K Ψ_row."""
-    measured = sensitivity[row].copy()
+def output_sensitivity(sensitivity: Matrix, output: Vector, row: Vector) -> None:
+    """Write c Ψ, (q,), the derivative of an output by the parameters."""
+    row[:] = 0.0
+    for i in range(output.shape[0]):
+        if output[i] != 0.0:
+            add_multiple(row, output[i], sensitivity[i])
+
+
+@compiled
+def correct_covariance(P: Matrix, gain: Vector, variance: float) -> None:
+    """Write P - K Kᵀ s, given K, (d,)."""
+    d = P.shape[0]
+    for i in range(d):
+        for j in range(d):
+            P[i, j] -= gain[i] * gain[j] * variance
+
+
+@compiled
+def correct_sensitivity(gain: Vector, row: Vector, sensitivity: Matrix) -> None:
+    """Write Ψ - K c Ψ, given c Ψ, (q,)."""
     for i in range(gain.shape[0]):
-        add_multiple(sensitivity[i], -gain[i], measured)
+        add_multiple(sensitivity[i], -gain[i], row)

@@ -22,6 +22,7 @@ from dopt.kernel.information.cholesky import (
     solve_transposed_columns,
 )
 from dopt.kernel.model import regressors, write_features
+from dopt.kernel.network_backward import batch_back_signals
 from dopt.kernel.output_layer import output_inputs
 from dopt.kernel.state_structs import Covariance, State
 from dopt.kernel.structs import Network, Plant
@@ -124,7 +125,7 @@ def changes_along(
     hidden = np.empty((depth, width * N))
     write_features(network, states, features)
     nn.forward(network, theta, features, hidden, outputs)
-    signals = nn.batch_back_signals(network, theta, features, hidden, r)
+    signals = batch_back_signals(network, theta, features, hidden, r)
     last = nn.units_by_points(hidden[depth - 1], width, N)
     top = output_inputs(network, last, features)
     change = np.empty((width, N))
