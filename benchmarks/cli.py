@@ -28,6 +28,7 @@ QUESTIONS = (
     "evaluation",
     "trial",
     "width",
+    "long_trials",
     "store",
     "orchestration",
     "scaling",

@@ -23,21 +23,31 @@ LAST = 20
 
 FORMS = ("primal", "dual")
 
+WIDEST, WIDEST_FORMS = 1024, ("dual", "sketch")
+
 
 def measure(quick: bool) -> list[Row]:
     """Return microseconds of planning at the end of 500 steps, and exponents of q.
 
     The primal form costs the same in every step; with the dual form the last of many is dearest.
     """
-    widths = WIDTHS[:4] if quick else WIDTHS
-    return [row for form in FORMS for row in _form(form, widths, 60 if quick else 500)]
+    widths, horizon = WIDTHS[:4] if quick else WIDTHS, 60 if quick else 500
+    rows = [row for form in FORMS for row in _form(form, widths, horizon)]
+    return rows + [_widest(form, horizon) for form in WIDEST_FORMS]
+
+
+def _widest(form: str, horizon: int) -> Row:
+    spec = _trial(form, WIDEST, horizon)
+    note = f"q = {spec.model.n_parameters(spec.system):,}"
+    what = f"{form}, width {WIDEST:,}"
+    return Row(what, _planning_us(spec), "µs", Target(6, 5_000), note=note)
 
 
 def _form(form: str, widths: tuple[int, ...], horizon: int) -> Iterator[Row]:
     sizes, costs = [], []
     for width in widths:
         steps = SETTLED if form == "primal" else horizon
-        spec = cartpole(learner="adam", width=width, form=form, horizon=steps, grid=TINY_GRID)
+        spec = _trial(form, width, steps)
         q = spec.model.n_parameters(spec.system)
         if form == "primal" and 8 * q * q > LARGEST_MATRIX:
             note = f"M⁻¹ of {q:,} parameters takes {8e-9 * q * q:.1f} GB"
@@ -51,6 +61,10 @@ def _form(form: str, widths: tuple[int, ...], horizon: int) -> Iterator[Row]:
 
 
 _SLOPE = "log-log slope over the upper half of the widths"
+
+
+def _trial(form: str, width: int, horizon: int) -> TrialSpec:
+    return cartpole(learner="adam", width=width, form=form, horizon=horizon, grid=TINY_GRID)
 
 
 def _planning_us(spec: TrialSpec) -> float:
