@@ -222,21 +222,24 @@ def test_an_interruption_ends_all_processes(url: str, tmp_path: Path) -> None:
 def write_nothing(*_: object) -> None: ...
 
 
+def write_many(reader: Reader, interruption: threading.Timer) -> None:
+    """Write many tasks in two processes, with an interruption in the midst of them."""
+    tasks = {str(number): number for number in range(100)}
+    with processes.written(write_nothing, reader, tasks, 2) as wait:
+        interruption.start()
+        try:
+            for name in tasks:
+                wait(name)
+        finally:
+            interruption.join()  # not in the next test
+
+
 def test_an_interruption_comes_whole_at_any_moment(reader: Reader) -> None:
     """Ctrl-C within a wait for a result must not leave a lock of the pool in disorder."""
-    tasks = {str(number): number for number in range(100)}
     for delay in np.random.default_rng(0).uniform(0, 0.02, size=30):
         interruption = threading.Timer(delay, os.kill, (os.getpid(), signal.SIGINT))
-        with (
-            pytest.raises(KeyboardInterrupt),
-            processes.written(write_nothing, reader, tasks, 2) as wait,
-        ):
-            interruption.start()
-            try:
-                for name in tasks:
-                    wait(name)
-            finally:
-                interruption.join()  # within the wait, not in the next test
+        with pytest.raises(KeyboardInterrupt):
+            write_many(reader, interruption)
 
 
 def test_what_is_unchanged_is_not_drawn_again(reader: Reader, tmp_path: Path) -> None:
