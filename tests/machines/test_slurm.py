@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import random
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -11,10 +14,19 @@ from tests.machines.hosts import until
 from tests.machines.lab import GRID, SEEDS, Lab
 from tests.machines.outcome import Outcome
 from tests.machines.slurm import Slurm, need_slurm
+from tests.machines.waiting import SECONDS
 
 TRIALS = 400
 SECONDS_BETWEEN_PREEMPTIONS = 5.0
 FEWEST_PREEMPTIONS = 3
+
+WAITING_TRIALS = 10_000
+"""Trials that wait, unless DOPT_SLURM_TRIALS says how many."""
+
+LEAST_COMPUTING = 0.9
+"""Share of the walltime that goes to trials, of which there are enough to outweigh the starts."""
+
+CONF = Path(__file__).parent / "conf"
 
 PREEMPTIONS = (
     ("scontrol", "requeue"),
@@ -50,23 +62,54 @@ def test_an_array_runs_a_grid_and_ends(slurm: Slurm, lab: Lab, undisturbed: Outc
 def test_preempted_tasks_lose_double_and_fail_nothing(
     slurm: Slurm, lab: Lab, undisturbed: Outcome
 ) -> None:
-    chance = random.Random(1)
     launched = slurm.launch(*GRID, f"seed=range({TRIALS})", "executor.time=30m",
                             "executor.tasks=4", "executor.cpus_per_task=1")  # fmt: skip
     assert launched.wait() == 0, launched.output
-    preempted = 0
+    preempt(slurm)
+    outcome = lab.outcome()
+    check_each_done_once(outcome, TRIALS, slurm)
+    first = [[row for row in rows if row[0] < SEEDS] for rows in outcome.results]
+    assert first == undisturbed.results
+
+
+def test_preempted_tasks_compute_most_of_their_walltime(
+    lab: Lab, measured: Callable[[str, float], None]
+) -> None:
+    """Trials that wait take no processor, so that tasks are as if each had cores of its own."""
+    need_slurm()
+    slurm = Slurm(lab, cores=4)
+    trials = int(os.environ.get("DOPT_SLURM_TRIALS", WAITING_TRIALS))
+    waiting = ("policy=waiting", "env=pendulum", "env.horizon=10", f"seed=range({trials})")
+    launched = slurm.launch(f"--config-dir={CONF}", *waiting, "executor.time=1h",
+                            "executor.tasks=8", "executor.cpus_per_task=1")  # fmt: skip
+    assert launched.wait() == 0, launched.output
+    preempted = preempt(slurm)
+    check_each_done_once(lab.outcome(), trials, slurm)
+    walltime = sum(seconds for _, seconds in slurm.runs())
+    computing = trials * SECONDS / walltime
+    measured(
+        f"of walltime, {computing:.1%} computing {trials:,} trials, {preempted} preemptions",
+        walltime,
+    )
+    assert trials < WAITING_TRIALS or computing >= LEAST_COMPUTING
+
+
+def preempt(slurm: Slurm) -> int:
+    """Preempt one of the running tasks every few seconds until none is left; return how often."""
+    chance, preempted = random.Random(1), 0
     while slurm.tasks():
         time.sleep(SECONDS_BETWEEN_PREEMPTIONS)
         if running := slurm.tasks("RUNNING"):
             slurm.ask("timeout", "5", *chance.choice(PREEMPTIONS), chance.choice(running))
             preempted += 1
     assert preempted >= FEWEST_PREEMPTIONS
-    outcome = lab.outcome()
-    assert [row[1] for row in outcome.trials] == ["done"] * TRIALS, slurm.logs()
-    assert [row[0] for row in outcome.attempts if row[2] == "done"] == list(range(TRIALS))
+    return preempted
+
+
+def check_each_done_once(outcome: Outcome, trials: int, slurm: Slurm) -> None:
+    assert [row[1] for row in outcome.trials] == ["done"] * trials, slurm.logs()
+    assert [row[0] for row in outcome.attempts if row[2] == "done"] == list(range(trials))
     assert {row[2] for row in outcome.attempts} <= {"done", "released", "lost"}
-    first = [[row for row in rows if row[0] < SEEDS] for rows in outcome.results]
-    assert first == undisturbed.results
 
 
 def test_a_task_whose_node_is_lost_runs_elsewhere(
