@@ -72,6 +72,7 @@ def test_preempted_tasks_lose_double_and_fail_nothing(
     assert first == undisturbed.results
 
 
+@pytest.mark.timeout(1800)
 def test_preempted_tasks_compute_most_of_their_walltime(
     lab: Lab, measured: Callable[[str, float], None]
 ) -> None:
