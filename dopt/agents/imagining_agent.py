@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dopt.agents.action import input_of
 from dopt.agents.normal_ensemble import NormalEnsemble, jensen_renyi_divergence
 from dopt.agents.observation import Observation
 from dopt.agents.soft_actor_critic import Agent, Settings
-from dopt.control.planner import within_ball
 from dopt.policies.active_exploration import AGENT_UNITS, ActiveExploration
 from dopt.policies.base import Planner
 from dopt.systems.base import System
@@ -98,4 +98,4 @@ class ImaginingAgent(Planner):
         return np.clip(states + system.dt * rate, -limit, limit)
 
     def _input(self, action: Array) -> Array:
-        return within_ball(self._system.gamma * action, self._system.gamma)
+        return input_of(action, self._system.gamma, self._policy.energy)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dopt.agents.action import input_of
 from dopt.agents.actor import Actor
 from dopt.agents.observation import Observation
 from dopt.agents.soft_actor_critic import Agent, Settings
 from dopt.control.episode import costs
-from dopt.control.planner import within_ball
 from dopt.control.task import Goal
 from dopt.policies.base import Planner
 from dopt.policies.soft_actor_critic import SoftActorCritic
@@ -27,9 +27,10 @@ class ActorFeedback:
     observation: Observation
     gamma: float
     hold: int
+    energy: str
 
     def __call__(self, state: Array) -> Array:
-        return within_ball(self.gamma * self.actor(self.observation(state)), self.gamma)
+        return input_of(self.actor(self.observation(state)), self.gamma, self.energy)
 
 
 class TaskAgent(Planner):
@@ -55,12 +56,12 @@ class TaskAgent(Planner):
     def choose(self, view: TrialView) -> Array:
         if self._decided_at == 0 or view.t - self._decided_at == self._policy.hold:
             self._decide(view)
-        return within_ball(self._system.gamma * self._action, self._system.gamma)
+        return input_of(self._action, self._system.gamma, self._policy.energy)
 
     def feedback(self) -> ActorFeedback:
-        return ActorFeedback(
-            self._agent.actor(), self._observation, self._system.gamma, self._policy.hold
-        )
+        policy, gamma = self._policy, self._system.gamma
+        actor = self._agent.actor()
+        return ActorFeedback(actor, self._observation, gamma, policy.hold, policy.energy)
 
     def _decide(self, view: TrialView) -> None:
         """Learn from what the last decision brought, and make the next one."""

@@ -62,6 +62,8 @@ class ActiveExploration(CustomPolicy):
         Discount of the reward from one decision to the next.
     entropy_weight : float
         Weight of the actor's entropy beside the reward.
+    energy : str
+        "below": inputs of norm γ at most; "full": always γ, along the agent's action.
     """
 
     name: ClassVar[str] = "max_agent"
@@ -82,6 +84,7 @@ class ActiveExploration(CustomPolicy):
     batch: int = parameter(128, bound="positive")
     discount: float = parameter(0.95, bound="fraction")
     entropy_weight: float = parameter(0.02, bound="positive")
+    energy: str = parameter("below", choices=("below", "full"), added=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -42,6 +42,8 @@ class SoftActorCritic(TaskPolicy):
         Transitions of a minibatch.
     discount : float
         Discount of the reward from one decision to the next.
+    energy : str
+        "below": inputs of norm γ at most; "full": always γ, along the agent's action.
     """
 
     name: ClassVar[str] = "sac"
@@ -56,6 +58,7 @@ class SoftActorCritic(TaskPolicy):
     learning_rate: float = parameter(1e-3, bound="positive")
     batch: int = parameter(128, "transitions", "positive")
     discount: float = parameter(0.98, bound="fraction")
+    energy: str = parameter("below", choices=("below", "full"), added=True)
 
     def task_planner(self, system: System, goal: Goal, rng: np.random.Generator) -> Planner:
         self.check_library()

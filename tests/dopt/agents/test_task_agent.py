@@ -8,6 +8,7 @@ import importlib.util
 import numpy as np
 import pytest
 
+from dopt.agents.action import input_of
 from dopt.agents.task_agent import ActorFeedback, TaskAgent
 from dopt.control import Control
 from dopt.control.episode import costs, run_feedback
@@ -43,6 +44,19 @@ def test_an_input_is_held_between_two_decisions() -> None:
     for start in range(0, 27, 3):
         assert np.all(inputs[start : start + 3] == inputs[start])
     assert len(np.unique(inputs[:, 0])) == 10
+
+
+@pytest.mark.parametrize("policy", ["sac", "max_agent"])
+@pytest.mark.parametrize("env", ["arm", "pendulum"])
+def test_with_the_full_energy_every_input_has_the_largest_norm(env: str, policy: str) -> None:
+    inputs = run_trial(trial(env, policy, policy={"energy": "full"})).inputs
+    gamma = trial(env, policy).system.gamma
+    np.testing.assert_allclose(np.linalg.norm(inputs, axis=1), gamma, rtol=1e-12)
+    assert len(np.unique(inputs[:, 0])) > 1
+
+
+def test_an_action_of_zero_has_an_input_of_the_full_energy() -> None:
+    np.testing.assert_array_equal(input_of(np.zeros((2, 3)), 5.0, "full"), [[5.0, 0.0, 0.0]] * 2)
 
 
 def test_the_transitions_are_those_of_the_trial(monkeypatch: pytest.MonkeyPatch) -> None:
