@@ -45,10 +45,9 @@ def written(
         }
 
         def wait(name: str) -> None:
-            while not futures[name].done():
-                raise_interrupt()
-                futures_wait([futures[name]], timeout=INTERRUPT_INTERVAL)
             raise_interrupt()
+            while not futures_wait([futures[name]], timeout=INTERRUPT_INTERVAL).done:
+                raise_interrupt()
             try:
                 futures[name].result()
             except BrokenProcessPool as error:
