@@ -24,6 +24,7 @@ QUESTIONS = (
     "jax_scan",
     "reference",
     "linearisation_gap",
+    "noise_bound",
     "adaptive_seeds",
     "evaluation",
     "trial",

@@ -33,7 +33,11 @@ from sqlalchemy.exc import OperationalError  # noqa: E402
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile(
-    "suite", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    "suite",
+    max_examples=50,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("suite")
 

@@ -7,10 +7,12 @@ import pandas as pd
 import pytest
 from scipy import stats
 
+from benchmarks.noise_bound import INPUTS, measured
 from tests.findings.report_columns import FINDINGS
 from tests.pages import DOCS
 
 TABLE = pd.read_csv(DOCS / "noisy_angle.csv")
+BOUNDS = pd.read_csv(DOCS / "noisy_angle_bound.csv")
 ROWS = [
     ("state", "adam_window"),
     ("state", "ekf"),
@@ -86,3 +88,27 @@ def test_a_fitted_noise_need_not_be_known() -> None:
     assert f"where these stay, at {low_given} and {high_given} times" in words
     for start in ("0.001", "100"):
         assert found[f"fitted from {start}"] < 0.8 * found[f"of {start}"]
+
+
+def test_bounds_are_those_of_their_table() -> None:
+    means = BOUNDS.groupby("inputs")[["final_loss", "bound"]].agg(geometric_mean)
+    assert set(means.index) == set(INPUTS)
+    assert BOUNDS.groupby("inputs").seed.nunique().eq(100).all()
+    for name, row in means.iterrows():
+        policy, learner, known = str(name).split(", ")
+        shown = {"d_optimal": "D-optimal"}.get(policy, policy)
+        assert f"| {shown}, `{learner}`, {known} | {row.final_loss:.3g} | {row.bound:.3g} |" in FINDINGS
+    own = means.loc["d_optimal, joint_ekf, angle"]
+    assert f"ends at {own.final_loss / own.bound:.3g} times the bound" in FINDINGS
+    full = means.loc["d_optimal, gauss_newton, state"]
+    assert full.bound / full.final_loss == pytest.approx(11, abs=0.5)
+    assert full.bound / full.final_loss > 10.5
+
+
+def test_a_bound_is_found_again() -> None:
+    """Up to what the trial of another processor chose otherwise."""
+    rows = BOUNDS[BOUNDS.seed == 0].set_index("inputs")
+    name = "d_optimal, joint_ekf, angle"
+    loss, bound = measured(name, 0)
+    assert loss == pytest.approx(rows.final_loss[name], rel=0.02)
+    assert bound == pytest.approx(rows.bound[name], rel=0.02)
