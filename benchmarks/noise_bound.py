@@ -24,7 +24,7 @@ Reference: H. Van Trees, "Detection, estimation, and modulation theory" I (1968)
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -41,12 +41,13 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 
 Array = npt.NDArray[np.float64]
+Fields = Mapping[str, object]
 
-ANGLE = {"measured_states": [0], "measurement_noise": [0.0174532925]}
+ANGLE: Fields = {"measured_states": [0], "measurement_noise": [0.0174532925]}
 """The angle of the pendulum alone, with noise of 1°."""
 
-PLANNED = {"name": "d_optimal", "regularization": 3.0}
-INPUTS = {
+PLANNED: Fields = {"name": "d_optimal", "regularization": 3.0}
+INPUTS: Mapping[str, tuple[Fields, str, Fields]] = {
     "d_optimal, joint_ekf, angle": (PLANNED, "joint_ekf", ANGLE),
     "random, joint_ekf, angle": ({"name": "random"}, "joint_ekf", ANGLE),
     "d_optimal, gauss_newton, state": ({"name": "d_optimal"}, "gauss_newton", {}),
@@ -75,7 +76,9 @@ def sensitivities(spec: TrialSpec, parameters: Array, states: Array, inputs: Arr
 def _derivatives(function: Callable[[Array], Array], size: int) -> Array:
     """Return the derivatives of (T, d) values in a vector that is added, (T, d, size)."""
     moves = _STEP * np.eye(size)
-    return np.stack([function(move) - function(-move) for move in moves], axis=-1) / (2 * _STEP)
+    changes = np.stack([function(move) - function(-move) for move in moves], axis=-1)
+    found: Array = changes / (2.0 * _STEP)
+    return found
 
 
 def bound(spec: TrialSpec, states: Array, inputs: Array) -> float:
@@ -123,9 +126,7 @@ def measured(name: str, seed: int) -> tuple[float, float]:
     return result.final_loss, bound(judged, result.states, result.inputs)
 
 
-def _spec(
-    policy: dict[str, object], learner: str, sensors: dict[str, object], seed: int
-) -> TrialSpec:
+def _spec(policy: Fields, learner: str, sensors: Fields, seed: int) -> TrialSpec:
     sections = {"policy": policy, "model": {"name": "mlp"}, "learner": {"name": learner}}
     return TrialSpec.from_mapping(
         {"env": {"name": "pendulum", **sensors}, **sections, "path": "kernel", "seed": seed}

@@ -96,8 +96,8 @@ def test_bounds_are_those_of_their_table() -> None:
     assert BOUNDS.groupby("inputs").seed.nunique().eq(100).all()
     for name, row in means.iterrows():
         policy, learner, known = str(name).split(", ")
-        shown = {"d_optimal": "D-optimal"}.get(policy, policy)
-        assert f"| {shown}, `{learner}`, {known} | {row.final_loss:.3g} | {row.bound:.3g} |" in FINDINGS
+        inputs = f"{policy.replace('d_optimal', 'D-optimal')}, `{learner}`, {known}"
+        assert f"| {inputs} | {row.final_loss:.3g} | {row.bound:.3g} |" in FINDINGS
     own = means.loc["d_optimal, joint_ekf, angle"]
     assert f"ends at {own.final_loss / own.bound:.3g} times the bound" in FINDINGS
     full = means.loc["d_optimal, gauss_newton, state"]
