@@ -63,7 +63,8 @@ def sensitivities(spec: TrialSpec, parameters: Array, states: Array, inputs: Arr
 
     def following(theta: Array, at: Array) -> Array:
         accelerations = functools.partial(spec.model.predict, system, theta)
-        return predict(system, accelerations, at, inputs[:, None])[0]
+        reached: Array = predict(system, accelerations, at, inputs[:, None])[0]
+        return reached
 
     by_state = _derivatives(lambda move: following(parameters, x + move), x.shape[1])
     by_parameter = _derivatives(lambda move: following(parameters + move, x), len(parameters))
