@@ -24,7 +24,7 @@ QUESTIONS = (
     "jax_scan",
     "reference",
     "linearisation_gap",
-    "noise_bound",
+    "sensor_noise",
     "adaptive_seeds",
     "evaluation",
     "trial",

@@ -7,12 +7,12 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from benchmarks.noise_bound import INPUTS, measured
+from benchmarks.sensor_noise import INPUTS, measured
 from tests.findings.report_columns import FINDINGS
 from tests.pages import DOCS
 
 TABLE = pd.read_csv(DOCS / "noisy_angle.csv")
-BOUNDS = pd.read_csv(DOCS / "noisy_angle_bound.csv")
+EXPECTED = pd.read_csv(DOCS / "noisy_angle_expected.csv")
 ROWS = [
     ("state", "adam_window"),
     ("state", "ekf"),
@@ -90,25 +90,28 @@ def test_a_fitted_noise_need_not_be_known() -> None:
         assert found[f"fitted from {start}"] < 0.8 * found[f"of {start}"]
 
 
-def test_bounds_are_those_of_their_table() -> None:
-    means = BOUNDS.groupby("inputs")[["final_loss", "bound"]].agg(geometric_mean)
+def test_expected_errors_are_those_of_their_table() -> None:
+    means = EXPECTED.groupby("inputs")[["final_loss", "expected"]].agg(geometric_mean)
     assert set(means.index) == set(INPUTS)
-    assert BOUNDS.groupby("inputs").seed.nunique().eq(100).all()
+    assert EXPECTED.groupby("inputs").seed.nunique().eq(100).all()
     for name, row in means.iterrows():
         policy, learner, known = str(name).split(", ")
         inputs = f"{policy.replace('d_optimal', 'D-optimal')}, `{learner}`, {known}"
-        assert f"| {inputs} | {row.final_loss:.3g} | {row.bound:.3g} |" in FINDINGS
+        assert f"| {inputs} | {row.final_loss:.3g} | {row.expected:.3g} |" in FINDINGS
     own = means.loc["d_optimal, joint_ekf, angle"]
-    assert f"ends at {own.final_loss / own.bound:.3g} times the bound" in FINDINGS
+    white = means.loc["random, joint_ekf, angle"]
+    ratios = (f"{row.final_loss / row.expected:.3g}" for row in (own, white))
+    phrase = "ends at {} times what the noise leaves at its D-optimal inputs, and at {} times at random ones"
+    assert phrase.format(*ratios) in " ".join(FINDINGS.split())
     full = means.loc["d_optimal, gauss_newton, state"]
-    assert full.bound / full.final_loss == pytest.approx(11, abs=0.5)
-    assert full.bound / full.final_loss > 10.5
+    assert full.expected / full.final_loss == pytest.approx(11, abs=0.5)
+    assert full.expected / full.final_loss > 10.5
 
 
-def test_a_bound_is_found_again() -> None:
+def test_an_expected_error_is_found_again() -> None:
     """Up to what the trial of another processor chose otherwise."""
-    rows = BOUNDS[BOUNDS.seed == 0].set_index("inputs")
+    rows = EXPECTED[EXPECTED.seed == 0].set_index("inputs")
     name = "d_optimal, joint_ekf, angle"
-    loss, bound = measured(name, 0)
+    loss, expected = measured(name, 0)
     assert loss == pytest.approx(rows.final_loss[name], rel=0.02)
-    assert bound == pytest.approx(rows.bound[name], rel=0.02)
+    assert expected == pytest.approx(rows.expected[name], rel=0.02)

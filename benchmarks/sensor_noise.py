@@ -1,8 +1,8 @@
-"""Least loss that noisy measurements of some states allow, beside the losses of trials.
+"""Error that the noise of sensors leaves after a run, expected, beside the losses of trials.
 
 A network is fitted to the truth, and the sensitivity of the states to its parameters follows from
 the run alone. With the noise of the sensors it gives the information that the measurements hold,
-hence the covariance below which, in linear approximation, no estimate of the parameters can be.
+hence, in linear approximation, the covariance of the best estimate of the parameters.
 
 ======  ==================================================================  =====
 symbol  meaning                                                             shape
@@ -15,8 +15,8 @@ M       Λ + Σ_t (C Ψ_t)ᵀ R⁻¹ (C Ψ_t)                                   
 Λ       I / mean (θ* - θ_0)², a prior that knows how far θ* lies            q × q
 ======  ==================================================================  =====
 
-The bound is √(mean tr J M⁻¹ Jᵀ) over the grid, J the Jacobian of the accelerations. It leaves out
-the noise of the process, which would raise it.
+The expected error is √(mean tr J M⁻¹ Jᵀ) over the grid, J the Jacobian of the accelerations. It
+leaves out the noise of the process, which would raise it. Single trials may end below it.
 
 Reference: H. Van Trees, "Detection, estimation, and modulation theory" I (1968), section 2.4.
 """
@@ -82,8 +82,8 @@ def _derivatives(function: Callable[[Array], Array], size: int) -> Array:
     return found
 
 
-def bound(spec: TrialSpec, states: Array, inputs: Array) -> float:
-    """Return the bound on the loss of a trial whose states are measured with noise.
+def expected_error(spec: TrialSpec, states: Array, inputs: Array) -> float:
+    """Return the loss that the noise of the sensors leaves, of the best estimate.
 
     Parameters
     ----------
@@ -119,12 +119,12 @@ def _truth(system: System) -> Samples:
 
 
 def measured(name: str, seed: int) -> tuple[float, float]:
-    """Return the final loss of one of the trials of ``INPUTS``, and the bound at its inputs."""
+    """Return the final loss of one of the trials of ``INPUTS``, and the error expected at its inputs."""
     policy, learner, sensors = INPUTS[name]
     result = run_trial(_spec(policy, learner, sensors, seed))
     assert result.final_loss is not None, "the pendulum does not diverge"
     judged = _spec(PLANNED, "joint_ekf", ANGLE, seed)
-    return result.final_loss, bound(judged, result.states, result.inputs)
+    return result.final_loss, expected_error(judged, result.states, result.inputs)
 
 
 def _spec(policy: Fields, learner: str, sensors: Fields, seed: int) -> TrialSpec:
@@ -135,11 +135,11 @@ def _spec(policy: Fields, learner: str, sensors: Fields, seed: int) -> TrialSpec
 
 
 def measure(quick: bool) -> list[Row]:
-    """Return final losses and bounds, geometric means over the seeds."""
+    """Return final losses and expected errors, geometric means over the seeds."""
     return [row for name in INPUTS for row in _rows(name, 1 if quick else 100)]
 
 
 def _rows(name: str, seeds: int) -> Iterator[Row]:
     losses = np.array([measured(name, seed) for seed in range(seeds)])
-    for what, value in zip(("loss", "bound"), np.exp(np.log(losses).mean(axis=0)), strict=True):
+    for what, value in zip(("loss", "expected"), np.exp(np.log(losses).mean(axis=0)), strict=True):
         yield Row(f"{name}, {what}", float(value), "rad/s²", note=f"{seeds} trials")

@@ -1,4 +1,4 @@
-"""The bound on what noisy measurements tell: sensitivities, and how it moves with the sensors."""
+"""The error that noisy sensors leave: sensitivities, and how it moves with the sensors."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmarks import noise_bound
-from benchmarks.noise_bound import bound, sensitivities
+from benchmarks import sensor_noise
+from benchmarks.sensor_noise import expected_error, sensitivities
 from dopt.control.prediction import predict
 from dopt.randomness import initial_weights
 from dopt.run import run_trial
@@ -52,7 +52,7 @@ def test_it_falls_with_less_noise_and_with_more_sensors() -> None:
     run = run_trial(measured({0: DEGREE}))
 
     def of(noise: dict[int, float]) -> float:
-        return bound(measured(noise), run.states, run.inputs)
+        return expected_error(measured(noise), run.states, run.inputs)
 
     one, precise, both = of({0: DEGREE}), of({0: DEGREE / 10}), of({0: DEGREE, 1: 0.1})
     prior = of({0: 1e6})
@@ -61,8 +61,8 @@ def test_it_falls_with_less_noise_and_with_more_sensors() -> None:
     assert of({0: 1e8}) == pytest.approx(prior, rel=1e-9)
 
 
-def test_the_question_has_a_loss_and_a_bound_for_each_run() -> None:
-    rows = noise_bound.measure(quick=True)
+def test_the_question_has_a_loss_and_an_expectation_for_each_run() -> None:
+    rows = sensor_noise.measure(quick=True)
     assert len(rows) == 6
     planned, least, _, _, known, none = (row.value or 0.0 for row in rows)
     assert known < 0.2 * least
