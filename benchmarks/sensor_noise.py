@@ -119,7 +119,7 @@ def _truth(system: System) -> Samples:
 
 
 def measured(name: str, seed: int) -> tuple[float, float]:
-    """Return the final loss of one of the trials of ``INPUTS``, and the error expected at its inputs."""
+    """Return the final loss of a trial of ``INPUTS``, and the error expected at its inputs."""
     policy, learner, sensors = INPUTS[name]
     result = run_trial(_spec(policy, learner, sensors, seed))
     assert result.final_loss is not None, "the pendulum does not diverge"

@@ -32,11 +32,8 @@ from dopt.spec.trial import TrialSpec
 
 Array = npt.NDArray[np.float64]
 
-LEVEL = 0.9
-"""Probability that an interval is to hold the true acceleration."""
-
 HALF_WIDTH = 1.6448536269514722
-"""Half of its width in standard deviations: the normal quantile of 0.95."""
+"""Half of the width of an interval of 90 %, in standard deviations: the normal quantile of 0.95."""
 
 _STEP = 1e-6
 """Change of a parameter in the central differences, beside 1 or its own size."""

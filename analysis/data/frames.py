@@ -136,7 +136,8 @@ class Results:
         )
 
     def _tidy(self, config: ConfigRow, columns: tuple[str, ...]) -> pd.DataFrame:
-        read = {name: self.reader.curves(config.config_key, name) for name in columns}
+        with self.reader.moment() as moment:
+            read = {name: moment.curves(config.config_key, name) for name in columns}
         first = next(iter(read.values()))
         n, steps = first.values.shape
         frame = pd.DataFrame(
@@ -145,8 +146,7 @@ class Results:
                 "t": np.tile(first.t, n),
                 "time": np.tile(config.dt * first.t, n),
                 "diverged": np.repeat(first.diverged, steps),
-                # A launch may finish a trial between two reads: each column is cut to the first's.
-                **{k: c.values[np.isin(c.seeds, first.seeds)].ravel() for k, c in read.items()},
+                **{name: column.values.ravel() for name, column in read.items()},
             }
         )
         return _labelled(frame, config)
@@ -188,11 +188,12 @@ class Results:
     def trajectories(self, env: str, policy: str) -> Trajectories:
         """Return states and inputs of the finished trials of a policy in an environment."""
         config = self._one(env, policy)
-        trials = self.reader.trials(config.config_key)
-        seeds = [trial.seed for trial in trials if trial.status in ("done", "diverged")]
+        with self.reader.moment() as moment:
+            trials = moment.trials(config.config_key)
+            seeds = [trial.seed for trial in trials if trial.status in ("done", "diverged")]
+            paths = [moment.trajectory(config.config_key, seed) for seed in seeds]
         if not seeds:
             raise AnalysisError(f"{env} × {policy} has no finished trial: run the grid first.")
-        paths = [self.reader.trajectory(config.config_key, seed) for seed in seeds]
         return Trajectories(
             seeds=np.array(seeds, dtype=np.int64),
             t=config.dt * np.arange(max(len(path.states) for path in paths), dtype=np.float64),

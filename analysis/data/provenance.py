@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.metadata
+import os
 import platform
 import subprocess
 from pathlib import Path
@@ -32,21 +33,28 @@ def versions() -> dict[str, str | None]:
 
 @functools.cache
 def git_state() -> dict[str, str | bool | None]:
-    """Return commit and dirty flag of the code; None outside a repository.
+    """Return commit and dirty flag of the code; None outside a repository of its own.
 
-    As at the first call: code that changes later does not run in this process.
+    A repository that merely holds an installed copy is another one; ``DOPT_COMMIT`` then gives the
+    commit. As at the first call: code that changes later does not run in this process.
     """
-    commit = _git("rev-parse", "HEAD")
+    top = _git("rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != PACKAGE.parent.resolve():
+        return {"commit": os.environ.get("DOPT_COMMIT") or None, "dirty": None}
     changes = _git("status", "--porcelain", "--untracked-files=no")
-    return {"commit": commit, "dirty": bool(changes) if commit else None}
+    return {"commit": _git("rev-parse", "HEAD"), "dirty": bool(changes)}
 
 
 def _git(*arguments: str) -> str | None:
     try:
         done = subprocess.run(
-            ["git", *arguments], cwd=PACKAGE, capture_output=True, text=True, check=True
+            ["git", "-C", PACKAGE, *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=20,
         )
-    except (OSError, subprocess.CalledProcessError):
+    except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
 

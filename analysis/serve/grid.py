@@ -35,7 +35,7 @@ def grid(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa: AR
     stored = reader.configs()
     configs = newest(stored)
     policies = sorted({config.policy for config in configs}, key=policy_rank)
-    finals = state.cache.get_or_compute(
+    finals = state.selections.get_or_compute(
         ("final", reader, progress["token"]), lambda: _finals(reader)
     )
     slots = _slots(configs, finals)

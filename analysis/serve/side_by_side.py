@@ -82,7 +82,7 @@ def _losses(state: ServerState) -> dict[str, Losses]:
     """Return the final losses of every configuration."""
     reader = state.database.reader()
     key = ("final by seed", reader, read_progress(reader)["token"])
-    return state.cache.get_or_compute(key, lambda: _read(reader))
+    return state.selections.get_or_compute(key, lambda: _read(reader))
 
 
 def _read(reader: Reader) -> dict[str, Losses]:

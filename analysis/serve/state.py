@@ -40,7 +40,7 @@ class ServerState:
     link: Link
     links: tuple[Link, ...]
     cache: Cache = field(default_factory=Cache)
-    selections: Cache = field(default_factory=lambda: Cache(4))  # each contains all its trials
+    selections: Cache = field(default_factory=lambda: Cache(6))  # each contains all its trials
 
     @property
     def name(self) -> str:

@@ -36,8 +36,11 @@ def trials(state: ServerState, params: QueryParams) -> dict[str, Any]:
     after, before = (params.position(name, text=sort in TEXTS) for name in ("after", "before"))
     backwards = before is not None and after is None
     rows = read_page(
-        reader, COLUMNS, conditions, sort, descending, after or before, backwards, size
+        reader, COLUMNS, conditions, sort, descending, after or before, backwards, size + 1
     )
+    further = len(rows) > size  # in the direction of the walk; back there is where it came from
+    rows = rows[1:] if backwards and further else rows[:size]
+    came = after is not None or before is not None
     total = count(reader, conditions)
     matching = _matching(params, configs)
     computed = computed_columns(matching)
@@ -49,8 +52,10 @@ def trials(state: ServerState, params: QueryParams) -> dict[str, Any]:
         "total": total,
         "sort": sort,
         "order": "desc" if descending else "asc",
-        "previous": position_of(rows[0], sort) if rows and (after or before) else None,
-        "next": position_of(rows[-1], sort) if len(rows) == size else None,
+        "previous": position_of(rows[0], sort)
+        if rows and (further if backwards else came)
+        else None,
+        "next": position_of(rows[-1], sort) if rows and (came if backwards else further) else None,
         "columns": shown_columns(matching, computed, sort),
         "sortable": list(COLUMNS),
         "numbers": NUMBERS,

@@ -47,9 +47,10 @@ def run_motor(port: int, loss: float, jitter: float) -> None:
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     wire.connect(("127.0.0.1", port))
     angle = rate = voltage = area = 0.0
-    measured = now = time.monotonic()
+    measured = now = tick = time.monotonic()
     while True:
-        planned = measured + DT * (1.0 + random.uniform(-jitter, jitter))
+        tick = max(tick + DT, now + DT / 2)  # after a pause of this process it does not catch up
+        planned = tick + DT * random.uniform(-jitter, jitter)
         while now < planned:
             wire.settimeout(max(planned - time.monotonic(), 1e-4))
             command = _received(wire, COMMAND.size, loss)

@@ -17,7 +17,7 @@ from dopt.explorer.arguments import finite, numbers, safe_input, seconds, within
 from dopt.explorer.interrupts import uninterrupted
 from dopt.explorer.journal import FORMAT, Event, Journal
 from dopt.explorer.measured import measured
-from dopt.explorer.planner import PunctualPlanner
+from dopt.explorer.planner import PunctualPlanner, may_remember_plans
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import difference
 from dopt.spec.added_fields import completed
@@ -134,6 +134,7 @@ class Explorer(SavedExplored):
         self._limits = np.full(len(measured_states), system.state_limit)
         self._limits[self._angles] = np.finfo(float).max
         super().__init__(spec)
+        self._plans_each_step = may_remember_plans(spec)
         self._in_vain = 0  # states in a row that were not learned from
         self._journal = None if journal is None else Journal(Path(journal), fsync)
         self._planner = PunctualPlanner(self._state.plan, deadline)
@@ -251,6 +252,8 @@ class Explorer(SavedExplored):
         elif not np.isfinite(state.accelerations(x, u, elapsed)).all():
             self._note({"lost": "unusable"})
         else:
+            if state.answer is None:
+                self._plan_unasked()
             if now is None and state.time is not None:
                 now = state.time + dt
             event = {"learn": x.tolist(), "applied": u.tolist(), "dt": elapsed, "time": now}
@@ -315,6 +318,13 @@ class Explorer(SavedExplored):
             self._note_plan()
         if self._state.answer is None:
             self._note({"missed": self._fallback.tolist()}, durable=False)
+
+    def _plan_unasked(self) -> None:
+        """Let a policy that may remember its plans make one where none was asked for."""
+        if self._plans_each_step:
+            if not self._planner.plan():
+                self._planner.wait()
+            self._note_plan()
 
     def _note_plan(self) -> None:
         planned = self._state.planned

@@ -21,5 +21,5 @@ def uninterrupted() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-    if pressed and callable(before):
-        before(signal.SIGINT, pressed[0])
+        if pressed and callable(before):
+            before(signal.SIGINT, pressed[0])

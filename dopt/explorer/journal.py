@@ -47,26 +47,30 @@ class Journal:
 
     def __init__(self, path: Path, fsync: bool) -> None:
         self.path, self._fsync = path.expanduser(), fsync
-        new = [path for path in (self.path, *self.path.parents) if not path.exists()]
+        self._process, self._broken = os.getpid(), False
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("ab", buffering=0)
+            self._open()
         except OSError as error:
             raise SpecificationError(
-                f"the journal {path} cannot be written ({error}): give a file in a folder that can "
-                f"be written."
+                f"the journal {path} cannot be written or read ({error}): give a file in a folder "
+                f"that can be."
             ) from error
-        self._process, self._broken = os.getpid(), False
+
+    def _open(self) -> None:
+        """Open the file, or leave it closed and unlocked with an error."""
+        new = [path for path in (self.path, *self.path.parents) if not path.exists()]
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = self.path.open("ab", buffering=0)
         try:
             _lock(self._file.fileno(), self.path)
             self._size, self.events = _read(self.path)
-        except SpecificationError:
+            self._file.truncate(self._size)
+            if self._fsync:
+                for path in new:
+                    _sync_folder(path.parent)
+        except BaseException:
             self._file.close()
             raise
-        self._file.truncate(self._size)
-        if fsync:
-            for path in new:
-                _sync_folder(path.parent)
 
     def write(self, event: Event, *, durable: bool) -> None:
         """Append an event; one that is not durable may wait for the next one that is.

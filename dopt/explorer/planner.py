@@ -6,6 +6,8 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
 
+from dopt.spec.trial import TrialSpec
+
 
 class PunctualPlanner:
     """Makes plans in this thread, or with a deadline in a thread of its own.
@@ -32,12 +34,12 @@ class PunctualPlanner:
         if self._thread is None:
             self._make()
             return True
-        self._late = self._thread.submit(self._make)
+        plan = self._thread.submit(self._make)
         try:
-            self._late.result(timeout=self._deadline)
+            plan.result(timeout=self._deadline)
         except TooLate:
+            self._late = plan
             return False
-        self._late = None
         return True
 
     @property
@@ -57,3 +59,10 @@ class PunctualPlanner:
         """End the thread."""
         if self._thread is not None:
             self._thread.shutdown()
+
+
+def may_remember_plans(spec: TrialSpec) -> bool:
+    """Tell whether the plan of a step may depend on those of the steps before."""
+    policy, q = spec.policy, spec.model.n_parameters(spec.system)
+    compiled = policy.compiled and not policy.is_in_numpy()
+    return not compiled or policy.memory_size(spec.system, q) > 0

@@ -6,11 +6,13 @@ second: a launch that only wants to know whether there is anything to compile do
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import fcntl
 import hashlib
 import logging
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Iterable, Iterator
@@ -43,7 +45,10 @@ def _source_digest() -> str:
 
 
 def _cache_folder() -> Path:
-    """Return a writable folder for compiled code."""
+    """Return a writable folder for compiled code.
+
+    Where the cache cannot be written it is a temporary one, for this process and those it starts.
+    """
     base = os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME")
     root = Path(base) if base else Path.home() / ".cache"
     folder = root / "dopt" / f"kernel-{_source_digest()}"
@@ -53,9 +58,18 @@ def _cache_folder() -> Path:
             return folder
     except OSError:
         pass
-    folder = Path(tempfile.mkdtemp(prefix="dopt-")) / folder.relative_to(root)
+    temporary = Path(tempfile.mkdtemp(prefix="dopt-"))
+    os.environ[CACHE_VARIABLE] = str(temporary)
+    atexit.register(_remove, temporary, os.getpid())
+    folder = temporary / folder.relative_to(root)
     folder.mkdir(parents=True)
     return folder
+
+
+def _remove(folder: Path, maker: int) -> None:
+    """Remove a temporary folder at the end of the process that made it, not of its forks."""
+    if os.getpid() == maker:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 CACHE_FOLDER = _cache_folder()

@@ -119,7 +119,7 @@ class Lockstep(BatchSteps):
 
     def _clock(self) -> float:
         if self.device != "cpu":
-            torch.cuda.synchronize()
+            torch.cuda.synchronize(self.device)
         return time.perf_counter()
 
 

@@ -25,7 +25,7 @@ def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator
     Raises
     ------
     StoreError
-        If the last copy fails; the local database is kept.
+        If what was collected cannot be merged, or the last copy fails; the local database is kept.
     """
     if settings.collect_in is None:
         yield

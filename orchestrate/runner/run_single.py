@@ -28,7 +28,8 @@ def launch_trial(
     code = launch_grid(grid, settings, record, work, say=_ignore, stream=None, warn=_warn)
     with Reader.open(settings.store_url) as reader:
         row = _row(reader, trial)
-        assert row is not None
+        if row is None:  # interrupted before it was registered
+            return code, f"{_name(trial)} · not started · {reader.safe_url}"
         if row.status == "failed":
             sys.stderr.write(_traceback(reader, trial))
         was_done = row.attempt == before and row.status != "pending"

@@ -8,13 +8,23 @@ import resource
 import socket
 import sys
 import threading
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from dopt.result import TrialResult
 from orchestrate.executors.task import BYTES_PER_KIB
+from orchestrate.runner.heartbeat import Heartbeat
 from orchestrate.runner.provenance import launch_record
-from orchestrate.store import Registrable, RunRecord, Saved, Store, StoreError, default_url
+from orchestrate.store import (
+    LEASE_SECONDS,
+    Registrable,
+    RunRecord,
+    Saved,
+    Store,
+    StoreError,
+    default_url,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -38,7 +48,7 @@ class ExplorationSaver:
 
     def __init__(self, url: str | None) -> None:
         self._record = launch_record(sys.argv, [], ROOT)
-        self._store = Store.open(default_url() if url is None else str(url))
+        self._store = Store.open(default_url() if url is None else str(url), LEASE_SECONDS)
         try:
             self._store.recover()  # marks the launch of a process that was killed as lost
         except StoreError:
@@ -46,6 +56,7 @@ class ExplorationSaver:
             raise
         self._lock = threading.Lock()
         self._launch: int | None = None
+        self._alive = ExitStack()
         self._last: Saved | None = None
 
     def save(self, spec: Registrable, result: TrialResult) -> bool:
@@ -61,6 +72,7 @@ class ExplorationSaver:
                 if self._store.holds_more(spec, result):
                     return False
                 self._launch = self._store.begin_launch(self._record)
+                self._alive.enter_context(Heartbeat(self._store, self._launch, LEASE_SECONDS))
             last, self._last = self._last, None  # whether a save that fails has written is unknown
             self._last = self._store.save(self._launch, spec, result, _run_record(result), last)
             return self._last is not None
@@ -70,6 +82,7 @@ class ExplorationSaver:
         if os.getpid() != self._record.pid:
             return  # a process that was forked, whose parent goes on
         with self._lock:
+            self._alive.close()
             try:
                 if self._launch is not None:
                     self._store.end_launch(self._launch, "done", 0)

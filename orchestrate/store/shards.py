@@ -24,7 +24,8 @@ SUFFIX = ".db"
 def collect(url: str, folder: Path) -> None:
     """Copy a SQLite database, which launches may be writing, to a file of its name in a folder.
 
-    Raises ``StoreUnavailableError`` if the folder cannot be written; an older copy stays then.
+    Raises ``StoreUnavailableError`` if the folder has no room or fails, and ``StoreError`` if it
+    can never be written; an older copy stays then.
     """
     path = database_url.sqlite_path(database_url.parse(url))
     partial = folder / f"{path.name}.{os.getpid()}.partial"

@@ -100,9 +100,9 @@ def test_expected_errors_are_those_of_their_table() -> None:
         assert f"| {inputs} | {row.final_loss:.3g} | {row.expected:.3g} |" in FINDINGS
     own = means.loc["d_optimal, joint_ekf, angle"]
     white = means.loc["random, joint_ekf, angle"]
-    ratios = (f"{row.final_loss / row.expected:.3g}" for row in (own, white))
-    phrase = "ends at {} times what the noise leaves at its D-optimal inputs, and at {} times at random ones"
-    assert phrase.format(*ratios) in " ".join(FINDINGS.split())
+    planned, drawn = (f"{row.final_loss / row.expected:.3g}" for row in (own, white))
+    left = f"ends at {planned} times what the noise leaves at its D-optimal inputs"
+    assert f"{left}, and at {drawn} times at random ones" in " ".join(FINDINGS.split())
     full = means.loc["d_optimal, gauss_newton, state"]
     assert full.expected / full.final_loss == pytest.approx(11, abs=0.5)
     assert full.expected / full.final_loss > 10.5

@@ -151,11 +151,11 @@ PHRASES = [
     ),
     ("the look-ahead is better ({:.2f}).", beyond(("drifting_pendulum", "lookahead"))),
     (
-        "with $f = 0.99$ it is not ({:.1f}).",
+        "with 0.99 it ends at {:.2f} times its loss.",
         beyond(("drifting_pendulum", "d optimal, ekf, forgetting=0.99")),
     ),
     (
-        "better than white noise ({:.2f}); the exact gain reaches {:.2f}.",
+        "at {:.2f} times the loss of D-optimal ones; the exact gain ends at {:.2f}.",
         beyond(("chain", "random"), ("chain", "exact")),
     ),
     (

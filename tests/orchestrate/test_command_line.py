@@ -15,6 +15,7 @@ import pytest
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from orchestrate.runner import run_grid
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import Reader
 from tests.orchestrate.conftest import ROOT
@@ -283,3 +284,15 @@ def test_a_defect_of_the_program_is_not_taken_for_failed_trials(
     assert "secret" not in errors
     with Reader.open(url) as reader:
         assert reader.query("SELECT state, exit_code FROM launch")[0] == ("failed", 70)
+
+
+def test_a_single_trial_that_is_interrupted_before_its_start_says_so(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run_grid, "free_trials", interrupted)
+    code, output, errors = command_line("env=pendulum", *SHORT)
+    assert (code, errors) == (130, "")
+    assert re.fullmatch(r"env=pendulum .* · not started · sqlite:.*\n", output)

@@ -146,7 +146,7 @@ def _extra(given: Mapping[str, object]) -> Iterator[tuple[str, str | None]]:
             raise LaunchError(f"{key} is {value!r}, but {_OWN[own].format(own)}: remove {key}.")
         if value is None or value is True:
             yield name, None
-        elif isinstance(value, str | int | float) and "\n" not in str(value):
+        elif value is not False and isinstance(value, str | int | float) and "\n" not in str(value):
             yield name, str(value)
         else:
             raise wrong(key, value, "a text, a number, or true for an option without a value")

@@ -120,3 +120,22 @@ def test_a_place_of_another_kind_than_the_column_is_harmless(client: TestClient)
             for way in ("after", "before"):
                 answer = client.get("/api/trials", params={"sort": sort, way: place})
                 assert answer.status_code in (200, 400), answer.text
+
+
+def test_only_pages_that_hold_trials_are_linked(client: TestClient) -> None:
+    """Also where rows have moved, so that a page backwards is short."""
+
+    def page(**place: str) -> dict[str, Any]:
+        given = {"sort": "seed", "order": "asc", "size": "25", **place}
+        answer: dict[str, Any] = client.get("/api/trials", params=given).json()
+        return answer
+
+    first = page()
+    second = page(after=first["next"])
+    assert (first["previous"], second["next"]) == (None, None)
+    back = page(before=second["previous"])
+    assert back["rows"] == first["rows"]
+    assert (back["previous"], back["next"]) == (None, first["next"])
+    short = page(before=_place(first["rows"][3], "seed"))
+    assert short["rows"] == first["rows"][:3]
+    assert (short["previous"], short["next"]) == (None, _place(first["rows"][2], "seed"))

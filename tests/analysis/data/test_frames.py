@@ -12,8 +12,8 @@ import analysis
 from analysis.data.frames import STEP_COLUMNS
 from analysis.errors import AnalysisError
 from dopt.run import run_trial
-from orchestrate.store import NoDatabaseError
-from tests.analysis.synthetic import fake_result, fill, make_spec
+from orchestrate.store import Curves, NoDatabaseError, Reader
+from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec
 
 
 @pytest.fixture
@@ -128,3 +128,24 @@ def test_the_error_of_a_stored_model_is_the_stored_loss(tmp_path: Path) -> None:
     error = model.predict(grid) - spec.system.learned(grid)
     rms = np.sqrt(np.mean(np.sum(error**2, axis=1)))
     assert trials.final_loss[0] == pytest.approx(rms, rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_what_is_finished_during_a_read_is_not_in_a_part_of_it(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    url, short = request.getfixturevalue(f"{kind}_url"), {"env": {"horizon": 20}}
+    fill(url, make_grid(("pendulum",), ("random",), range(2), **short))
+    read, left = Reader.curves, make_grid(("pendulum",), ("random",), range(2, 4), **short)
+
+    def curves(self: Reader, config_key: str, column: str) -> Curves:
+        found = read(self, config_key, column)
+        if left:
+            fill(url, [left.pop()])
+        return found
+
+    monkeypatch.setattr(Reader, "curves", curves)
+    with analysis.load(url) as results:
+        table = results.curves("loss", "plan_us")
+        assert table.seed.unique().tolist() == [0, 1]
+        assert len(results.curves("loss", "plan_us")) == 4 * 20

@@ -248,3 +248,16 @@ def test_a_journal_from_elsewhere_is_replayed_with_a_warning(
     with caplog.at_level(logging.WARNING), Explorer(MOTOR, steps=9, journal=journal) as explorer:
         assert explorer.n_steps == 4
     assert len([r for r in caplog.records if "another version or processor" in r.message]) == 1
+
+
+def test_a_file_that_cannot_be_read_is_refused_and_freed(
+    journal: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "read_bytes", refuse)
+        with pytest.raises(SpecificationError, match="cannot be written or read"):
+            Explorer(MOTOR, steps=5, journal=journal)
+    Explorer(MOTOR, steps=5, journal=journal).close()

@@ -264,3 +264,23 @@ def test_no_function_that_may_fuse_uses_the_operator_of_powers() -> None:
                 if names & {"contracted", "vectorized"}:
                     powers = [n for n in ast.walk(node) if isinstance(n, ast.Pow)]
                     assert not powers, f"{path.name}: {node.name}"
+
+
+def test_a_cache_that_cannot_be_written_is_one_folder_for_all_processes(tmp_path: Path) -> None:
+    """And is gone with the process that made it."""
+    program = (
+        "import subprocess, sys\n"
+        "from dopt.kernel.cache import CACHE_FOLDER\n"
+        "print(CACHE_FOLDER)\n"
+        "if len(sys.argv) < 2:\n"
+        "    subprocess.run([sys.executable, __file__, 'child'], check=True)\n"
+        "print(CACHE_FOLDER.is_dir())\n"
+    )
+    (tmp_path / "program.py").write_text(program)
+    (tmp_path / "file").touch()
+    given = {**os.environ, "PYTHONPATH": str(ROOT), "DOPT_CACHE": str(tmp_path / "file" / "cache")}
+    command = [sys.executable, "-u", str(tmp_path / "program.py")]
+    done = subprocess.run(command, env=given, check=True, capture_output=True, text=True)
+    made, used, there, still_there = done.stdout.split()
+    assert (made, there, still_there) == (used, "True", "True")
+    assert not Path(made).exists()

@@ -87,6 +87,7 @@ def test_a_dry_run_prints_the_script_and_needs_no_slurm(command_line: CommandLin
         ("options", {"signal": "x"}, "every job sets --signal as its workers need it"),
         ("options", {"Q": "x"}, "a long name of an option of sbatch"),
         ("options", {"qos": ["x"]}, "executor.options.qos is ['x']"),
+        ("options", {"exclusive": False}, "executor.options.exclusive is False"),
         ("options", {"comment": "a\nb"}, "executor.options.comment is 'a\\nb'"),
     ],
 )
