@@ -129,7 +129,7 @@ def draw(latencies: np.ndarray, path: str) -> None:
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
     axes.hist(ms, np.linspace(0.0, max(longest, 6.0), 120), log=True)
     axes.axvline(1.0, color="C1", linestyle="--", label="target 1 ms")
-    axes.axvline(1e3 * DT, color="C3", label=f"deadline {1e3 * DT:g} ms")
+    axes.axvline(1e3 * DT, color="C3", label=f"step {1e3 * DT:g} ms")
     axes.set(xlabel="time of an answer [ms]", ylabel="answers")
     axes.set_title(
         f"{len(ms):,} answers: median {median:.2g} ms, p99 {high:.2g} ms, longest {longest:.2g} ms"
