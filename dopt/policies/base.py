@@ -51,15 +51,12 @@ def check_ensemble(networks: int) -> None:
 class Policy(KernelPart):
     """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.
 
-    ``uses_full_amplitude`` says whether every input has the norm γ, with a model that is affine in
-    the inputs; without it inputs may have other norms. ``reads_inputs`` says whether it goes with
-    models that depend on the inputs. ``library`` is a module that it cannot do without, and
-    ``extra`` the extra of this package that installs it.
+    ``reads_inputs`` says whether it goes with models that depend on the inputs. ``library`` is a
+    module that it cannot do without, and ``extra`` the extra of this package that installs it.
     """
 
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
-    uses_full_amplitude: ClassVar[bool] = True
     reads_inputs: ClassVar[bool] = False
     library: ClassVar[str] = ""
     extra: ClassVar[str] = ""
@@ -168,7 +165,6 @@ class CustomPolicy(ClosedLoop):
 
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = PLAN_IN_NUMPY
-    uses_full_amplitude: ClassVar[bool] = False
 
     @abstractmethod
     def planner(self, system: System, rng: np.random.Generator) -> Planner:
@@ -204,7 +200,6 @@ class CompiledPolicy(ClosedLoop):
 
     compiled: ClassVar[bool] = True
     brings_function: ClassVar[bool] = True
-    uses_full_amplitude: ClassVar[bool] = False
 
     @staticmethod
     @abstractmethod

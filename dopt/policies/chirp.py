@@ -28,7 +28,6 @@ class Chirp(OpenLoop):
     """
 
     name: ClassVar[str] = "chirp"
-    uses_full_amplitude: ClassVar[bool] = False
 
     band: float = parameter(0.1, "1", "share")
 

@@ -29,7 +29,6 @@ class Multisine(OpenLoop):
     """
 
     name: ClassVar[str] = "multisine"
-    uses_full_amplitude: ClassVar[bool] = False
 
     band: float = parameter(0.1, "1", "share")
 

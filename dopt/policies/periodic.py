@@ -76,7 +76,6 @@ class Periodic(AtEigenfrequency):
     """
 
     name: ClassVar[str] = "periodic"
-    uses_full_amplitude: ClassVar[bool] = False
 
     def wave(self, phase: Array) -> Array:
         return np.sin(phase)

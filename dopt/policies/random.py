@@ -22,7 +22,6 @@ class RandomGaussian(OpenLoop):
 
     name: ClassVar[str] = "random"
     exceeds: ClassVar[bool] = True
-    uses_full_amplitude: ClassVar[bool] = False
 
     def inputs(self, system: System, rng: np.random.Generator) -> Array:
         shape = (system.horizon, system.n_inputs)

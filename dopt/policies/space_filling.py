@@ -53,7 +53,6 @@ class SpaceFilling(HeldCandidates, CustomPolicy):
 
     name: ClassVar[str] = "space_filling"
     compiled: ClassVar[bool] = True
-    uses_full_amplitude: ClassVar[bool] = True
     reads_inputs: ClassVar[bool] = True
 
     criterion: str = parameter("idw", choices=("gsx", "igs", "idw"))
