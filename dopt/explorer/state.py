@@ -215,7 +215,7 @@ def _steps_of(spec: TrialSpec) -> Steps:
 def difference(stored: Any, given: Any, path: str = "") -> str:
     """Say where two specifications differ first."""
     if isinstance(stored, dict) and isinstance(given, dict):
-        for key in sorted({*stored, *given}):
+        for key in sorted({*stored, *given}, key=lambda key: (key != "name", key)):
             if stored.get(key) != given.get(key):
                 return difference(stored.get(key), given.get(key), f"{path}.{key}".lstrip("."))
     return f"{path} was {stored!r} and is {given!r}"

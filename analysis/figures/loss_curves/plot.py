@@ -197,7 +197,6 @@ def legend_handles(styles: Mapping[str, LineStyle], options: PlotOptions) -> lis
 def caption(numbers: Numbers) -> str:
     """Return the caption, with the statistic, the band, n and the rule for diverged trials."""
     column, options, curves = numbers
-    where = "evaluation grid" if column == "loss" else "reachable set"
     counts = [
         f"{environment_title(env)} "
         + count_text({c.label: c.sample.describe() for c in curves if c.env == env})
@@ -211,10 +210,21 @@ def caption(numbers: Numbers) -> str:
         DivergenceRule.MEDIAN: "A diverged trial counts with the median loss of each step.",
     }
     return (
-        f"Root mean square error of the model over the {where} against time t, one panel per "
-        f"environment. "
+        f"{_what(column, curves)} against time t, one panel per environment. "
         f"Lines: {options.statistic.label} over trials; {_SPREADS[options.spread]}: "
         f"{options.interval}; no smoothing. {_bandless(curves, options)}"
         f"{_breaks(curves)}{rules[options.rule]} Policies of one environment share initial "
         f"weights and noise for the same seed.{''.join(absent)} Trials: {'. '.join(counts)}."
     )
+
+
+def _what(column: str, curves: Sequence[LossCurve]) -> str:
+    """Return what the curves show; those of explorations that were measured have no grid."""
+    if column != "loss":
+        return "Root mean square error of the model over the reachable set"
+    kinds = {curve.is_prequential for curve in curves}
+    found = "Root mean square error of the model over the evaluation grid"
+    told = "error of each prediction of a measured exploration before it was learned from"
+    if kinds == {True}:
+        return told.capitalize()
+    return f"{found}, or {told}," if True in kinds else found

@@ -35,7 +35,7 @@ def existing_path(url: URL) -> Path:
     if not there:
         raise NoDatabaseError(
             f"There is no results database at {database_url.safe(url)}: run a launch that writes "
-            "it, or give the URL of another one."
+            "it, or give the URL of another one (--db, or the variable DOPT_DB)."
         )
     return path
 

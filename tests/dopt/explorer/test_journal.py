@@ -147,6 +147,8 @@ def test_the_journal_of_another_exploration_is_refused(journal: Path) -> None:
     Explorer(MOTOR, steps=5, journal=journal).close()
     with pytest.raises(SpecificationError, match=r"seed was 0 and is 1.*another file"):
         Explorer(MOTOR, steps=5, journal=journal, seed=1)
+    with pytest.raises(SpecificationError, match=r"policy\.name was 'd_optimal' and is 'random'"):
+        Explorer(MOTOR, steps=5, journal=journal, policy="random")
     Explorer(MOTOR, steps=5, journal=journal).close()  # which is not locked by the refused one
 
 

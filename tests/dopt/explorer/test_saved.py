@@ -10,6 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 import analysis
+import analysis.cli
 import dopt
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import select
@@ -175,3 +176,15 @@ def test_simulated_trials_go_before_it(sqlite_url: str) -> None:
         "pendulum: 1 other stored configurations are not part of this (see --where)",
     )
     assert not examine(sqlite_url, trial_key)
+
+
+def test_the_caption_of_its_curve_names_no_grid(
+    sqlite_url: str, run: Explorer, tmp_path: Path
+) -> None:
+    run.save(sqlite_url)
+    folder = tmp_path / "figures"
+    drawn = ["figures", "--db", sqlite_url, "--out", str(folder), "--only", "figure1"]
+    assert analysis.cli.main(drawn) == 0
+    words = (folder / "figure1.txt").read_text()
+    assert words.startswith("Error of each prediction of a measured exploration before it was")
+    assert "grid" not in words
