@@ -305,10 +305,11 @@ def test_an_exploration_lives_between_two_saves(
     postgresql_url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A launch whose lease has run out is taken for lost, and its session ended in a save."""
-    monkeypatch.setattr(saving, "LEASE_SECONDS", 1.0)
+    lease = 3.0
+    monkeypatch.setattr(saving, "LEASE_SECONDS", lease)
     assert run.save(postgresql_url)
-    with Store.open(postgresql_url, 1.0) as others, Reader.open(postgresql_url) as reader:
-        end = time.monotonic() + 2.5
+    with Store.open(postgresql_url, lease) as others, Reader.open(postgresql_url) as reader:
+        end = time.monotonic() + 1.5 * lease
         while time.monotonic() < end:
             assert others.recover() == 0
             time.sleep(0.2)
