@@ -41,6 +41,7 @@ def trials(state: ServerState, params: QueryParams) -> dict[str, Any]:
     further = len(rows) > size  # in the direction of the walk; back there is where it came from
     rows = rows[1:] if backwards and further else rows[:size]
     came = after is not None or before is not None
+    earlier, later = (further, came) if backwards else (came, further)
     total = count(reader, conditions)
     matching = _matching(params, configs)
     computed = computed_columns(matching)
@@ -52,10 +53,8 @@ def trials(state: ServerState, params: QueryParams) -> dict[str, Any]:
         "total": total,
         "sort": sort,
         "order": "desc" if descending else "asc",
-        "previous": position_of(rows[0], sort)
-        if rows and (further if backwards else came)
-        else None,
-        "next": position_of(rows[-1], sort) if rows and (came if backwards else further) else None,
+        "previous": position_of(rows[0], sort) if rows and earlier else None,
+        "next": position_of(rows[-1], sort) if rows and later else None,
         "columns": shown_columns(matching, computed, sort),
         "sortable": list(COLUMNS),
         "numbers": NUMBERS,

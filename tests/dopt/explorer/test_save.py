@@ -7,7 +7,6 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ import dopt
 from dopt import Explorer, TrialSpec
 from dopt.errors import DoptError, SpecificationError
 from orchestrate.commands.doctor import trial_key
-from orchestrate.runner import saving
 from orchestrate.store import (
     Reader,
     Store,
@@ -299,25 +297,3 @@ def test_no_launch_takes_it(url: str, run: Explorer) -> None:
         assert store.claim(launch, [before["trial_key"]]) == []
         assert store.retry("all") == 0
     assert content(url) == before
-
-
-def test_an_exploration_lives_between_two_saves(
-    postgresql_url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A launch whose lease has run out is taken for lost, and its session ended in a save."""
-    lease = 3.0
-    monkeypatch.setattr(saving, "LEASE_SECONDS", lease)
-    assert run.save(postgresql_url)
-    with Store.open(postgresql_url, lease) as others, Reader.open(postgresql_url) as reader:
-        end = time.monotonic() + 1.5 * lease
-        while time.monotonic() < end:
-            assert others.recover() == 0
-            time.sleep(0.2)
-        [launch] = reader.launches()
-        assert launch.state == "running"
-        drive(run, 2)
-        assert run.save(postgresql_url)
-        run.close()
-        [launch] = reader.launches()
-        assert launch.state == "done"
-    assert "heartbeat" not in [thread.name for thread in threading.enumerate()]

@@ -1,7 +1,9 @@
-"""Saved explorations: commands, merges, pages, frames and comparisons show them."""
+"""Saved explorations: they live between saves, and commands, merges, pages and frames show them."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from analysis.tables.comparisons import compare_policies
 from dopt import Explorer, TrialSpec
 from orchestrate.__main__ import main
 from orchestrate.commands.doctor import trial_key
+from orchestrate.runner import saving
 from orchestrate.store import (
     Reader,
     Store,
@@ -41,6 +44,28 @@ def test_it_runs_until_it_is_closed(url: str, run: Explorer) -> None:
     assert state() == "running, 40 of 300 steps"
     run.close()
     assert state() == "done, 40 of 300 steps"
+
+
+def test_an_exploration_lives_between_two_saves(
+    postgresql_url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A launch whose lease has run out is taken for lost, and its session ended in a save."""
+    lease = 3.0
+    monkeypatch.setattr(saving, "LEASE_SECONDS", lease)
+    assert run.save(postgresql_url)
+    with Store.open(postgresql_url, lease) as others, Reader.open(postgresql_url) as reader:
+        end = time.monotonic() + 1.5 * lease
+        while time.monotonic() < end:
+            assert others.recover() == 0
+            time.sleep(0.2)
+        [launch] = reader.launches()
+        assert launch.state == "running"
+        drive(run, 2)
+        assert run.save(postgresql_url)
+        run.close()
+        [launch] = reader.launches()
+        assert launch.state == "done"
+    assert "heartbeat" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_commands_show_it(
