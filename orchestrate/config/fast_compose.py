@@ -74,20 +74,29 @@ class Composer:
 
     def _exchanged(self, files: _Files, choices: Sequence[Override]) -> DictConfig:
         options = [one for one in choices if files.is_section(one)]
+        composed = self._similar(files, choices, options)
+        alone = [one for one in options if composed.source(one)]
+        if len(alone) < len(options):  # other files write to the sections of the rest
+            composed = self._similar(files, choices, alone)
+        config = _restored(composed.pickled)
+        with flag_override(config, ["struct", "no_deepcopy_set_nodes"], [False, True]):
+            for one in alone:
+                source = composed.source(one)
+                if source is None:
+                    return _restored(self._compose(files, choices).pickled)
+                config[one.key_or_group] = self._section(files, source, one)
+        return config
+
+    def _similar(
+        self, files: _Files, choices: Sequence[Override], options: Sequence[Override]
+    ) -> _Composed:
+        """Return a configuration that was composed for these choices, or for other ``options``."""
         pattern = tuple(
             one.key_or_group if one in options else str(one.input_line) for one in choices
         )
         if pattern not in self._composed:
             self._composed[pattern] = self._compose(files, choices)
-        composed = self._composed[pattern]
-        sources = [composed.source(one) for one in options]
-        config = _restored(composed.pickled)
-        with flag_override(config, ["struct", "no_deepcopy_set_nodes"], [False, True]):
-            for one, source in zip(options, sources, strict=True):
-                if source is None:
-                    return _restored(self._compose(files, choices).pickled)
-                config[one.key_or_group] = self._section(files, source, one)
-        return config
+        return self._composed[pattern]
 
     def _section(self, files: _Files, source: ResultDefault, option: Override) -> DictConfig:
         """Return the content of an option that takes the place of another one."""

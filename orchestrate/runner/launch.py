@@ -10,6 +10,7 @@ from pathlib import Path
 
 from dopt.kernel import warm_up
 from dopt.run import run_trial
+from orchestrate.cli_parser import discard_output
 from orchestrate.config.argv import normalize
 from orchestrate.config.error_messages import format_error
 from orchestrate.config.grid import Grid, build_grid
@@ -131,9 +132,12 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
 
 
 def say(text: str) -> None:
-    """Print a line and flush it."""
-    sys.stdout.write(f"{without_password(text)}\n")
-    sys.stdout.flush()
+    """Print a line and flush it; the trials go on although nobody reads the output any longer."""
+    try:
+        sys.stdout.write(f"{without_password(text)}\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        discard_output()
 
 
 def _refuse(sentence: str, code: ExitCode) -> ExitCode:

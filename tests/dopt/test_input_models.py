@@ -13,8 +13,6 @@ from torch.func import jacrev
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.kernel.model import model_accelerations, network_jacobian
-from dopt.kernel.run import KernelTrial
 from dopt.models import MODELS
 from dopt.offline_fit import fit_offline
 from dopt.randomness import PLANNED_DIMENSIONS, draw
@@ -26,7 +24,7 @@ from dopt.samples import uniform_samples
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
-from tests.dopt.kernel.calls import call
+from tests.dopt.kernel.calls import model_of_kernel
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.torch_models import for_one, model_of_one
 from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES
@@ -89,18 +87,16 @@ def test_forms_of_the_information_agree(model: str, policy: dict[str, Any]) -> N
 @pytest.mark.parametrize("model", READERS)
 def test_values_and_rows_are_those_of_automatic_differentiation(model: str) -> None:
     spec = small("arm", model)
-    kernel, function = KernelTrial(spec).trial, model_of_one(spec.system, spec.model)
+    function = model_of_one(spec.system, spec.model)
     rng = np.random.default_rng(1)
     theta = draw(spec).weights + 0.1 * rng.standard_normal(len(draw(spec).weights))
     x, u = rng.standard_normal((5, 4)), 3.0 * rng.standard_normal((5, 2))
-    values = spec.model.predict(spec.system, theta, x, u)
-    for point, value in zip(np.hstack([x, u]), values, strict=True):
+    values, points = spec.model.predict(spec.system, theta, x, u), np.hstack([x, u])
+    kernel = model_of_kernel(spec, theta)
+    assert kernel.predict(points) == pytest.approx(values, rel=1e-12)
+    for point, value in zip(points, values, strict=True):
         given = (torch.tensor(theta), torch.tensor(point))
-        out, rows_value = np.empty(2), np.empty(2)
-        call(model_accelerations, kernel.plant, kernel.network, theta, point, out)
-        rows = network_jacobian(kernel.network, theta, point, rows_value)
-        assert out == pytest.approx(value, rel=1e-12)
-        assert rows_value == pytest.approx(value, rel=1e-12)
+        rows = kernel.jacobian(point)
         assert function(*given).numpy() == pytest.approx(value, rel=1e-12)
         np.testing.assert_allclose(rows, jacrev(function)(*given).numpy(), rtol=1e-9, atol=1e-12)
 

@@ -20,6 +20,7 @@ from dopt.kernel.state_structs import Covariance
 from dopt.learning import ExtendedKalman
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from tests.dopt.kernel.calls import interpreted
 from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import observed, relative_gap, transplant
@@ -134,8 +135,8 @@ def test_a_step_removes_at_most_a_share_of_an_error_and_of_its_variance(
     )
     before = float(J[0] @ J[0]) / regularization
     rows, residuals = J.copy(), e.copy()
-    whiten(covariance, rows, residuals, noise_variance, underweighting)
-    filter_step(covariance, theta, rows, residuals)
+    interpreted(whiten)(covariance, rows, residuals, noise_variance, underweighting)
+    interpreted(filter_step)(covariance, theta, rows, residuals)
     share = underweighting / (1.0 + underweighting)
     left = float((e - J @ theta)[0] / e[0])
     assert left >= share * (1 - 1e-9)

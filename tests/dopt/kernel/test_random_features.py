@@ -12,14 +12,12 @@ from dopt.forecasts import model_forecast
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
 from dopt.kernel.information.primal import dense
-from dopt.kernel.model import rows_at
-from dopt.kernel.random_features import write_row_along
 from dopt.kernel.run import KernelTrial
 from dopt.policies import POLICIES
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close
-from tests.dopt.kernel.calls import call
+from tests.dopt.kernel.calls import model_of_kernel
 from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
@@ -87,18 +85,14 @@ def test_the_inverse_information_is_that_of_all_rows_of_the_learned_parameters(p
 
 @pytest.mark.parametrize("env", ["pendulum", "arm", "quadrotor"])
 def test_change_of_the_rows_is_that_of_finite_differences(env: str) -> None:
-    fast, rng = KernelTrial(features(env)), np.random.default_rng(0)
-    plant, network, theta = fast.trial.plant, fast.trial.network, fast.state.theta
-    given, d, h = (plant, network, theta), fast.spec.system.n_states, 1e-5
+    spec, rng, h = features(env), np.random.default_rng(0), 1e-5
+    model = model_of_kernel(spec)
     for _ in range(5):
-        x, direction = rng.normal(size=d), rng.normal(size=d)
-        ends = np.stack([x + h * direction, x - h * direction])
-        ahead, behind = np.split(call(rows_at, *given, ends), 2)
-        differences = (ahead - behind) / (2.0 * h)
-        for k, expected in enumerate(differences):
-            change = np.empty(len(theta))
-            write_row_along(network, x, direction, k, change)
-            assert relative_gap(change, expected) < 1e-8
+        x, direction = rng.normal(size=(2, spec.system.n_states))
+        ahead, behind = model.jacobian(x + h * direction), model.jacobian(x - h * direction)
+        change = model.jacobian_change(x, direction[None])[0]
+        for k, expected in enumerate((ahead - behind) / (2.0 * h)):
+            assert relative_gap(change[k], expected) < 1e-8
 
 
 def test_stored_parameters_give_the_last_loss_and_keep_what_was_drawn() -> None:

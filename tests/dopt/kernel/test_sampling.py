@@ -21,6 +21,7 @@ from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from dopt.types import Array
+from tests.dopt.kernel.calls import interpreted
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
@@ -172,8 +173,9 @@ def test_the_weight_of_a_state_falls_with_its_distance_from_the_box_on_the_circl
     )
     turned = half + torch.tensor([2 * math.pi, 0.0, -2 * math.pi, 0.0])
     assert float(_domain_weights(domain, turned)) == pytest.approx(1.0)
+    weight = interpreted(domain_weight)
     for x in torch.randn(20, 4, dtype=torch.float64) * 2:
-        assert domain_weight(domain.numpy(), x.numpy()) == pytest.approx(
+        assert weight(domain.numpy(), x.numpy()) == pytest.approx(
             float(_domain_weights(domain, x)), rel=1e-12
         )
 

@@ -8,6 +8,7 @@ import pytest
 from dopt.kernel.information.primal import dense, rank_update, restore
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.state_structs import Covariance
+from tests.dopt.kernel.calls import interpreted
 from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.test_information import jacobians
 from tests.dopt.trials import trial
@@ -51,7 +52,7 @@ def test_a_negative_variance_is_mended() -> None:
     axes, _ = np.linalg.qr(rng.standard_normal((6, 6)))
     broken = axes @ np.diag([2.0, 1.0, 0.5, 0.1, 1e-3, -1e-6]) @ axes.T
     carried = covariance(broken)
-    rank_update(carried, axes[:, 5:].T.copy(), np.zeros(1), np.zeros((1, 6)))
+    interpreted(rank_update)(carried, axes[:, 5:].T.copy(), np.zeros(1), np.zeros((1, 6)))
     assert np.linalg.eigvalsh(dense(carried))[0] >= -1e-15
     assert np.linalg.norm(dense(carried) - broken, 2) < 2e-6
 
@@ -63,6 +64,6 @@ def test_restoring_keeps_what_is_definite() -> None:
     carried.pending[0] = 1e-2 * rng.standard_normal(7)
     carried.n_pending[0] = 1
     before = dense(carried)
-    restore(carried)
+    interpreted(restore)(carried)
     assert carried.n_pending[0] == 0
     assert dense(carried) == pytest.approx(before, rel=1e-12, abs=1e-12)

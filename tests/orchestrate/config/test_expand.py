@@ -126,6 +126,7 @@ def test_any_mixture_expands_as_by_hydra(sample: Sample, arguments: list[str]) -
     [
         ["env=first,second", "policy=plain,free", "env.dt=1,2"],
         ["env=first,second", "policy=cramped"],  # which writes to the section of env too
+        ["env=first,second", "policy=cramped,plain", "model=mlp,linear"],
         ["policy=plain,free", "model=shaped"],  # the defaults of which name the policy
     ],
 )
@@ -150,6 +151,22 @@ def test_each_choice_of_groups_is_composed_once(
     jobs = by_us(sample, ["env=glob(*)", "model=mlp,linear", "scale=range(50)", "seed=range(9)"])
     assert len(composed) == 4
     assert sum(jobs.values()) == 4 * 50 * 9
+
+
+def test_an_option_is_exchanged_although_another_is_not_alone_in_its_section(
+    sample: Sample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    composed: list[Sequence[Any]] = []
+    compose = fast_compose.Composer._compose
+
+    def counted(self: Any, files: Any, choices: Sequence[Any]) -> Any:
+        composed.append(choices)
+        return compose(self, files, choices)
+
+    monkeypatch.setattr(fast_compose.Composer, "_compose", counted)
+    arguments = ["policy=cramped", "env=first,second", "model=mlp,linear"]
+    assert by_us(sample, arguments) == by_hydra(sample, arguments)
+    assert len(composed) == 3  # one to find this out, and one for each env
 
 
 def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> None:
