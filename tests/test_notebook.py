@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import nbformat
 import pytest
 from nbclient import NotebookClient
@@ -34,11 +35,12 @@ def test_the_notebook_of_a_plant_runs_in_ten_cells_without_a_database(tmp_path: 
     assert float(error["data"]["text/plain"]) < 0.05
 
 
-@pytest.mark.parametrize("opened_in", ["docs", "."])
-def test_it_runs_on_two_configs_of_a_policy(
-    opened_in: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In the root of a repository and in its docs; the other configuration has as many trials."""
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the root of a repository whose database has two configurations of a policy.
+
+    The other configuration has as many trials.
+    """
     url = f"sqlite:///{tmp_path}/results/results.db"
     (tmp_path / "docs").mkdir()
     for fields in ({"horizon": 40}, {"horizon": 40, "gamma": 3.0}):
@@ -46,6 +48,20 @@ def test_it_runs_on_two_configs_of_a_policy(
         fill(url, make_grid(systems, ("d_optimal", "random"), range(6), env=fields))
     monkeypatch.delenv("DOPT_DB", raising=False)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    place = {"metadata": {"path": str(tmp_path / opened_in)}}
+    return tmp_path
+
+
+def test_it_runs_in_docs(root: Path) -> None:
+    place = {"metadata": {"path": str(root / "docs")}}
     client = NotebookClient(nbformat.from_dict(NOTEBOOK), timeout=200, resources=place)
     client.execute()  # raises what a cell raises
+
+
+def test_its_cells_run_in_the_root(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root)
+    names: dict[str, object] = {}
+    for cell in NOTEBOOK.cells:
+        if cell.cell_type == "code":
+            exec(cell.source, names)
+    assert len(plt.get_fignums()) >= 1
+    plt.close("all")

@@ -12,11 +12,15 @@ import pytest
 from analysis import cli
 from orchestrate import __main__ as orchestrate
 from orchestrate.runner import launch
+from tests.hydra_files import parse_once
 from tests.paths import ROOT
 
+parse_once()
+
 STEPS, STEPS_OF_TASK = ("env.horizon=20",), ("env.horizon=100", "+task.iterations=1")
-"""Added to each launch: what a page shows does not depend on how long its trials are, nor on how
-well its tasks are solved.
+FRAMES = ["--frames", "4"]
+"""Added to each launch and to each film: what a page shows does not depend on how long its trials
+are, nor on how well its tasks are solved.
 """
 
 
@@ -42,7 +46,7 @@ def run_typed(
 def _main(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     if words[0] == "-m":
         program = {"orchestrate": orchestrate.main, "analysis": cli.main}[words[1]]
-        return int(program(words[2:]))
+        return int(program(words[2:] + (FRAMES if words[2] == "animate" else [])))
     assert words[0] == "orchestrate/launch.py", words
     here = ["executor=inprocess" if word == "executor=local" else word for word in words[1:]]
     steps = STEPS_OF_TASK if any(word.startswith("task=") for word in here) else STEPS

@@ -9,7 +9,6 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from dopt.kernel.compiler import compiled
-from dopt.kernel.information.update import model_rows
 from dopt.kernel.structs import Trial
 from dopt.kernel.user_code import _OwnCode
 from dopt.learning.base import Array, CustomLearner, Updater
@@ -61,34 +60,28 @@ def plan(trial: Trial, t: int, u: Array) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Descent(CustomLearner):
-    """A gradient step on the newest sample."""
+class Decay(CustomLearner):
+    """Parameters that lose a share of their size at every step, whatever is observed."""
 
-    name: ClassVar[str] = "descent"
+    name: ClassVar[str] = "decay"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "tests.dopt.newcomers.learn"
 
-    learning_rate: float = 1e-4
+    share: float = 0.01
 
     def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
-        return _Updater(self.learning_rate)
+        return _Updater(self.share)
 
 
 class _Updater(Updater):
-    def __init__(self, learning_rate: float) -> None:
-        self._learning_rate = learning_rate
+    def __init__(self, share: float) -> None:
+        self._share = share
 
     def update(self, view: TrialView) -> Array:
-        x = view.states[-2]
-        error = view.predict(x[None])[0] - view.accelerations[-1]
-        return view.parameters - self._learning_rate * error @ view.jacobian(x)
+        return (1.0 - self._share) * view.parameters
 
 
 @kept
-def learn(trial: Trial, t: int, target: Array) -> None:
-    value = np.empty(target.shape[0])
-    J = model_rows(trial.plant, trial.network, trial.state.theta, trial.record.states[t], value)
-    for k in range(target.shape[0]):
-        error = value[k] - target[k]
-        for i in range(J.shape[1]):
-            trial.state.theta[i] -= trial.algorithm.learner[0] * error * J[k, i]
+def learn(trial: Trial, t: int, target: Array) -> None:  # noqa: ARG001
+    for i in range(len(trial.state.theta)):
+        trial.state.theta[i] *= 1.0 - trial.algorithm.learner[0]

@@ -23,6 +23,9 @@ from analysis.serve.app import create_app
 from analysis.serve.server import Server
 from tests.paths import ROOT
 
+PROGRAMS = ("chromium-headless-shell", "chromium")
+"""Debian's packages; the first draws the same pages in half of the time."""
+
 FLAGS = [
     "--headless",
     "--no-sandbox",
@@ -38,10 +41,10 @@ PATIENCE = 45.0
 
 def find() -> str:
     """Return the path of Chromium; skip without one, or fail where DOPT_REQUIRE_BROWSER=1."""
-    path = os.environ.get("DOPT_CHROMIUM") or shutil.which("chromium")
-    if path:
-        return path
-    message = "no chromium is installed (Debian's package, or DOPT_CHROMIUM names another one)"
+    for program in (os.environ.get("DOPT_CHROMIUM"), *PROGRAMS):
+        if program and (path := shutil.which(program)):
+            return path
+    message = f"none of {', '.join(PROGRAMS)} is installed, and DOPT_CHROMIUM names no other one"
     if os.environ.get("DOPT_REQUIRE_BROWSER") == "1":
         pytest.fail(message)
     pytest.skip(message)

@@ -22,13 +22,16 @@ def numbers(result: TrialResult) -> bytes:
     return b"".join(getattr(result, name).tobytes() for name in NUMBERS)
 
 
-@pytest.mark.parametrize(("env", "policy"), PAIRS)
-def test_the_same_trial_gives_the_same_bits_whatever_ran_before(env: str, policy: str) -> None:
-    spec = trial(env, policy, 8)
-    first = numbers(run_trial(spec))
+@pytest.mark.parametrize("policy", sorted({policy for _, policy in PAIRS}))
+def test_the_same_trial_gives_the_same_bits_whatever_ran_before(policy: str) -> None:
+    """In every system, the second time after other systems than the first time."""
+    specs = [trial(env, policy, 8) for env, one in PAIRS if one == policy]
+    first = [numbers(run_trial(spec)) for spec in specs]
     run_trial(trial("arm", "d_optimal", 9, model={"width": 11}))
     run_trial(trial("quadrotor", "oracle", 10))
-    assert numbers(run_trial(TrialSpec.from_mapping(spec.to_mapping()))) == first
+    for spec, expected in zip(reversed(specs), reversed(first), strict=True):
+        again = numbers(run_trial(TrialSpec.from_mapping(spec.to_mapping())))
+        assert again == expected, spec.system.name
 
 
 @pytest.mark.parametrize("policy", ["random", "uniform", "d_optimal", "oracle"])

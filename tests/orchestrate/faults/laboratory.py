@@ -110,9 +110,11 @@ class Laboratory:
     def complete(self, **changes: Any) -> str:
         """Give the same command once more, let it end well and return what it said.
 
-        Its trials take no time: nothing has to happen while they run.
+        Its trials take no time, and no processes of their own where it would start them itself:
+        nothing has to happen while they run.
         """
-        with self.launched(**{"seconds": 0.0, **changes}) as launched:
+        executor = "inprocess" if self.order.executor == "local" else self.order.executor
+        with self.launched(**{"seconds": 0.0, "executor": executor, **changes}) as launched:
             code = launched.end()
         assert code == 0, launched.said + launched.errors
         self.check()

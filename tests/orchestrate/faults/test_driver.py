@@ -48,7 +48,7 @@ def die_in_mid_run(laboratory: Laboratory, settings: dict[str, int]) -> None:
     before = laboratory.count()
     assert 5 <= before < laboratory.order.trials
     laboratory.check_whole()
-    said = laboratory.complete(settings=settings, executor="local")
+    said = laboratory.complete(settings=settings, executor="inprocess")
     assert f"{before} of {laboratory.order.trials} already done" in said
 
 

@@ -47,7 +47,7 @@ def test_a_killed_worker_costs_nothing(laboratory: Laboratory) -> None:
     laboratory.check()
 
 
-@pytest.mark.parametrize(("name", "then"), [("raylet", "ray"), ("gcs_server", "local")])
+@pytest.mark.parametrize(("name", "then"), [("raylet", "ray"), ("gcs_server", "inprocess")])
 def test_the_end_of_ray_frees_the_claims_and_a_rerun_completes(
     laboratory: Laboratory, name: str, then: str
 ) -> None:
