@@ -7,6 +7,7 @@ import shutil
 import site
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -16,18 +17,19 @@ from tests.paths import ROOT
 
 SOURCES = ("dopt", "hydra_plugins", "orchestrate", "analysis", "conf")
 FILES = ("pyproject.toml", "README.md", "LICENSE")
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
 
 pytestmark = pytest.mark.xdist_group("wheel")
 
 
-def run(*command: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
+def run(*command: str | Path, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run a command that does not see the repository, whatever PYTHONPATH says to this process."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     return subprocess.run(
         list(map(str, command)),
         cwd=folder,
-        env=environment,
+        env=environment | variables,
         capture_output=True,
         text=True,
         check=False,
@@ -90,10 +92,13 @@ def test_an_installed_launch_finds_its_settings_and_its_sweeper(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("program", ["dopt", "dopt-analysis", "dopt-launch"])
+@pytest.mark.parametrize("program", sorted(SCRIPTS))
 def test_an_installed_program_explains_itself(programs: Path, tmp_path: Path, program: str) -> None:
-    done = run(programs / program, "--help", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    """Even where modules of a user's own have the names of our packages, and come before them."""
+    for name in ("analysis", "orchestrate"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('the wrong module')\n")
+    done = run(programs / program, "--help", folder=tmp_path, PYTHONPATH=str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
     assert len(done.stdout.splitlines()) > 5
     wrong = run(programs / program, "--nope", folder=tmp_path)
     assert wrong.returncode == 2, wrong.stderr

@@ -207,18 +207,6 @@ def test_one_trial_of_an_experiment_is_one_whose_sweeps_are_all_decided(
     assert "1 trial, 0 done, 1 to run" in output
 
 
-def test_every_experiment_is_a_grid(command_line: Command) -> None:
-    """And a setting of one of its grids is not said to hold for the others."""
-    said = {}
-    for path in (ROOT / "conf" / "experiment").glob("*.yaml"):
-        words = (f"experiment={path.stem}", "seed=0", "launch.dry_run=true")
-        code, output, errors = command_line("-m", *words)
-        assert code == 0, errors
-        assert re.search(r"[1-9][\d,]* trials, 0 done", output)
-        said[path.stem] = output
-    assert said["beyond"].startswith("learner.forgetting applies to learner=ekf only\n")
-
-
 def test_provenance_is_written_without_passwords(command_line: Command, tmp_path: Path) -> None:
     command_line("-m", "seed=1,2", "+model.note=1", *SHORT)  # refused, and not written down
     command_line("-m", "seed=1,2", "~launch.ray", "+launch.ray={address: 'ray://u:pw@h'}", *SHORT)

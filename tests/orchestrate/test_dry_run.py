@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.orchestrate.test_command_line import SHORT, Command
+from tests.pages import commands
+from tests.paths import ROOT
 
 
 def test_a_dry_run_shows_the_grid_and_makes_no_database(
@@ -57,3 +59,21 @@ def test_width_reaches_the_model_and_a_model_without_width_runs_once(
     assert re.search(r"random +mlp .* 4 .* 1\n", output)
     assert re.search(r"random +mlp .* 8 .* 1\n", output)
     assert len(re.findall("oracle", output)) == 1
+
+
+SHOWN = {word for command in commands("launch.py") for word in command.words}
+"""Words of the commands on the pages, which ``tests/test_docs.py`` gives."""
+
+
+def test_every_experiment_is_a_grid(command_line: Command) -> None:
+    """Those of the pages are run there; a setting of one grid is not said to hold for others."""
+    said = {}
+    for path in (ROOT / "conf" / "experiment").glob("*.yaml"):
+        name = f"experiment={path.stem}"
+        if path.stem == "beyond" or name not in SHOWN:
+            code, output, errors = command_line("-m", name, "seed=0", "launch.dry_run=true")
+            assert code == 0, errors
+            assert re.search(r"[1-9][\d,]* trials, 0 done", output)
+            said[path.stem] = output
+    assert len(said) < 10
+    assert said["beyond"].startswith("learner.forgetting applies to learner=ekf only\n")
