@@ -15,6 +15,7 @@ from dopt.kernel import absent_steps
 from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.loop import advance, evaluate_next
+from dopt.kernel.outermost_code import leave_callees_out
 from dopt.kernel.pointers import (
     BETWEEN,
     OTHER_STEPS,
@@ -92,4 +93,5 @@ def compile_parts(end: str, names: Container[str]) -> None:
 
 
 if __name__ == "__main__":
+    leave_callees_out()
     compile_parts(sys.argv[1], sys.argv[2:])

@@ -1,0 +1,53 @@
+"""Machine code of the outermost functions alone, in a process that only fills the cache.
+
+Numba makes machine code of each function that it compiles, also where only other compiled functions
+call it, whose code holds it already: a third of the time. A process that calls nothing that it
+compiles can do without. Callers come out smaller, as they take in what their callees were before
+the compiler's back end rewrote them, and their numbers are the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import _dynfunc
+from numba.core.codegen import CPUCodeLibrary
+from numba.core.cpu import CPUContext
+from numba.core.targetconfig import ConfigStack
+
+_finish = CPUCodeLibrary._finalize_final_module
+_executable = CPUContext.get_executable
+
+
+def leave_callees_out() -> None:
+    """Make no machine code, from now on, of what another function's compilation asks for.
+
+    Python must not call such a function in this process.
+    """
+    CPUCodeLibrary._finalize_final_module = _finish_outermost
+    CPUContext.get_executable = _executable_of_outermost
+
+
+def _is_callee() -> bool:
+    """Tell whether what is compiled now was asked for by the compilation of another function."""
+    return len(ConfigStack()) > 1
+
+
+def _finish_outermost(library: Any) -> None:
+    """Hand a library to the compiler's back end; a callee's is only linked into its callers'."""
+    if not _is_callee():
+        _finish(library)
+        return
+    library._finalize_dynamic_globals()
+    library._verify_declare_only_symbols()
+    library._finalized = True
+
+
+def _executable_of_outermost(context: Any, library: Any, described: Any, env: Any) -> Any:
+    """Return what Python calls; of a callee an object without code by which Numba knows it."""
+    if not _is_callee():
+        return _executable(context, library, described, env)
+    library._ensure_finalized()
+    name, nowhere = described.qualname.rpartition(".")[-1], 0
+    module = described.lookup_module()
+    return _dynfunc.make_function(module, name, "", nowhere, env, (library,))
