@@ -136,17 +136,23 @@ def test_options_are_exchanged_where_nothing_else_depends_on_them(
     assert by_us(sample, arguments) == by_hydra(sample, arguments)
 
 
+def calls(monkeypatch: pytest.MonkeyPatch, method: str) -> list[Sequence[object]]:
+    """Return a list to which each call of a method of the composer adds what it composes."""
+    composed: list[Sequence[object]] = []
+    compose = getattr(fast_compose.Composer, method)
+
+    def counted(self: Any, files: Any, choices: Sequence[object]) -> Any:
+        composed.append(choices)
+        return compose(self, files, choices)
+
+    monkeypatch.setattr(fast_compose.Composer, method, counted)
+    return composed
+
+
 def test_each_choice_of_groups_is_composed_once(
     sample: Sample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    composed: list[Sequence[str]] = []
-    quick = fast_compose.Composer._quick
-
-    def counted(self: Any, files: Any, words: Sequence[str]) -> DictConfig:
-        composed.append(words)
-        return quick(self, files, words)
-
-    monkeypatch.setattr(fast_compose.Composer, "_quick", counted)
+    composed = calls(monkeypatch, "_quick")
     monkeypatch.setattr(fast_compose.Composer, "like_hydra", None)
     jobs = by_us(sample, ["env=glob(*)", "model=mlp,linear", "scale=range(50)", "seed=range(9)"])
     assert len(composed) == 4
@@ -156,14 +162,7 @@ def test_each_choice_of_groups_is_composed_once(
 def test_an_option_is_exchanged_although_another_is_not_alone_in_its_section(
     sample: Sample, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    composed: list[Sequence[Any]] = []
-    compose = fast_compose.Composer._compose
-
-    def counted(self: Any, files: Any, choices: Sequence[Any]) -> Any:
-        composed.append(choices)
-        return compose(self, files, choices)
-
-    monkeypatch.setattr(fast_compose.Composer, "_compose", counted)
+    composed = calls(monkeypatch, "_compose")
     arguments = ["policy=cramped", "env=first,second", "model=mlp,linear"]
     assert by_us(sample, arguments) == by_hydra(sample, arguments)
     assert len(composed) == 3  # one to find this out, and one for each env
