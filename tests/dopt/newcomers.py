@@ -60,14 +60,14 @@ def plan(trial: Trial, t: int, u: Array) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Decay(CustomLearner):
-    """Parameters that lose a share of their size at every step, whatever is observed."""
+class Average(CustomLearner):
+    """Every parameter follows the first observed acceleration."""
 
-    name: ClassVar[str] = "decay"
+    name: ClassVar[str] = "average"
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = "tests.dopt.newcomers.learn"
 
-    share: float = 0.01
+    share: float = 0.1
 
     def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
         return _Updater(self.share)
@@ -78,10 +78,11 @@ class _Updater(Updater):
         self._share = share
 
     def update(self, view: TrialView) -> Array:
-        return (1.0 - self._share) * view.parameters
+        return view.parameters + self._share * (view.accelerations[-1, 0] - view.parameters)
 
 
 @kept
-def learn(trial: Trial, t: int, target: Array) -> None:  # noqa: ARG001
-    for i in range(len(trial.state.theta)):
-        trial.state.theta[i] *= 1.0 - trial.algorithm.learner[0]
+def learn(trial: Trial, t: int, target: Array) -> None:  # noqa: ARG001  # the signature of all
+    theta = trial.state.theta
+    for i in range(len(theta)):
+        theta[i] += trial.algorithm.learner[0] * (target[0] - theta[i])

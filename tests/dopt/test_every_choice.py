@@ -25,7 +25,7 @@ from dopt.run import run_trial
 from dopt.spec.information_form import held_information
 from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.twin import relative_gap
-from tests.dopt.newcomers import Alternating, Decay
+from tests.dopt.newcomers import Alternating, Average
 from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES
 
 ENVS = ("arm", "mass_spring", "pendulum")
@@ -146,8 +146,8 @@ def test_a_new_policy_or_learner_is_four_files(monkeypatch: pytest.MonkeyPatch) 
     other path has to know of it.
     """
     monkeypatch.setitem(POLICIES, "alternating", Alternating)
-    monkeypatch.setitem(LEARNERS, "decay", Decay)
-    spec = combined("arm", "alternating", "mlp", "decay", "auto")
+    monkeypatch.setitem(LEARNERS, "average", Average)
+    spec = combined("arm", "alternating", "mlp", "average", "auto")
     assert spec is not None
     assert spec.config.path == "kernel"
     fast, plain = run_trial(spec), run_trial(spec, "reference")

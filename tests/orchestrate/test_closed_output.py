@@ -7,16 +7,15 @@ import sys
 from pathlib import Path
 
 from orchestrate.store import Reader
+from tests.orchestrate.test_command_line import SHORT
 from tests.paths import ROOT
-
-FEW = ("env.horizon=5", "executor=local", "launch.workers=1")
 
 
 def test_a_grid_goes_on_when_its_output_is_closed(tmp_path: Path) -> None:
     """As by ``| head``."""
     command = [sys.executable, str(ROOT / "orchestrate/launch.py"), "-m", "policy=random"]
     with subprocess.Popen(
-        [*command, "seed=0,1", *FEW], cwd=tmp_path, text=True,
+        [*command, "seed=0,1", *SHORT], cwd=tmp_path, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     ) as process:  # fmt: skip
         assert process.stdout is not None

@@ -75,5 +75,4 @@ def test_every_experiment_is_a_grid(command_line: Command) -> None:
             assert code == 0, errors
             assert re.search(r"[1-9][\d,]* trials, 0 done", output)
             said[path.stem] = output
-    assert len(said) < 10
     assert said["beyond"].startswith("learner.forgetting applies to learner=ekf only\n")

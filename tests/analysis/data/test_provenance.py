@@ -17,21 +17,9 @@ def test_the_commit_is_that_of_the_code_and_not_of_a_folder_around_it(
     """Such as the repository that holds the virtual environment of an installed copy."""
     package = tmp_path / "venv" / "analysis"
     package.mkdir(parents=True)
-    for words in (
-        ("init", "--quiet"),
-        (
-            "-c",
-            "user.name=a",
-            "-c",
-            "user.email=a@b",
-            "commit",
-            "--quiet",
-            "--allow-empty",
-            "-m",
-            "x",
-        ),
-    ):
-        subprocess.run(["git", "-C", tmp_path, *words], check=True)
+    git = ("git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b")
+    subprocess.run([*git, "init", "--quiet"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message", "x"], check=True)
     monkeypatch.setattr(provenance, "PACKAGE", package)
     state = provenance.git_state.__wrapped__
     monkeypatch.delenv("DOPT_COMMIT", raising=False)

@@ -89,7 +89,6 @@ class TestMlflow:
         costs = [row for row in RESULTS[MEASURED].assessments if row.measure == "cost"]
         assert [(one.step, one.value) for one in history] == [(c.t, c.value) for c in costs]
 
-    @pytest.mark.parametrize("url", ["sqlite"], indirect=True)
     def test_it_is_replaced_by_another_and_names_its_origin(
         self, command: Run, tmp_path: Path
     ) -> None:
