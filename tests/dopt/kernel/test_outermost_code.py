@@ -1,4 +1,4 @@
-"""Compilation without machine code of callees."""
+"""Compilation that neither optimizes callees nor makes machine code of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.cpu import CPUContext
 
-from dopt.kernel.compiler import compiled
+from dopt.kernel import outermost_code
+from dopt.kernel.compiler import compiled, contracted
 from dopt.kernel.outermost_code import leave_callees_out
 from dopt.types import CompiledFunction, Vector
 
@@ -18,15 +19,19 @@ def has_code(function: CompiledFunction) -> bool:
     return result.library._compiled_object is not None
 
 
-def test_callers_give_their_numbers_and_callees_have_no_code(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let Numba be as it is when the test has ended."""
     for owner, name in (
+        (CPUCodeLibrary, "_optimize_final_module"),
         (CPUCodeLibrary, "_finalize_final_module"),
         (CPUContext, "get_executable"),
     ):
-        monkeypatch.setattr(owner, name, getattr(owner, name))  # as they are, after this test
+        monkeypatch.setattr(owner, name, getattr(owner, name))
 
+
+@pytest.mark.usefixtures("as_before")
+def test_callers_give_their_numbers_and_callees_have_no_code() -> None:
     @compiled
     def total(values: Vector) -> float:
         result = 0.0
@@ -46,3 +51,35 @@ def test_callers_give_their_numbers_and_callees_have_no_code(
         mean(np.array([1.0, -2.0]))
     assert has_code(mean)
     assert not has_code(total)
+
+
+@pytest.mark.usefixtures("as_before")
+def test_callees_are_optimized_where_they_may_round_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    optimized: list[str] = []
+
+    def optimize(library: CPUCodeLibrary) -> None:
+        optimized.append(library.name)
+        whole(library)
+
+    whole = outermost_code._optimize
+    monkeypatch.setattr(outermost_code, "_optimize", optimize)
+
+    @compiled
+    def first(a: float, b: float, c: float) -> float:
+        return a * b + c
+
+    @contracted
+    def second(a: float, b: float, c: float) -> float:
+        return a * b + c
+
+    @compiled
+    def both(a: float, b: float, c: float) -> float:
+        return first(a, b, c) + second(a, b, c)
+
+    leave_callees_out()
+    assert both(2.0, 3.0, 4.0) == 20.0
+    assert [name for name in optimized if "first" in name] == []
+    assert len([name for name in optimized if "second" in name]) == 1
+    assert len([name for name in optimized if "both" in name]) == 1
