@@ -1,8 +1,8 @@
 """Machine code of the outermost functions alone, in a process that only fills the cache.
 
 Numba optimizes each function that it compiles, and makes machine code of it, also where only other
-compiled functions call it, whose code holds it already and is optimized as a whole: more than half
-of the time. A process that calls nothing that it compiles can do without. Callers come out smaller,
+compiled functions call it, whose code holds it already and is optimized as a whole: about half of
+the time. A process that calls nothing that it compiles can do without. Callers come out smaller,
 and their numbers are the same, up to the rounding of sums that may be taken in any order.
 """
 
