@@ -10,6 +10,7 @@ from benchmarks.trials import cartpole
 from dopt.result import TrialResult
 
 BATCH = 100
+GPU_BATCH = 1_000
 SKIPPED = 14
 """First steps of a batch, in which torch allocates and operations are recorded."""
 
@@ -25,7 +26,7 @@ def measure(quick: bool) -> list[Row]:
     if not quick:
         rows += _rows(BATCH, SKIPPED + 10)
     if not quick and torch.cuda.is_available():
-        rows += _rows(BATCH, 120, "cuda")
+        rows += _rows(BATCH, SETTLED, "cuda") + _rows(GPU_BATCH, SETTLED, "cuda")
     return rows
 
 

@@ -15,7 +15,8 @@ from dopt.evaluation import evaluation_set
 from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.dynamics import true_accelerations, true_next_states
 from dopt.reference.gaussian_process import Posterior
-from dopt.reference.recorded import recorded
+from dopt.reference.models import BatchModel
+from dopt.reference.recorded import Recorded
 from dopt.reference.steps import BatchSteps
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
@@ -47,7 +48,9 @@ class Lockstep(BatchSteps):
         self.evaluated = self.points(self.visited, self.applied)
         self.prepare(self.evaluated)
         constant = functools.partial(true_next_states, self.system, 0)
-        self._true_next_states = recorded(constant, self.device)
+        self._true_next_states = Recorded(constant)
+        known = self.model, self.evaluated.unsqueeze(0), self.n_grid
+        self._errors = Recorded(functools.partial(errors_of_model, *known))
         self.checkpoints: dict[int, Array] = {}
         self.feedbacks: dict[int, list[Feedback | None]] = {}
 
@@ -75,19 +78,11 @@ class Lockstep(BatchSteps):
         """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""
         if len(self.system.history) > 1:
             self.truth = true_accelerations(self.system, self.visited, self.applied, t)
-        squares = (self._predicted() - self.truth).square().sum(dim=-1)
-        grid, reachable = squares[:, : self.n_grid], squares[:, self.n_grid :]
-        return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
-
-    def _predicted(self) -> Tensor:
-        """Return the modelled accelerations at the evaluation points, (n, N, r)."""
         if isinstance(self.learner, Posterior):
-            return self.learner.predict_points()
-        points = self.evaluated.unsqueeze(0)
-        if self.members is None:
-            return self.model(self.theta, points)
-        each = [self.model(theta, points) for theta in self.members.unbind(1)]
-        return torch.stack(each).mean(dim=0)
+            return errors(self.learner.predict_points(), self.truth, self.n_grid)
+        learned = self.theta if self.members is None else self.members
+        found: tuple[Tensor, Tensor] = self._errors(learned, self.truth)
+        return found
 
     def step(self, t: int) -> None:
         """Take step t of every trial and record it."""
@@ -121,6 +116,23 @@ class Lockstep(BatchSteps):
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)
         return time.perf_counter()
+
+
+def errors_of_model(
+    model: BatchModel, points: Tensor, n_grid: int, theta: Tensor, truth: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return :func:`errors` at points (1, N, ·) for θ (n, q), or (n, E, q) for networks' mean."""
+    if theta.ndim == 2:
+        return errors(model(theta, points), truth, n_grid)
+    each = [model(member, points) for member in theta.unbind(1)]
+    return errors(torch.stack(each).mean(dim=0), truth, n_grid)
+
+
+def errors(predicted: Tensor, truth: Tensor, n_grid: int) -> tuple[Tensor, Tensor]:
+    """Return the RMS errors of accelerations (n, N, r) at the first points and at the others."""
+    squares = (predicted - truth).square().sum(dim=-1)
+    grid, reachable = squares[:, :n_grid], squares[:, n_grid:]
+    return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
 
 
 @torch.no_grad()

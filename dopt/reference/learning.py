@@ -14,7 +14,7 @@ from dopt.learning import Adam, AdamReplay, AdamRule, ExtendedKalman, GaussNewto
 from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.information import BatchInformation
 from dopt.reference.models import BatchModel
-from dopt.reference.recorded import recorded
+from dopt.reference.recorded import Recorded
 
 
 class BatchLearner(Protocol):
@@ -42,7 +42,7 @@ class AdamLearner:
         self.moments = torch.zeros_like(theta), torch.zeros_like(theta)
         self.n_steps = 0
         self._rule, self._theta = learner, theta
-        self._gradient = recorded(functools.partial(loss_gradient, model), theta.device.type)
+        self._gradient = Recorded(functools.partial(loss_gradient, model))
 
     def learn(self, states: Tensor, targets: Tensor) -> None:
         """Take one step on states (n, t + 1, d) and observed accelerations (n, t + 1, r)."""
@@ -138,7 +138,7 @@ class KalmanLearner:
     ) -> None:
         self._learner, self._learned, self._theta = learner, learned, theta
         self._information = information
-        self._linearized = recorded(functools.partial(linearized, learned), theta.device.type)
+        self._linearized = Recorded(functools.partial(linearized, learned))
         self._renewal = learner.renewal(theta.shape[1], regularization)
 
     def learn(self, states: Tensor, targets: Tensor) -> None:

@@ -18,7 +18,7 @@ from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.limits import BatchLimits
 from dopt.reference.planner_registry import plan_for
 from dopt.reference.planning import best_inputs, planning_columns, uniform_inputs
-from dopt.reference.recorded import recorded
+from dopt.reference.recorded import Recorded
 from dopt.reference.search import searched_inputs
 from dopt.reference.sensors import BatchSensors
 from dopt.reference.state import BatchState
@@ -39,12 +39,12 @@ class BatchSteps(BatchState):
         self.own_plan = plan_for(self, self.learner)
         if isinstance(self.config.policy, Search) and self.held is not None:
             given = self.config.policy, self.learned, self.held.noise_variance
-            self._searched = recorded(functools.partial(searched_inputs, *given), self.device)
+            self._searched = Recorded(functools.partial(searched_inputs, *given))
         columns = functools.partial(planning_columns, self.learned, self.project)
-        self._columns = recorded(columns, self.device)
+        self._columns = Recorded(columns)
         best = functools.partial(best_inputs, self.system.gamma)
-        self._best = recorded(best, self.device)
-        self._rows = recorded(self.learned.jacobian, self.device)
+        self._best = Recorded(best)
+        self._rows = Recorded(self.learned.jacobian)
         limits, self.limits = self.config.limits, None
         if limits and limits.enforced:
             self.limits = BatchLimits(self, limits, self.learner)

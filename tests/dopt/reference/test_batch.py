@@ -16,8 +16,6 @@ from tests.close import assert_close
 from tests.dopt.torch_models import for_one, model_of_one
 from tests.dopt.trials import PAIRS, trial
 
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
-
 
 class Residual(nn.Module):
     """A network of another kind: GELU units with a skip connection and a layer norm."""
@@ -126,12 +124,3 @@ def test_the_kernel_and_the_reference_start_alike() -> None:
     batch, fast = Lockstep([spec]), KernelTrial(spec)
     assert np.array_equal(batch.theta[0].numpy(), fast.state.theta)
     assert np.array_equal(batch.states[0, 0].numpy(), fast.record.states[0])
-
-
-@CUDA
-@pytest.mark.parametrize("policy", ["random", "uniform", "d_optimal"])
-def test_a_gpu_runs_the_same_trials(policy: str) -> None:
-    specs = [trial("arm", policy, seed, env={"horizon": 10}) for seed in range(3)]
-    for gpu, cpu in zip(run_trials(specs, device="cuda"), run_trials(specs), strict=True):
-        assert gpu.inputs == pytest.approx(cpu.inputs, rel=0.0, abs=1e-7 * specs[0].system.gamma)
-        assert gpu.loss == pytest.approx(cpu.loss, rel=1e-7)

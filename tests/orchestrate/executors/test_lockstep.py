@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 
 from dopt.result import TrialResult
 from dopt.run import run_trial
@@ -87,3 +88,16 @@ def test_lockstep_and_the_kernel_keep_their_trials_apart(
             "kernel",
             "reference",
         ]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
+def test_a_grid_runs_on_a_gpu(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    grid = ("-m", "env=pendulum", "policy=random,d_optimal", "seed=range(4)", "env.horizon=6")
+    device = ("executor=lockstep", "executor.device=cuda:0")
+    code, _, errors = command_line(*grid, *device, f"store.url={url}")
+    assert code == 0, errors
+    with Reader.open(url) as reader:
+        assert [config.n_done for config in reader.configs()] == [4, 4]
