@@ -26,6 +26,7 @@ from dopt import Explorer, Plant
 from dopt.errors import DoptError
 
 DT = 0.005  # s
+PATIENCE = 30.0  # s, for the first state
 MOTOR = Plant(
     states={"angle": "rad", "rate": "rad/s"},
     inputs={"voltage": "V"},
@@ -85,9 +86,9 @@ def _moved(angle: float, rate: float, voltage: float, seconds: float) -> tuple[f
 
 
 def explore(wire: socket.socket, explorer: Explorer, seconds: float) -> np.ndarray:
-    """Answer each state with an input; return the seconds that each answer took."""
+    """Answer states, for some seconds from the first; return the time that each answer took."""
     latencies: list[float] = []
-    end, motor = time.monotonic() + seconds, None
+    end, motor = time.monotonic() + PATIENCE, None
     wire.settimeout(1.0)
     while time.monotonic() < end:
         try:
@@ -95,6 +96,8 @@ def explore(wire: socket.socket, explorer: Explorer, seconds: float) -> np.ndarr
         except TimeoutError:
             continue  # the motor is not there
         start = time.perf_counter()
+        if not latencies:
+            end = time.monotonic() + seconds
         process, clock, angle, rate, voltage = STATE.unpack(datagram)
         if motor not in (None, process):
             explorer.reset()  # another process, at rest
@@ -141,7 +144,7 @@ def draw(latencies: np.ndarray, path: str) -> None:
 def main() -> None:
     """Start the motor and explore it."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seconds", type=float, default=60.0, help="from the first state")
     parser.add_argument("--journal", default="rig.jsonl")
     parser.add_argument("--loss", type=float, default=0.01, help="share of lost datagrams")
     parser.add_argument("--jitter", type=float, default=0.1, help="share of dt")
@@ -176,7 +179,7 @@ def main() -> None:
             saver.join()
         save(explorer, given.save)
         if not len(latencies):
-            raise SystemExit(f"no measurement came within {given.seconds:g} s: start the motor.")
+            raise SystemExit(f"no measurement came within {PATIENCE:g} s: start the motor.")
         median, high, longest = np.percentile(1e6 * latencies, [50, 99, 100])
         print(f"{len(latencies)} answers: {median:.0f} µs, p99 {high:.0f}, longest {longest:.0f}")
         print(explorer.counts)

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -97,3 +98,30 @@ def test_a_database_that_fails_does_not_end_it(tmp_path: Path) -> None:
     said = process.communicate(timeout=120.0)[0]
     assert process.returncode == 0
     assert "answers: " in said
+
+
+def test_the_seconds_begin_with_the_first_state(rig: object) -> None:
+    """A process that starts takes its time, and that of the exploration is not shortened by it."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as motor,
+        Explorer(rig.MOTOR, steps=50) as explorer,  # type: ignore[attr-defined]
+    ):
+        wire.bind(("127.0.0.1", 0))
+        state = rig.STATE.pack(1, 0.0, 0.0, 0.0, 0.0)  # type: ignore[attr-defined]
+        late = threading.Timer(0.3, motor.sendto, (state, wire.getsockname()))
+        late.start()
+        assert len(rig.explore(wire, explorer, seconds=0.1)) == 1  # type: ignore[attr-defined]
+        late.join()
+
+
+def test_a_motor_that_never_comes_is_not_waited_for(
+    rig: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig, "PATIENCE", 0.1)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire,
+        Explorer(rig.MOTOR, steps=50) as explorer,  # type: ignore[attr-defined]
+    ):
+        wire.bind(("127.0.0.1", 0))
+        assert len(rig.explore(wire, explorer, seconds=600.0)) == 0  # type: ignore[attr-defined]
