@@ -57,6 +57,24 @@ def planning_columns(
     return project(torch.cat([g.unsqueeze(2), DB], dim=2))
 
 
+def drawn_columns(
+    learned: LearnedDynamics,
+    project: Callable[[Tensor], Tensor],
+    theta: Tensor,
+    x: Tensor,
+    components: Tensor,
+    directions: Tensor,
+    shares: Tensor,
+) -> Tensor:
+    """Return :func:`planning_columns` for next inputs of drawn directions, (n, m).
+
+    Their norms are drawn shares of γ, (n, 1).
+    """
+    lengths = torch.linalg.vector_norm(directions, dim=1, keepdim=True)
+    next_inputs = directions * (learned.system.gamma * shares / lengths)
+    return planning_columns(learned, project, theta, x, components, next_inputs)
+
+
 def quadratic_problem(columns: Tensor, solved: Tensor) -> QuadraticProblem:
     """Return the sum of Q and of v over components k, from their :func:`planning_columns`.
 

@@ -52,21 +52,25 @@ class Recorded:
     ----------
     function : callable
         Takes tensors, returns tensors or nested tuples of them.
+    in_place : int
+        Number of its first arguments that are read where they are; the others are copied for each
+        call. They are to stay in the same memory: elsewhere, the function is recorded anew.
     """
 
-    def __init__(self, function: Function) -> None:
-        self._function = function
-        self._shapes: tuple[torch.Size, ...] = ()
+    def __init__(self, function: Function, in_place: int = 0) -> None:
+        self._function, self._in_place = function, in_place
+        self._kind: tuple[object, ...] = ()
         self._calls = 0
         self._recording: Recording | None = None
 
     def __call__(self, *arguments: Tensor) -> Any:
-        shapes = tuple(argument.shape for argument in arguments)
-        if shapes != self._shapes:
-            self._shapes, self._calls, self._recording = shapes, 0, None
+        places = [(one.data_ptr(), one.stride()) for one in arguments[: self._in_place]]
+        kind = (*places, *[argument.shape for argument in arguments])
+        if kind != self._kind:
+            self._kind, self._calls, self._recording = kind, 0, None
         self._calls += 1
         if self._recording is None and self._calls > FIRST_CALLS:
-            self._recording = Recording(self._function, arguments)
+            self._recording = Recording(self._function, arguments, self._in_place)
             return self._recording.result
         if self._recording is None or not self._recording.can_be_repeated:
             return self._function(*arguments)
@@ -86,8 +90,9 @@ class Recording:
         Whether other numbers need the same operations, and these were kept.
     """
 
-    def __init__(self, function: Function, arguments: Sequence[Tensor]) -> None:
-        self._inputs = [argument.clone() for argument in arguments]
+    def __init__(self, function: Function, arguments: Sequence[Tensor], in_place: int = 0) -> None:
+        copies = [argument.clone() for argument in arguments[in_place:]]
+        self._inputs, self._in_place = [*arguments[:in_place], *copies], in_place
         recorder = _Recorder(self._inputs)
         with recorder:
             result = function(*self._inputs)
@@ -99,8 +104,9 @@ class Recording:
     @torch.no_grad()
     def repeat(self, arguments: Sequence[Tensor]) -> Any:
         """Return what the function returns for other arguments of the same shapes."""
-        for own, argument in zip(self._inputs, arguments, strict=True):
-            own.copy_(argument)
+        if len(arguments) > self._in_place:
+            given = [*arguments[self._in_place :]]
+            torch._foreach_copy_(self._inputs[self._in_place :], given)
         if self._graph is None:
             self._call()
         else:

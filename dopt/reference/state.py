@@ -55,6 +55,8 @@ class BatchState:
         M in the space to which ``project`` maps gradients, (..., q).
     held : Information or None
         Form and λ of M.
+    learned_rows : (r,) tensor
+        Components of the derivative of the state that are learned.
     diverged : (n, 1) tensor
         Whether a trial has ended.
     noise, measurement_noise, open_loop, ties, radii : tensors
@@ -133,6 +135,7 @@ class BatchState:
         self.inputs = self._unset(n, T, self.system.n_inputs)
         self.targets = self._unset(n, T, self.system.n_learned)
         self.sampled_states = self._unset(n, T, self.system.n_states)
+        self.learned_rows = torch.tensor(self.system.learned_rows, device=self.device)
         self.diverged = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
 
     def _unset(self, *shape: int) -> Tensor:

@@ -17,7 +17,7 @@ from dopt.reference.learner_registry import batch_learner
 from dopt.reference.learning import GaussNewtonLearner, KalmanLearner
 from dopt.reference.limits import BatchLimits
 from dopt.reference.planner_registry import plan_for
-from dopt.reference.planning import best_inputs, planning_columns, uniform_inputs
+from dopt.reference.planning import best_inputs, drawn_columns, uniform_inputs
 from dopt.reference.recorded import Recorded
 from dopt.reference.search import searched_inputs
 from dopt.reference.sensors import BatchSensors
@@ -40,7 +40,7 @@ class BatchSteps(BatchState):
         if isinstance(self.config.policy, Search) and self.held is not None:
             given = self.config.policy, self.learned, self.held.noise_variance
             self._searched = Recorded(functools.partial(searched_inputs, *given))
-        columns = functools.partial(planning_columns, self.learned, self.project)
+        columns = functools.partial(drawn_columns, self.learned, self.project)
         self._columns = Recorded(columns)
         best = functools.partial(best_inputs, self.system.gamma)
         self._best = Recorded(best)
@@ -81,9 +81,7 @@ class BatchSteps(BatchState):
         if isinstance(policy, TraceLinearized):
             components = torch.arange(self.system.n_learned).to(components).expand(len(x), -1)
         ties, radii = self.ties[:, t], self.radii[:, t]
-        norms = self.system.gamma * radii[:, 1:]
-        v = ties * (norms / torch.linalg.vector_norm(ties, dim=1, keepdim=True))
-        columns = self._columns(self.theta, x, components, v)
+        columns = self._columns(self.theta, x, components, ties, radii[:, 1:])
         solved = self.information.solve(columns.flatten(1, 2).mT)
         best: Tensor = self._best(columns, solved, ties, radii[:, 0])
         return best
@@ -97,17 +95,21 @@ class BatchSteps(BatchState):
         if self.sensors:
             self.sensors.estimate(t, dt)
         system, x, u = self.system, self.states[:, t], self.sampled_inputs(t)
-        rows, at = list(system.learned_rows), x
+        at = x
         if system.integrator != "euler":
             at = 0.5 * (x + self.states[:, t + 1])
         self.sampled_states[:, t] = at
         known = known_flow(system, at, u)
-        observed = ((self.states[:, t + 1] - x) / dt - known)[:, rows]
+        observed = self._learned_of((self.states[:, t + 1] - x) / dt - known)
         if system.integrator != "euler":
             end = self.learned.next_states(self.theta, x, u, dt)
             value = self.model(self.theta, self.points(at, u).unsqueeze(1)).squeeze(1)
-            observed = observed - (((end - x) / dt - known)[:, rows] - value)
+            observed = observed - (self._learned_of((end - x) / dt - known) - value)
         self.targets[:, t] = observed
+
+    def _learned_of(self, values: Tensor) -> Tensor:
+        """Return the components that are learned, (n, r), of derivatives of states (n, d)."""
+        return values.index_select(1, self.learned_rows)
 
     def learn(self, t: int) -> None:
         """Update the parameters with the samples up to time t; diverged trials keep theirs.

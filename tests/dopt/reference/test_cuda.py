@@ -82,15 +82,23 @@ def test_a_module_on_the_cpu_is_explored_on_a_gpu() -> None:
     check_alike(spec, nn.Sequential(*layers).double())
 
 
+def check_captured(function: Recorded) -> None:
+    assert function._recording is not None
+    assert function._recording.can_be_repeated
+    assert function._recording._graph is not None
+
+
 @torch.no_grad()
 @pytest.mark.parametrize("part", ["_columns", "_best", "_rows", "_errors", "_true_next_states"])
 def test_a_graph_launches_what_a_step_calls(part: str) -> None:
-    batch = Lockstep([trial("cartpole", "d_optimal", seed) for seed in range(3)], "cuda")
+    learner = {"name": "adam"}
+    specs = [trial("cartpole", "d_optimal", seed, learner=learner) for seed in range(3)]
+    batch = Lockstep(specs, "cuda")
     for t in range(8):
         batch.step(t)
-    recording = getattr(batch, part)._recording
-    assert recording.can_be_repeated
-    assert recording._graph is not None
+    check_captured(getattr(batch, part))
+    check_captured(batch.learner._gradient)  # type: ignore[union-attr]
+    check_captured(batch.information._solve_with_rows)  # type: ignore[union-attr]
 
 
 @torch.no_grad()

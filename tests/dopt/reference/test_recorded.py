@@ -120,6 +120,21 @@ def test_a_recorded_function_gives_the_same_numbers(function: Callable[..., Any]
 
 
 @torch.no_grad()
+def test_what_is_read_in_place_may_change_there_and_may_move() -> None:
+    one, (large, _) = Recorded(lambda x, y: x @ y.mT, in_place=1), drawn(0, 4)
+    for seed in range(6):
+        _, y = drawn(seed, 4)
+        large += 1.0
+        check_equal(one(large, y), large @ y.mT)
+    assert one._recording is not None
+    assert one._recording._inputs[0] is large
+    for moved in (large.clone(), large.clone().mT.contiguous().mT, large[:, [2, 1, 0]]):
+        for seed in range(6):
+            _, y = drawn(seed, 4)
+            check_equal(one(moved, y), moved @ y.mT)
+
+
+@torch.no_grad()
 def test_a_constant_is_computed_once() -> None:
     one = Recorded(lambda x, y: x + torch.arange(3.0).cos() * (y[0] * 0.0 + 1.0))
     for seed in range(3):
