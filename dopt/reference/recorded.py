@@ -104,9 +104,9 @@ class Recording:
     @torch.no_grad()
     def repeat(self, arguments: Sequence[Tensor]) -> Any:
         """Return what the function returns for other arguments of the same shapes."""
-        if len(arguments) > self._in_place:
-            given = [*arguments[self._in_place :]]
-            torch._foreach_copy_(self._inputs[self._in_place :], given)
+        copied = slice(self._in_place, None)
+        for own, argument in zip(self._inputs[copied], arguments[copied], strict=True):
+            own.copy_(argument)
         if self._graph is None:
             self._call()
         else:
