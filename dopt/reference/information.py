@@ -75,7 +75,7 @@ class BatchInformation:
             self._inverse = self.covariance() / factor
 
     def solve(self, columns: Tensor) -> Tensor:
-        """Return M⁻¹ C, (n, s, c), for columns C (n, s, c)."""
+        """Return M⁻¹ C, (n, s, c), for columns C (n, s, c); the next call may overwrite it."""
         waiting = self._waiting
         r = waiting.shape[1]
         if r and self._matrix is not None:
