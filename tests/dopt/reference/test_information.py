@@ -53,6 +53,29 @@ def test_it_solves_as_a_fresh_factorisation_whatever_was_done(size: int) -> None
     assert information.size == size
 
 
+def test_steps_of_one_kind_are_recorded_and_stay_right_where_m_is_replaced() -> None:
+    size, rng = SMALL + 1, torch.Generator().manual_seed(0)
+    M = 0.1 * torch.eye(size, dtype=torch.float64).repeat(3, 1, 1)
+    information = BatchInformation(M)
+    for change in ("none", "scale", "replace"):
+        if change == "scale":
+            information.scale(0.5)
+            M = 0.5 * M
+        elif change == "replace":
+            M = M + torch.eye(size, dtype=torch.float64)
+            information.replace(M)
+            information.covariance()
+        for _ in range(2 * MOST_ROOTS):
+            rows = random_rows(3, 2, size, rng)
+            information.add(rows)
+            M = M + rows.mT @ rows
+            columns = torch.randn(3, size, 2, generator=rng, dtype=torch.float64)
+            assert gap(information.solve(columns), torch.linalg.solve(M, columns)) < 1e-8
+        recording = information._solve_with_rows._recording
+        assert recording is not None, change
+        assert recording.can_be_repeated, change
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_a_trial_with_an_indefinite_matrix_has_no_solution_and_the_others_keep_theirs(
     size: int,
