@@ -5,7 +5,7 @@ deciding what to call: views, and the graph of automatic differentiation. A reco
 called, below automatic differentiation, with the tensors that it was called with. Views need not be
 made again, as the memory that they look at is the same. What a repetition computes is what the
 function would compute, bit for bit. On a GPU, a CUDA graph launches all operations of a recording
-at once: to launch them one by one takes ten times longer than to compute them.
+at once: to launch them one by one takes more than ten times as long as to compute them.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Recording:
         self.result = _detached(result)
         self._calls = recorder.calls_for(self.result)
         self.can_be_repeated = recorder.can_be_repeated
-        self._graph = self._captured() if self._inputs[0].is_cuda else None
+        self._graph = self._captured() if self._calls and self._inputs[0].is_cuda else None
 
     @torch.no_grad()
     def repeat(self, arguments: Sequence[Tensor]) -> Any:

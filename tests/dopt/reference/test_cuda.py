@@ -42,7 +42,7 @@ SETTINGS: dict[str, TrialSpec] = {
 """Settings that lead to code of their own."""
 
 
-def check_alike(spec: TrialSpec, module: nn.Module | None = None, bound: float = 1e-6) -> None:
+def check_alike(spec: TrialSpec, module: nn.Module | None = None, bound: float = 1e-7) -> None:
     """Run two trials on the GPU and on the CPU, and compare what was applied, seen and learned."""
     specs = [spec, spec.with_seed(spec.seed + 1)]
     on_gpu = run_trials(specs, "cuda", module)
@@ -54,7 +54,8 @@ def check_alike(spec: TrialSpec, module: nn.Module | None = None, bound: float =
 
 @pytest.mark.parametrize("name", CASES)
 def test_every_choice_runs_on_a_gpu(name: str) -> None:
-    check_alike(CASES[name])
+    # This ascent ends on a flat top: its inputs are known to the root of the rounding.
+    check_alike(CASES[name], bound=1e-6 if CASES[name].policy.name == "gradient" else 1e-7)
 
 
 @pytest.mark.parametrize("env", KNOWN_EFFECT)

@@ -90,9 +90,9 @@ def test_a_worker_holds_nothing_at_the_end_of_its_time(sqlite_url: str, laborato
     laboratory = laboratory_at(sqlite_url, 1000, seconds=0.05)
     register(laboratory)
     start = time.monotonic()
-    with laboratory.launched(worker={"seconds": 8.0}) as worker:
+    with laboratory.launched(worker={"seconds": 5.0}) as worker:
         assert worker.end() == 3, worker.errors
-    assert time.monotonic() - start < 15.0
+    assert time.monotonic() - start < 10.0
     assert laboratory.count() > 0
     assert laboratory.count("status = 'running'") == 0
     assert laboratory.query("SELECT outcome FROM attempt WHERE outcome = 'released'") == []
