@@ -12,9 +12,11 @@ if __package__ in (None, ""):
     # Python puts a script's own folder first; the packages are in the folder above it.
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
+from dopt.garbage_collection import collect_rarely
 from orchestrate.executors.worker_environment import pin_threads
 
 pin_threads()
+collect_rarely()
 
 from orchestrate.errors import ExitCode  # noqa: E402
 from orchestrate.runner.launch import main  # noqa: E402

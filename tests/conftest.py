@@ -5,19 +5,23 @@ Here too: one database for each test, of each kind.
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
+# The collector of garbage runs less often than it does by itself: 5 % of the time of the suite, and
+# a fifth of the time in which the tests are collected.
+gc.set_threshold(100_000, 20, 50)
+
 # Otherwise pytest rewrites every test anew, and each process that a test starts compiles the
 # sources of its libraries, for seconds.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-import gc  # noqa: E402  all of these after the threads are set
-import shutil  # noqa: E402
+import shutil  # noqa: E402  all of these after the threads are set
 import signal  # noqa: E402
 import uuid  # noqa: E402
 from collections.abc import Iterator  # noqa: E402
@@ -67,12 +71,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Let the collector of garbage pass over the modules and tests, which stay to the end.
-
-    It also runs less often than it does by itself: 5 % of the time of the suite.
-    """
+    """Let the collector of garbage pass over the modules and tests, which stay to the end."""
     gc.freeze()
-    gc.set_threshold(100_000, 20, 50)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -126,7 +126,7 @@ def mark_complete(what: str) -> None:
     (CACHE_FOLDER / f"{what}.complete").touch()
 
 
-def n_complete(names: Iterable[str]) -> int:
-    """Return how many of the functions with these names are in the cache, for some signature."""
+def complete_names() -> set[str]:
+    """Return the names of the functions that are in the cache, for some signature."""
     there = {path.stem for path in CACHE_FOLDER.glob("*.complete")}
-    return len({*names} & (there | {stem.rpartition("-")[0] for stem in there}))
+    return there | {stem.rpartition("-")[0] for stem in there}

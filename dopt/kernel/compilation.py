@@ -16,7 +16,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from dopt.kernel.cache import CACHE_FOLDER, CACHE_VARIABLE, n_complete
+from dopt.kernel.cache import CACHE_FOLDER, CACHE_VARIABLE, complete_names
 
 ENDS = ("first", "last")
 """Ends of the list of parts, at which the two processes begin."""
@@ -38,7 +38,8 @@ def compile_missing(names: Sequence[str]) -> None:
     names : sequence of str
         Names of parts of the package: those of :func:`dopt.kernel.warming.kernel_parts`.
     """
-    missing = [name for name in names if not n_complete([name])]
+    there = complete_names()
+    missing = [name for name in names if name not in there]
     if not missing:
         return
     start = time.perf_counter()
@@ -51,7 +52,7 @@ def compile_missing(names: Sequence[str]) -> None:
                 said = seconds
                 _log.warning(
                     "compiling the kernel, once per machine: %d of %d parts, %.0f s",
-                    *(n_complete(missing), len(missing), seconds),
+                    *(len(complete_names() & {*missing}), len(missing), seconds),
                 )
             time.sleep(0.1)
     finally:

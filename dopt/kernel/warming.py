@@ -11,6 +11,7 @@ from functools import partial
 from types import ModuleType
 from typing import NamedTuple
 
+from dopt.garbage_collection import collect_rarely
 from dopt.kernel import absent_steps
 from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
@@ -93,5 +94,6 @@ def compile_parts(end: str, names: Container[str]) -> None:
 
 
 if __name__ == "__main__":
+    collect_rarely()
     leave_callees_out()
     compile_parts(sys.argv[1], sys.argv[2:])

@@ -159,6 +159,11 @@ class _Recorder(TorchDispatchMode):
         self._size, self._largest = 0, LARGEST[inputs[0].device.type]
         self.can_be_repeated = True
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Return False: torch would load its compiler, for a second, to keep it away from here."""
+        return False
+
     def __torch_dispatch__(
         self,
         operation: Any,

@@ -15,6 +15,7 @@ import sys
 import threading
 from multiprocessing.connection import Connection
 
+from dopt.garbage_collection import collect_rarely
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits, die_with_parent, ended_after, limit_memory
 from orchestrate.executors.live import Live
@@ -32,6 +33,7 @@ def main(descriptor: int, crash_report: int) -> None:
     faulthandler.enable(crash_report)
     die_with_parent()
     pin_threads()
+    collect_rarely()
     connection = Connection(descriptor)
     run: Run
     limits: Limits

@@ -86,6 +86,17 @@ def test_a_warm_cache_is_seen_without_the_compiler() -> None:
     subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
 
 
+def test_a_trial_of_a_warm_cache_is_run_without_the_compiler_s_rules() -> None:
+    """Numba would load them first, for a tenth of a second in every process."""
+    warm_up()
+    program = (
+        "import sys; from dopt import TrialSpec, run_trial; "
+        "run_trial(TrialSpec.from_names('pendulum', 'd_optimal')); "
+        "assert not {'numba.np.arraymath', 'numba.typed.typeddict'} & {*sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
 def test_everything_is_what_any_shipped_choice_calls() -> None:
     """That is beside what stands for parts of a user's own in numpy."""
     chosen = choices(everything=True)
