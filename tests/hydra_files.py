@@ -19,7 +19,7 @@ _parsed: dict[tuple[str, str, str, int], bytes] = {}
 
 
 def parse_once() -> None:
-    """Let launches in this process keep what they have parsed: half of Hydra's time."""
+    """Let launches in this process keep what they have parsed, and compose once."""
     setattr(ConfigRepository, "load_config", _load_config)  # noqa: B010  # mypy forbids the other way
     setattr(Hydra, "get_mode", _mode)  # noqa: B010
 
