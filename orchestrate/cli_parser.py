@@ -81,6 +81,26 @@ def positive(option: str, number: type[int] | type[float]) -> Callable[[str], fl
     return read
 
 
+def integer(option: str) -> Callable[[str], int]:
+    """Return the argument type for a whole number that a database can hold, 0 or above."""
+
+    def read(given: str) -> int:
+        try:
+            value = int(given)
+        except ValueError:
+            value = -1
+        if not 0 <= value < 2**63:
+            raise UsageError(
+                f"{option} is {given!r}, a whole number from 0 to 2^63 - 1 is expected: give one."
+            )
+        return value
+
+    return read
+
+
+LONGEST = 100 * 365 * 86_400
+"""Longest time [s] that an option takes: a hundred years."""
+
 _TIME = re.compile(r"(?:(\d+)d)?(?:(\d+)h)?(?:(\d+)m)?(?:(\d+(?:\.\d+)?)s?)?")
 
 
@@ -91,6 +111,10 @@ def length_of_time(option: str) -> Callable[[str], float]:
         found = _TIME.fullmatch(given)
         parts = [float(part or 0) for part in found.groups()] if found else [0.0] * 4
         whole = sum(part * unit for part, unit in zip(parts, (86_400, 3_600, 60, 1), strict=True))
+        if whole > LONGEST:
+            raise UsageError(
+                f"{option} is {given!r}, at most a hundred years are expected: give a shorter time."
+            )
         if not whole:
             raise UsageError(
                 f"{option} is {given!r}, a time such as 55m, 1h30m or 90s is expected: give one."

@@ -12,6 +12,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from orchestrate.cli_parser import integer
 from orchestrate.commands.command import Command
 from orchestrate.commands.display import plain, show, table
 from orchestrate.commands.filtering import add_filters
@@ -29,8 +30,8 @@ _ATTEMPT = ("attempt", "launch", "outcome", "cause", "node", "ended", "wall s", 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("trial", metavar="TRIAL", nargs="?", help="first digits of the trial's key")
     add_filters(parser)
-    parser.add_argument("--width", type=int, help="the trial of this width")
-    parser.add_argument("--seed", type=int, help="the trial of this seed")
+    parser.add_argument("--width", type=integer("--width"), help="the trial of this width")
+    parser.add_argument("--seed", type=integer("--seed"), help="the trial of this seed")
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:

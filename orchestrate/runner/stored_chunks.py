@@ -65,6 +65,8 @@ class StoredChunks(Chunks):
     ----------
     left : int
         Trials of the database without an outcome, as of the last look.
+    left_here : int
+        Those of them that this worker can run, or could if another worker gave them back.
     """
 
     def __init__(
@@ -76,7 +78,7 @@ class StoredChunks(Chunks):
         warn: Callable[[str], None],
     ) -> None:
         super().__init__([], seconds, slots)
-        self.left = 0
+        self.left = self.left_here = 0
         self._store = store
         self._length = length
         self._end = None if length is None else time.monotonic() + length
@@ -91,9 +93,11 @@ class StoredChunks(Chunks):
         start = time.monotonic()
         self._store.recover()
         open_configs = self._store.open_configs()
-        self.left = sum(config.pending + config.running for config in open_configs)
         kinds = (self._kind(config) for config in open_configs)
         self._kinds = {kind.first.config_key: kind for kind in kinds if kind is not None}
+        counts = {config.config_key: config.pending + config.running for config in open_configs}
+        self.left = sum(counts.values())
+        self.left_here = sum(counts[key] for key in self._kinds)
         now = time.monotonic()
         self._next_look = now + max(REFRESH_SECONDS, 20 * (now - start))
 
@@ -126,6 +130,7 @@ class StoredChunks(Chunks):
     def observe(self, config_key: str, seconds: float) -> None:
         super().observe(config_key, seconds)
         self.left -= 1
+        self.left_here -= 1
         if kind := self._kinds.get(config_key):
             kind.mean = self._costs[config_key]
             kind.longest = max(seconds, kind.longest or 0.0)

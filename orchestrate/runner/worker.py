@@ -209,6 +209,6 @@ def _pull(scheduler: Scheduler, chunks: StoredChunks, leave: Leave, progress: Pr
         start = time.monotonic()
         chunks.look()
         chunks.look_for_suspects()
-        if leave.stop_requested or not chunks.left or (chunks.waiting and not len(chunks)):
+        if leave.stop_requested or not chunks.left_here or (chunks.waiting and not len(chunks)):
             return
         pause = max(POLL_SECONDS, 5 * (time.monotonic() - start))

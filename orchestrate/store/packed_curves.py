@@ -36,6 +36,12 @@ def exist(connection: Connection) -> bool:
     return inspect(connection).has_table(curve.name)
 
 
+def in_use(connection: Connection, backend: Backend) -> bool:
+    """Return whether the database has the table by now: an upgrade may run beside a launch."""
+    backend.has_curves = backend.has_curves or exist(connection)
+    return backend.has_curves
+
+
 def create(connection: Connection) -> None:
     """Create the table where there is none."""
     derived.create_all(connection)

@@ -70,8 +70,13 @@ class Store:
 
     def begin_launch(self, record: LaunchRecord) -> int:
         """Insert a launch that starts now and return its number."""
-        with self._backend.transaction() as connection:
-            return launches.begin(connection, self._backend, record)
+        token = self._backend.token()
+        try:
+            with self._backend.transaction() as connection:
+                return launches.begin(connection, self._backend, record, token)
+        except BaseException:
+            self._backend.forget(token)
+            raise
 
     def end_launch(self, launch: int, state: str, exit_code: int | None = None) -> None:
         """End a launch as "done", "failed", "interrupted" or "lost" and release its claims."""

@@ -15,7 +15,7 @@ _held: weakref.WeakSet[LaunchLocks] = weakref.WeakSet()
 @contextmanager
 def file_lock(path: Path) -> Iterator[None]:
     """Hold the lock of a file, which is created if needed; wait for other holders."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -33,7 +33,7 @@ class LaunchLocks:
 
     def acquire(self, token: str) -> None:
         """Create and lock the file of a new token."""
-        descriptor = os.open(self._path(token), os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        descriptor = os.open(self._path(token), os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._descriptors[token] = descriptor
 

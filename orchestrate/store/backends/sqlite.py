@@ -188,7 +188,8 @@ def _insert_block(n: int) -> str:
 def dead(url: URL, _: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
     """Return the launches whose process is gone, for a reader."""
     locks = LaunchLocks(_locks_folder(database_url.sqlite_path(url)))
-    return [launch for launch in launches if not locks.is_held(launch.token)]
+    with translated_file(database_url.safe(url)):
+        return [launch for launch in launches if not locks.is_held(launch.token)]
 
 
 def size(connection: Connection) -> int:

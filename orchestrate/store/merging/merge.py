@@ -86,14 +86,14 @@ def merge(url: str, other_url: str) -> Merged:
     merged = Merged()
     with Reader.open(other_url) as reader, reader.moment() as moment, Store.open(url) as store:
         store.recover()
-        source, configs = Source(moment), dict[str, int]()
+        source = Source(moment)
         with store._backend.transaction() as connection:
             store._backend.exclusive(connection)
             launches, merged.launches = add_launches(connection, source.launches())
         for page in source.pages():
             with store._backend.transaction() as connection:
                 store._backend.exclusive(connection)
-                target = Target(connection, store._backend, source, launches, configs)
+                target = Target(connection, store._backend, source, launches)
                 found = _merge_page(target, page)
             _count(merged, found)
     return merged
@@ -131,7 +131,7 @@ def _merge_trial(target: Target, page: Page, row: dict[str, Any], here: Row[Any]
             return "kept"
         target.clear(here)
     attempts = target.new_attempts(page.attempts[row["trial_id"]], here)
-    if here is not None and not finished and not attempts:
+    if here is not None and row["status"] != "done" and not attempts:
         return "kept"  # it was merged before, and a new run was requested here since
     target.add(row, here, attempts, curve)
     return "added"

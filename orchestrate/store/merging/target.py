@@ -25,6 +25,7 @@ from orchestrate.store.schema import (
 )
 from orchestrate.store.schema import step as step_table
 from orchestrate.store.schema import trajectory as trajectory_table
+from orchestrate.store.write.results import insert_error
 
 _COPIED = ("status", *OUTCOME_COLUMNS)
 _NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
@@ -60,13 +61,12 @@ class Target:
         backend: Backend,
         source: Source,
         launches: Mapping[int, int],
-        configs: dict[str, int],
     ) -> None:
         self._connection = connection
         self._backend = backend
         self._source = source
         self._launches = launches
-        self._configs = configs  # config_id here by key, filled on the way
+        self._configs: dict[str, int] = {}  # config_id here by key, filled on the way
         self._added: list[_Added] = []
 
     def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
@@ -118,7 +118,7 @@ class Target:
                     {"trial_id": trial_id, "t": t, "measure": measure, "value": value}
                     for t, measure, value in one.curve.assessments
                 ]
-        if self._backend.has_curves:
+        if packed_curves.in_use(self._connection, self._backend):
             packed_curves.write(self._connection, curves)
         for table, rows in (
             (attempt, attempts),
@@ -213,8 +213,7 @@ class Target:
         if here is None:
             values = self._source.error(digest)
             del values["error_id"]
-            adding = insert(error).values(values).returning(error.c.error_id)
-            here = self._connection.execute(adding).scalar_one()
+            return insert_error(self._connection, values)
         return int(here)
 
 

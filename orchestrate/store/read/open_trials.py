@@ -72,9 +72,10 @@ def _attempts(trial: str, condition: str) -> str:
 
 
 _LOST = "a.outcome = 'lost'"
+# A query of its own that refers to no trial, so that it is carried out once.
 _LONE = (
-    f"{_LOST} AND NOT EXISTS (SELECT 1 FROM attempt b WHERE b.launch_id = a.launch_id "
-    "AND b.outcome = 'lost' AND b.trial_id <> a.trial_id)"
+    f"{_LOST} AND a.launch_id IN (SELECT b.launch_id FROM attempt b WHERE b.outcome = 'lost' "
+    "GROUP BY b.launch_id HAVING min(b.trial_id) = max(b.trial_id))"
 )
 _CRASHES = _attempts("r", "a.cause IN ('killed', 'out of memory')")
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Select, delete, insert, select, update
 
+from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Claim
 from orchestrate.store.schema import (
@@ -111,9 +112,12 @@ def retry(
     which = which & trial.c.config_id.not_in(explored)
     if trial_keys is not None:
         which = which & trial.c.trial_key.in_(backend.members(trial_keys))
-    chosen = select(trial.c.trial_id).where(which)
-    packed = (curve,) if backend.has_curves else ()
+    pending = {"status": "pending", **dict.fromkeys((*OUTCOME_COLUMNS, "launch_id", "error_id"))}
+    reset = update(trial).where(which).values(pending).returning(trial.c.trial_key)
+    keys = list(connection.execute(reset).scalars())
+    # By the keys: a launch may write another outcome of the same status meanwhile.
+    chosen = select(trial.c.trial_id).where(trial.c.trial_key.in_(backend.members(keys)))
+    packed = (curve,) if packed_curves.in_use(connection, backend) else ()
     for table in (step, trajectory, assessment, *packed):
         connection.execute(delete(table).where(table.c.trial_id.in_(chosen)))
-    pending = {"status": "pending", **dict.fromkeys((*OUTCOME_COLUMNS, "launch_id", "error_id"))}
-    return connection.execute(update(trial).where(which).values(pending)).rowcount
+    return len(keys)

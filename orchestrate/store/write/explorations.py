@@ -54,6 +54,7 @@ def save(
     Where the database holds more steps of it, nothing is written and None is returned. Raises
     ``StoreError`` if the database holds another exploration of the same key.
     """
+    backend.exclusive(connection)  # before any row is locked, as everywhere
     renew(connection, backend, launch_id)
     if last is None or last.n_steps > len(result.loss) or not _is_mine(connection, last):
         last = _take(connection, backend, launch_id, spec, result)
@@ -132,7 +133,7 @@ def _write_steps(
         steps, n_stored = np.concatenate([steps, missing]), 0
         connection.execute(delete(step).where(step.c.trial_id == trial_id))
     backend.insert_steps(connection, trial_id, steps[n_stored:], n_stored)
-    if backend.has_curves:
+    if packed_curves.in_use(connection, backend):
         packed_curves.write(connection, [(trial_id, rows.claim.attempt, steps)])
 
 

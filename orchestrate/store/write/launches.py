@@ -14,13 +14,12 @@ from orchestrate.store.serialization import now
 from orchestrate.store.write.claims import free_claims
 
 
-def begin(connection: Connection, backend: Backend, record: LaunchRecord) -> int:
+def begin(connection: Connection, backend: Backend, record: LaunchRecord, token: str) -> int:
     """Insert a running launch and return its number.
 
     The launch holds its lock or lease before the transaction ends, so that no other process finds
     it without one and takes it for dead.
     """
-    token = backend.token()
     statement = insert(launch).values(
         token=token,
         state="running",

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection, delete, or_, select, union
 
+from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.schema import (
     ENDED,
@@ -35,7 +36,7 @@ def prune(connection: Connection, backend: Backend, trial_keys: Sequence[str]) -
         .with_for_update()
     )
     found = list(connection.execute(chosen).scalars())
-    packed = (curve,) if backend.has_curves else ()
+    packed = (curve,) if packed_curves.in_use(connection, backend) else ()
     for table in (step, trajectory, assessment, *packed, attempt, trial):
         connection.execute(delete(table).where(table.c.trial_id.in_(found)))
     return len(found)
@@ -48,4 +49,10 @@ def prune_unused(connection: Connection, backend: Backend) -> None:
     connection.execute(delete(config).where(~used.exists()))
     named = (select(table.c.error_id) for table in (trial, attempt))
     kept = union(*(one.where(one.selected_columns.error_id.is_not(None)) for one in named))
-    connection.execute(delete(error).where(error.c.error_id.not_in(kept)))
+    unused = error.c.error_id.not_in(kept)
+    # Locked first: a trial that fails now may refer to one of them before it can be deleted.
+    locked = select(error.c.error_id).where(unused).with_for_update(skip_locked=True)
+    found = list(connection.execute(locked).scalars())
+    for start in range(0, len(found), PAGE):
+        page = found[start : start + PAGE]
+        connection.execute(delete(error).where(error.c.error_id.in_(page), unused))

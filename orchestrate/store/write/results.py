@@ -29,7 +29,6 @@ from orchestrate.store.schema import (
     STEP_VALUES,
     assessment,
     attempt,
-    error,
     trajectory,
     trial,
 )
@@ -86,11 +85,12 @@ _SET_ERROR = (
 )
 _INSERT_TRAJECTORY = insert(trajectory)
 _INSERT_ASSESSMENT = insert(assessment)
+# An update locks a row that exists, so that none that is referred to can be pruned meanwhile.
 _INSERT_ERROR = text(
     "INSERT INTO error (hash, type, message, traceback) "
-    "VALUES (:hash, :type, :message, :traceback) ON CONFLICT (hash) DO NOTHING"
+    "VALUES (:hash, :type, :message, :traceback) "
+    "ON CONFLICT (hash) DO UPDATE SET hash = excluded.hash RETURNING error_id"
 )
-_ERROR_ID = select(error.c.error_id).where(error.c.hash == bindparam("hash"))
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def write(connection: Connection, backend: Backend, rows: PreparedRows) -> bool:
         return False
     check_horizon(rows.claim.trial_key, len(rows.steps), horizon)
     backend.insert_steps(connection, rows.claim.trial_id, rows.steps)
-    if backend.has_curves:
+    if packed_curves.in_use(connection, backend):
         packed_curves.write(connection, [(rows.claim.trial_id, rows.claim.attempt, rows.steps)])
     connection.execute(_INSERT_TRAJECTORY, rows.trajectory)
     if rows.assessments:
@@ -220,5 +220,9 @@ def _error_id(connection: Connection, failure: Failure) -> int:
         "traceback": storable(without_password(failure.traceback)),
     }
     row["hash"] = hashlib.sha256("\0".join(row.values()).encode()).hexdigest()
-    connection.execute(_INSERT_ERROR, row)
-    return int(connection.execute(_ERROR_ID, {"hash": row["hash"]}).scalar_one())
+    return insert_error(connection, row)
+
+
+def insert_error(connection: Connection, row: Mapping[str, Any]) -> int:
+    """Insert a traceback unless it is there, and return its id."""
+    return int(connection.execute(_INSERT_ERROR, row).scalar_one())

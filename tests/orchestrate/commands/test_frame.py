@@ -74,7 +74,7 @@ def test_every_command_has_help_and_the_common_options(command: Command, capsys:
         (["query", "SELECT 1", "--limit", "0"], "a whole number above 0 is expected"),
         (["query", "SELECT 1", "--timeout", "nan"], "a number above 0 is expected"),
         (["status", "--watch", "soon"], "a number above 0 is expected"),
-        (["show", "--seed", "one"], "see python -m orchestrate show --help"),
+        (["show", "--seed", "one"], "a whole number from 0 to 2^63 - 1 is expected"),
         (["export", "curves", "--out", "x", "--format", "parket"], "did you mean 'parquet'?"),
         (["export", "curves", "--out", "curves.xlsx"], "give --format"),
         (["status", "--db", "results.db"], "The database URL cannot be read"),

@@ -146,6 +146,7 @@ class TestPrune:
             (["SELECT seed FROM trial", "--yes"], "columns seed, trial_key is expected"),
             (["DELETE FROM trial", "--yes"], "failed"),
             (["--older-than", "soon", "--yes"], "a time such as"),
+            (["--older-than", "99999999999d", "--yes"], "at most a hundred years"),
         ],
     )
     def test_a_wrong_rule_is_refused(

@@ -120,6 +120,8 @@ def test_choices_name_the_columns_in_which_they_differ(command: Run, store: Stor
         (["ffffffffffffffff"], "There is no trial with a key that starts with ffff"),
         (["xyzt"], "first 4 hexadecimal digits"),
         (["--seed", "99"], "There is no trial with these names"),
+        (["--seed", "9" * 20], "a whole number from 0 to 2^63 - 1 is expected"),
+        (["--width", "-1"], "a whole number from 0 to 2^63 - 1 is expected"),
         (["--policy", "randon"], "did you mean 'random'?"),
     ],
 )

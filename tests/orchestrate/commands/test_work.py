@@ -128,6 +128,18 @@ def test_what_does_not_go_with_leaving_is_refused(
     assert named in err
 
 
+@pytest.mark.timeout(60)
+def test_a_worker_ends_when_the_rest_cannot_run_here(
+    command_line: Run, pull: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command_line(*GRID, LEAVE)
+    monkeypatch.setattr("orchestrate.runner.stored_chunks.memory_of_this_machine", lambda: 10)
+    code, out, err = pull("work")
+    assert code == 3
+    assert "6 left" in out
+    assert "3 trials are left to other workers" in err
+
+
 def test_a_worker_makes_no_database(pull: Run, tmp_path: Path) -> None:
     code, _, err = pull("work")
     assert code == 2

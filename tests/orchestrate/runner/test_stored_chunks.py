@@ -126,7 +126,7 @@ def test_what_this_machine_cannot_build_is_left_to_others(
     monkeypatch.setattr("orchestrate.runner.stored_chunks.memory_of_this_machine", lambda: 10)
     chunks, said = build(trials_of("random", 4), {})
     assert len(chunks) == 0
-    assert (chunks.left, chunks.waiting) == (4, 0)
+    assert (chunks.left, chunks.left_here, chunks.waiting) == (4, 0, 0)
     assert said == [one for one in said if "give a lower --processes" in one]
     chunks.look()
     assert len(said) == 1

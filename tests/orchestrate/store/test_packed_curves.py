@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from orchestrate.store import Claim, Reader, Store, StoreUnavailableError, examine, upgrade
 from orchestrate.store.schema import STEP_VALUES
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, FakeResult, Spec, diverged, result
 from tests.orchestrate.store.places import execute
 
 Take = Callable[..., list[Claim]]
@@ -103,3 +104,31 @@ def test_a_database_without_the_table_takes_results(url: str) -> None:
         (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
         assert store.commit(claim, result(), RUN)
         np.testing.assert_array_equal(reader.curves(Spec().config_key).values[0], result().loss)
+
+
+class Explored(Spec):
+    @property
+    def config_json(self) -> str:
+        return '{"env":{"loss":"prequential"}}'
+
+
+def test_an_exploration_is_read_after_an_upgrade_beside_its_session(url: str) -> None:
+    with Store.open(url):
+        execute(url, "DROP TABLE curve")  # as in a database of an older program
+    with Store.open(url) as store:
+        launch = store.begin_launch(LAUNCH)
+        last = store.save(launch, Explored(), first_steps(3), RUN)
+        assert upgrade(url).packed == 1
+        store.save(launch, Explored(), first_steps(5), RUN, last)
+        store.end_launch(launch, "done")
+    with Reader.open(url) as reader:
+        found = reader.curves(Explored().config_key).values
+    np.testing.assert_array_equal(found, [result().loss[:5]])
+
+
+def first_steps(n: int) -> FakeResult:
+    """Return a result that has come to its first n steps."""
+    whole = result()
+    cut = {name: getattr(whole, name)[:n] for name in (*STEP_VALUES, "inputs")}
+    final = float(whole.loss[n - 1])
+    return replace(whole, **cut, states=whole.states[: n + 1], n_steps=n, final_loss=final)

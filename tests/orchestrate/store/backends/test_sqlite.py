@@ -6,6 +6,7 @@ import os
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import event
@@ -20,6 +21,7 @@ from orchestrate.store import (
     StoreUnavailableError,
 )
 from orchestrate.store.backends.sqlite_engine import _is_read_only, _read_mode
+from orchestrate.store.write import launches
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import eight_open
 
@@ -143,6 +145,33 @@ def test_a_forked_worker_does_not_keep_the_launch_alive(store: Store, url: str) 
         os.close(wakes)
         os.close(waits)
         os.waitpid(child, 0)
+
+
+def test_a_launch_that_could_not_begin_leaves_no_lock(
+    store: Store, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = launches.begin
+
+    def fail(*given: Any) -> int:
+        begin(*given)
+        raise OSError(28, "no space left")
+
+    monkeypatch.setattr(launches, "begin", fail)
+    descriptors = len(list(Path("/proc/self/fd").iterdir()))
+    with pytest.raises(OSError, match="no space left"):
+        store.begin_launch(LAUNCH)
+    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
+    assert not list(path.with_name("results.db-locks").glob("launch-*"))
+
+
+def test_a_group_may_share_a_database(tmp_path: Path) -> None:
+    mask = os.umask(0o002)
+    try:
+        with Store.open(f"sqlite:///{tmp_path}/shared/results.db"):
+            lock = tmp_path / "shared" / "results.db-locks" / "create"
+            assert lock.stat().st_mode & 0o777 == 0o664
+    finally:
+        os.umask(mask)
 
 
 def test_two_names_of_one_file_share_their_locks(store: Store, path: Path) -> None:

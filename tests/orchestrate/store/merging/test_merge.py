@@ -166,11 +166,14 @@ def test_a_result_takes_the_place_of_a_failure_and_not_the_other_way(url: str, o
         assert [row.attempt for row in rows] == [2, 1, 2]
 
 
-def test_a_failure_that_is_to_run_again_does_not_come_back(url: str, other: str) -> None:
-    fill(other, *seeds(2), Spec(99))
+@pytest.mark.parametrize(("seed", "status"), [(1, "diverged"), (2, "failed")])
+def test_what_is_to_run_again_does_not_come_back(
+    url: str, other: str, seed: int, status: str
+) -> None:
+    fill(other, *seeds(seed), Spec(99))
     merge(url, other)
     with Store.open(url) as store:
-        assert store.retry("failed") == 1
+        assert store.retry(status) == 1
     assert merge(url, other).kept == 1
     with Reader.open(url) as reader:
         assert [row.status for row in reader.trials(KEY)] == ["pending"]
