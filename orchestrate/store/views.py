@@ -23,15 +23,18 @@ WHERE r.config_id = c.config_id AND s.trial_id = r.trial_id
 
 # One pass is exact enough: losses of different seeds differ by far more than 1e-6 of their mean,
 # so cancellation in the variance costs less than 1e-3 of the error. The outer CASE keeps rounding
-# from making the variance of equal losses negative.
+# from making the variance of equal losses negative. The square of a loss above 1e150 overflows, which
+# PostgreSQL refuses for the whole query: such losses, of models that diverge, have no error.
 _CURVE_STATS = """
 SELECT config_key, label, env, policy, model, learner, width, depth, t, n, n_finite, mean,
-       CASE WHEN n_finite < 2 THEN NULL
+       CASE WHEN n_finite < 2 OR n_squares < n_finite THEN NULL
             WHEN squares <= n_finite * mean * mean THEN 0.0
             ELSE sqrt((squares - n_finite * mean * mean) / (n_finite - 1) / n_finite)
        END AS standard_error
 FROM (SELECT config_key, label, env, policy, model, learner, width, depth, t,
-             count(*) AS n, count(loss) AS n_finite, avg(loss) AS mean, sum(loss * loss) AS squares
+             count(*) AS n, count(loss) AS n_finite, avg(loss) AS mean,
+             count(CASE WHEN abs(loss) < 1e150 THEN 1 END) AS n_squares,
+             sum(CASE WHEN abs(loss) < 1e150 THEN loss * loss END) AS squares
       FROM v_curve
       GROUP BY config_key, label, env, policy, model, learner, width, depth, t) AS sums
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +152,19 @@ class TestViews:
             "SELECT n_finite, standard_error FROM v_curve_stats WHERE policy='uniform' AND t=0"
         )
         assert tuple(row) == (1, None)
+
+    def test_losses_whose_square_overflows_have_no_error(
+        self, store: Store, take: Take, reader: Reader
+    ) -> None:
+        for claim in take(*(Spec(seed, policy="uniform") for seed in range(3))):
+            loss = result().loss.copy()
+            loss[2] = 1e200
+            store.commit(claim, replace(result(), loss=loss), RUN)
+        rows = reader.query(
+            "SELECT mean, standard_error FROM v_curve_stats WHERE policy = 'uniform' ORDER BY t"
+        )
+        assert math.isclose(rows[2].mean, 1e200)
+        assert [row.standard_error is None for row in rows] == [t == 2 for t in range(HORIZON)]
 
     def test_equal_curves_have_no_error(self, store: Store, take: Take, reader: Reader) -> None:
         for claim in take(*(Spec(seed, policy="uniform") for seed in range(3))):
