@@ -23,8 +23,8 @@ WHERE r.config_id = c.config_id AND s.trial_id = r.trial_id
 
 # One pass is exact enough: losses of different seeds differ by far more than 1e-6 of their mean,
 # so cancellation in the variance costs less than 1e-3 of the error. The outer CASE keeps rounding
-# from making the variance of equal losses negative. The square of a loss above 1e150 overflows, which
-# PostgreSQL refuses for the whole query: such losses, of models that diverge, have no error.
+# from making the variance of equal losses negative. The square of a loss above 1e150 overflows,
+# for which PostgreSQL refuses the whole query: such losses, of diverging models, have no error.
 _CURVE_STATS = """
 SELECT config_key, label, env, policy, model, learner, width, depth, t, n, n_finite, mean,
        CASE WHEN n_finite < 2 OR n_squares < n_finite THEN NULL
