@@ -7,6 +7,7 @@ configurations that are shown together with each other, such as ``Î³=2`` and ``Î
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
@@ -80,8 +81,10 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
     """Return a label for each configuration that says only what differs among those of its env.
 
     The policy is named where several are shown. Of the settings that differ, usual values are left
-    out, unless the label would be empty or equal to that of another configuration. A loss
-    of its own and limits are always named, the bounds only where they differ.
+    out, unless the label would be empty or equal to that of another configuration. Of a user's
+    class whose defaults are unknown, a value is left out where all that have this class share it;
+    its path and digest are named only where nothing else differs. A loss of its own and limits are
+    always named, the bounds only where they differ.
     """
     flats = [flatten(completed(config)) for config in configs]
     titled = len({flat.get("policy.name") for flat in flats}) > 1
@@ -98,19 +101,58 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
 def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[str]:
     """Return the labels of the configurations of one environment."""
     paths = [path for path in _paths(flats) if len({repr(flat.get(path)) for flat in flats}) > 1]
+    rows = [
+        _choices(flat, _with_shared(flat, own, flats), own, paths, flats, titled)
+        for flat, own in zip(flats, usual, strict=True)
+    ]
+    counts = [Counter(column) for column in zip(*rows, strict=True)]
+    return [
+        next((text for text, n in zip(row, counts, strict=True) if n[text] == 1), row[-1])
+        for row in rows
+    ]
+
+
+def _choices(
+    flat: Flat,
+    usual: Flat,
+    own: Flat,
+    differing: Sequence[str],
+    flats: Sequence[Flat],
+    titled: bool,
+) -> list[str]:
+    """Return the labels that a configuration may have, of which the first that is unique is taken.
+
+    ``usual`` holds the values that are not named where they differ, and ``own`` the defaults.
+    """
+    paths = [path for path in differing if not _is_origin(path)]
     common = [path for path in paths if all(path in flat for flat in flats)]
-    rows = []
-    for flat, own in zip(flats, usual, strict=True):
-        title = [_title(flat)] if titled or not paths else []
-        words = _words(flat, [path for path in paths if _is_unusual(path, flat, own)])
-        brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
-        whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
-        rest = [path for path in _paths([flat]) if path in _ALWAYS and path not in paths]
-        always = [path for path in rest if _is_unusual(path, flat, own)]
-        brief, whole = ([*one, *_words(flat, always)] for one in (brief, whole))
-        rows.append((", ".join(brief), ", ".join(whole)))
-    counts = Counter(brief for brief, _ in rows)
-    return [brief if counts[brief] == 1 else whole for brief, whole in rows]
+    title = [_title(flat)] if titled or not paths else []
+    words = _words(flat, [path for path in paths if _is_unusual(path, flat, usual)])
+    brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
+    whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
+    rest = [path for path in _paths([flat]) if path in _ALWAYS and path not in paths]
+    always = _words(flat, [path for path in rest if _is_unusual(path, flat, own)])
+    origins = [path for path in differing if _is_origin(path) and _is_unusual(path, flat, usual)]
+    origin = _words(flat, origins)
+    ends = (brief, always), (whole, always), (brief, always, origin), (whole, always, origin)
+    return [", ".join(itertools.chain(*parts)) for parts in ends]
+
+
+def _is_origin(path: str) -> bool:
+    """Return whether a path names the class or the file of a section."""
+    return path.rpartition(".")[2] in (SOURCE, TARGET)
+
+
+def _with_shared(flat: Flat, usual: Flat, flats: Sequence[Flat]) -> Flat:
+    """Return the usual values; of a setting without one, the value that all of its class share."""
+    found = dict(usual)
+    for path in set(flat) - set(usual):
+        section = path.partition(".")[0]
+        name = flat.get(f"{section}.name")
+        peers = [one for one in flats if name and one.get(f"{section}.name") == name]
+        if peers and all(one.get(path) == flat[path] for one in peers):
+            found[path] = flat[path]
+    return found
 
 
 def _telling(paths: Sequence[str]) -> list[str]:

@@ -108,6 +108,29 @@ def test_settings_of_a_class_that_is_not_loaded_are_told_apart() -> None:
     assert labels(boats) == ["mass=1", "mass=2"]
 
 
+def test_a_class_and_its_file_are_named_only_where_nothing_else_differs() -> None:
+    env = {"name": "boat", "_target_": "my_module.Boat", "mass": 2.0}
+    policy = {"name": "curiosity", "_target_": "my_module.Curiosity", "candidates": 32}
+    old, new = ({**section, "source": digit * 16} for section, digit in ((env, "0"), (env, "1")))
+    plain, edited = ({**PLAIN, "env": one} for one in (old, new))
+    own = {**plain, "policy": {**policy, "source": "2" * 16}}
+    many = {**own, "policy": {**policy, "source": "2" * 16, "candidates": 64}}
+    again = {**own, "policy": {**policy, "source": "3" * 16}}
+    heavy = {**edited, "env": {**new, "mass": 3.0}}
+    assert labels([plain, own]) == ["D-optimal", "curiosity"]
+    assert labels([plain, own, many]) == [
+        "D-optimal",
+        "curiosity, candidates=32",
+        "curiosity, candidates=64",
+    ]
+    assert labels([plain, heavy]) == ["mass=2", "mass=3"]
+    assert labels([plain, edited]) == [f"D-optimal, source={digit * 16}" for digit in "01"]
+    assert labels([plain, own, again]) == [
+        "D-optimal",
+        *(f"curiosity, source={digit * 16}" for digit in "23"),
+    ]
+
+
 def test_every_shipped_policy_has_a_title() -> None:
     assert set(TITLES) == set(POLICIES)
 
