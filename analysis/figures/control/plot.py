@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 
 from analysis.data.trial_selection import policy_rank
 from analysis.figures.axes import log_limits, log_scale
+from analysis.figures.legend import legend_below
 from analysis.figures.plot import Plot
 from analysis.figures.style import GUIDE, TEXT_WIDTH
 from analysis.formatting import count_text, share
@@ -66,7 +67,7 @@ def draw_control(curves: Curves) -> Figure:
         for policy in policies
     ]
     handles.append(Line2D([], [], **TRUTH, label="true model"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)))
+    legend_below(figure, min(4, len(handles)), handles=handles)
     return figure
 
 

@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 
 from analysis.figures.axes import log_limits, log_ticks, rows_and_columns
 from analysis.figures.error_budget.data import Budget
+from analysis.figures.legend import legend_below
 from analysis.figures.loss_curves.plot import loss_label
 from analysis.figures.style import TEXT_WIDTH
 from analysis.formatting import count_text, number
@@ -55,7 +56,7 @@ def draw(budgets: Sequence[Budget], units: Mapping[str, str]) -> Figure:
         axes.set_xlabel(loss_label("loss", units[part[0].env]))
     for axes in panels[len(own) :]:
         axes.remove()
-    figure.legend(handles=_handles(), loc="outside lower center", ncols=2)
+    legend_below(figure, 2, handles=_handles())
     return figure
 
 

@@ -14,6 +14,7 @@ from analysis.figures.input_spectrum.data import (
     measure_spectra,
     tabulate_spectra,
 )
+from analysis.figures.legend import legend_below
 from analysis.figures.plot import Plot
 from analysis.figures.style import COLUMN_WIDTH, GUIDE
 from analysis.formatting import count_text
@@ -58,7 +59,7 @@ def draw(spectra: InputSpectra) -> Figure:
     axes.set_ylabel(f"power spectral density of u [{unit}²/Hz]")
     _mark(axes, spectra.eigenfrequency)
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=2, fontsize=6.5)
+    legend_below(figure, 2, handles=handles[::-1], labels=labels[::-1], fontsize=6.5)
     return figure
 
 

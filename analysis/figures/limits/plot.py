@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from analysis.data.missing_trials import ranges
+from analysis.figures.legend import legend_below
 from analysis.figures.limits.data import (
     MOST_SEEDS,
     Panel,
@@ -71,7 +72,7 @@ def draw(panels: Panels) -> Figure:
     names = {kind: f"one trial, limits {WORDS[kind]}" for kind in kinds}
     handles = [Line2D([], [], color=COLOURS[kind], lw=0.8, label=names[kind]) for kind in kinds]
     handles.append(Line2D([], [], **GUIDE, label="bound"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    legend_below(figure, 3, handles=handles)
     return figure
 
 

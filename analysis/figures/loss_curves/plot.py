@@ -18,6 +18,7 @@ from analysis.data.missing_trials import why_impossible
 from analysis.data.trial_selection import policy_rank
 from analysis.figures.axes import log_scale, rows_and_columns
 from analysis.figures.axis_break import Limits, axis_parts, mark_break
+from analysis.figures.legend import legend_below
 from analysis.figures.loss_curves.data import Axis, LossCurve, measure_curves, tabulate_curves
 from analysis.figures.plot import Plot
 from analysis.figures.style import TEXT_WIDTH
@@ -79,8 +80,7 @@ def draw(numbers: Numbers) -> Figure:
         panel[0].set_ylabel(loss_label(column, shown[0].unit, shown[0].is_prequential))
     ordered = sorted(curves, key=lambda curve: policy_rank(curve.policy))
     handles = legend_handles({curve.label: curve.style for curve in ordered}, options)
-    per_row = 4 if columns > 1 else 2
-    figure.legend(handles=handles, loc="outside lower center", ncols=per_row)
+    legend_below(figure, 4 if columns > 1 else 2, handles=handles)
     return figure
 
 

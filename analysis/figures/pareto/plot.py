@@ -15,6 +15,7 @@ from matplotlib.patheffects import withStroke
 from analysis.data.divergence import DivergenceRule
 from analysis.figures.axes import log_limits, log_scale, log_ticks, rows_and_columns
 from analysis.figures.control.plot import MARKERS
+from analysis.figures.legend import legend_below
 from analysis.figures.loss_curves.plot import loss_label
 from analysis.figures.pareto.data import (
     Point,
@@ -93,10 +94,7 @@ def draw(points: Points) -> Figure:
         _panel(axes, [point for point in points if point.env == env], colours, markers)
     for axes in panels[len(environments) :]:
         axes.remove()
-    figure.legend(
-        handles=handles, loc="outside lower center", fontsize=6.5, ncols=LEGEND_COLUMNS,
-        handlelength=1.2,
-    )  # fmt: skip
+    legend_below(figure, LEGEND_COLUMNS, handles=handles, fontsize=6.5, handlelength=1.2)
     return figure
 
 

@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from analysis.figures.axes import angle_ticks, rows_and_columns
+from analysis.figures.legend import legend_below
 from analysis.figures.phase_portraits.data import (
     SEED_RULE,
     DrawnPlane,
@@ -71,7 +72,7 @@ def draw(portraits: Portraits) -> Figure:
     if last < len(panels):
         panels[-1].legend(handles=handles, loc="center")
     else:
-        figure.legend(handles=handles, loc="outside lower center", ncols=min(3, columns + 1))
+        legend_below(figure, min(3, columns + 1), handles=handles)
     return figure
 
 

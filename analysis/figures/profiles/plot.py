@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from analysis.figures.axes import log_ticks
+from analysis.figures.legend import legend_below
 from analysis.figures.plot import Plot
 from analysis.figures.profiles.data import (
     Profile,
@@ -63,7 +64,7 @@ def draw(profiles: Profiles) -> Figure:
                label=_name(one, every))
         for one in profiles
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    legend_below(figure, 3, handles=handles)
     return figure
 
 

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from analysis.data.trial_selection import policy_rank
 from analysis.figures.axes import log_limits, log_scale, value_ticks
+from analysis.figures.legend import legend_below
 from analysis.figures.plot import Plot
 from analysis.figures.sensitivity.data import (
     Line,
@@ -77,7 +78,7 @@ def draw(lines: Lines) -> Figure:
         for style in map(policy_style, sorted(policies, key=policy_rank))
     ]
     handles.append(Line2D([], [], **GUIDE, label="value elsewhere"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    legend_below(figure, 4, handles=handles)
     return figure
 
 

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.figures.axes import log_limits, log_scale, value_ticks
+from analysis.figures.legend import legend_below
 from analysis.figures.loss_curves.plot import loss_label
 from analysis.figures.plot import Plot
 from analysis.figures.style import COLUMN_WIDTH, GUIDE
@@ -76,7 +77,7 @@ def draw_costs(numbers: WidthCosts) -> Figure:
     log_scale(axes, *log_limits(np.r_[drawn, numbers.limit_us], margin=1.5))
     axes.set_ylabel("time per step [µs]")
     axes.set_title(f"{policy_style(numbers.policy).label}, {environment_title(numbers.env)}")
-    figure.legend(loc="outside lower center", ncols=2)
+    legend_below(figure, 2)
     return figure
 
 
