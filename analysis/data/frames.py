@@ -22,6 +22,7 @@ import pandas as pd
 
 from analysis.data.config_matching import Candidate, Filter, choose
 from analysis.data.learned_model import LearnedModel, learned_model
+from analysis.data.source_files import latest_sources
 from analysis.data.trial_selection import environment_rank, newest, policy_rank
 from analysis.errors import AnalysisError
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
@@ -240,7 +241,8 @@ class Results:
     def _configs(self) -> list[ConfigRow]:
         configs = self.reader.configs()
         self._wanted.check_where(configs)
-        fitting = newest([config for config in configs if self._wanted.accepts(config)])
+        current = newest([config for config in configs if self._wanted.accepts(config)])
+        fitting = latest_sources(self.reader, current)
         if not fitting:
             raise AnalysisError(
                 f"No configuration in {self.reader.safe_url} fits the request, "

@@ -21,6 +21,7 @@ from analysis.data.config_matching import (
 )
 from analysis.data.missing_trials import Compatible, Gap, absent_pairs, is_possible
 from analysis.data.selection_notes import omissions
+from analysis.data.source_files import latest_sources, source_notes
 from analysis.errors import AnalysisError
 from dopt.policies.titles import TITLES
 from dopt.spec.label import labels, value_label
@@ -175,7 +176,8 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     check_names("environment", wanted.environments, {config.env for config in configs})
     check_names("policy", wanted.policies, {config.policy for config in configs})
     wanted.check_where(configs)
-    accepted = newest([config for config in configs if wanted.accepts(config)])
+    current = newest([config for config in configs if wanted.accepts(config)])
+    accepted = latest_sources(reader, current, wanted.group_by)
     if not accepted:
         raise AnalysisError(
             f"No configuration in {reader.safe_url} fits the request, "
@@ -196,7 +198,7 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
     return Selection(
         entries,
         tuple(_gaps(entries, compatible if by_policy else None)),
-        tuple(omissions(accepted, chosen)),
+        (*omissions(accepted, chosen), *source_notes(current, chosen)),
         tuple(labelled(Entry(config, trials[config.config_key]) for config in accepted)),
         wanted.reference,
         wanted.group_by,

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.data.config_matching import Filter, difference, nearness
+from analysis.data.source_files import latest_sources
 from analysis.data.trial_selection import Entry, environment_rank, labels_of, newest, policy_rank
 from analysis.data.variants import one_each, one_world, section_text
 from analysis.errors import AnalysisError
@@ -69,11 +70,12 @@ def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
     AnalysisError
         If no environment has both.
     """
-    configs = [
+    current = [
         config
         for config in newest(list(reader.configs()))
         if wanted.accepts(config) and not is_prequential(config.config)
     ]
+    configs = latest_sources(reader, current)
     entries = [Entry(config, tuple(reader.trials(config.config_key))) for config in configs]
     names = sorted({config.env for config in configs}, key=environment_rank)
     found = [

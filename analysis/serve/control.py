@@ -6,6 +6,7 @@ from typing import Any
 
 import pandas as pd
 
+from analysis.data.source_files import latest_sources
 from analysis.data.trial_selection import Selection, environment_rank, newest
 from analysis.errors import AnalysisError
 from analysis.formatting import but_lost, number, share, within
@@ -68,7 +69,8 @@ def table(state: ServerState, params: QueryParams) -> pd.DataFrame:
 
 def _assessed(reader: Reader) -> list[ConfigRow]:
     """Return the configurations with a task."""
-    return [config for config in newest(reader.configs()) if config.config.get("task")]
+    configs = latest_sources(reader, newest(reader.configs()))
+    return [config for config in configs if config.config.get("task")]
 
 
 def _measured(

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from analysis.data.divergence import DivergenceRule
+from analysis.data.source_files import latest_sources
 from analysis.data.trial_selection import Selection, environment_rank, newest
 from analysis.errors import AnalysisError
 from analysis.figures.axis_break import axis_parts
@@ -35,7 +36,7 @@ def choices(state: ServerState, params: QueryParams) -> dict[str, Any]:
 
 def by_environment(reader: Reader) -> dict[str, list[ConfigRow]]:
     """Return the stored configurations by environment, in the paper's order."""
-    configs = newest(reader.configs())
+    configs = latest_sources(reader, newest(reader.configs()))
     names = sorted({config.env for config in configs}, key=environment_rank)
     return {env: [config for config in configs if config.env == env] for env in names}
 
