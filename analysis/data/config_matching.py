@@ -89,8 +89,9 @@ class Filter:
                     f"choose for instance one of {', '.join(near) or 'model.width, env.gamma'}."
                 )
             if not any(entry.get(path) == value for entry in flat if path in entry):
+                text = json.dumps(value, default=str)
                 raise AnalysisError(
-                    f"--where {path}={json.dumps(value)} fits no stored configuration, "
+                    f"--where {path}={text} fits no stored configuration, "
                     f"stored are {', '.join(sorted(stored))}: choose one of these."
                 )
 

@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.config_matching import Candidate, Filter, choose
+from analysis.data.arguments import request, trial_key
+from analysis.data.config_matching import Candidate, Filter, check_names, choose
 from analysis.data.learned_model import LearnedModel, learned_model
 from analysis.data.source_files import latest_sources
 from analysis.data.trial_selection import environment_rank, newest, policy_rank
@@ -75,15 +76,12 @@ def load(
     NoDatabaseError, SchemaVersionError
         If there is nothing to read, or it was written by another version of the program.
     AnalysisError
-        If nothing stored fits.
+        If ``env``, ``policy`` or ``where`` is of another kind. If a name is not stored or nothing
+        fits, the methods of the results raise it.
     """
     url = db or default_url()
-    wanted = Filter(_names(env), _names(policy), where or {})
+    wanted = request(env, policy, where)
     return Results(Reader.open(url), wanted)
-
-
-def _names(given: str | Iterable[str]) -> tuple[str, ...]:
-    return (given,) if isinstance(given, str) else tuple(given)
 
 
 class Results:
@@ -213,11 +211,11 @@ class Results:
         Raises
         ------
         AnalysisError
-            If no trial of the request has that key.
+            If it is neither a row nor a key, or no trial of the request has that key.
         QueryError
             If the trial is not finished.
         """
-        key = trial if isinstance(trial, str) else str(trial["trial_key"])
+        key = trial_key(trial)
         for config in self._configs():
             for row in self.reader.trials(config.config_key):
                 if row.trial_key == key:
@@ -240,6 +238,8 @@ class Results:
 
     def _configs(self) -> list[ConfigRow]:
         configs = self.reader.configs()
+        check_names("environment", self._wanted.environments, {config.env for config in configs})
+        check_names("policy", self._wanted.policies, {config.policy for config in configs})
         self._wanted.check_where(configs)
         current = newest([config for config in configs if self._wanted.accepts(config)])
         fitting = latest_sources(self.reader, current)

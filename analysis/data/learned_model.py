@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,11 +51,16 @@ class LearnedModel:
         Raises
         ------
         AnalysisError
-            If the last axes are not those of the system's states and inputs.
+            If they are no numbers, or not of the shapes above.
         """
         x = _rows(states, self.spec.system.n_states, "states")
         single = np.ndim(states) == 1
         u = None if inputs is None else _rows(inputs, self.spec.system.n_inputs, "inputs")
+        if u is not None and len(u) not in (1, len(x)):
+            raise AnalysisError(
+                f"inputs have {len(u)} rows and states have {len(x)}, but as many are expected: "
+                f"give one input for each state."
+            )
         values = self.spec.model.predict(self.spec.system, self.parameters, x, u)
         if u is not None:
             values = self._derivative(x, u, values)
@@ -69,7 +75,13 @@ class LearnedModel:
 
 
 def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
-    rows = np.atleast_2d(np.asarray(given, dtype=float))
+    try:
+        rows = np.atleast_2d(np.asarray(given, dtype=float))
+    except (TypeError, ValueError) as error:
+        raise AnalysisError(
+            f"{what} are {reprlib.repr(given)}, but numbers of the shape (N, {size}) or ({size},) "
+            f"are expected: give one row for each point."
+        ) from error
     if rows.ndim != 2 or rows.shape[1] != size:
         raise AnalysisError(
             f"{what} have the shape {np.shape(given)}, but (N, {size}) or ({size},) is expected: "

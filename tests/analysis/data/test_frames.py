@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,6 +115,44 @@ def test_a_model_of_no_trial_or_of_wrong_states_is_a_sentence(results: analysis.
     model = results.model(results.trials().iloc[0])
     with pytest.raises(AnalysisError, match=r"states have the shape \(3,\), but \(N, 2\)"):
         model.predict(np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("request_", "sentence"),
+    [
+        ({"where": "model.width=16"}, r"^where is 'model.width=16', .*where=\{'model.width': 16\}"),
+        ({"where": ["model.width=16"]}, r"^where is \['model.width=16'\], .*'model.width': 16\}"),
+        ({"where": {3: 4}}, r"^where is \{3: 4\}, but a mapping of dotted paths"),
+        ({"where": {"model.width": np.int64(5)}}, r"model.width=\S+ fits no stored"),
+        ({"env": 3}, r"^env is 3, but a name or a list of names is expected: write .*\]\.$"),
+        ({"policy": ["random", None]}, r"^policy is \['random', None\], but a name"),
+        ({"env": ["pendulum", "motr"]}, r"no trial of environment 'motr', choose one of cartpole"),
+        ({"policy": "greedy"}, r"no trial of policy 'greedy', choose one of"),
+    ],
+)
+def test_a_request_of_another_kind_is_a_sentence(
+    url: str, request_: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(AnalysisError, match=sentence):
+        analysis.load(url, **request_).trials()
+
+
+def test_what_is_no_trial_or_no_number_is_a_sentence(results: analysis.Results) -> None:
+    trials = results.trials()
+    for given, said in (
+        (3, "is 3"),
+        (trials.iloc[:2], "is a table of 2 rows"),
+        ({"seed": 1}, r"is \{'seed': 1\}"),
+        (None, "is None"),
+    ):
+        with pytest.raises(AnalysisError, match=rf"^The trial {said}, but one row of"):
+            results.model(given)
+    model = results.model(dict(trials.iloc[0]))
+    for states in ("x", [[1.0, 2.0], [3.0]], {"a": 1}):
+        with pytest.raises(AnalysisError, match=r"^states are .*but numbers of the shape \(N, 2\)"):
+            model.predict(states)
+    with pytest.raises(AnalysisError, match=r"^inputs have 2 rows and states have 3"):
+        model.predict(np.zeros((3, 2)), np.zeros((2, 1)))
 
 
 def test_the_error_of_a_stored_model_is_the_stored_loss(tmp_path: Path) -> None:
