@@ -143,8 +143,21 @@ def _unfinished(entries: Iterable[Entry]) -> Iterable[str]:
 
 def measure_control(reader: Reader, selection: Selection) -> tuple[ControlCurve, ...]:
     """Return a curve for each entry."""
-    truths = {env: true_model(reader, selection.of(env)) for env in selection.environments}
-    return tuple(_curve(reader, entry, truths[entry.config.env]) for entry in selection.entries)
+    with reader.moment() as moment:
+        truths = {env: true_model(moment, selection.of(env)) for env in selection.environments}
+        return tuple(_curve(moment, entry, truths[entry.config.env]) for entry in selection.entries)
+
+
+def _measured(reader: Reader, entry: Entry, *measures: str) -> list[Assessments]:
+    """Return measures of the trials that the entry holds as finished, all of one moment."""
+    seeds = [trial.seed for trial in entry.finished]
+    with reader.moment() as moment:
+        found = [moment.assessments(entry.config.config_key, measure) for measure in measures]
+    kept = [np.isin(one.seeds, seeds) for one in found]
+    return [
+        Assessments(one.seeds[rows], one.t, one.values[rows], one.diverged[rows])
+        for one, rows in zip(found, kept, strict=True)
+    ]
 
 
 def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
@@ -152,14 +165,13 @@ def true_model(reader: Reader, entries: Iterable[Entry]) -> TrueModel:
 
     Trials of one seed, environment and task share that episode.
     """
-    successes, costs = (
-        {
-            seed: value
-            for entry in entries
-            for seed, value in _first(reader.assessments(entry.config.config_key, measure)).items()
-        }
-        for measure in ("true_model_success", "true_model_cost")
-    )
+    successes: dict[int, float] = {}
+    costs: dict[int, float] = {}
+    with reader.moment() as moment:
+        for entry in entries:
+            own = _measured(moment, entry, "true_model_success", "true_model_cost")
+            for total, measured in zip((successes, costs), own, strict=True):
+                total.update(_first(measured))
     found = np.array(list(successes.values()))
     known = [seed for seed, success in successes.items() if np.isfinite(success)]
     finite = _usable(np.array([costs.get(seed, np.nan) for seed in known]))
@@ -172,8 +184,9 @@ def _first(found: Assessments) -> dict[int, float]:
 
 
 def _curve(reader: Reader, entry: Entry, truth: TrueModel) -> ControlCurve:
-    successes = reader.assessments(entry.config.config_key, "control_success")
-    ratios = relative_costs(reader, entry).values
+    with reader.moment() as moment:
+        (successes,) = _measured(moment, entry, "control_success")
+        ratios = relative_costs(moment, entry).values
     reached = np.isfinite(successes.values)
     success, success_low, success_high = _by_step(_rate, successes.values)
     cost, cost_low, cost_high = _by_step(_mean_ratio, ratios)
@@ -206,10 +219,9 @@ def relative_costs(reader: Reader, entry: Entry) -> Assessments:
     It is inf where the episode has no finite cost, and NaN where there was no episode or where the
     true model's has no finite cost, so that nothing can be said.
     """
-    key = entry.config.config_key
-    costs = reader.assessments(key, "control_cost")
-    reached = np.isfinite(reader.assessments(key, "control_success").values)
-    of_seed = _first(reader.assessments(key, "true_model_cost"))
+    measures = "control_cost", "control_success", "true_model_cost"
+    costs, successes, truths = _measured(reader, entry, *measures)
+    reached, of_seed = np.isfinite(successes.values), _first(truths)
     divisors = np.array([of_seed.get(seed, np.nan) for seed in costs.seeds.tolist()])
     divisors = np.where(_usable(divisors), divisors, np.nan)
     values = np.where(reached & ~np.isfinite(costs.values), np.inf, costs.values)
@@ -246,8 +258,10 @@ def scores_at(reader: Reader, entry: Entry, t: int) -> Scores:
 
     As in :func:`relative_costs` a lost episode has inf, and NaN where the true model's was lost.
     """
-    costs = relative_costs(reader, entry)
-    reached = np.isfinite(reader.assessments(entry.config.config_key, "control_success").values)
+    with reader.moment() as moment:
+        costs = relative_costs(moment, entry)
+        (successes,) = _measured(moment, entry, "control_success")
+    reached = np.isfinite(successes.values)
     at = costs.t == t
     seeds = costs.seeds[reached[:, at].any(axis=1)]
     column = costs.values[reached & at]

@@ -20,12 +20,13 @@ from analysis.stats.control import (
     relative_costs,
     scores_at,
     tabulate_control,
+    true_model,
 )
 from analysis.tables.comparisons import compare_control
 from analysis.tables.rendering import control_table
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.store import Reader
+from orchestrate.store import Assessments, Reader
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import fake_result, fill, make_grid
 
@@ -63,6 +64,40 @@ def test_the_numbers_are_those_of_the_trials(reader: Reader, part: Selection) ->
         assert curve.cost[j] == pytest.approx(np.exp(np.mean(np.log(costs))))
         assert curve.cost_low[j] < curve.cost[j] < curve.cost_high[j]
         assert curve.success[j] == np.mean([_value(of, t, "control_success") for of in rows])
+
+
+@pytest.mark.parametrize(
+    "measure",
+    [
+        lambda reader, part: measure_control(reader, part)[0].cost,
+        lambda reader, part: relative_costs(reader, part.entries[0]).values,
+        lambda reader, part: list(scores_at(reader, part.entries[0], 20).by_seed.items()),
+        lambda reader, part: dataclasses.astuple(true_model(reader, part.entries)),
+    ],
+)
+def test_what_is_finished_during_a_read_is_not_in_a_part_of_it(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    measure: Callable[[Reader, Selection], object],
+) -> None:
+    address, task = f"sqlite:///{tmp_path}/live.db", {"name": "control", "checkpoints": [20]}
+    specs = make_grid(("pendulum",), ("random",), range(6), **SHORT, task=task)
+    fill(address, specs, skipped=specs[2:])
+    read, left = Reader.assessments, [spec for spec in specs[2:] if spec.seed % 2]
+
+    def assessments(self: Reader, config_key: str, measure: str) -> Assessments:
+        found = read(self, config_key, measure)
+        if left:
+            fill(address, [left.pop()])
+        return found
+
+    with Reader.open(address) as reader:
+        part = control_part(select(reader, Filter()))
+        expected = measure(reader, part)
+        fill(address, specs[2::2])  # between the selection and the read
+        monkeypatch.setattr(Reader, "assessments", assessments)
+        np.testing.assert_array_equal(measure(reader, part), expected)
+    assert len(left) < 2
 
 
 def _value(rows: tuple[Assessment, ...], t: int, measure: str) -> float:
