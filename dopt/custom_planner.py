@@ -2,14 +2,85 @@
 
 from __future__ import annotations
 
-from dopt.policies.base import CustomPolicy, Planner, TaskPolicy
+from typing import Any
+
+import numpy as np
+
+from dopt.control.feedback import Feedback
+from dopt.declare.returned_part import check_returned
+from dopt.errors import SpecificationError
+from dopt.policies import POLICIES
+from dopt.policies.base import Array, CustomPolicy, Planner, TaskPolicy
 from dopt.randomness import stream
 from dopt.spec.trial import TrialSpec
+from dopt.trial_view import TrialView
+
+OVERFLOWING = 1e30
+"""Size of a parameter from which on a plan may overflow that is right."""
 
 
 def custom_planner(spec: TrialSpec) -> Planner | None:
-    """Return a new plan of a trial; None where the policy brings none."""
+    """Return a new plan of a trial; None where the policy brings none.
+
+    Raises
+    ------
+    SpecificationError
+        If a policy of a user's own returns something else.
+    """
     policy, system, rng = spec.policy, spec.system, stream(spec.seed, "planner")
+    if not isinstance(policy, CustomPolicy):
+        return None
     if isinstance(policy, TaskPolicy):
-        return policy.task_planner(system, spec.config.goal, rng)
-    return policy.planner(system, rng) if isinstance(policy, CustomPolicy) else None
+        method, plan = "task_planner", policy.task_planner(system, spec.config.goal, rng)
+    else:
+        method, plan = "planner", policy.planner(system, rng)
+    if type(policy) in POLICIES.values():
+        return plan
+    check_returned(f"policy '{policy.name}'", method, plan, Planner)
+    return _Checked(policy.name, plan)
+
+
+class _Checked(Planner):
+    """A plan of a user's own, whose inputs are finite numbers or refused."""
+
+    def __init__(self, name: str, plan: Planner) -> None:
+        self._name, self._plan = name, plan
+
+    def choose(self, view: TrialView) -> Array:
+        """Return the input that the plan chooses.
+
+        Raises
+        ------
+        SpecificationError
+            If it is none, no real numbers, or not finite while the model still is sound.
+        """
+        given: Any = self._plan.choose(view)
+        chosen = _array(given)
+        if chosen is None or chosen.dtype.kind not in "fiu":
+            raise self._wrong(given, view)
+        if not np.isfinite(chosen).all() and np.abs(view.parameters).max() < OVERFLOWING:
+            raise self._wrong(given, view)
+        return chosen
+
+    def observe(self, view: TrialView) -> None:
+        self._plan.observe(view)
+
+    def feedback(self) -> Feedback | None:
+        return self._plan.feedback()
+
+    def _wrong(self, given: object, view: TrialView) -> SpecificationError:
+        shown = " ".join(repr(given).split())
+        return SpecificationError(
+            f"choose() of the planner of policy '{self._name}' returned {shown[:80]} at step "
+            f"{view.t}, but an input of finite real numbers, shape {(view.system.n_inputs,)}, is "
+            f"expected: correct its choose()."
+        )
+
+
+def _array(given: Any) -> Array | None:
+    """Return what was given as an array; None for what is none, such as lists of two lengths."""
+    try:
+        array: Array = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError):
+        return None
+    return array

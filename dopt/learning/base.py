@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.declare.kernel_support import LEARN_IN_NUMPY, KernelPart
+from dopt.declare.returned_part import check_returned
 from dopt.errors import SpecificationError
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
@@ -67,9 +70,26 @@ class CustomLearner(Learner):
     compiled: ClassVar[bool] = True
     kernel_function: ClassVar[str] = LEARN_IN_NUMPY
 
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "updater" in cls.__dict__:
+            cls.updater = _checked(cls.updater)  # type: ignore[method-assign]
+
     @abstractmethod
     def updater(self, system: System, rng: np.random.Generator) -> Updater:
         """Return the learning of a new trial; all that is random in it comes from ``rng``."""
+
+
+def _checked(make: Callable[..., Updater]) -> Callable[..., Updater]:
+    """Return a method that makes an updater and refuses what is none."""
+
+    @functools.wraps(make)
+    def updater(self: CustomLearner, system: System, rng: np.random.Generator) -> Updater:
+        found = make(self, system, rng)
+        check_returned(f"learner '{self.name}'", "updater", found, Updater)
+        return found
+
+    return updater
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +129,9 @@ class CompiledLearner(Learner):
 def check_update(name: str, updated: Array, shape: tuple[int, ...]) -> None:
     """Raise SpecificationError if a learner has returned parameters of another shape."""
     if updated.shape != shape:
+        none = updated.shape == () and np.isnan(updated)
+        given = "None" if none else f"parameters of shape {updated.shape}"
         raise SpecificationError(
-            f"learner '{name}' returned parameters of shape {updated.shape}, but {shape} is "
-            f"expected: correct its update."
+            f"learner '{name}' returned {given}, but parameters of shape {shape} are expected: "
+            f"correct its update()."
         )

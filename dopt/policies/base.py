@@ -140,7 +140,8 @@ class Planner(ABC):
     def choose(self, view: TrialView) -> Array:
         """Return the input u_t, (m,), ‖u_t‖ ≤ γ, after t ≥ 1 steps: the first one is random.
 
-        An input that is not finite ends the trial as diverged.
+        An input that is not finite is refused, or ends the trial as diverged where the parameters
+        of the model have grown so large that a plan may overflow.
         """
 
     def observe(self, view: TrialView) -> None:  # noqa: B027  # most plans keep nothing
@@ -228,7 +229,7 @@ def check_choice(name: str, chosen: Array, t: int, system: System) -> None:
     if chosen.shape != (system.n_inputs,):
         raise SpecificationError(
             f"policy '{name}' chose an input of shape {chosen.shape} at step {t}, but "
-            f"{(system.n_inputs,)} is expected: correct its plan."
+            f"{(system.n_inputs,)} is expected: correct its choose()."
         )
     check_norms(name, chosen[None], t, system.gamma)
 

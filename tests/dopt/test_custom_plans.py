@@ -165,8 +165,15 @@ def test_an_update_of_another_size_is_refused(path: str) -> None:
 
 
 @PATHS
-def test_a_plan_that_gets_lost_ends_its_trial_alone(path: str) -> None:
-    result = run_trial(specification(policy=own("Lost")), path)
+def test_a_plan_that_gets_lost_is_refused_while_the_model_is_sound(path: str) -> None:
+    with pytest.raises(SpecificationError, match=r"returned array\(\[nan\]\) at step 5"):
+        run_trial(specification(policy=own("Lost")), path)
+
+
+@PATHS
+def test_a_plan_that_gets_lost_with_its_model_ends_its_trial_alone(path: str) -> None:
+    learner = {"name": "adam", "learning_rate": 1e40}
+    result = run_trial(specification(policy=own("Lost"), learner=learner), path)
     assert result.diverged_at == 5
     assert np.isfinite(result.loss[:5]).all()
     assert np.isnan(result.loss[5:]).all()
