@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dopt.errors import SpecificationError
+from dopt.spec.custom_numbers_check import check_finite, check_linear, check_names
 from dopt.systems.base import Array, System
 from dopt.systems.black_box import BlackBox
 from dopt.systems.features import KINDS
@@ -37,9 +38,11 @@ def check_system(system: System) -> None:
     ------
     SpecificationError
         If a declared index is none of a state's, or the equations fail, return something else than
-        was declared, depend on the inputs in another way than an affine one, or have a wrong
-        derivative by a complex step; if a run of a black box says so.
+        was declared, are not finite where a trial begins or is evaluated, depend on the inputs or
+        the linear parameters in another way than an affine one, or have a wrong derivative by a
+        complex step; if a run of a black box says so.
     """
+    check_names(system)
     _check_indices(system)
     if isinstance(system, BlackBox) and system.measured:
         return  # nothing may run on it
@@ -52,6 +55,8 @@ def check_system(system: System) -> None:
     points = np.concatenate([states, inputs]) if system.reads_inputs else states
     _tried(system, "accelerations", system.n_learned, tuple(points))
     _tried(system, "known", system.n_states, tuple(states), tuple(inputs))
+    check_finite(system)
+    check_linear(system, points)
     if not input_effect(system).is_affine:
         raise SpecificationError(
             f"known() of env '{system.name}' is not affine in the inputs, but a derivative of the "
@@ -114,6 +119,11 @@ def _check_indices(system: System) -> None:
                     f"{what} of env '{name}' holds {index}, but its {d} states have the numbers 0 "
                     f"to {d - 1}: correct it."
                 )
+    if len(set(system.learned_rows)) < len(system.learned_rows):
+        raise SpecificationError(
+            f"learned_rows of env '{name}' are {system.learned_rows}, but no row twice is "
+            f"expected: name each learned row of the state derivative once."
+        )
     for feature in system.features:
         if feature.kind not in KINDS:
             raise SpecificationError(
@@ -126,8 +136,11 @@ def _tried(system: System, what: str, size: int, *arguments: Sequence[Any]) -> A
     """Return what an equation gives for many states at once, (size, STATES)."""
     equation: Callable[..., Any] = getattr(system, what)
     try:
-        values = equation(*arguments, system.parameters)
-        found = np.array([np.broadcast_to(value, (STATES,)) for value in values], dtype=float)
+        with np.errstate(all="ignore"):
+            values = equation(*arguments, system.parameters)
+        single = _is_single(values, size)
+        entries = () if single else values
+        found = np.array([np.broadcast_to(value, (STATES,)) for value in entries], dtype=float)
     except Exception as error:
         raise SpecificationError(
             f"{what}() of env '{system.name}' fails for arrays of {STATES} states "
@@ -135,9 +148,26 @@ def _tried(system: System, what: str, size: int, *arguments: Sequence[Any]) -> A
             f"dopt.systems.elementary are expected in it, which serve numbers, arrays and tensors "
             f"alike: write it with these."
         ) from error
+    if single:
+        raise SpecificationError(
+            f"{what}() of env '{system.name}' returns one number, but a tuple of {size} is "
+            f"expected, one for each {_entry(what)}: return {'a,' if size == 1 else 'a, b, ...'} "
+            f"with its comma{'' if size == 1 else 's'}."
+        )
     if len(found) != size:
         raise SpecificationError(
             f"{what}() of env '{system.name}' returns {len(found)} numbers, but {size} are "
-            f"expected, one for each {'state' if what == 'known' else 'learned row'}: correct it."
+            f"expected, one for each {_entry(what)}: correct it."
         )
     return found
+
+
+def _is_single(values: Any, size: int) -> bool:
+    """Return whether an equation gives one number, or one for each state, in place of a tuple."""
+    if isinstance(values, np.ndarray) and values.ndim:
+        return values.shape == (STATES,) and size != STATES
+    return isinstance(values, int | float | np.generic | np.ndarray)
+
+
+def _entry(what: str) -> str:
+    return "state" if what == "known" else "learned row"

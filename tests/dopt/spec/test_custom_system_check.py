@@ -33,6 +33,7 @@ def by_the_sign(state: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG001
 
 CASES: list[tuple[str, Any, str]] = [
     ("learned_rows", (5,), r"learned_rows of env 'pendulum' holds 5, but its 2 states .* 0 to 1"),
+    ("learned_rows", (1, 1), r"learned_rows of env 'pendulum' are \(1, 1\), but no row twice"),
     ("features", (Feature("cos", 7),), r"features of env 'pendulum' holds 7"),
     ("features", (Feature("tan", 0),), r"one of kind 'tan', but the kinds are identity, cos, sin"),
     ("phase_plane", (0, -1), r"phase_plane of env 'pendulum' holds -1"),
@@ -41,6 +42,12 @@ CASES: list[tuple[str, Any, str]] = [
         lambda state, *_: (state[0], state[1]),
         r"accelerations\(\) .* returns 2 numbers, but 1 are expected, one for each learned row",
     ),
+    (
+        "accelerations",
+        lambda state, *_: -state[1],
+        r"accelerations\(\) .* returns one number, but a tuple of 1 is .* return a, with its comma",
+    ),
+    ("known", lambda *_: 0.0, r"known\(\) .* returns one number, but a tuple of 2 is expected"),
     ("accelerations", lambda *_: None, r"accelerations\(\) .* fails .*TypeError"),
     (
         "accelerations",
