@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
+from dopt.declare.own_fields import check_own_fields
 from dopt.declare.validated_fields import Validated
 from dopt.errors import SpecificationError, unknown_name
 
@@ -99,6 +100,7 @@ def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obje
     wanted = _base(next(iter(registry.values())))
     if not (isinstance(cls, type) and issubclass(cls, wanted) and dataclasses.is_dataclass(cls)):
         raise _unfit(section, path, f"a dataclass derived from dopt's {wanted.__name__}")
+    check_own_fields(cls)
     own = cast("type[T]", cls)
     missing = [key for key in dir(own) if getattr(getattr(own, key), "__isabstractmethod__", False)]
     if missing:

@@ -10,6 +10,7 @@ import typing
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
+from dopt.declare.own_fields import check_own_fields
 from dopt.errors import SpecificationError, unknown_name
 
 LARGEST_WHOLE = 2**31 - 1
@@ -119,6 +120,7 @@ class _Kind(NamedTuple):
 def _kinds(cls: type[Validated]) -> dict[str, _Kind]:
     """Return what the fields of a class hold, read once from their annotations."""
     if cls not in _known:
+        check_own_fields(cls)
         fields = [f for f in dataclasses.fields(cls) if f.metadata.get("validated", True)]
         _known[cls] = {field.name: _kind(cls, field) for field in fields}
     return _known[cls]
