@@ -11,8 +11,10 @@ import dataclasses
 import hashlib
 import importlib
 import inspect
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 from dopt.declare.own_fields import check_own_fields
@@ -134,13 +136,42 @@ def _base(cls: type[Validated]) -> type[Validated]:
 def imported(section: str, path: str) -> object:
     """Return what a dotted path names, or raise SpecificationError."""
     module, _, name = path.rpartition(".")
+    found = _module(section, path, module)
     try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        return getattr(found, name)
+    except AttributeError as error:
+        raise _absent(section, path, error) from error
+
+
+def _module(section: str, path: str, module: str) -> ModuleType:
+    """Import a module; an error of its own code names the file."""
+    try:
+        return importlib.import_module(module)
+    except Exception as error:
+        place = _place(error)
+        if place is None:
+            raise _absent(section, path, error) from error
         raise SpecificationError(
-            f"{section}.{TARGET} is '{path}', which cannot be imported ({error}): give the path of "
-            f"a class as module.Class, in a folder that PYTHONPATH names."
+            f"{section}.{TARGET} is '{path}', but the file {place[0]} fails in line {place[1]} "
+            f"({type(error).__name__}: {getattr(error, 'msg', error)}): correct the file."
         ) from error
+
+
+def _place(error: Exception) -> tuple[str, int | None] | None:
+    """Return file and line of an error in an imported file; None where there is no such file."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return error.filename, error.lineno
+    for frame in traceback.extract_tb(error.__traceback__)[1:]:
+        if frame.filename != importlib.__file__ and not frame.filename.startswith("<frozen"):
+            return frame.filename, frame.lineno
+    return None
+
+
+def _absent(section: str, path: str, error: Exception) -> SpecificationError:
+    return SpecificationError(
+        f"{section}.{TARGET} is '{path}', which cannot be imported ({error}): give the path of "
+        f"a class as module.Class, in a folder that PYTHONPATH names."
+    )
 
 
 def _unfit(section: str, path: str, expected: str) -> SpecificationError:

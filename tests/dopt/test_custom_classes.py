@@ -120,6 +120,25 @@ def test_a_wrong_system_is_refused_in_a_sentence(path: str, sentence: str) -> No
 
 
 @pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("x = 1\ny = x / 0\n", r"fails in line 2 \(ZeroDivisionError: division by zero\)"),
+        ("def f(:\n", r"fails in line 1 \(SyntaxError: invalid syntax\)"),
+        ("import nowhere_else\n", r"fails in line 1 \(ModuleNotFoundError: .*nowhere_else'"),
+    ],
+)
+def test_a_file_that_fails_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, sentence: str
+) -> None:
+    file = tmp_path / "failing.py"
+    file.write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    expected = rf"^env\._target_ is 'failing\.Boat', but the file {file} {sentence}"
+    with pytest.raises(SpecificationError, match=expected):
+        specification({"_target_": "failing.Boat"})
+
+
+@pytest.mark.parametrize(
     ("name", "sentence"),
     [
         ("Nameless", "a class with a 'name' of its own"),
