@@ -6,6 +6,7 @@ import dataclasses
 from typing import Literal
 
 from dopt.assessment import assessed
+from dopt.errors import SpecificationError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 
@@ -30,8 +31,13 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     Raises
     ------
     SpecificationError
-        If that path cannot run the trial.
+        If that path cannot run the trial, or the specification is none.
     """
+    if not isinstance(spec, TrialSpec):
+        raise SpecificationError(
+            f"run_trial was given {spec!r}, but a TrialSpec is expected: make one with "
+            f"TrialSpec.from_names or TrialSpec.of_system."
+        )
     if path is not None:
         spec = dataclasses.replace(spec, config=dataclasses.replace(spec.config, path=path))
     if spec.config.path == "reference":

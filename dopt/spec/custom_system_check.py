@@ -12,7 +12,7 @@ from dopt.errors import SpecificationError
 from dopt.spec.custom_numbers_check import check_finite, check_linear, check_names
 from dopt.systems.base import Array, System
 from dopt.systems.black_box import BlackBox
-from dopt.systems.features import KINDS
+from dopt.systems.features import KINDS, Feature
 from dopt.systems.input_effect import input_effect
 
 STATES = 5
@@ -105,6 +105,12 @@ def _moved(system: System, point: Any, step: complex) -> Any:
 
 def _check_indices(system: System) -> None:
     d, name = system.n_states, system.name
+    for feature in system.features:
+        if not isinstance(feature, Feature):
+            raise SpecificationError(
+                f"features of env '{name}' hold {feature!r}, but entries like "
+                f"Feature('cos', 0) are expected: make it a dopt.systems.Feature."
+            )
     declared = {
         "learned_rows": system.learned_rows,
         "grid_indices": system.grid_indices,

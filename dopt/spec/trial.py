@@ -139,11 +139,18 @@ class TrialSpec(Validated):
         """Return the trial of a system, with the other parts as in :meth:`from_names`.
 
         ``path`` is the execution path; without one it is chosen as in :meth:`from_mapping`.
+
+        Raises
+        ------
+        SpecificationError, IncompatibleError
+            If the system is no object of a class of systems, or as :meth:`from_mapping`.
         """
         parts = {"policy": policy, "model": model, "learner": learner}
         rest: dict[str, object] = {"seed": seed, "limits": limits}
         rest |= {"path": path} if path else {}
-        return cls._of_parts(system, _sections(parts), rest)
+        _check_system(system)
+        sections = _sections(parts)
+        return cls._of_parts(system, {key: _section(sections, key) for key in parts}, rest)
 
     def with_seed(self, seed: int) -> TrialSpec:
         """Return the same configuration with another seed."""
@@ -237,8 +244,27 @@ def _shown(value: object) -> str:
     return "null" if value is None else repr(value)
 
 
+def _check_system(system: object) -> None:
+    """Refuse what is no system, such as a class of systems or a name."""
+    if isinstance(system, System):
+        return
+    if isinstance(system, type) and issubclass(system, System):
+        given, remedy = f"the class {system.__name__}", f"give an object of it, {system.__name__}()"
+    else:
+        given, remedy = repr(system), "use TrialSpec.from_names for a name or a section"
+    raise SpecificationError(
+        f"the system of TrialSpec.of_system is {given}, but an object of a class derived from "
+        f"dopt.systems.System is expected: {remedy}."
+    )
+
+
 def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:
     section = given.get(key)
+    if isinstance(section, System):
+        raise SpecificationError(
+            f"configuration key '{key}' is a {type(section).__name__}, but a name or a section is "
+            f"expected: give an object of a class of systems to TrialSpec.of_system."
+        )
     if not isinstance(section, Mapping):
         raise SpecificationError(
             f"configuration key '{key}' is {section!r}, but a section with a name and fields is "

@@ -35,6 +35,7 @@ CASES: list[tuple[str, Any, str]] = [
     ("learned_rows", (5,), r"learned_rows of env 'pendulum' holds 5, but its 2 states .* 0 to 1"),
     ("learned_rows", (1, 1), r"learned_rows of env 'pendulum' are \(1, 1\), but no row twice"),
     ("features", (Feature("cos", 7),), r"features of env 'pendulum' holds 7"),
+    ("features", (("cos", 0),), r"features of env 'pendulum' hold \('cos', 0\), .* Feature\('cos"),
     ("features", (Feature("tan", 0),), r"one of kind 'tan', but the kinds are identity, cos, sin"),
     ("phase_plane", (0, -1), r"phase_plane of env 'pendulum' holds -1"),
     (
