@@ -18,6 +18,7 @@ from orchestrate.runner.heartbeat import Heartbeat
 from orchestrate.runner.provenance import launch_record
 from orchestrate.store import (
     LEASE_SECONDS,
+    DatabaseMovedError,
     Registrable,
     RunRecord,
     Saved,
@@ -48,12 +49,8 @@ class ExplorationSaver:
 
     def __init__(self, url: str | None) -> None:
         self._record = launch_record(sys.argv, [], ROOT)
-        self._store = Store.open(default_url() if url is None else str(url), LEASE_SECONDS)
-        try:
-            self._store.recover()  # marks the launch of a process that was killed as lost
-        except StoreError:
-            self._store.close()
-            raise
+        self._url = default_url() if url is None else str(url)
+        self._store: Store | None = _opened(self._url)
         self._lock = threading.Lock()
         self._launch: int | None = None
         self._alive = ExitStack()
@@ -65,32 +62,57 @@ class ExplorationSaver:
         Raises
         ------
         StoreError
-            If nothing was written: the database fails, or holds another exploration.
+            If nothing was written: the database fails, or holds another exploration. If its file
+            was removed, renamed or replaced, the next save opens the URL anew.
         """
         with self._lock:
-            if self._launch is None:
-                if self._store.holds_more(spec, result):
-                    return False
-                self._launch = self._store.begin_launch(self._record)
-                self._alive.enter_context(Heartbeat(self._store, self._launch, LEASE_SECONDS))
-            last, self._last = self._last, None  # whether a save that fails has written is unknown
-            self._last = self._store.save(self._launch, spec, result, _run_record(result), last)
-            return self._last is not None
+            self._store = self._store or _opened(self._url)
+            try:
+                return self._save(self._store, spec, result)
+            except DatabaseMovedError:
+                self._end()
+                raise
+
+    def _save(self, store: Store, spec: Registrable, result: TrialResult) -> bool:
+        if self._launch is None:
+            if store.holds_more(spec, result):
+                return False
+            self._launch = store.begin_launch(self._record)
+            self._alive.enter_context(Heartbeat(store, self._launch, LEASE_SECONDS))
+        last, self._last = self._last, None  # whether a save that fails has written is unknown
+        self._last = store.save(self._launch, spec, result, _run_record(result), last)
+        return self._last is not None
 
     def close(self) -> None:
         """End the launch and close the database."""
         if os.getpid() != self._record.pid:
             return  # a process that was forked, whose parent goes on
         with self._lock:
-            self._alive.close()
-            try:
-                if self._launch is not None:
-                    self._store.end_launch(self._launch, "done", 0)
-            except StoreError as error:
-                _log.warning("the launch of the saves could not be ended: %s", error)
-            finally:
-                self._launch = None
-                self._store.close()
+            self._end()
+
+    def _end(self) -> None:
+        store, launch = self._store, self._launch
+        self._store = self._launch = self._last = None
+        self._alive.close()
+        if store is None:
+            return
+        try:
+            if launch is not None:
+                store.end_launch(launch, "done", 0)
+        except StoreError as error:
+            _log.warning("the launch of the saves could not be ended: %s", error)
+        finally:
+            store.close()
+
+
+def _opened(url: str) -> Store:
+    store = Store.open(url, LEASE_SECONDS)
+    try:
+        store.recover()  # marks the launch of a process that was killed as lost
+    except StoreError:
+        store.close()
+        raise
+    return store
 
 
 def _run_record(result: TrialResult) -> RunRecord:

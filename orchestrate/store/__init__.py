@@ -13,6 +13,7 @@ from orchestrate.store.database_url import DEFAULT_URL, URL_VARIABLE, default_ur
 from orchestrate.store.doctor.examine import examine
 from orchestrate.store.doctor.findings import Finding
 from orchestrate.store.errors import (
+    DatabaseMovedError,
     InvalidResultError,
     LaunchAliveError,
     NoDatabaseError,
@@ -61,6 +62,7 @@ __all__ = [
     "Claim",
     "ConfigRow",
     "Curves",
+    "DatabaseMovedError",
     "ExplorationRow",
     "Failure",
     "FailureKind",

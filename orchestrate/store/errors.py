@@ -21,6 +21,10 @@ class StoreUnavailableError(StoreError):
         self.transient = transient
 
 
+class DatabaseMovedError(StoreUnavailableError):
+    """Database file that was removed, renamed or replaced after it was opened."""
+
+
 class NoDatabaseError(StoreError):
     """No database at the given URL."""
 

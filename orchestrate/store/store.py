@@ -157,7 +157,7 @@ class Store:
 
     def holds_more(self, spec: Registrable, result: Result) -> bool:
         """Return whether more steps of an exploration are stored; raises as :meth:`save`."""
-        with self._backend.transaction() as connection:
+        with self._backend.saving() as connection:
             return explorations.is_longer(connection, self._backend, spec, result)
 
     def save(
@@ -174,7 +174,7 @@ class Store:
         appended. Returns None, and writes nothing, if more steps of it are stored. Raises
         ``StoreError`` for another exploration of the same key, and ``InvalidResultError``.
         """
-        with self._backend.transaction() as connection:
+        with self._backend.saving() as connection:
             return explorations.save(connection, self._backend, launch, spec, result, run, last)
 
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:

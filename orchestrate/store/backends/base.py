@@ -53,6 +53,15 @@ class Backend(ABC):
             self._has_answered = True
             yield connection
 
+    @contextmanager
+    def saving(self) -> Iterator[Connection]:
+        """Run the block in one writing transaction of the database that its URL still names.
+
+        Raises ``DatabaseMovedError`` if that is another one.
+        """
+        with self.transaction() as connection:
+            yield connection
+
     @abstractmethod
     def creation(self) -> AbstractContextManager[Connection]:
         """Open a transaction that only one process can hold at a time."""

@@ -6,12 +6,13 @@ import json
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import URL, Connection, Select, func, insert, select, text
+from sqlalchemy.exc import SQLAlchemyError
 
 from orchestrate.store import database_url
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
@@ -25,7 +26,7 @@ from orchestrate.store.backends.sqlite_engine import (
     read_engine,
     write_engine,
 )
-from orchestrate.store.errors import StoreError, StoreUnavailableError
+from orchestrate.store.errors import DatabaseMovedError, StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, trial
 
@@ -42,6 +43,7 @@ _READING = (
 )
 _SAFE_PRAGMAS = ("table_info", "table_xinfo", "table_list", "index_list", "index_xinfo")
 _SIZE = text("SELECT page_count * page_size FROM pragma_page_count, pragma_page_size")
+_TRUNCATE = "PRAGMA wal_checkpoint(TRUNCATE)"
 _MAX_VALUE_BYTES = 2**26  # holds the parameters of a network with 2,800 units in each layer
 _PROGRESS_STEPS = 10_000  # instructions of SQLite's virtual machine, well below a millisecond
 
@@ -62,12 +64,31 @@ class SQLiteBackend(Backend):
                 )
             self._folder.mkdir(parents=True, exist_ok=True)
         self._locks = LaunchLocks(self._folder)
+        self._opened: tuple[int, int] | None = None
 
     @contextmanager
     def creation(self) -> Iterator[Connection]:
         # The change to WAL is outside transactions and fails if two processes attempt it.
         with self._creation_lock(), self.transaction() as connection:
+            self._opened = _identity(self._path)
             yield connection
+
+    @contextmanager
+    def saving(self) -> Iterator[Connection]:
+        # A write to a file that was removed or renamed succeeds, and nobody finds it.
+        self._require_opened()
+        with self.transaction() as connection:
+            yield connection
+            self._require_opened()
+
+    def _require_opened(self) -> None:
+        found = _identity(self._path)
+        if found != self._opened:
+            what = "was removed or renamed" if found is None else "was replaced by another file"
+            raise DatabaseMovedError(
+                f"The results database {self.safe_url} {what} since it was opened, so that nothing "
+                f"was saved: save again to write everything there anew, or give another path."
+            )
 
     @contextmanager
     def rebuilding(self) -> Iterator[Connection]:
@@ -142,7 +163,7 @@ class SQLiteBackend(Backend):
             driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 1)  # the new file
             driver.execute("VACUUM")
             driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
-            driver.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            driver.execute(_TRUNCATE)
 
     def evict(self) -> None:
         """Do nothing: the kernel releases the locks of a dead process."""
@@ -151,8 +172,21 @@ class SQLiteBackend(Backend):
         self._locks.release(token)
 
     def close(self) -> None:
+        if self._opened not in (None, _identity(self._path)):
+            # SQLite leaves the log of a renamed file behind, under the old name.
+            with suppress(SQLAlchemyError, sqlite3.Error), self.engine.connect() as connection:
+                driver_of(connection).execute(_TRUNCATE)
         self._locks.close()
         self.engine.dispose()
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return device and inode of a file, or None if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _locks_folder(path: Path) -> Path:

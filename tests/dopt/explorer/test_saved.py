@@ -26,6 +26,7 @@ from orchestrate.runner import saving
 from orchestrate.store import (
     Reader,
     Store,
+    StoreUnavailableError,
     examine,
     explorations,
     merge,
@@ -213,3 +214,29 @@ def test_the_caption_of_its_curve_names_no_grid(
     words = (folder / "figure1.txt").read_text()
     assert words.startswith("Error of each prediction of a measured exploration before it was")
     assert "grid" not in words
+
+
+@pytest.mark.parametrize("renamed", [False, True])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_database_that_is_gone_is_said_and_written_anew(
+    renamed: bool, replaced: bool, sqlite_url: str, tmp_path: Path, run: Explorer
+) -> None:
+    path, moved = Path(sqlite_url.removeprefix("sqlite:///")), tmp_path / "moved.db"
+    run.save(sqlite_url)
+    before = content(sqlite_url)
+    path.rename(moved)
+    if not renamed:
+        moved.unlink()
+    if replaced:
+        path.touch()
+    drive(run, 5)
+    said = "replaced by another file" if replaced else "removed or renamed"
+    with pytest.raises(StoreUnavailableError, match=rf"{said} since .*: save again"):
+        run.save(sqlite_url)
+    if renamed:
+        assert content(f"sqlite:///{moved}") == before
+    drive(run, 5)
+    assert run.save(sqlite_url)
+    assert content(sqlite_url)["n_steps"] == 50
+    assert not examine(sqlite_url, trial_key)
+    run.close()
