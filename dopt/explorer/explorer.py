@@ -15,7 +15,7 @@ import numpy.typing as npt
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.arguments import finite, numbers, safe_input, seconds, within
 from dopt.explorer.interrupts import uninterrupted
-from dopt.explorer.journal import FORMAT, Event, Journal
+from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.measured import measured
 from dopt.explorer.planner import PunctualPlanner, may_remember_plans
 from dopt.explorer.saving import SavedExplored
@@ -136,7 +136,7 @@ class Explorer(SavedExplored):
         super().__init__(spec)
         self._plans_each_step = may_remember_plans(spec)
         self._in_vain = 0  # states in a row that were not learned from
-        self._journal = None if journal is None else Journal(Path(journal), fsync)
+        self._journal = None if journal is None else Journal(Path(journal), fsync, self._about())
         self._planner = PunctualPlanner(self._state.plan, deadline)
         if self._journal is not None:
             try:
@@ -336,11 +336,14 @@ class Explorer(SavedExplored):
         if self._planner.wait():
             self._note_plan()
 
+    def _about(self) -> Event:
+        """Return the first line of the journal."""
+        return {"format": FORMAT, "trial": self.spec.to_mapping()}
+
     def _resume(self, journal: Journal) -> None:
         """Replay what the journal holds, or write what it is about."""
-        about = {"format": FORMAT, "trial": self.spec.to_mapping()}
         if not journal.events:
-            journal.write(about, durable=True)
+            journal.write(self._about(), durable=True)
             return
         stored, given = completed(journal.events[0]["trial"]), completed(self.spec.to_mapping())
         if stored != given:
@@ -349,7 +352,9 @@ class Explorer(SavedExplored):
                 f"({difference(stored, given)}): give the same arguments as then, or "
                 f"another file."
             )
-        for event in journal.events[1:]:
+        for number, event in enumerate(journal.events[1:], start=2):
+            if not self._state.may_replay(event):
+                raise foreign(journal.path, f"line {number} is no event that can follow there")
             self._state.replay(event)
 
     def close(self) -> None:

@@ -2,7 +2,8 @@
 
 Each line is one event as JSON. It is in the file before the exploration goes on, and a durable one
 is on the disk where ``fsync`` is set; a line that a power cut has torn is dropped when the file is
-opened again. Real numbers are written so that they are read back bit for bit.
+opened again, the first one only where it is the beginning of the one that would be written. Real
+numbers are written so that they are read back bit for bit.
 """
 
 from __future__ import annotations
@@ -32,12 +33,14 @@ class Journal:
         File, which is made if it is not there.
     fsync : bool
         Whether a durable event is on the disk before :meth:`write` returns.
+    about : mapping
+        First line, with the specification, which :meth:`write` has to begin with.
 
     Attributes
     ----------
     path : Path
     events : list of mappings
-        Events in the file when it was opened, the first with the specification.
+        Events in the file when it was opened, the first with a specification.
 
     Raises
     ------
@@ -45,8 +48,8 @@ class Journal:
         If the file cannot be opened, is being written, or is none of this kind.
     """
 
-    def __init__(self, path: Path, fsync: bool) -> None:
-        self.path, self._fsync = path.expanduser(), fsync
+    def __init__(self, path: Path, fsync: bool, about: Event) -> None:
+        self.path, self._fsync, self._about = path.expanduser(), fsync, about
         self._process, self._broken = os.getpid(), False
         try:
             self._open()
@@ -63,7 +66,7 @@ class Journal:
         self._file = self.path.open("ab", buffering=0)
         try:
             _lock(self._file.fileno(), self.path)
-            self._size, self.events = _read(self.path)
+            self._size, self.events = _read(self.path, _line(self._about))
             self._file.truncate(self._size)
             if self._fsync:
                 for path in new:
@@ -78,15 +81,21 @@ class Journal:
         Raises
         ------
         ExplorationError
-            If the disk is full or broken, now or before; if the journal is closed, or another
-            process has opened it.
+            If the disk is full or broken, now or before; if the journal is closed, another process
+            has opened it, or its file was removed.
         """
         if self._file.closed or self._broken or os.getpid() != self._process:
             raise ExplorationError(
                 f"the journal {self.path} is closed, or belongs to another process: open the "
                 f"exploration again."
             )
-        line = f"{json.dumps(event, allow_nan=False)}\n".encode()
+        if durable and os.fstat(self._file.fileno()).st_nlink == 0:
+            raise ExplorationError(
+                f"the journal {self.path} was removed or replaced since it was opened, so that "
+                f"nothing more is kept: save() what was explored, and begin again with another "
+                f"journal."
+            )
+        line = _line(event)
         try:
             if self._file.write(line) != len(line):
                 raise OSError("the disk is full")
@@ -110,6 +119,10 @@ class Journal:
             self._file.close()
 
 
+def _line(event: Event) -> bytes:
+    return f"{json.dumps(event, allow_nan=False)}\n".encode()
+
+
 def _sync_folder(folder: Path) -> None:
     """Put the names of the files in a folder on the disk: a new file is lost without its name."""
     descriptor = os.open(folder, os.O_RDONLY)
@@ -129,31 +142,34 @@ def _lock(file: int, path: Path) -> None:
         ) from error
 
 
-def _read(path: Path) -> tuple[int, list[dict[str, Any]]]:
-    """Return the number of bytes that are whole lines, and their events."""
+def _read(path: Path, beginning: bytes) -> tuple[int, list[dict[str, Any]]]:
+    """Return the number of bytes that are whole lines, and their events.
+
+    A first line that is not whole has to be part of the beginning.
+    """
     content = path.read_bytes()
     whole = content.rfind(b"\n") + 1
     torn = content[whole:]
-    if whole == 0 and not torn.startswith(_BEGINNING[: len(torn)]):
-        raise _foreign(path, f"it begins with {torn[:20]!r}")
+    if whole == 0 and not beginning.startswith(torn):
+        raise foreign(path, f"it has no whole line, and begins with {torn[:20]!r}")
     events: list[dict[str, Any]] = []
     for number, line in enumerate(content[:whole].splitlines(), start=1):
         try:
             event = json.loads(line)
         except ValueError as error:
-            raise _foreign(path, f"line {number}: {error}") from error
+            raise foreign(path, f"line {number}: {error}") from error
         if not isinstance(event, dict):
-            raise _foreign(path, f"line {number} is no JSON object")
+            raise foreign(path, f"line {number} is no JSON object")
         events.append(event)
-    if events and (events[0].get("format") != FORMAT or "trial" not in events[0]):
-        raise _foreign(path, "its first line is that of no exploration")
+    if events and (
+        events[0].get("format") != FORMAT or not isinstance(events[0].get("trial"), dict)
+    ):
+        raise foreign(path, "its first line is that of no exploration")
     return whole, events
 
 
-_BEGINNING = f'{{"format": {FORMAT}, "trial": '.encode()
-
-
-def _foreign(path: Path, reason: str) -> SpecificationError:
+def foreign(path: Path, reason: str) -> SpecificationError:
+    """Return the error for a file that is none of this kind."""
     return SpecificationError(
         f"{path} is no journal of format {FORMAT} ({reason}), but one was expected there: give the "
         f"path of a journal, or of a file that does not exist."

@@ -24,6 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dopt.errors import ExplorationError
+from dopt.explorer.events import is_event
 from dopt.explorer.journal import Event
 from dopt.models import MLP
 from dopt.spec.scale_check import warn_of_sizes
@@ -114,6 +115,13 @@ class ExplorerState:
             self.present = self.answer = self.time = None
         else:
             self.counts[event["counted"]] += 1
+
+    def may_replay(self, event: Event) -> bool:
+        """Tell whether an event of a journal is one that can follow."""
+        needs_state = event.keys() & {"learn", "plan", "missed"}
+        follows = self.present is not None and self.done < self.spec.system.horizon
+        whole = is_event(event, len(self._measured), self.spec.system.n_inputs)
+        return whole and (follows or not needs_state)
 
     def replay(self, event: Event) -> None:
         """Do an event of a journal; a plan is made again, as the policy may remember it."""

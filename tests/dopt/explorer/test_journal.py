@@ -34,6 +34,8 @@ SHORT = {"name": "icem", "lookahead": 8, "hold": 4, "stride": 4, "plans": 12}
 PARTS: dict[str, Any] = {"policy": SHORT, "learner": "gauss_newton"}
 """A policy that remembers its last plan, and a learner that keeps all samples."""
 
+ABOUT: dict[str, Any] = {"format": 1, "trial": {}}
+
 
 def test_a_reopened_exploration_goes_on_as_an_undisturbed_one(journal: Path) -> None:
     with Explorer(MOTOR, steps=40, **PARTS) as undisturbed:
@@ -62,10 +64,10 @@ def test_the_name_of_a_new_journal_is_on_the_disk(
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", noted)
-    Journal(journal, fsync=True).close()
+    Journal(journal, True, ABOUT).close()
     assert {str(journal.parent), str(journal.parent.parent)} <= set(synced)
     synced.clear()
-    Journal(journal, fsync=True).close()
+    Journal(journal, True, ABOUT).close()
     assert synced == [str(journal)]  # as it is closed
 
 
@@ -126,10 +128,10 @@ def test_a_torn_line_is_dropped(journal: Path, cut: int) -> None:
 
 def test_numbers_are_read_back_bit_for_bit(journal: Path) -> None:
     values = [np.nextafter(0.1, 1.0), 1e-310, -0.0, 2.0**53 + 1, np.pi]
-    written = Journal(journal, fsync=True)
+    written = Journal(journal, True, ABOUT)
     written.write({"format": 1, "trial": {}, "values": values}, durable=True)
     written.close()
-    reopened = Journal(journal, fsync=True)
+    reopened = Journal(journal, True, ABOUT)
     read = reopened.events[0]["values"]
     reopened.close()
     assert np.array(read).tobytes() == np.array(values).tobytes()

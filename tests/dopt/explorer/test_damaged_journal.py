@@ -1,0 +1,122 @@
+"""Journals that were damaged, removed or replaced: nothing is lost in silence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dopt import Explorer
+from dopt.errors import ExplorationError, SpecificationError
+from tests.dopt.explorer.plants import MOTOR, following
+from tests.dopt.explorer.test_explorer import explored
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Path:
+    return tmp_path / "motor.jsonl"
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.parametrize("fsync", [False, True])
+def test_a_journal_that_is_removed_is_said(journal: Path, fsync: bool, replaced: bool) -> None:
+    with Explorer(MOTOR, steps=9, journal=journal, fsync=fsync) as explorer:
+        x = explored(explorer, 3)
+        u = explorer.ask(x)
+        journal.unlink()
+        if replaced:
+            journal.touch()
+        with pytest.raises(ExplorationError, match=r"was removed or replaced .* another journal"):
+            explorer.tell(following(x, u))
+        assert explorer.n_steps == 3
+
+
+def test_a_renamed_journal_holds_what_follows(journal: Path, tmp_path: Path) -> None:
+    with Explorer(MOTOR, steps=9, journal=journal) as explorer:
+        x = explored(explorer, 3)
+        journal.rename(tmp_path / "renamed.jsonl")
+        explored(explorer, 2, x)
+    with Explorer(MOTOR, steps=9, journal=tmp_path / "renamed.jsonl") as again:
+        assert again.n_steps == 5
+
+
+@pytest.mark.parametrize("end", [b"", b" ", b"}"])
+def test_a_journal_without_newlines_is_kept(journal: Path, end: bytes) -> None:
+    with Explorer(MOTOR, steps=9, journal=journal) as explorer:
+        explored(explorer, 0 if end else 3)
+    whole = journal.read_bytes().replace(b"\n", b"") + end
+    journal.write_bytes(whole)
+    with pytest.raises(SpecificationError, match=r"no journal of format 1 \(it has no whole line"):
+        Explorer(MOTOR, steps=9, journal=journal)
+    assert journal.read_bytes() == whole
+
+
+def test_a_first_line_that_lacks_its_end_alone_is_begun_again(journal: Path) -> None:
+    Explorer(MOTOR, steps=9, journal=journal).close()
+    whole = journal.read_bytes()
+    journal.write_bytes(whole[:-1])
+    Explorer(MOTOR, steps=9, journal=journal).close()
+    assert journal.read_bytes() == whole
+
+
+LEARN = {"learn": [0.1, 0.0], "applied": [1.0], "dt": 0.02, "time": None}
+
+DAMAGED: list[object] = [
+    {"foo": 1},
+    {**LEARN, "learn": [1.0]},
+    {**LEARN, "learn": [1.0, 2.0, 3.0]},
+    {**LEARN, "learn": "ab"},
+    {**LEARN, "learn": [float("nan"), 0.0]},
+    {**LEARN, "applied": [1.0, 2.0]},
+    {**LEARN, "dt": "x"},
+    {**LEARN, "dt": 0.0},
+    {**LEARN, "time": [1]},
+    {"learn": [0.1, 0.0]},
+    {"lost": ["x"]},
+    {"lost": "x"},
+    {"counted": {}},
+    {"plan": 3},
+    {"missed": None},
+    {"begin": [0.1, 0.0]},
+    {"gap": [0.1, True], "time": "1"},
+    {"begin": [10**400, 0], "time": None},
+]
+
+
+@pytest.mark.parametrize("event", DAMAGED)
+def test_a_line_that_is_no_event_is_refused_with_its_number(journal: Path, event: Any) -> None:
+    with Explorer(MOTOR, steps=9, journal=journal) as explorer:
+        explored(explorer, 1)
+    lines = journal.read_text().splitlines(keepends=True)
+    lines.insert(3, f"{json.dumps(event)}\n")
+    journal.write_text("".join(lines))
+    with pytest.raises(SpecificationError, match=r"no journal of format 1 \(line 4 is no event"):
+        Explorer(MOTOR, steps=9, journal=journal)
+    assert journal.read_text() == "".join(lines)
+
+
+def test_a_journal_without_its_first_state_is_refused(journal: Path) -> None:
+    with Explorer(MOTOR, steps=9, journal=journal) as explorer:
+        explored(explorer, 1)
+    first, _, *rest = journal.read_text().splitlines(keepends=True)
+    journal.write_text("".join([first, *rest]))
+    with pytest.raises(SpecificationError, match="line 2 is no event that can follow"):
+        Explorer(MOTOR, steps=9, journal=journal)
+
+
+def test_more_steps_than_there_are_are_refused(journal: Path) -> None:
+    with Explorer(MOTOR, steps=2, journal=journal) as explorer:
+        explored(explorer, 2)
+    with journal.open("a") as file:
+        file.write(f"{json.dumps(LEARN)}\n")
+    with pytest.raises(SpecificationError, match="line 7 is no event that can follow"):
+        Explorer(MOTOR, steps=2, journal=journal)
+
+
+@pytest.mark.parametrize("trial", [5, None, [], {}, {"policy": 5}])
+def test_a_first_line_without_a_specification_is_refused(journal: Path, trial: object) -> None:
+    journal.write_text(f"{json.dumps({'format': 1, 'trial': trial})}\n")
+    with pytest.raises(SpecificationError, match=r"no exploration|another exploration"):
+        Explorer(MOTOR, steps=2, journal=journal)
