@@ -136,6 +136,7 @@ class Explorer(SavedExplored):
         super().__init__(spec)
         self._plans_each_step = may_remember_plans(spec)
         self._in_vain = 0  # states in a row that were not learned from
+        self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
         self._journal = None if journal is None else Journal(Path(journal), fsync, self._about())
         self._planner = PunctualPlanner(self._state.plan, deadline)
         if self._journal is not None:
@@ -170,18 +171,26 @@ class Explorer(SavedExplored):
             self._require_step()
             if not self._is_usable(x):
                 self._wait()
-                self._note({"lost": "unusable"})
+                if self._state.present is not None or not self._was_told(state, now):
+                    self._note({"lost": "unusable"})
                 return self._fallback.copy()
-            return self._answer(x, now).copy()
+            return self._answer(x, now, self._was_told(state, now)).copy()
 
-    def _answer(self, x: Array, now: float | None) -> Array:
+    def _was_told(self, state: npt.ArrayLike, now: float | None) -> bool:
+        """Tell whether a state is the one that was told last, and so is counted already."""
+        told, then = self._told
+        return now in (None, then) and np.array_equal(np.asarray(state), told, equal_nan=True)
+
+    def _answer(self, x: Array, now: float | None, was_told: bool) -> Array:
         """Return the input for a usable state."""
         state = self._state
         elapsed = self._elapsed(now)
         same = state.present is not None and np.array_equal(x, state.present)
         older = state.present is not None and now is not None and elapsed <= 0.0
         if older and not same:
-            self._note({"counted": "out_of_order" if elapsed < 0.0 else "repeated"}, durable=False)
+            if not was_told:
+                kind = "out_of_order" if elapsed < 0.0 else "repeated"
+                self._note({"counted": kind}, durable=False)
         elif not same or (now is not None and elapsed > 0.0):
             self._wait()
             self._note({"begin": x.tolist(), "time": now})
@@ -227,9 +236,8 @@ class Explorer(SavedExplored):
         with uninterrupted(), self._lock:
             self._require_step()
             self._wait()
-            learned = self._take_in(x, u, now)
-        self._warn_in_vain(learned)
-        return learned
+            self._told = np.array(state, dtype=float), now
+            return self._take_in(x, u, now)
 
     def _take_in(self, x: Array, applied: Array | None, now: float | None) -> bool:
         state, dt = self._state, self.spec.system.dt
@@ -281,14 +289,16 @@ class Explorer(SavedExplored):
         """Tell whether a state can be a measurement; angles may turn as often as they like."""
         return bool(np.all(np.abs(x) <= self._limits))  # also false for NaN
 
-    def _warn_in_vain(self, learned: bool) -> None:
+    def _warn_in_vain(self, event: Event) -> None:
         """Say so once when nothing was learned from many states in a row."""
-        self._in_vain = 0 if learned else self._in_vain + 1
-        if self._in_vain == IN_VAIN:
+        counts = event.keys().isdisjoint(("plan", "missed")) and event.get("lost") != "resets"
+        self._in_vain = 0 if "learn" in event else self._in_vain + counts
+        if counts and self._in_vain == IN_VAIN:
             _log.warning(
                 "nothing was learned from the last %d states (%s), but states are expected every "
-                "%g s: give times in seconds, a limit that no state is beyond, and a policy and a "
-                "learner that are faster than that",
+                "%g s: tell() each state that followed an input, give times in seconds, call "
+                "reset() if their clock began anew, and give a limit that no state is beyond, and "
+                "a policy and a learner that are faster than that",
                 *(IN_VAIN, self.counts, self.spec.system.dt),
             )
 
@@ -311,6 +321,7 @@ class Explorer(SavedExplored):
         if self._journal is not None:
             self._journal.write(event, durable=durable)
         self._state.do(event)
+        self._warn_in_vain(event)
 
     def _plan(self) -> None:
         """Plan for the present state; the fallback is the answer if that is not ready in time."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,51 @@ class TestMeasurements:
                 explorer.ask([0.1, 0.0], time=20.0 * step)
                 explorer.tell([0.1, 0.0], time=20.0 * (step + 1))
         assert len([r for r in caplog.records if "last 20 states" in r.message]) == 1
+
+    def test_states_that_are_never_told_are_said(self, caplog: pytest.LogCaptureFixture) -> None:
+        explorer = Explorer(MOTOR, steps=40)
+        with caplog.at_level("WARNING"):
+            for step in range(30):
+                explorer.ask([0.1 * step, 0.0])
+        assert len([r for r in caplog.records if "tell() each state" in r.message]) == 1
+
+    def test_a_clock_that_began_anew_is_said(
+        self, caplog: pytest.LogCaptureFixture, tmp_path: Path
+    ) -> None:
+        journal = tmp_path / "run.jsonl"
+        with Explorer(MOTOR, steps=40, journal=journal) as explorer:
+            explorer.ask([0.1, 0.0], time=1e3)
+        with (
+            Explorer(MOTOR, steps=40, journal=journal) as explorer,
+            caplog.at_level("WARNING"),
+        ):
+            for step in range(30):
+                explorer.tell([0.1, 0.1 * step], time=0.02 * step)
+                explorer.ask([0.1, 0.1 * step], time=0.02 * step)
+            assert explorer.counts["out_of_order"] == 30
+        said = "call reset() if their clock began anew"
+        assert len([r for r in caplog.records if said in r.message]) == 1
+
+    @pytest.mark.parametrize("timed", [False, True])
+    def test_a_state_that_is_told_and_asked_about_is_counted_once(self, timed: bool) -> None:
+        explorer, x = self.begun()
+        now = 0.02
+        bad = [("unusable", [7.0, np.nan], 0.04), ("unusable", [0.0, 1e5], 0.06)]
+        if timed:
+            bad = [("repeated", x + 1.0, now), ("out_of_order", x + 1.0, 0.01), *bad]
+        before = explorer.parameters
+        for kind, state, when in bad:
+            count = explorer.counts[kind]
+            for _ in range(2):
+                given = np.array(state)
+                if explorer.counts[kind] == count:
+                    assert not explorer.tell(given, time=when if timed else None)
+                explorer.ask(given, time=when if timed else None)
+                given[:] = 0.0
+            assert explorer.counts[kind] == count + 1
+        assert np.array_equal(explorer.parameters, before)
+        assert not explorer.tell(x, time=0.08)
+        assert explorer.tell(following(x, explorer.ask(x)), time=0.10)
 
     @pytest.mark.parametrize("time", [np.nan, np.inf, "1", True, [0.1]])
     def test_times_that_are_none_are_refused(self, time: Any) -> None:
