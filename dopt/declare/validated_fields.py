@@ -10,6 +10,8 @@ import typing
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
 from dopt.declare.own_fields import check_own_fields
 from dopt.errors import SpecificationError, unknown_name
 
@@ -217,6 +219,8 @@ def _converted_number(
     path: str, field: dataclasses.Field[Any], whole: bool, value: object
 ) -> float:
     expected = "a whole number" if whole else "a number"
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
         raise _wrong_type(path, value, expected)
     number = value if whole else _real(value)

@@ -3,22 +3,50 @@
 from __future__ import annotations
 
 import math
+from types import UnionType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from dopt.declare.validated_fields import LARGEST_WHOLE
 from dopt.errors import SpecificationError
 from dopt.policies.base import ROUNDING
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 
 
+def instance(what: str, given: object, kinds: type | UnionType, expected: str) -> None:
+    """Raise SpecificationError unless something is of one of some kinds."""
+    if not isinstance(given, kinds):
+        shown = f"the class {given.__name__}" if isinstance(given, type) else repr(given)
+        raise SpecificationError(f"{what} is {shown}, but {expected} is expected: give one.")
+
+
+def whole(what: str, given: object, lower: int = -LARGEST_WHOLE, upper: int = LARGEST_WHOLE) -> int:
+    """Return a whole number within bounds, or raise SpecificationError."""
+    if not _is_real(given, "iu") or not lower <= int(given) <= upper:  # type: ignore[call-overload]
+        raise SpecificationError(
+            f"{what} is {given!r}, but a whole number"
+            f"{f' from {lower} to {upper:,}' if lower > 0 else ''} is expected: correct it."
+        )
+    return int(given)  # type: ignore[call-overload,no-any-return]
+
+
+def reals(what: str, given: npt.ArrayLike) -> Array:
+    """Return an array of real numbers, or raise SpecificationError."""
+    values = _array(given)
+    if values.dtype.kind not in "fiu":
+        raise SpecificationError(
+            f"{what} of the type {values.dtype} were given, but an array of real numbers is "
+            f"expected: correct them."
+        )
+    return values.astype(np.float64)
+
+
 def numbers(what: str, given: npt.ArrayLike, size: int) -> Array:
     """Return so many real numbers, or raise SpecificationError."""
-    try:
-        values = np.asarray(given)
-    except ValueError:  # rows of different lengths
-        values = np.asarray(given, dtype=object)
+    values = _array(given)
     if values.shape != (size,) or values.dtype.kind not in "fiu":
         raise SpecificationError(
             f"{what} has the shape {values.shape} and the type {values.dtype}, but {size} real "
@@ -68,6 +96,13 @@ def seconds(given: float | None) -> float | None:
     return None if given is None else float(given)
 
 
-def _is_real(given: object) -> bool:
-    value = np.asarray(given)
-    return value.shape == () and value.dtype.kind in "fiu"
+def _is_real(given: object, kinds: str = "fiu") -> bool:
+    value = _array(given)
+    return value.shape == () and value.dtype.kind in kinds
+
+
+def _array(given: Any) -> npt.NDArray[Any]:
+    try:
+        return np.asarray(given)
+    except ValueError:  # rows of different lengths
+        return np.asarray(given, dtype=object)

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import SpecificationError
+from dopt.explorer.arguments import reals
 from dopt.explorer.recorded_run import free_run_error
 from dopt.explorer.state import ExplorerState
 from dopt.spec.trial import TrialSpec
@@ -134,7 +135,7 @@ def predict(
 
 
 def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
-    rows = np.atleast_2d(np.asarray(given, dtype=float))
+    rows = np.atleast_2d(reals(what, given))
     if rows.ndim != 2 or rows.shape[1] != size:
         raise SpecificationError(
             f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "

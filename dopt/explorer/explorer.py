@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from threading import TIMEOUT_MAX
 from types import TracebackType
 from typing import Self
 
@@ -13,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.arguments import finite, numbers, safe_input, seconds, within
+from dopt.explorer.arguments import finite, instance, numbers, safe_input, seconds, whole, within
 from dopt.explorer.interrupts import uninterrupted
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
 from dopt.explorer.measured import measured
@@ -21,6 +22,7 @@ from dopt.explorer.planner import PunctualPlanner, may_remember_plans
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import difference
 from dopt.spec.added_fields import completed
+from dopt.spec.config import LARGEST_HORIZON
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import Plant
@@ -122,12 +124,15 @@ class Explorer(SavedExplored):
         tolerance: float = 0.5,
         path: str | None = None,
     ) -> None:
+        instance("plant", plant, Plant | System, "a plant or a system, no class,")
+        instance("journal", journal, str | Path | None, "the path of a file")
+        steps = whole("steps", steps, 1, LARGEST_HORIZON)
         system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
         spec = TrialSpec.of_system(
             *(system, policy), model=model, learner=learner, limits=limits, seed=seed, path=path
         )
         self._tolerance = within("tolerance", tolerance, 1.0)
-        deadline = None if deadline is None else within("deadline", deadline, math.inf)
+        deadline = None if deadline is None else within("deadline", deadline, TIMEOUT_MAX)
         self._fallback = safe_input(spec, fallback)
         measured_states = system.measured_states or range(system.n_states)
         self._angles = [i for i, row in enumerate(measured_states) if row in system.angle_indices]

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from dopt.control.free_run import relative_error
 from dopt.control.prediction import forecast_by
 from dopt.errors import SpecificationError
+from dopt.explorer.arguments import reals, whole
 from dopt.explorer.output_filter import filtered_states
 from dopt.learning import JointKalman
 from dopt.spec.trial import TrialSpec
@@ -30,20 +31,28 @@ def free_run_error(
     the first of them after so many steps as a prediction has, and their error is that of the
     measured states.
     """
-    system, y, u = spec.system, np.array(states, dtype=float), np.asarray(inputs, dtype=float)
+    system = spec.system
+    y, u = (np.atleast_1d(reals(*run)) for run in (("states", states), ("inputs", inputs)))
+    steps = whole("steps", steps)
     rows = _rows_of(system, y)
     first = 0 if isinstance(rows, slice) else max(steps, 1)  # in which the filter settles
     n = (len(u) - first) // max(steps, 1)
     _check_shapes(system, y, u, steps, n)
+    _check_finite(y, u)
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
     x = y if isinstance(rows, slice) else filtered_states(system, predict, y, u, _variance(spec))
     last = first + n * steps
     cut = u[first:last].reshape(n, steps, system.n_inputs)
-    ends = y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
+    starts, ends = y[first:last:steps], y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
+    if (starts == ends).all():
+        raise SpecificationError(
+            "a run was given in which nothing changes, but the error of its predictions is "
+            "relative to the changes: give a run that moves."
+        )
     predicted = forecast_by(system, predict)(x[first:last:steps], cut)
-    return relative_error(predicted[..., rows], ends, y[first:last:steps])
+    return relative_error(predicted[..., rows], ends, starts)
 
 
 def _rows_of(system: System, run: Array) -> slice | list[int]:
@@ -62,6 +71,16 @@ def _check_shapes(system: System, run: Array, inputs: Array, steps: int, n: int)
             f"for predictions of {steps} steps, but shapes (T + 1, {d}) and (T, {m}) with at least "
             f"so many steps T{alone} are expected: correct it."
         )
+
+
+def _check_finite(run: Array, inputs: Array) -> None:
+    for what, rows in (("states", run), ("inputs", inputs)):
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if len(bad):
+            raise SpecificationError(
+                f"a run was given in which the {what} of row {bad[0]} are {rows[bad[0]].tolist()}, "
+                f"but finite numbers are expected: give a part of the run without such rows."
+            )
 
 
 def _variance(spec: TrialSpec) -> float:

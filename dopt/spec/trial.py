@@ -9,6 +9,8 @@ import json
 from collections.abc import Mapping
 from typing import ClassVar
 
+import numpy as np
+
 from dopt.control import Control, task_from
 from dopt.declare.kernel_support import default_path
 from dopt.declare.registry import TARGET, build
@@ -43,6 +45,9 @@ class TrialSpec(Validated):
     seed: int = parameter(0, bound="nonnegative")
 
     def __post_init__(self) -> None:
+        given: object = self.seed
+        if isinstance(given, np.integer):
+            object.__setattr__(self, "seed", int(given))
         whole = isinstance(self.seed, int) and not isinstance(self.seed, bool)
         if not whole or not 0 <= self.seed <= LARGEST_SEED:
             raise SpecificationError(
@@ -145,12 +150,12 @@ class TrialSpec(Validated):
         SpecificationError, IncompatibleError
             If the system is no object of a class of systems, or as :meth:`from_mapping`.
         """
-        parts = {"policy": policy, "model": model, "learner": learner}
+        given = _sections({"policy": policy, "model": model, "learner": learner})
+        parts = {key: _section(given, key) for key in given}
         rest: dict[str, object] = {"seed": seed, "limits": limits}
         rest |= {"path": path} if path else {}
         _check_system(system)
-        sections = _sections(parts)
-        return cls._of_parts(system, {key: _section(sections, key) for key in parts}, rest)
+        return cls._of_parts(system, parts, rest)
 
     def with_seed(self, seed: int) -> TrialSpec:
         """Return the same configuration with another seed."""
