@@ -248,9 +248,9 @@ def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFra
 
 def nothing_to_compare(selection: Selection) -> AnalysisError:
     """Return the error for a selection without a pair of simulated trials."""
-    selected = ", ".join(selection.labels) or "no simulated trial"
+    selected = f"only {', '.join(selection.labels)}" if selection.labels else "no simulated trial"
     return AnalysisError(
         f"A comparison needs trials of the reference {selection.reference} and of another "
-        f"variant in one environment, but only {selected} is selected: run the others, ask wider, "
+        f"variant in one environment, but {selected} is selected: run the others, ask wider, "
         f"or choose another --reference."
     )

@@ -34,6 +34,11 @@ from dopt.types import Array
 SIZED_STEPS = 50
 """First steps over which the size of the accelerations is taken."""
 
+_UNITS = (
+    "check that the known part and the applied inputs are in the units of the states and inputs, "
+    "or "
+)
+
 MANY_JUMPS = 10
 """Jumps of a plant some of whose states are measured after which that is said."""
 
@@ -196,7 +201,8 @@ class ExplorerState:
             self._squares += self.accelerations(following, u, dt) ** 2
             if t == SIZED_STEPS - 1:
                 sizes = np.sqrt(self._squares / SIZED_STEPS)
-                warn_of_sizes(self.spec.system, sizes, f"over the first {SIZED_STEPS} steps")
+                where = f"over the first {SIZED_STEPS} steps"
+                warn_of_sizes(self.spec.system, sizes, where, _UNITS)
 
     def _compare(self, planned: Array) -> None:
         """Say so once if a plan that is replayed is another one than when it was made."""

@@ -115,7 +115,7 @@ class TrialConfig:
     def _check_estimates(self) -> None:
         """Refuse limits where nobody says how uncertain the estimated states are."""
         if not isinstance(self.learner, JointKalman):
-            expected = "learner 'joint_ekf', which knows how uncertain its estimates are,"
+            expected = "learner 'joint_ekf', which knows how uncertain its estimates are"
             given = f"learner '{self.learner.name}'"
             raise mismatch("limits of measured states", expected, given)
 

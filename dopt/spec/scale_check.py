@@ -59,14 +59,17 @@ def warn_of_prior(policy: Policy, model: Model, learner: Learner) -> None:
         )
 
 
-def warn_of_sizes(system: System, sizes: Array, where: str) -> None:
-    """Warn of each learned acceleration whose size, (r,), a network does not learn well."""
+def warn_of_sizes(system: System, sizes: Array, where: str, first: str = "") -> None:
+    """Warn of each learned acceleration whose size, (r,), a network does not learn well.
+
+    ``first`` is advice that goes before that on its unit.
+    """
     for row, size in zip(system.learned_rows, sizes, strict=True):
         if size > LARGEST or 0 < size < SMALLEST:
             warnings.warn(
                 f"The learned acceleration of {system.state_labels[row]} in env '{system.name}' "
                 f"has a root mean square of {size:.3g} {where}, but a network learns one of "
-                f"{SMALLEST:g} to {LARGEST:g} well: measure that state in a unit about "
+                f"{SMALLEST:g} to {LARGEST:g} well: {first}measure that state in a unit about "
                 f"{size:.1g} times as large.",
                 ScaleWarning,
                 stacklevel=2,

@@ -99,7 +99,7 @@ class ExplorationSaver:
         try:
             if launch is not None:
                 store.end_launch(launch, "done", 0)
-        except StoreError as error:
+        except (StoreError, ValueError) as error:  # the latter if its row was deleted
             _log.warning("the launch of the saves could not be ended: %s", error)
         finally:
             store.close()

@@ -109,6 +109,8 @@ def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None
 
 def test_limits_of_filtered_differences_are_refused() -> None:
     """Nothing says how uncertain these are; limits that are counted alone need no such thing."""
-    with pytest.raises(IncompatibleError, match="goes with learner 'joint_ekf', which knows how"):
+    with pytest.raises(
+        IncompatibleError, match="which knows how uncertain its estimates are, but l"
+    ):
         limited(RAIL, learner="adam_window")
     limited(RAIL | {"enforced": False}, learner="adam_window")

@@ -15,6 +15,8 @@ from orchestrate.store.errors import QueryError, StoreError, StoreUnavailableErr
 _SQLITE = {
     "SQLITE_BUSY": "another process has locked it for too long; find the process that has it open",
     "SQLITE_CANTOPEN": "the file cannot be opened; check that its folder exists and is writable",
+    "SQLITE_CONSTRAINT": "its tables contradict each other, as after a deletion by hand; restore a "
+    "copy, or give another path",
     "SQLITE_CORRUPT": "the file is damaged; restore a copy, or move it away and run again",
     "SQLITE_FULL": "the disk is full; make room and run the same command again",
     "SQLITE_IOERR": "reading or writing the disk failed; check the disk and run again",
@@ -22,6 +24,7 @@ _SQLITE = {
     "SQLITE_READONLY": "the file is read-only; make it writable or give another path",
 }
 _STATES = {
+    "23": "its tables contradict each other, as after a deletion by hand; restore a backup",
     "28": "the server rejects this user; check the name and the password",
     "2B": "another view depends on a view of this program; drop it and create it again later",
     "3F": "its schema does not exist; create it or correct the search path",
@@ -44,7 +47,7 @@ _OUT_OF_TIME = ("SQLITE_INTERRUPT", "57014")
 _NOT_OF_THE_QUERY = (*(name for name in _SQLITE if name != "SQLITE_READONLY"), "08", "53", "57P")
 # Names instead of classes, so that a driver that is not installed is not imported.
 _DRIVERS = ("sqlite3", "psycopg")
-_KINDS = ("OperationalError", "InterfaceError", "InternalError")
+_KINDS = ("OperationalError", "InterfaceError", "InternalError", "IntegrityError")
 _NOT_YET_ALLOWED = ("42501", "3F000")
 _REFUSED = "its server refuses the connection; see the reason in brackets"
 _ELSEWHERE = "check that its server runs and answers, then run the same command again"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator
@@ -177,7 +178,7 @@ def test_it_is_not_compared_with_simulated_trials(sqlite_url: str) -> None:
         selection = select(reader, Filter())
         assert selection.labels == ("D-optimal, prequential loss", "random, prequential loss")
         assert not selection.gaps
-        with pytest.raises(AnalysisError, match="no simulated trial"):
+        with pytest.raises(AnalysisError, match="but no simulated trial is selected"):
             compare_policies(reader, selection)
 
 
@@ -239,4 +240,18 @@ def test_a_database_that_is_gone_is_said_and_written_anew(
     assert run.save(sqlite_url)
     assert content(sqlite_url)["n_steps"] == 50
     assert not examine(sqlite_url, trial_key)
+    run.close()
+
+
+@pytest.mark.parametrize("table", ["trial", "launch"])
+def test_rows_that_were_deleted_by_hand_are_said(
+    table: str, sqlite_url: str, run: Explorer
+) -> None:
+    run.save(sqlite_url)
+    with sqlite3.connect(sqlite_url.removeprefix("sqlite:///")) as connection:
+        connection.execute(f"DELETE FROM {table}")
+    connection.close()
+    drive(run, 5)
+    with pytest.raises(StoreUnavailableError, match=r"its tables contradict each other.*restore"):
+        run.save(sqlite_url)
     run.close()
