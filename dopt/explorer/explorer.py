@@ -124,7 +124,9 @@ class Explorer(SavedExplored):
         tolerance: float = 0.5,
         path: str | None = None,
     ) -> None:
-        instance("plant", plant, Plant | System, "a plant or a system, no class,")
+        instance(
+            "plant", plant, Plant | System, "a plant or a system such as SYSTEMS['pendulum']()"
+        )
         instance("journal", journal, str | Path | None, "the path of a file")
         steps = whole("steps", steps, 1, LARGEST_HORIZON)
         system = plant.system(steps) if isinstance(plant, Plant) else measured(plant)
