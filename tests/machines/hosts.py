@@ -19,15 +19,16 @@ from pathlib import Path
 
 from tests.paths import ROOT
 
-"""The checkout, which every host sees, also where it lies below /tmp."""
-
 _FIRST_PROCESS = (
     "import os, signal, socket; signal.signal(signal.SIGCHLD, signal.SIG_IGN); "
     "os.write(1, b'up'); signal.pause()"
 )
+# Every host sees the checkout and the cache of the kernel, also where they lie below /tmp.
 _HOST_SCRIPT = """
 hostname "$1"
-case "$5" in /tmp/*) mkdir -p "$2$5" && mount --bind "$5" "$2$5" ;; esac
+for shared in "$5" "$6"; do
+    case "$shared" in /tmp/*) mkdir -p "$2$shared" && mount --bind "$shared" "$2$shared" ;; esac
+done
 mount --rbind "$2/tmp" /tmp
 mount --bind "$2/hosts" /etc/hosts
 mount -t tmpfs -o size=1g shm /dev/shm
@@ -142,6 +143,7 @@ class Host:
                 sys.executable,
                 _FIRST_PROCESS,
                 str(ROOT),
+                self._environment["DOPT_CACHE"],
             ],
         )
         self.pid = self._namespaces.pid
