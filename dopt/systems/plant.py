@@ -127,6 +127,8 @@ class Plant:
             given = getattr(self, what)
             if isinstance(given, str) or not isinstance(given, Sequence):
                 raise _unlike(what, given, "a list of states")
+            if not all(isinstance(name, str) for name in given):
+                raise _unlike(what, given, "a list of names of states")
             if len(set(given)) < len(given):
                 raise _unlike(what, given, "a list that names no state twice")
         for what in ("states", "inputs", "learned"):

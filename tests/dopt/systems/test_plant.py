@@ -92,6 +92,8 @@ def test_a_plant_is_read_back_from_its_section(plant: Plant) -> None:
         ({"states": ["angle", "rate"]}, "a mapping of names is expected"),
         ({"learned": "rate"}, "'learned' of a plant is 'rate', but a list"),
         ({"learned": ["rate", "rate"]}, "names no state twice"),
+        ({"learned": [["rate"]]}, "'learned' of a plant is [['rate']], but a list of names"),
+        ({"angles": [{}]}, "'angles' of a plant is [{}], but a list of names of states"),
         ({"dt": 0.0}, "'dt' of a plant is 0.0, but a positive number"),
         ({"gamma": "6"}, "'gamma' of a plant is '6'"),
         ({"limit": float("inf")}, "'limit' of a plant is inf"),
