@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,17 +20,13 @@ from dopt.explorer.measured import measured
 from dopt.explorer.planner import PunctualPlanner, may_remember_plans
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import difference
+from dopt.explorer.unlearned_states import UnlearnedStates
 from dopt.spec.added_fields import completed
 from dopt.spec.config import LARGEST_HORIZON
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import Plant
 from dopt.types import Array
-
-IN_VAIN = 20
-"""States in a row without a learned step after which that is said."""
-
-_log = logging.getLogger("dopt.explorer")
 
 STEPS = 20_000
 """Steps of an exploration unless it is told otherwise."""
@@ -142,7 +137,7 @@ class Explorer(SavedExplored):
         self._limits[self._angles] = np.finfo(float).max
         super().__init__(spec)
         self._plans_each_step = may_remember_plans(spec)
-        self._in_vain = 0  # states in a row that were not learned from
+        self._unlearned = UnlearnedStates(spec.system.dt)
         self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
         self._journal = None if journal is None else Journal(Path(journal), fsync, self._about())
         self._planner = PunctualPlanner(self._state.plan, deadline)
@@ -296,19 +291,6 @@ class Explorer(SavedExplored):
         """Tell whether a state can be a measurement; angles may turn as often as they like."""
         return bool(np.all(np.abs(x) <= self._limits))  # also false for NaN
 
-    def _warn_in_vain(self, event: Event) -> None:
-        """Say so once when nothing was learned from many states in a row."""
-        counts = event.keys().isdisjoint(("plan", "missed")) and event.get("lost") != "resets"
-        self._in_vain = 0 if "learn" in event else self._in_vain + counts
-        if counts and self._in_vain == IN_VAIN:
-            _log.warning(
-                "nothing was learned from the last %d states (%s), but states are expected every "
-                "%g s: tell() each state that followed an input, give times in seconds, call "
-                "reset() if their clock began anew, and give a limit that no state is beyond, and "
-                "a policy and a learner that are faster than that",
-                *(IN_VAIN, self.counts, self.spec.system.dt),
-            )
-
     def _require_open(self) -> None:
         if self._closed:
             raise ExplorationError(
@@ -328,7 +310,7 @@ class Explorer(SavedExplored):
         if self._journal is not None:
             self._journal.write(event, durable=durable)
         self._state.do(event)
-        self._warn_in_vain(event)
+        self._unlearned.note(event, self.counts)
 
     def _plan(self) -> None:
         """Plan for the present state; the fallback is the answer if that is not ready in time."""

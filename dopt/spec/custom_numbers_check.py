@@ -108,7 +108,7 @@ def check_finite(system: System) -> None:
 
 INITIAL = "the initial state", "env.initial_state"
 GRID = "a state of the evaluation grid", "env.grid_half_widths"
-"""Where an equation is not finite, and the field that moves these states."""
+"""State at which an equation has to be finite, and the field that moves it."""
 
 
 def _refuse(

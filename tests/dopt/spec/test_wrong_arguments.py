@@ -1,4 +1,4 @@
-"""What is no specification, and no system, is answered with the call that takes it."""
+"""Arguments that are no specification and no system: the answer names the call that takes them."""
 
 from __future__ import annotations
 
