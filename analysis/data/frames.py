@@ -22,9 +22,9 @@ import pandas as pd
 
 from analysis.data.arguments import request, trial_key
 from analysis.data.config_matching import Candidate, Filter, check_names, choose
+from analysis.data.latest_configs import latest
 from analysis.data.learned_model import LearnedModel, learned_model
-from analysis.data.source_files import latest_sources
-from analysis.data.trial_selection import environment_rank, newest, policy_rank
+from analysis.data.trial_selection import environment_rank, policy_rank
 from analysis.errors import AnalysisError
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
 from orchestrate.store.serialization import stacked
@@ -241,8 +241,8 @@ class Results:
         check_names("environment", self._wanted.environments, {config.env for config in configs})
         check_names("policy", self._wanted.policies, {config.policy for config in configs})
         self._wanted.check_where(configs)
-        current = newest([config for config in configs if self._wanted.accepts(config)])
-        fitting = latest_sources(self.reader, current)
+        accepted = [config for config in configs if self._wanted.accepts(config)]
+        fitting = latest(self.reader, accepted)
         if not fitting:
             raise AnalysisError(
                 f"No configuration in {self.reader.safe_url} fits the request, "

@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.data.config_matching import Filter, difference, nearness
+from analysis.data.latest_configs import newest
 from analysis.data.source_files import latest_sources
-from analysis.data.trial_selection import Entry, environment_rank, labels_of, newest, policy_rank
+from analysis.data.trial_selection import Entry, environment_rank, labels_of, policy_rank
 from analysis.data.variants import one_each, one_world, section_text
 from analysis.errors import AnalysisError
 from analysis.stats.control import common_task, task_of

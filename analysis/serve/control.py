@@ -6,8 +6,8 @@ from typing import Any
 
 import pandas as pd
 
-from analysis.data.source_files import latest_sources
-from analysis.data.trial_selection import Selection, environment_rank, newest
+from analysis.data.latest_configs import latest
+from analysis.data.trial_selection import Selection, environment_rank
 from analysis.errors import AnalysisError
 from analysis.formatting import but_lost, number, share, within
 from analysis.serve.curves import widths
@@ -69,7 +69,7 @@ def table(state: ServerState, params: QueryParams) -> pd.DataFrame:
 
 def _assessed(reader: Reader) -> list[ConfigRow]:
     """Return the configurations with a task."""
-    configs = latest_sources(reader, newest(reader.configs()))
+    configs = latest(reader, reader.configs())
     return [config for config in configs if config.config.get("task")]
 
 

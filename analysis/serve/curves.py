@@ -8,8 +8,8 @@ from typing import Any
 import pandas as pd
 
 from analysis.data.divergence import DivergenceRule
-from analysis.data.source_files import latest_sources
-from analysis.data.trial_selection import Selection, environment_rank, newest
+from analysis.data.latest_configs import latest
+from analysis.data.trial_selection import Selection, environment_rank
 from analysis.errors import AnalysisError
 from analysis.figures.axis_break import axis_parts
 from analysis.figures.loss_curves.data import Axis, LossCurve, measure_curves, tabulate_curves
@@ -36,7 +36,7 @@ def choices(state: ServerState, params: QueryParams) -> dict[str, Any]:
 
 def by_environment(reader: Reader) -> dict[str, list[ConfigRow]]:
     """Return the stored configurations by environment, in the paper's order."""
-    configs = latest_sources(reader, newest(reader.configs()))
+    configs = latest(reader, reader.configs())
     names = sorted({config.env for config in configs}, key=environment_rank)
     return {env: [config for config in configs if config.env == env] for env in names}
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from analysis.data.latest_configs import latest
 from analysis.data.missing_trials import absent_pairs
-from analysis.data.source_files import latest_sources
-from analysis.data.trial_selection import environment_rank, newest, policy_rank
+from analysis.data.trial_selection import environment_rank, policy_rank
 from analysis.serve.policy_labels import legend_entry
 from analysis.serve.progress import read_progress
 from analysis.serve.query_params import QueryParams
@@ -34,7 +34,7 @@ def grid(state: ServerState, params: QueryParams) -> dict[str, Any]:  # noqa: AR
     reader = state.database.reader()
     progress = read_progress(reader)
     stored = reader.configs()
-    configs = latest_sources(reader, newest(stored))
+    configs = latest(reader, stored)
     policies = sorted({config.policy for config in configs}, key=policy_rank)
     finals = state.selections.get_or_compute(
         ("final", reader, progress["token"]), lambda: _finals(reader)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.data.source_files import latest_sources
-from analysis.data.trial_selection import environment_rank, newest, policy_rank
+from analysis.data.latest_configs import latest
+from analysis.data.trial_selection import environment_rank, policy_rank
 from analysis.serve.errors import NotFoundError
 from analysis.serve.policy_labels import legend_entry
 from analysis.serve.progress import read_progress
@@ -55,7 +55,7 @@ def side_by_side(states: Sequence[ServerState], params: QueryParams) -> dict[str
 def _configs(state: ServerState) -> dict[str, ConfigRow]:
     """Return the newest configurations by their settings, in the order of the grid page."""
     reader = state.database.reader()
-    rows = latest_sources(reader, newest(reader.configs()))
+    rows = latest(reader, reader.configs())
     rows.sort(key=lambda row: (environment_rank(row.env), policy_rank(row.policy), row.label))
     return {json.dumps(without_versions(row.config), sort_keys=True): row for row in rows}
 

@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-from analysis.data.source_files import latest_sources
-from analysis.data.trial_selection import Entry, newest
+from analysis.data.latest_configs import latest
+from analysis.data.trial_selection import Entry
 from analysis.errors import AnalysisError
 from orchestrate.store import ConfigRow, Reader
 
@@ -39,7 +39,7 @@ def distinct_entries(
     AnalysisError
         If two configurations have the same place.
     """
-    found = latest_sources(reader, newest([one for one in reader.configs() if belongs(one)]))
+    found = latest(reader, [one for one in reader.configs() if belongs(one)])
     entries = [Entry(one, tuple(reader.trials(one.config_key))) for one in found]
     entries.sort(key=place)
     for one, other in itertools.pairwise(entries):

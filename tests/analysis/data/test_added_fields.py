@@ -11,7 +11,8 @@ import pytest
 
 from analysis.__main__ import main
 from analysis.data.config_matching import Filter, defaults, nearness
-from analysis.data.trial_selection import newest, select
+from analysis.data.latest_configs import newest
+from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError
 from analysis.tables.comparisons import compare_policies
 from dopt.spec.trial import TrialSpec

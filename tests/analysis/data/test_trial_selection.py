@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from analysis.data.config_matching import Filter
+from analysis.data.latest_configs import newest
 from analysis.data.missing_trials import ranges
-from analysis.data.trial_selection import Selection, environment_rank, newest, policy_rank, select
+from analysis.data.trial_selection import Selection, environment_rank, policy_rank, select
 from analysis.errors import AnalysisError
 from dopt.policies import POLICIES
 from dopt.spec import config
