@@ -46,7 +46,7 @@ def launch_trials(url: str, specs: Sequence[TrialSpec], workers: int) -> Account
     if code is not ExitCode.DONE:
         raise RuntimeError(f"the launch ended with {code!r}, but {ExitCode.DONE!r} is expected.")
     with Reader.open(url) as reader:
-        rows = reader.query("SELECT pid, started, ended, wall_seconds FROM attempt")
+        rows = reader.rows("SELECT pid, started, ended, wall_seconds FROM attempt")
     return _accounts(
         [(pid, _seconds(start), _seconds(end), work) for pid, start, end, work in rows]
     )

@@ -47,7 +47,7 @@ def _steps(url: str) -> int:
     """Return the number of steps that are stored, 0 where there is no database yet."""
     try:
         with Reader.open(url) as reader:
-            return int(reader.query(STEPS)[0][0])
+            return int(reader.rows(STEPS)[0][0])
     except NoDatabaseError:
         return 0
 

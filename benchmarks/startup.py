@@ -47,5 +47,5 @@ def _first(executor: str, rounds: int) -> float:
 def _launch(executor: str, url: str) -> float:
     started = launch("-m", *TRIALS, f"executor={executor}", f"store.url={url}").started
     with Reader.open(url) as reader:
-        first = reader.query("SELECT min(started) FROM attempt")[0][0]
+        first = reader.rows("SELECT min(started) FROM attempt")[0][0]
     return datetime.fromisoformat(first).timestamp() - started

@@ -60,7 +60,7 @@ def _statuses(url: str) -> dict[str, str]:
 
 
 def _rows(reader: Reader) -> list[tuple[object, ...]]:
-    return [tuple(row) for row in reader.query("SELECT trial_key, status FROM trial")]
+    return [tuple(row) for row in reader.rows("SELECT trial_key, status FROM trial")]
 
 
 def _heading(status: str | None) -> str:

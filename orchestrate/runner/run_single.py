@@ -85,9 +85,9 @@ def _outcome(row: TrialRow) -> str:
 
 
 def _traceback(reader: Reader, trial: TrialSpec) -> str:
-    """Return the traceback of the last failure; the key holds only hexadecimal digits."""
-    rows = reader.query(
-        f"SELECT traceback FROM v_failures WHERE trial_key = '{trial.trial_key}' "
-        "ORDER BY attempt DESC LIMIT 1"
+    """Return the traceback of the last failure."""
+    rows = reader.rows(
+        "SELECT traceback FROM v_failures WHERE trial_key = :key ORDER BY attempt DESC LIMIT 1",
+        key=trial.trial_key,
     )
     return str(rows[0][0]) if rows else ""

@@ -73,7 +73,7 @@ def read(url: str) -> dict[str, list[list[Any]]]:
     """Return the rows of each query."""
     with Reader.open(url) as reader:
         return {
-            key: [[_plain(value) for value in row] for row in reader.query(sql)]
+            key: [[_plain(value) for value in row] for row in reader.rows(sql)]
             for key, sql in _QUERIES.items()
         }
 

@@ -48,7 +48,7 @@ class Launches:
 
     def query(self, sql: str) -> list[tuple[Any, ...]]:
         with Reader.open(self.url) as reader:
-            return [tuple(row) for row in reader.query(sql)]
+            return [tuple(row) for row in reader.rows(sql)]
 
 
 @pytest.fixture

@@ -102,15 +102,25 @@ def translated_query(safe_url: str, seconds: float | None = None) -> Iterator[No
         except DBAPIError as error:
             code = _code(error.orig)
             if code in _OUT_OF_TIME:
-                raise QueryError(
-                    f"The query took longer than {seconds:g} s and was cancelled: make it smaller, "
-                    f"or increase its time limit."
-                ) from error
+                raise out_of_time(seconds) from error
             if code.startswith(_NOT_OF_THE_QUERY) or (not code and _is_infrastructure(error.orig)):
                 raise
             refused = code == "SQLITE_AUTH"
             reason = "only a SELECT is allowed" if refused else _first_line(error.orig)
             raise QueryError(f"The query failed on {safe_url}: {reason}.") from error
+
+
+def out_of_time(seconds: float | None) -> QueryError:
+    """Return the error of a query that was ended after ``seconds``."""
+    return QueryError(
+        f"The query took longer than {seconds or 0:g} s and was cancelled: make it smaller, or "
+        "increase its time limit."
+    )
+
+
+def is_of_driver(error: BaseException) -> bool:
+    """Return whether a database driver raised the error."""
+    return any(base.__module__.partition(".")[0] in _DRIVERS for base in type(error).__mro__)
 
 
 def _code(original: BaseException | None) -> str:

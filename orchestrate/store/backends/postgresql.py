@@ -221,25 +221,25 @@ def size(connection: Connection) -> int:
     return int(connection.execute(_SIZE).scalar_one())
 
 
-@contextmanager
-def reading(connection: Connection, seconds: float | None) -> Iterator[None]:
-    """Limit the time of each statement of the block.
+def request(url: URL) -> dict[str, Any]:
+    """Return how the process of a query connects.
 
     Access of a SELECT beside the tables, such as ``pg_read_file``, depends on the rights of the
     database user; a session cannot drop them.
     """
-    # After a first query no statement can make the transaction writable.
-    connection.exec_driver_sql("SELECT 1")
-    milliseconds = 0 if seconds is None else max(1, round(1000 * seconds))
-    connection.exec_driver_sql(f"SET LOCAL statement_timeout = {milliseconds}")
-    yield
+    _, arguments = _engine(url).dialect.create_connect_args(url)
+    del arguments["context"]  # SQLAlchemy's own conversions of what is sent
+    return {"driver": "postgresql", "connection": {**_settings(url), **arguments}}
+
+
+def _settings(url: URL, more: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+    wanted = {**_CONNECTION, **more}
+    return {key: value for key, value in wanted.items() if key not in url.query}
 
 
 def _engine(url: URL, more: Mapping[str, str] = MappingProxyType({})) -> Engine:
-    wanted = {**_CONNECTION, **more}
-    settings = {key: value for key, value in wanted.items() if key not in url.query}
     try:
-        return create_engine(url, connect_args=settings, pool_pre_ping=True)
+        return create_engine(url, connect_args=_settings(url, more), pool_pre_ping=True)
     except ModuleNotFoundError as error:
         raise StoreError(
             f"A PostgreSQL database needs the library {error.name}: "

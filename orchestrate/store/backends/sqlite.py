@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
@@ -23,6 +22,7 @@ from orchestrate.store.backends.sqlite_backup import copy_file
 from orchestrate.store.backends.sqlite_engine import (
     driver_of,
     existing_path,
+    read_address,
     read_engine,
     write_engine,
 )
@@ -30,22 +30,13 @@ from orchestrate.store.errors import DatabaseMovedError, StoreError, StoreUnavai
 from orchestrate.store.records import Array
 from orchestrate.store.schema import STEP_VALUES, trial
 
-__all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "reading", "size"]
+__all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "request", "size"]
 
 # Rows in one statement: its 502 parameters stay below the 999 that every SQLite takes.
 _BLOCK = 100
 
-_READING = (
-    sqlite3.SQLITE_SELECT,
-    sqlite3.SQLITE_READ,
-    sqlite3.SQLITE_FUNCTION,
-    sqlite3.SQLITE_RECURSIVE,
-)
-_SAFE_PRAGMAS = ("table_info", "table_xinfo", "table_list", "index_list", "index_xinfo")
 _SIZE = text("SELECT page_count * page_size FROM pragma_page_count, pragma_page_size")
 _TRUNCATE = "PRAGMA wal_checkpoint(TRUNCATE)"
-_MAX_VALUE_BYTES = 2**26  # holds the parameters of a network with 2,800 units in each layer
-_PROGRESS_STEPS = 10_000  # instructions of SQLite's virtual machine, well below a millisecond
 
 
 class SQLiteBackend(Backend):
@@ -231,30 +222,6 @@ def size(connection: Connection) -> int:
     return int(connection.execute(_SIZE).scalar_one())
 
 
-@contextmanager
-def reading(connection: Connection, seconds: float | None) -> Iterator[None]:
-    """Reject statements of the block that do more than read tables, and cancel slow ones.
-
-    The connection cannot write, attach or load anything; but a temporary table, a setting or the
-    end of the transaction would affect later queries.
-    """
-    driver = driver_of(connection)
-    driver.set_authorizer(_may_read)
-    longest = driver.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_VALUE_BYTES)
-    if seconds is not None:
-        end = time.monotonic() + seconds
-        driver.set_progress_handler(lambda: time.monotonic() > end, _PROGRESS_STEPS)
-    try:
-        yield
-    finally:
-        driver.set_authorizer(None)
-        driver.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
-        driver.set_progress_handler(None, 0)
-
-
-def _may_read(action: int, name: str | None, *_: str | None) -> int:
-    reads = action == sqlite3.SQLITE_PRAGMA and name in _SAFE_PRAGMAS
-    # Table-valued functions, such as json_each, are declared like a change of the catalogue;
-    # SQLite itself rejects statements that would change it.
-    declares = action == sqlite3.SQLITE_UPDATE and name == "sqlite_master"
-    return sqlite3.SQLITE_OK if action in _READING or reads or declares else sqlite3.SQLITE_DENY
+def request(url: URL) -> dict[str, Any]:
+    """Return how the process of a query opens the file."""
+    return {"driver": "sqlite", "file": read_address(existing_path(url))}

@@ -24,7 +24,7 @@ MAX_LOG_BYTES = 16 * 2**20
 def read_engine(url: URL) -> Engine:
     """Return an engine that cannot write; raise ``NoDatabaseError`` if there is no file."""
     path = existing_path(url)
-    return _engine(lambda: _connect(path, _read_mode(path)), "BEGIN")
+    return _engine(lambda: _connect(read_address(path)), "BEGIN")
 
 
 def existing_path(url: URL) -> Path:
@@ -52,7 +52,7 @@ def filling_engine(path: Path) -> Engine:
     """
 
     def connect() -> sqlite3.Connection:
-        connection = _connect(path, "mode=rwc")
+        connection = _connect(_address(path, "mode=rwc"))
         connection.execute("PRAGMA journal_mode = OFF")
         connection.execute("PRAGMA synchronous = OFF")
         return connection
@@ -70,9 +70,13 @@ def _engine(connect: Any, begin: str) -> Engine:
     return engine
 
 
-def _connect(path: Path, mode: str) -> sqlite3.Connection:
+def _address(path: Path, mode: str) -> str:
+    return f"file:{quote(str(path))}?{mode}"
+
+
+def _connect(address: str) -> sqlite3.Connection:
     connection = sqlite3.connect(
-        f"file:{quote(str(path))}?{mode}",
+        address,
         uri=True,
         timeout=BUSY_TIMEOUT_SECONDS,
         isolation_level=None,  # the engine says BEGIN
@@ -84,7 +88,7 @@ def _connect(path: Path, mode: str) -> sqlite3.Connection:
 
 def _writer(path: Path) -> sqlite3.Connection:
     _refuse_read_only(path)
-    connection = _connect(path, "mode=rwc")
+    connection = _connect(_address(path, "mode=rwc"))
     tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master")]
     if not tables or "trial" in tables:  # a file of another program is not changed
         connection.execute("PRAGMA journal_mode = WAL")
@@ -119,13 +123,14 @@ def _is_read_only(file: Path) -> bool:
         return False
 
 
-def _read_mode(path: Path) -> str:
+def read_address(path: Path) -> str:
+    """Return the address with which SQLite opens a file that it cannot write."""
     # A database in WAL mode is read through two files beside it. On a medium where they cannot be
     # created, there are no writers, and the file is read as immutable.
     wal = path.with_name(path.name + "-wal")
     if not wal.exists() and not os.access(path.parent, os.W_OK):
-        return "mode=ro&immutable=1"
-    return "mode=ro"
+        return _address(path, "mode=ro&immutable=1")
+    return _address(path, "mode=ro")
 
 
 def driver_of(connection: Connection) -> sqlite3.Connection:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain
@@ -17,7 +17,7 @@ from dopt.errors import suggestion
 from dopt.spec.added_fields import completed
 from orchestrate.store import database_url, packed_curves, schema_version
 from orchestrate.store.backends import bundle, postgresql, sqlite
-from orchestrate.store.backends.driver_errors import translated, translated_query
+from orchestrate.store.backends.driver_errors import translated
 from orchestrate.store.errors import QueryError
 from orchestrate.store.read import liveness
 from orchestrate.store.read.curves import read_curves
@@ -192,15 +192,24 @@ class Reader:
         dtype, *packed = row
         return Trajectory(*(unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)))
 
-    def query(self, sql: str, limit: int | None = None, timeout: float | None = None) -> Table:
+    def query(
+        self,
+        sql: str,
+        limit: int | None = None,
+        timeout: float | None = None,
+        login: URL | None = None,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> Table:
         """Return the rows of one SELECT, with values by position and by column name.
 
         Only the first ``limit`` rows are read; ``cut`` of the table is True if there are more.
-        Raises ``QueryError`` if the database rejects the statement, such as one that writes or
-        several in one text, or if it takes longer than ``timeout`` seconds.
+        The statement runs in a process and through a connection of its own, with the URL ``login``
+        where one is given, until ``stopped`` says True. Raises ``QueryError`` if the database
+        rejects the statement, such as one that writes or several in one text, or if it takes
+        longer than ``timeout`` seconds, 1 GiB of memory or 50 MB of rows.
         """
-        with translated_query(self.safe_url, timeout):
-            return run_select(self._engine, self._kind.reading, sql, limit, timeout)
+        request = self._kind.request(login or self._url)
+        return run_select(request, self.safe_url, sql, limit, timeout, stopped)
 
     def rows(self, sql: str, /, **values: object) -> Table:
         """Return the rows of a trusted SELECT, with each ``:name`` in it bound to a value.

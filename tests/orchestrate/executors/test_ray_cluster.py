@@ -47,7 +47,7 @@ class Outcome:
 
     def query(self, name: str, sql: str) -> list[tuple[Any, ...]]:
         with Reader.open(f"sqlite:///{self._folder / name}.db") as reader:
-            return [tuple(row) for row in reader.query(sql)]
+            return [tuple(row) for row in reader.rows(sql)]
 
     def curves(self, name: str) -> list[tuple[Any, ...]]:
         return self.query(name, CURVES)

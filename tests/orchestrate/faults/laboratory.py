@@ -144,7 +144,7 @@ class Laboratory:
 
     def query(self, sql: str) -> list[tuple[Any, ...]]:
         with Reader.open(self.url) as reader:
-            return [tuple(row) for row in reader.query(sql)]
+            return [tuple(row) for row in reader.rows(sql)]
 
 
 def until(condition: Callable[[], bool], seconds: float = PATIENCE_SECONDS) -> None:

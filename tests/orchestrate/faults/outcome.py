@@ -63,7 +63,7 @@ def results(url: str, but: int | None = None) -> Rows:
     """
     with Reader.open(url) as reader:
         return {
-            name: [tuple(row) for row in reader.query(sql) if row[0] != but]
+            name: [tuple(row) for row in reader.rows(sql) if row[0] != but]
             for name, sql in _RESULTS.items()
         }
 
@@ -74,5 +74,5 @@ def flaws(url: str) -> list[str]:
         return [
             f"the trial with seed {row[0]} {flaw}"
             for flaw, sql in _FLAWS.items()
-            for row in reader.query(sql)
+            for row in reader.rows(sql)
         ]

@@ -32,7 +32,7 @@ ALL = (
 def everything(url: str) -> list[list[str]]:
     """Return all that is in a database, without the numbers that it gave itself."""
     with Reader.open(url) as reader:
-        return [sorted(repr(_plain(row)) for row in reader.query(sql)) for sql in ALL]
+        return [sorted(repr(_plain(row)) for row in reader.rows(sql)) for sql in ALL]
 
 
 def _plain(row: tuple[object, ...]) -> list[object]:

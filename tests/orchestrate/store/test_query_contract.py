@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import datetime
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
 
+from orchestrate.errors import ExitCode
 from orchestrate.store import Claim, QueryError, Reader, Store, StoreUnavailableError
+from orchestrate.store.read import user_query
+from tests.orchestrate.faults.laboratory import PATIENCE_SECONDS, alive, children, until
 from tests.orchestrate.store.fakes import HORIZON, RUN, Spec, result
 
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT count(*) FROM n"
+SERIES = "WITH RECURSIVE s(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM s WHERE n < {}) "
+ONE_CALL = "SELECT instr(hex(zeroblob(30000000)), hex(zeroblob(15000000)) || '1')"
+"""One call of a function of SQLite, which takes hours and never looks at a limit."""
+
 ESCAPES = (
     "DELETE FROM step",
     "COMMIT; DELETE FROM step",
@@ -132,3 +146,143 @@ def test_a_lost_server_is_not_the_fault_of_the_query(postgresql_url: str) -> Non
     with Reader.open(postgresql_url) as reader, pytest.raises(StoreUnavailableError) as caught:
         reader.query("SELECT pg_terminate_backend(pg_backend_pid())")
     assert caught.value.transient
+
+
+@pytest.fixture
+def file(sqlite_url: str) -> Iterator[Reader]:
+    Store.open(sqlite_url).close()
+    with Reader.open(sqlite_url) as opened:
+        yield opened
+
+
+@pytest.fixture
+def on_server(postgresql_url: str) -> Iterator[Reader]:
+    Store.open(postgresql_url).close()
+    with Reader.open(postgresql_url) as opened:
+        yield opened
+
+
+def test_one_call_is_ended_after_its_time(file: Reader) -> None:
+    with pytest.raises(QueryError, match=r"longer than 0\.2 s and was cancelled"):
+        file.query(ONE_CALL, timeout=0.2)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "SELECT zeroblob(67000000)",
+        SERIES.format(1000) + "SELECT zeroblob(67000000) FROM s",
+        SERIES.format(1000) + "SELECT hex(zeroblob(100000)) FROM s",
+    ],
+)
+def test_a_result_has_a_limit(file: Reader, statement: str) -> None:
+    with pytest.raises(QueryError, match="larger than 50 MB"):
+        file.query(statement, limit=1000)
+
+
+def test_a_result_of_a_server_has_a_limit(on_server: Reader) -> None:
+    with pytest.raises(QueryError, match="larger than 50 MB"):
+        on_server.query("SELECT repeat('x', 60000000) FROM generate_series(1, 1000)", limit=1000)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        f"SELECT {', '.join(['zeroblob(60000000)'] * 20)}",
+        # A sort, which would fill the disk with a temporary file.
+        f"SELECT count(*) FROM ({SERIES.format(100)} SELECT zeroblob(60000000) AS b FROM s"
+        " ORDER BY n % 7)",
+    ],
+    ids=["row", "sort"],
+)
+def test_memory_has_a_limit(file: Reader, statement: str) -> None:
+    with pytest.raises(QueryError, match="needs more than 1 GiB of memory"):
+        file.query(statement)
+
+
+def test_a_text_that_no_database_takes_is_one_sentence(reader: Reader) -> None:
+    with pytest.raises(QueryError, match="The query failed on"):
+        reader.query("SELECT '\ud800'")
+
+
+def test_values_keep_their_types(file: Reader, on_server: Reader) -> None:
+    (row,) = file.query("SELECT NULL, 1, 2.5, 'ä', x'00ff', 9e999, -9223372036854775808")
+    assert tuple(row) == (None, 1, 2.5, "ä", b"\0\xff", float("inf"), -(2**63))
+    (row,) = on_server.query(
+        "SELECT NULL, 1, 2.5::float8, 2.50::numeric, 'ä', '\\x00ff'::bytea, true, "
+        "DATE '2024-02-29', ARRAY[1, 2], '{\"a\": 1}'::json, interval '1 day', 7 % 4"
+    )
+    assert tuple(row[:8]) == (
+        *(None, 1, 2.5, Decimal("2.50"), "ä", b"\0\xff", True, datetime.date(2024, 2, 29)),
+    )
+    assert tuple(row[8:]) == ([1, 2], {"a": 1}, datetime.timedelta(days=1), 3)
+
+
+@contextmanager
+def asked(url: str, statement: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Run the command ``query`` with an endless statement; yield it and the query's process."""
+    words = ["query", statement, "--db", url, "--timeout", "3600"]
+    command = subprocess.Popen(
+        [sys.executable, "-m", "orchestrate", *words], start_new_session=True
+    )
+    try:
+        until(lambda: bool(children(command.pid)))
+        yield command, children(command.pid)[0]
+    finally:
+        command.kill()
+        command.wait()
+
+
+def test_ctrl_c_ends_the_command_and_its_query(sqlite_url: str) -> None:
+    Store.open(sqlite_url).close()
+    with asked(sqlite_url, ONE_CALL) as (command, query):
+        os.killpg(command.pid, signal.SIGINT)  # as a terminal does
+        assert command.wait(PATIENCE_SECONDS) == ExitCode.INTERRUPTED
+        until(lambda: not alive(query))
+
+
+def test_no_query_outlives_its_command(sqlite_url: str) -> None:
+    Store.open(sqlite_url).close()
+    with asked(sqlite_url, ONE_CALL) as (command, query):
+        command.kill()
+        until(lambda: not alive(query))
+
+
+def test_a_query_that_was_killed_is_one_sentence(
+    file: Reader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(user_query, "_COMMAND", (sys.executable, "-c", ""))
+    with pytest.raises(QueryError, match="was killed before its end"):
+        file.query("SELECT 1" + " " * 10**6)
+
+
+def test_it_ends_when_nobody_waits_for_it(reader: Reader) -> None:
+    with pytest.raises(QueryError, match="nobody waits for it"):
+        reader.query(ENDLESS, stopped=lambda: True)
+
+
+def test_a_statement_cannot_lift_its_limit(on_server: Reader) -> None:
+    with pytest.raises(QueryError, match=r"longer than 0\.5 s"):
+        on_server.query(
+            "SELECT set_config('statement_timeout', '0', false) "
+            "UNION ALL SELECT pg_sleep(3600)::text",
+            timeout=0.5,
+        )
+    running = "SELECT 1 FROM pg_stat_activity WHERE query LIKE 'FETCH%query%' AND state = 'active'"
+    until(lambda: not on_server.rows(running))
+
+
+def test_its_process_imports_the_driver_alone(
+    file: Reader, on_server: Reader, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    listing = tmp_path / "imports"
+    python, *words = user_query._COMMAND
+    traced = ("sh", "-c", f'exec "$0" "$@" 2>>{listing}', python, "-X", "importtime", *words)
+    monkeypatch.setattr(user_query, "_COMMAND", traced)
+    monkeypatch.setattr(user_query.subprocess, "DEVNULL", None)
+    for reader in (file, on_server):
+        assert reader.query("SELECT 1 AS one")[0].one == 1
+    found = {line.rpartition("|")[2].strip() for line in listing.read_text().splitlines()}
+    assert {"sqlite3", "psycopg"} <= found
+    packages = {name.partition(".")[0] for name in found}
+    assert packages.isdisjoint({"sqlalchemy", "numpy", "dopt", "orchestrate", "analysis", "site"})
