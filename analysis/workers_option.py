@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import os
 
+from dopt.cores import usable_cores
 from orchestrate.cli_parser import UsageError
 
 
 def add_workers(command: argparse.ArgumentParser, what: str) -> None:
     """Add the option; ``what`` names the things."""
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     command.add_argument(
         "--workers", type=_workers, default=cores, help=f"{what} at a time (one for each core)"
     )

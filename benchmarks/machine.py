@@ -7,12 +7,14 @@ import os
 import platform
 from pathlib import Path
 
+from dopt.cores import usable_cores
+
 LIBRARIES = ("numpy", "numba", "llvmlite", "torch", "jax", "ray", "sqlalchemy", "matplotlib")
 
 
 def describe() -> list[str]:
     """Return lines about the processor, its load, and the versions of the libraries."""
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     load = os.getloadavg()[0]
     found = [f"{name} {version}" for name in LIBRARIES if (version := _version(name))]
     return [

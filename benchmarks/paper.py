@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 
 from benchmarks.processes import database, launch
 from benchmarks.rows import Row, Target
+from dopt.cores import usable_cores
 
 SEEDS = 100
 
@@ -18,7 +18,7 @@ def measure(quick: bool) -> list[Row]:
         short, long = (_seconds(folder, seeds) for seeds in (few, more))
     each = (long - short) / (more - few)
     minutes = (long + (SEEDS - more) * each) / 60
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     note = f"extended from {more} seeds at {each:.2f} s each, {cores} workers"
     return [Row("19 configurations × 100 seeds", minutes, "min", Target(3, 5), note=note)]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from statistics import median
 
@@ -10,13 +9,14 @@ from benchmarks.launches import launch_trials
 from benchmarks.processes import database
 from benchmarks.rows import Row, Target
 from benchmarks.trials import cartpole
+from dopt.cores import usable_cores
 
 ROUNDS = 2
 
 
 def measure(quick: bool) -> list[Row]:
     """Return the speed of two local workers in that of one, once all have loaded their code."""
-    if len(os.sched_getaffinity(0)) < 2:
+    if usable_cores() < 2:
         return [Row("two workers in speeds of one", None, note="this machine has one core")]
     specs = [cartpole(seed=seed) for seed in range(24 if quick else 80)]
     ratios, rates = [], []

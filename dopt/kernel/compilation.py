@@ -16,6 +16,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from dopt.cores import usable_cores
 from dopt.kernel.cache import CACHE_FOLDER, CACHE_VARIABLE, complete_names
 
 ENDS = ("first", "last")
@@ -43,7 +44,7 @@ def compile_missing(names: Sequence[str]) -> None:
     if not missing:
         return
     start = time.perf_counter()
-    running = [_started(end, missing) for end in ENDS[: len(os.sched_getaffinity(0))]]
+    running = [_started(end, missing) for end in ENDS[: usable_cores()]]
     said = -SECONDS_BETWEEN_MESSAGES
     try:
         while any(process.poll() is None for process in running):

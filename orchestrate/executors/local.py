@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from multiprocessing.connection import Connection, wait
 
+from dopt.cores import usable_cores
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.exit_status import CrashReport, ExitStatus
@@ -97,7 +98,7 @@ class Worker:
 
 
 class LocalExecutor(Executor):
-    """Runs chunks on ``workers`` processes, by default one on each core in the affinity mask.
+    """Runs chunks on ``workers`` processes, by default one on each core that is usable.
 
     Every ``live`` seconds a worker reports a sample of the trial that it runs; None reports none.
     """
@@ -112,7 +113,7 @@ class LocalExecutor(Executor):
         self._run = run
         self._limits = limits
         self._live = live
-        self.slots = workers or len(os.sched_getaffinity(0))
+        self.slots = workers or usable_cores()
         self._workers: list[Worker] = []
         self._queue: deque[Sequence[Task]] = deque()
         self._failed_starts = 0
@@ -217,5 +218,5 @@ FACTORY = ExecutorFactory(
     make=lambda settings, run, _: LocalExecutor(
         run, settings.workers, limits_of(settings), settings.live
     ),
-    trials_at_once=lambda settings: settings.workers or len(os.sched_getaffinity(0)),
+    trials_at_once=lambda settings: settings.workers or usable_cores(),
 )

@@ -18,6 +18,9 @@ LINE_INTERVAL_SECONDS = 10.0
 RATE_WINDOW_SECONDS = 30.0
 """Period over which the rate is averaged."""
 
+SHARE_BEFORE_ESTIMATE = 0.1
+"""Share of the trials of a launch before which its rate, of workers that start, says nothing."""
+
 
 @dataclass
 class Tally:
@@ -93,7 +96,7 @@ class Progress:
             self._print()
 
     def line(self) -> str:
-        """Return the tally, the rate and the estimated remaining time."""
+        """Return the tally, the rate and the estimated remaining time, once that is known."""
         tally = self._tally
         (start, before), (end, over) = self._recent[0], self._recent[-1]
         rate = (over - before) / (end - start) if end > start else 0.0
@@ -104,7 +107,8 @@ class Progress:
             f"{tally.diverged:,} diverged",
             f"{rate:.1f}/s",
         ]
-        if tally.left and rate:
+        known = tally.over >= SHARE_BEFORE_ESTIMATE * (tally.over + tally.left)
+        if tally.left and rate and known:
             words.append(f"{duration(tally.left / rate)} left")
         return " · ".join(words)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import time
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+from dopt.cores import usable_cores
 from dopt.kernel import warm_up
 from dopt.run import run_trial
 from orchestrate.config.launch_settings import LaunchSettings
@@ -84,7 +84,7 @@ class WorkerSettings:
         return LaunchSettings(
             executor="local",
             store_url=self.url,
-            workers=self.processes or len(os.sched_getaffinity(0)),
+            workers=self.processes or usable_cores(),
             timeout=self.timeout,
             memory_gib=self.memory_gib,
             retry_memory=self.retry_memory,

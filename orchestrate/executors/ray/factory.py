@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-
+from dopt.cores import usable_cores
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.executors.base import Executor, Prepare, Run
 from orchestrate.executors.factory import ExecutorFactory, limits_of
@@ -20,7 +19,7 @@ def _trials_at_once(settings: LaunchSettings) -> int | None:
     """Return the number of workers on this machine; None for a cluster."""
     if settings.ray_address != "local":
         return None
-    return settings.workers or os.cpu_count() or 1  # Ray ignores the CPU affinity mask
+    return settings.workers or usable_cores()
 
 
 FACTORY = ExecutorFactory(_make, _trials_at_once)

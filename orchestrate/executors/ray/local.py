@@ -7,6 +7,7 @@ from typing import Any
 
 import ray
 
+from dopt.cores import usable_cores
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
@@ -24,7 +25,7 @@ class OwnRay(Connection):
     """Ray with ``workers`` processes, by default one on each core."""
 
     def __init__(self, workers: int | None) -> None:
-        self._workers = workers
+        self._workers = workers or usable_cores()
 
     def connect(self) -> None:
         # Workers inherit this environment, which is seconds faster than a runtime environment.
@@ -32,8 +33,6 @@ class OwnRay(Connection):
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         start(self._start)
         self._task: Any = ray.remote(**TASK_OPTIONS)(run_chunk)
-        resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-        self._cores = int(resources.get("CPU", 1.0))
 
     def _start(self) -> None:
         self._init(
@@ -45,7 +44,7 @@ class OwnRay(Connection):
 
     @property
     def slots(self) -> int:
-        return self._workers or self._cores
+        return self._workers
 
     def run(self, run: Run, tasks: list[Task], limits: Limits, channel: Channel | None) -> Any:
         return self._task.remote(run, tasks, limits, None, channel)

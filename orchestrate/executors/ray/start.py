@@ -13,6 +13,7 @@ from typing import Any
 
 from ray._private import services
 
+from dopt.cores import usable_cores
 from orchestrate.errors import InfrastructureError
 
 START_SECONDS = 120.0
@@ -86,4 +87,4 @@ def _kill(processes: set[int]) -> None:
 
 
 def _load() -> str:
-    return f"the load is {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    return f"the load is {os.getloadavg()[0]:.1f} on {usable_cores()} cores"

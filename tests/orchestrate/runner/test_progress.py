@@ -27,12 +27,26 @@ def test_the_line_has_the_outcomes_the_rate_and_the_time_left(
 ) -> None:
     tally = Tally(total=2000, before=500, failed_before=3)
     shown = Progress(tally, io.StringIO())
-    tally.done, tally.diverged, tally.failed = 95, 4, 1
+    tally.done, tally.diverged, tally.failed = 145, 4, 1
     clock(10.0)
     shown.update()
     assert shown.line() == (
-        "600 of 2,000 · 95 done now · 4 failed · 4 diverged · 10.0/s · 2 min 20 s left"
+        "650 of 2,000 · 145 done now · 4 failed · 4 diverged · 15.0/s · 1 min 30 s left"
     )
+
+
+def test_the_time_left_is_not_estimated_before_a_tenth_of_the_trials(
+    clock: Callable[[float], None],
+) -> None:
+    """A grid of 100 s said "1 h 46 min left": its first trials waited for the workers to start."""
+    tally = Tally(total=600, before=100)
+    shown = Progress(tally, None)
+    tally.done = 49
+    clock(30.0)
+    shown.update()
+    assert "left" not in shown.line()
+    tally.done = 50
+    assert shown.line().endswith("4 min 36 s left")
 
 
 def test_the_rate_is_that_of_the_last_half_minute(clock: Callable[[float], None]) -> None:

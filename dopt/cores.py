@@ -1,0 +1,52 @@
+"""Cores that this process may use: its affinity, and the quotas of its control groups."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+PROC = Path("/proc/self")
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process can keep busy, at least 1.
+
+    Quotas of control groups count (``docker --cpus``, limits of Kubernetes, ``CPUQuota`` of
+    systemd), versions 1 and 2, also those of the groups around that of this process. A part of a
+    core counts for nothing.
+    """
+    return max(1, int(min([len(os.sched_getaffinity(0)), *_quotas()])))
+
+
+def _quotas() -> Iterator[float]:
+    """Yield the quota in cores of every control group that this process is in."""
+    for folder in _groups():
+        with suppress(OSError, ValueError, ZeroDivisionError):  # "max", or -1, without a quota
+            quota, period = map(int, (folder / "cpu.max").read_text().split())
+            yield quota / period
+        with suppress(OSError, ValueError, ZeroDivisionError):
+            names = ("cpu.cfs_quota_us", "cpu.cfs_period_us")
+            quota, period = (int((folder / name).read_text()) for name in names)
+            if quota > 0:
+                yield quota / period
+
+
+def _groups() -> Iterator[Path]:
+    """Yield the folders of the control groups of this process that may limit its cores.
+
+    A container may see a part of the hierarchy: what is mounted begins at a group of its own.
+    """
+    with suppress(OSError, ValueError):
+        lines = [line.split(":", 2) for line in (PROC / "cgroup").read_text().splitlines()]
+        paths = {kind: path for _, kinds, path in lines for kind in kinds.split(",")}
+        for line in (PROC / "mountinfo").read_text().splitlines():
+            mount, _, system = line.partition(" - ")
+            root, point = mount.split()[3:5]
+            kind, _, options = system.split(maxsplit=2)
+            name = {"cgroup2": "", "cgroup": "cpu"}.get(kind)
+            if name not in paths or (name and name not in options.split(",")):
+                continue
+            below = Path(paths[name].removeprefix(root).lstrip("/"))
+            yield from (Path(point) / folder for folder in (below, *below.parents))
