@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import pandas as pd
 
@@ -33,7 +32,7 @@ from analysis.tables.rendering import TextTable, gaps_table
 from analysis.workers_option import add_workers
 from analysis.yardsticks import command as yardsticks
 from dopt.errors import DoptError
-from orchestrate.cli_parser import Parser, discard_output
+from orchestrate.cli_parser import Parser, discard_output, path
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
 COLUMNS = ("loss", "reachable_loss")
@@ -79,7 +78,7 @@ def parser() -> Parser:
     top = Parser(prog="python -m analysis", description=__doc__)
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     figures = _command(commands, "figures", _figures, "draw the paper's figures and tables")
-    figures.add_argument("--out", type=Path, default=Path("figures"), help="folder (figures/)")
+    figures.add_argument("--out", type=path("--out"), default="figures", help="folder (figures/)")
     figures.add_argument("--only", action="append", choices=NAMES, help="this output (repeat)")
     figures.add_argument("--x", choices=list(Axis), default=Axis.STEPS, help="axis of figure 1")
     figures.add_argument(

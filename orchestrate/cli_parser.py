@@ -7,9 +7,12 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any, NoReturn
 
 from dopt.errors import DoptError, unknown_name
+from dopt.given_path import given_path
 
 
 class UsageError(DoptError):
@@ -79,6 +82,11 @@ def positive(option: str, number: type[int] | type[float]) -> Callable[[str], fl
         return value
 
     return read
+
+
+def path(option: str) -> Callable[[str], Path]:
+    """Return the argument type for the path of a file or folder."""
+    return partial(given_path, what=option, refusal=UsageError)
 
 
 def integer(option: str) -> Callable[[str], int]:

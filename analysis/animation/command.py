@@ -11,6 +11,7 @@ from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Entry, select
 from analysis.errors import AnalysisError
 from analysis.figures.phase_portraits.data import median_seed
+from orchestrate.cli_parser import path
 from orchestrate.store import Reader
 
 HELP = "a film of one stored trial: system, phase trace, learned and true force, loss"
@@ -21,7 +22,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("env", metavar="ENV", help="environment of the trial")
     command.add_argument("policy", metavar="POLICY", help="policy of the trial")
     command.add_argument("--seed", type=int, help="seed (that of the median final loss)")
-    command.add_argument("--out", type=Path, help=".gif or .mp4 (figures/ENV_POLICY.gif)")
+    command.add_argument("--out", type=path("--out"), help=".gif or .mp4 (figures/ENV_POLICY.gif)")
     command.add_argument("--frames", type=int, default=150, help="pictures in all (150)")
     command.add_argument("--fps", type=int, default=15, help="pictures a second (15)")
 

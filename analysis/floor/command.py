@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -23,6 +22,7 @@ from analysis.units import loss_unit
 from analysis.workers_option import add_workers
 from dopt.offline_fit import RIDGE
 from dopt.spec.prequential import system_of
+from orchestrate.cli_parser import path
 from orchestrate.store import Reader
 
 HELP = "fit the models of stored trials offline: how much exploration and learner lose"
@@ -32,7 +32,7 @@ TRIALS = f"{NAME}_trials"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options that only this command has."""
-    parser.add_argument("--out", type=Path, default=Path("floor"), help="folder (floor/)")
+    parser.add_argument("--out", type=path("--out"), default="floor", help="folder (floor/)")
     parser.add_argument(
         "--ridge",
         type=float,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable
-from pathlib import Path
 
 from analysis.data import provenance
 from analysis.data.config_matching import Filter
@@ -16,6 +15,7 @@ from analysis.outputs import publish
 from analysis.report import control, page, variant_table
 from analysis.report.variants import VariantGroup, variant_groups
 from analysis.tables.rendering import gaps_table
+from orchestrate.cli_parser import path
 from orchestrate.store import Reader
 
 HELP = "compare every policy, model and learner with the reference, on one page"
@@ -26,7 +26,7 @@ PAGE = "README.md"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options that only this command has."""
-    parser.add_argument("--out", type=Path, default=Path("report"), help="folder (report/)")
+    parser.add_argument("--out", type=path("--out"), default="report", help="folder (report/)")
 
 
 def run(options: argparse.Namespace, wanted: Filter) -> int:

@@ -6,10 +6,10 @@ import argparse
 import socket
 import sys
 from contextlib import ExitStack
-from pathlib import Path
 
 from analysis.errors import AnalysisError
 from analysis.serve.addresses import is_loopback
+from orchestrate.cli_parser import path
 from orchestrate.store import DEFAULT_URL, default_url
 
 HELP = "show the results in a browser, read-only, while a launch writes"
@@ -29,7 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=PORT, help=f"port, 0: any free one ({PORT})")
     parser.add_argument("--host", default=HOST, help=f"address to listen at ({HOST})")
     parser.add_argument(
-        "--figures", type=Path, default=Path("figures"), help="folder of figures (figures/)"
+        "--figures",
+        type=path("--figures"),
+        default="figures",
+        help="folder of figures (figures/)",
     )
 
 

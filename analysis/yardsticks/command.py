@@ -17,6 +17,7 @@ from analysis.errors import AnalysisError, IncompleteError
 from analysis.outputs import publish
 from analysis.tables.rendering import TextTable
 from analysis.yardsticks import disk_rows, pendulum_rows, star_rows, swing_up_rows
+from orchestrate.cli_parser import path
 from orchestrate.store import Reader
 
 HELP = "published tables, run here, beside the published numbers"
@@ -41,7 +42,9 @@ YARDSTICKS = tuple(
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options that only this command has."""
-    parser.add_argument("--out", type=Path, default=Path("yardsticks"), help="folder (yardsticks/)")
+    parser.add_argument(
+        "--out", type=path("--out"), default="yardsticks", help="folder (yardsticks/)"
+    )
 
 
 def run(options: argparse.Namespace, wanted: Filter) -> int:

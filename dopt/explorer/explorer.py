@@ -139,7 +139,7 @@ class Explorer(SavedExplored):
         self._plans_each_step = may_remember_plans(spec)
         self._unlearned = UnlearnedStates(spec.system.dt)
         self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
-        self._journal = None if journal is None else Journal(Path(journal), fsync, self._about())
+        self._journal = None if journal is None else Journal(journal, fsync, self._about())
         self._planner = PunctualPlanner(self._state.plan, deadline)
         if self._journal is not None:
             try:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dopt.errors import ExplorationError, SpecificationError
+from dopt.given_path import given_path
 
 FORMAT = 1
 """Version of the lines."""
@@ -29,7 +30,7 @@ class Journal:
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         File, which is made if it is not there.
     fsync : bool
         Whether a durable event is on the disk before :meth:`write` returns.
@@ -48,8 +49,8 @@ class Journal:
         If the file cannot be opened, is being written, or is none of this kind.
     """
 
-    def __init__(self, path: Path, fsync: bool, about: Event) -> None:
-        self.path, self._fsync, self._about = path.expanduser(), fsync, about
+    def __init__(self, path: str | Path, fsync: bool, about: Event) -> None:
+        self.path, self._fsync, self._about = given_path(path, "journal"), fsync, about
         self._process, self._broken = os.getpid(), False
         try:
             self._open()

@@ -21,6 +21,8 @@ from pathlib import Path
 
 import llvmlite.binding
 
+from dopt.given_path import given_path
+
 CACHE_VARIABLE = "DOPT_CACHE"
 _PACKAGE = Path(__file__).resolve().parent.parent
 COMPILED_SOURCES = ("algorithm.py", "kernel", "systems", "math")
@@ -50,7 +52,7 @@ def _cache_folder() -> Path:
     Where the cache cannot be written it is a temporary one, for this process and those it starts.
     """
     base = os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME")
-    root = Path(base) if base else Path.home() / ".cache"
+    root = given_path(base, CACHE_VARIABLE) if base else Path.home() / ".cache"
     folder = root / "dopt" / f"kernel-{_source_digest()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from orchestrate.cli_parser import path
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
@@ -14,7 +14,7 @@ from orchestrate.store import back_up
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file",
-        type=Path,
+        type=path("FILE"),
         metavar="FILE",
         help="new file: a database of SQLite, or an archive of PostgreSQL for pg_restore",
     )

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from orchestrate.cli_parser import UsageError
+from orchestrate.cli_parser import UsageError, path
 from orchestrate.commands.command import Command
 from orchestrate.commands.filtering import add_filters, chosen
 from orchestrate.commands.output import say, say_json
@@ -29,9 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(a tracking store of MLflow) or wandb (offline runs of Weights & Biases)",
     )
     parser.add_argument(
-        "path", nargs="?", type=Path, metavar="PATH", help="file or folder to write"
+        "path", nargs="?", type=path("PATH"), metavar="PATH", help="file or folder to write"
     )
-    parser.add_argument("--out", type=Path, metavar="PATH", help="the same, as an option")
+    parser.add_argument("--out", type=path("--out"), metavar="PATH", help="the same, as an option")
     parser.add_argument(
         "--format", choices=FORMATS, help="csv, parquet or npz (as the name of the file ends)"
     )
@@ -56,14 +56,14 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 
 
 def _target(arguments: argparse.Namespace) -> Path:
-    given = [path for path in (arguments.path, arguments.out) if path is not None]
+    given = [one for one in (arguments.path, arguments.out) if one is not None]
     if len(given) != 1:
         raise UsageError(
             f"{'Two paths are' if given else 'No path is'} given to write to, one is expected: "
             f"write export {arguments.kind} PATH."
         )
-    path: Path = given[0]
-    return path
+    out: Path = given[0]
+    return out
 
 
 def _to_file(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:

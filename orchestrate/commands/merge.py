@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
+from dopt.given_path import given_path
+from orchestrate.cli_parser import UsageError
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
@@ -35,20 +36,15 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 
 
 def _merge(url: str, other: str) -> Merged:
-    folder = Path(other)
-    if not any(folder.glob("*.db")):  # a bundle has other files
-        return merge(url, _url(other))
+    if "://" in other:
+        return merge(url, other)
+    place = given_path(other, "OTHER", UsageError)
+    if not any(place.glob("*.db")):  # a bundle has other files
+        return merge(url, f"{'bundle' if place.is_dir() else 'sqlite'}:///{place.absolute()}")
     total = Merged()
-    for merged in merge_collected(url, folder):
+    for merged in merge_collected(url, place):
         total.include(merged)
     return total
-
-
-def _url(text: str) -> str:
-    if "://" in text:
-        return text
-    kind = "bundle" if Path(text).is_dir() else "sqlite"
-    return f"{kind}:///{Path(text).absolute()}"
 
 
 def _plain(merged: Merged) -> dict[str, object]:

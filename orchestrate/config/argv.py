@@ -18,6 +18,10 @@ OTHER_SWEEPER = (
     "hydra/sweeper is set, but this program expands its grids itself: leave hydra/sweeper out."
 )
 
+_PATHS = ("store.url", "store.folder", "executor.logs")
+_UNQUOTED = re.compile(r"[^'\"]*[~\s][^'\"]*")
+"""Path with a character that Hydra takes in quotes alone."""
+
 _CHOICE = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>null|\[.*\]|)\s*")
 
 
@@ -50,9 +54,10 @@ def normalize(arguments: Sequence[str], folder: Path) -> list[str]:
 
 
 def _quoted(word: str) -> str:
-    """Return ``launch.until=ci<5%`` with the quotes that Hydra requires around a ``<``."""
+    """Return ``launch.until=ci<5%`` or a path with the quotes that Hydra requires around them."""
     key, _, value = word.partition("=")
-    if key.lstrip("+") == "launch.until" and value.startswith("ci"):
+    rule = key.lstrip("+") == "launch.until" and value.startswith("ci")
+    if rule or (key.lstrip("+") in _PATHS and _UNQUOTED.fullmatch(value)):
         return f"{key}='{value}'"
     return word
 

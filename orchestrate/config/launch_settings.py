@@ -5,12 +5,15 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, cast
 
 from dopt.errors import unknown_name
+from dopt.given_path import given_path, stripped
 from orchestrate.config.share import Share, share
 from orchestrate.config.stopping_rule import Until, until
 from orchestrate.config.value_checks import amount, count, factor, flag, limit, section, text, wrong
+from orchestrate.errors import LaunchError
 
 SHARD_SUFFIX = ".db"
 """End of the name of a file that holds a share."""
@@ -70,7 +73,7 @@ class LaunchSettings:
     detach: bool = False
     fail_fast: bool = False
     share: Share | None = None
-    collect_in: str | None = None
+    collect_in: Path | None = None
     collect_seconds: float = 60.0
     retry: Retry | None = None
     until: Until | None = None
@@ -134,13 +137,13 @@ class _Place:
     """Database of a launch, and the folder and the times of its copies."""
 
     url: str
-    folder: str | None = None
+    folder: Path | None = None
     seconds: float = 60.0
 
 
 def _place(store: Mapping[str, Any], part: Share | None) -> _Place:
     """Return where results go; a store with a folder for copies holds one share of a grid."""
-    url = text("store.url", store["url"])
+    url = stripped(text("store.url", store["url"]), "store.url", LaunchError)
     if store.get("folder") is None:
         return _Place(url)
     if part is None:
@@ -148,7 +151,7 @@ def _place(store: Mapping[str, Any], part: Share | None) -> _Place:
     if not url.startswith("sqlite") or not url.endswith(SHARD_SUFFIX):
         raise wrong("store.url", url, "with store=shards a file such as sqlite:////var/tmp/x.db")
     file = f"{url.removesuffix(SHARD_SUFFIX)}.{part}.{socket.gethostname()}{SHARD_SUFFIX}"
-    folder = text("store.folder", store["folder"])
+    folder = given_path(text("store.folder", store["folder"]), "store.folder", LaunchError)
     return _Place(file, folder, amount("store.every", store["every"], "seconds"))
 
 

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.store import StoreError, collect, merge_collected
@@ -30,7 +29,7 @@ def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator
     if settings.collect_in is None:
         yield
         return
-    folder, ended = Path(settings.collect_in), threading.Event()
+    folder, ended = settings.collect_in, threading.Event()
     earlier = f"*.{settings.share}.*.db"
     if any(folder.glob(earlier)):
         for _ in merge_collected(settings.store_url, folder, earlier):

@@ -58,6 +58,8 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
     grid = build_grid(request.combinations, single=request.single)
     settings = LaunchSettings.from_mapping(request.launch)
     check_launch(request.launch, CONFIGURATION)
+    from dopt.kernel import cache  # noqa: F401  refuses a path of the cache that cannot be meant
+
     path = executor_factory(settings).path
     if path != "kernel":
         grid = grid.on_path(path)

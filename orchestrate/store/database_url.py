@@ -9,6 +9,7 @@ from pathlib import Path
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
+from dopt.given_path import given_path, stripped
 from orchestrate.store.errors import StoreError
 
 DEFAULT_URL = "sqlite:///results/results.db"
@@ -19,6 +20,7 @@ URL_VARIABLE = "DOPT_DB"
 BUNDLE = "bundle"
 """Kind of URL that names the folder of a bundle, which is only read."""
 
+_IN_MEMORY = ":memory:"
 _EXAMPLES = (
     "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name, "
     "or bundle:///FOLDER to read a bundle"
@@ -40,12 +42,14 @@ def default_url() -> str:
 def parse(url: str) -> URL:
     """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
 
-    The path of a folder is taken for a bundle in it. The message says whether the URL came from
+    The path of a folder is taken for a bundle in it, and the path of a file is read as
+    :func:`dopt.given_path.given_path` does. The message says whether the URL came from
     ``DOPT_DB``. It repeats no text other than the path of a SQLite file, because a mistyped URL may
     hold a password.
     """
     source = f" in the environment variable {URL_VARIABLE}"
-    where = source if url == os.environ.get(URL_VARIABLE) else ""
+    where = source if url.strip() == os.environ.get(URL_VARIABLE, "").strip() else ""
+    url = stripped(url, f"The database URL{where}", StoreError)
     if "://" not in url and Path(url).is_dir():
         return URL.create(BUNDLE, database=url)
     try:
@@ -66,6 +70,9 @@ def parse(url: str) -> URL:
             f"{_NAMES[backend]} has none: write three slashes, {backend}:///{parsed.host}/"
             f"{parsed.database or _DEFAULT_NAMES[backend]}."
         )
+    if parsed.database and parsed.database != _IN_MEMORY:
+        file = given_path(parsed.database, f"The path in the database URL{where}", StoreError)
+        parsed = parsed.set(database=str(file))
     return parsed.set(drivername=backend)
 
 
@@ -90,7 +97,7 @@ def sqlite_path(url: URL) -> Path:
 
     The lock files are beside the file itself, so that two names of one database share them.
     """
-    if url.database in (None, "", ":memory:"):
+    if url.database in (None, "", _IN_MEMORY):
         raise StoreError(
             "A SQLite database in memory cannot be shared between processes: "
             "give a file, such as sqlite:///results/results.db."

@@ -103,7 +103,7 @@ def test_what_does_not_go_with_shares_is_refused(
 def test_copies_are_made_while_trials_run(tmp_path: Path) -> None:
     url, shared = f"sqlite:///{tmp_path}/s.1-of-2.here.db", tmp_path / "shared"
     settings = LaunchSettings(
-        "local", url, share=Share(1, 2), collect_in=str(shared), collect_seconds=0.05
+        "local", url, share=Share(1, 2), collect_in=shared, collect_seconds=0.05
     )
     with Store.open(url) as store, collected(settings, print):
         launch = store.begin_launch(LAUNCH)

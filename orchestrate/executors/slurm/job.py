@@ -102,13 +102,13 @@ class SlurmJob:
         return [sys.executable, "-P", "-m", "orchestrate", "work", *words]
 
 
-def _make_folder(logs: str) -> None:
+def _make_folder(logs: Path) -> None:
     """Make the folder without which SLURM ends a task before it has begun."""
     try:
-        Path(logs).mkdir(parents=True, exist_ok=True)
+        logs.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LaunchError(
-            f"executor.logs is {logs!r}, a folder that cannot be made ({error.strerror}): give "
+            f"executor.logs is '{logs}', a folder that cannot be made ({error.strerror}): give "
             "another one on a disk that the nodes see, and run the same command again."
         ) from error
 

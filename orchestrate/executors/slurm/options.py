@@ -6,9 +6,11 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from dopt.errors import DoptError
+from dopt.given_path import given_path
 from orchestrate.cli_parser import length_of_time
 from orchestrate.config.value_checks import count, limit, section, text, wrong
 from orchestrate.errors import LaunchError
@@ -70,7 +72,7 @@ class SlurmOptions:
     memory_gib: float | None
     partition: str | None
     account: str | None
-    logs: str
+    logs: Path
     extra: Mapping[str, str | None] = field(default_factory=dict)
 
     @classmethod
@@ -89,7 +91,7 @@ class SlurmOptions:
             memory_gib=limit("executor.memory_gib", given.get("memory_gib"), "GiB"),
             partition=_word("partition", given.get("partition")),
             account=_word("account", given.get("account")),
-            logs=text("executor.logs", given.get("logs")),
+            logs=given_path(text("executor.logs", given.get("logs")), "executor.logs", LaunchError),
             extra=dict(_extra(section("executor.options", given.get("options", {})))),
         )
 

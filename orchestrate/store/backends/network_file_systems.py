@@ -1,11 +1,12 @@
-"""File systems of several machines, on which SQLite loses what two of them write at once.
+"""File systems on which SQLite is known to be safe; others can lose or damage what is written.
 
-The write-ahead log is shared memory, which one machine cannot share with another
-(https://www.sqlite.org/wal.html), and the locks of many of these file systems fail.
+The write-ahead log is shared memory, which one machine, or a virtual one and its host, cannot share
+with another (https://www.sqlite.org/wal.html), and the locks of many such file systems fail.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -14,13 +15,19 @@ from orchestrate.store.errors import StoreError
 
 MOUNT_TABLE = Path("/proc/self/mountinfo")
 
-_NETWORK = frozenset(
+SAFE_VARIABLE = "DOPT_SAFE_FILE_SYSTEMS"
+"""Environment variable with further kinds of file systems that its user knows to be safe."""
+
+_SAFE = frozenset(
     {
-        *("nfs", "nfs4", "cifs", "smb3", "smbfs", "afs", "9p"),
-        *("lustre", "gpfs", "beegfs", "ceph", "glusterfs", "gfs2", "ocfs2", "orangefs", "pvfs2"),
-        *("panfs", "wekafs"),
+        *("ext2", "ext3", "ext4", "xfs", "btrfs", "zfs", "bcachefs", "f2fs", "jfs", "nilfs2"),
+        *("reiserfs", "ufs", "apfs", "hfs", "hfsplus", "ubifs", "simfs"),
+        *("vfat", "msdos", "exfat", "ntfs", "ntfs3", "fuseblk", "udf", "iso9660", "squashfs"),
+        *("tmpfs", "ramfs", "devtmpfs", "rootfs", "overlay", "overlayfs", "aufs", "ecryptfs"),
     }
 )
+"""File systems of disks and memory of this machine, and layers over them."""
+
 _LOCAL_PROGRAMS = frozenset(
     {"mergerfs", "fuse-overlayfs", "bindfs", "ntfs-3g", "exfat", "gocryptfs", "encfs", "cryfs"}
 )
@@ -34,8 +41,8 @@ class Mount(NamedTuple):
     kind: str  # such as ext4, or fuse.sshfs
 
 
-def refuse_network(path: Path, safe_url: str) -> None:
-    """Raise ``StoreError`` if the file of a database would be on a network file system.
+def refuse_unsafe(path: Path, safe_url: str) -> None:
+    """Raise ``StoreError`` if the file of a database would be where SQLite is not known to be safe.
 
     ``path`` is absolute, and neither it nor its folder has to exist. Where the system has no table
     of mounts, nothing is refused.
@@ -47,11 +54,13 @@ def refuse_network(path: Path, safe_url: str) -> None:
     mount = mount_of(PurePosixPath(path), table)
     if mount is not None and is_network(mount.kind):
         raise StoreError(
-            f"The results database {safe_url} would be on {mount.folder}, a network file system "
-            f"({mount.kind}), on which SQLite can lose results, but a disk of this machine is "
-            "expected: give a file on one, such as store.url=sqlite:////var/tmp/results.db, and "
-            "copy it afterwards, use PostgreSQL (store=postgresql), which many machines share, or "
-            "let each machine write a share of the grid to its own disk (store=shards)."
+            f"The results database {safe_url} would be on {mount.folder}, whose file system "
+            f"({mount.kind}) is not known to keep the log and the locks of SQLite whole, so that "
+            "results can be lost or damaged, but a disk of this machine is expected: give a file "
+            "on one, such as store.url=sqlite:////var/tmp/results.db (in a container a volume, in "
+            "WSL a folder of Linux), and copy it afterwards, use PostgreSQL (store=postgresql), "
+            "which many machines share, or let each machine write a share of the grid to its own "
+            f"disk (store=shards). If you know that it is safe, set {SAFE_VARIABLE}={mount.kind}."
         )
 
 
@@ -74,14 +83,13 @@ def mount_of(path: PurePosixPath, table: str) -> Mount | None:
 
 
 def is_network(kind: str) -> bool:
-    """Tell whether a kind of file system can be shared by machines.
+    """Return whether a kind of file system is taken for one that several machines share.
 
-    A program that serves files by FUSE is taken for one of a network unless it is known not to be.
+    Every kind is that is not known to be safe, and that ``DOPT_SAFE_FILE_SYSTEMS`` does not name.
     """
     system, _, program = kind.partition(".")
-    if system == "fuse":
-        return program not in _LOCAL_PROGRAMS
-    return system in _NETWORK
+    safe = program in _LOCAL_PROGRAMS if system == "fuse" else kind in _SAFE
+    return not safe and kind not in re.split(r"[,\s]+", os.environ.get(SAFE_VARIABLE, ""))
 
 
 def _unescaped(field: str) -> str:

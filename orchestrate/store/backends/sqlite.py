@@ -17,7 +17,7 @@ from orchestrate.store import database_url
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
 from orchestrate.store.backends.driver_errors import translated, translated_file
 from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
-from orchestrate.store.backends.network_file_systems import refuse_network
+from orchestrate.store.backends.network_file_systems import refuse_unsafe
 from orchestrate.store.backends.sqlite_backup import copy_file
 from orchestrate.store.backends.sqlite_engine import (
     driver_of,
@@ -46,7 +46,7 @@ class SQLiteBackend(Backend):
         self._path = database_url.sqlite_path(url)
         self._folder = _locks_folder(self._path)
         super().__init__(write_engine(self._path), database_url.safe(url))
-        refuse_network(self._path, self.safe_url)
+        refuse_unsafe(self._path, self.safe_url)
         with translated_file(self.safe_url):
             if self._path.is_dir():
                 raise StoreError(

@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
+from dopt.given_path import given_path
 from orchestrate.store.backends.file_locks import file_lock
 from orchestrate.store.bundles import checksums
 from orchestrate.store.bundles.filling import fill
@@ -98,7 +99,8 @@ def _remove_unused(copies: Path) -> None:
 def copies_folder() -> Path:
     """Return a writable folder for the copies: a temporary one where the cache is read-only."""
     base = os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME")
-    folder = (Path(base) if base else Path.home() / ".cache") / "dopt" / "bundles"
+    root = given_path(base, CACHE_VARIABLE) if base else Path.home() / ".cache"
+    folder = root / "dopt" / "bundles"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):

@@ -1,4 +1,4 @@
-"""Network file systems: found from the table of mounts, and refused before anything is written."""
+"""File systems where SQLite is not safe: found from the table of mounts, and refused at first."""
 
 from __future__ import annotations
 
@@ -73,7 +73,12 @@ TABLES = {
         ("/", "ext4"),
     ),
 }
-LOCAL = {"ext4", "xfs", "btrfs", "zfs", "overlay", "tmpfs", "fuseblk", "fuse.mergerfs", "virtiofs"}
+LOCAL = {"ext4", "xfs", "btrfs", "zfs", "overlay", "tmpfs", "fuseblk", "fuse.mergerfs", "ntfs3"}
+SHARED = {
+    *("nfs", "nfs4", "cifs", "smb3", "9p", "ceph", "fuse.sshfs", "fuse.glusterfs"),
+    *("virtiofs", "vboxsf", "prl_fs", "drvfs", "fakeowner"),  # a virtual machine and its host
+    *("vmhgfs", "fuse.vmhgfs-fuse", "fuse.grpcfuse", "fuse.osxfs", "fuse", "lxfs", "unheard_of"),
+}
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -88,6 +93,17 @@ def test_what_disks_of_this_machine_hold_is_no_network(kind: str) -> None:
     assert not is_network(kind)
 
 
+@pytest.mark.parametrize("kind", sorted(SHARED))
+def test_what_is_not_known_to_be_safe_is_refused_unless_the_user_says_that_it_is(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert is_network(kind)
+    monkeypatch.setenv("DOPT_SAFE_FILE_SYSTEMS", f"other, {kind}")
+    assert not is_network(kind)
+    monkeypatch.setenv("DOPT_SAFE_FILE_SYSTEMS", f"{kind}x")
+    assert is_network(kind)
+
+
 def test_a_database_on_a_network_is_refused_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -96,7 +112,7 @@ def test_a_database_on_a_network_is_refused_before_anything_is_written(
     monkeypatch.setattr(network_file_systems, "MOUNT_TABLE", table)
     (tmp_path / "link").symlink_to(tmp_path / "home", target_is_directory=True)
     url = make_url(f"sqlite:///{tmp_path}/link/results/results.db")
-    with pytest.raises(StoreError, match=r"home, a network file system \(nfs4\).*store=postgresql"):
+    with pytest.raises(StoreError, match=r"home, whose file system \(nfs4\).*store=postgresql"):
         make_backend(url)
     assert not (tmp_path / "home").exists()
     make_backend(make_url(f"sqlite:///{tmp_path}/local/results.db")).close()
