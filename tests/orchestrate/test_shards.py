@@ -14,10 +14,10 @@ from orchestrate.config.share import Share, share
 from orchestrate.errors import LaunchError
 from orchestrate.runner.collecting import collected
 from orchestrate.store import NoDatabaseError, Reader, Store, StoreError, collect, merge_collected
-from tests.orchestrate.faults.laboratory import until
 from tests.orchestrate.faults.outcome import flaws, results
 from tests.orchestrate.standins import grid_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.waiting import until
 
 GRID = ("-m", "policy=random", "seed=range(20)", "env.horizon=5", "executor=inprocess")
 SHARES = 3

@@ -10,15 +10,12 @@ from typing import Any
 
 import pytest
 
-from tests.orchestrate.faults.laboratory import PATIENCE_SECONDS, Laboratory
+from tests.orchestrate.faults.laboratory import Laboratory
 from tests.orchestrate.faults.outcome import Rows, results
 from tests.orchestrate.faults.program import Order
 from tests.orchestrate.faults.servers import Server, binaries
 
 TRIALS = Order.trials
-
-TRIAL_SECONDS = 0.1
-"""Longest time of a trial without work on a machine with much else to do [s]."""
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +57,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Row
             url = f"sqlite:///{folder}/results.db"
             order = Order(url, executor="inprocess", trials=trials, seconds=0.0)
             with Laboratory(folder, order, dict).launched() as launched:
-                assert launched.end(TRIAL_SECONDS * trials + PATIENCE_SECONDS) == 0, launched.errors
+                assert launched.end() == 0, launched.errors
             known[trials] = results(url)
         return known[trials]
 

@@ -6,20 +6,20 @@ import dataclasses
 import itertools
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import create_engine, text
+
 from orchestrate.store import NoDatabaseError, Reader, StoreError
+from tests.orchestrate.faults.gate import Gate
 from tests.orchestrate.faults.outcome import Rows, flaws, results
 from tests.orchestrate.faults.program import Order, carry_out, errors_beside
 from tests.orchestrate.store.processes import CLEAN
-
-PATIENCE_SECONDS = 120.0
-"""Longest wait on a machine with much else to do [s]."""
+from tests.waiting import PATIENCE_SECONDS, until
 
 
 @dataclasses.dataclass
@@ -55,17 +55,17 @@ class Launched:
         self.process.kill()
         self.process.join(PATIENCE_SECONDS)
 
-    def until(self, condition: Callable[[], bool]) -> None:
+    def until(self, condition: Callable[[], object]) -> None:
         """Wait for what the launch must live to see."""
         until(lambda: condition() or not self.process.is_alive())
         assert condition(), f"it ended too early: {self.said}{self.errors}"
 
-    def end(self, seconds: float = PATIENCE_SECONDS) -> int:
+    def end(self) -> int:
         """Wait for the end and return the exit code."""
-        self.process.join(seconds)
+        self.process.join(PATIENCE_SECONDS)
         if self.process.exitcode is None:
             self.send(signal.SIGUSR1)  # it writes down where it stands
-            self.process.join(1.0)
+            self.process.join(10.0)
         assert self.process.exitcode is not None, f"it does not end: {self.said}{self.errors}"
         return self.process.exitcode
 
@@ -81,12 +81,19 @@ class Laboratory:
     ----------
     expected
         Function that gives what an undisturbed run of the grid leaves; called where it is compared.
+    gate
+        Gate of all its trials, by which a test has the launch at work when the fault comes.
     """
 
     folder: Path
     order: Order
     expected: Callable[[], Rows]
+    gate: Gate = dataclasses.field(init=False)
     _numbers: Iterator[int] = dataclasses.field(default_factory=itertools.count)
+
+    def __post_init__(self) -> None:
+        self.gate = Gate(self.folder)
+        self.order = dataclasses.replace(self.order, gate=str(self.folder))
 
     @property
     def url(self) -> str:
@@ -111,8 +118,9 @@ class Laboratory:
         """Give the same command once more, let it end well and return what it said.
 
         Its trials take no time, and no processes of their own where it would start them itself:
-        nothing has to happen while they run.
+        nothing has to happen while they run. The gate opens.
         """
+        self.gate.open()
         executor = "inprocess" if self.order.executor == "local" else self.order.executor
         with self.launched(**{"seconds": 0.0, "executor": executor, **changes}) as launched:
             code = launched.end()
@@ -142,17 +150,19 @@ class Laboratory:
         except (NoDatabaseError, StoreError):
             return 0
 
+    def end_lease(self, launched: Launched) -> None:
+        """Let the lease of a dead launch run out, as time does; SQLite has none."""
+        engine = create_engine(self.url)
+        with engine.begin() as connection:
+            connection.execute(
+                text("UPDATE launch SET lease_until = 0 WHERE pid = :pid AND lease_until > 0"),
+                {"pid": launched.pid},
+            )
+        engine.dispose()
+
     def query(self, sql: str) -> list[tuple[Any, ...]]:
         with Reader.open(self.url) as reader:
             return [tuple(row) for row in reader.rows(sql)]
-
-
-def until(condition: Callable[[], bool], seconds: float = PATIENCE_SECONDS) -> None:
-    """Wait for the condition."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.05)
 
 
 def alive(pid: int) -> bool:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import random
 import signal
-import time
 from collections import Counter
 from contextlib import ExitStack
 
-from tests.orchestrate.faults.laboratory import PATIENCE_SECONDS, Laboratory, Launched
+from tests.orchestrate.faults.laboratory import Laboratory, Launched
+from tests.waiting import until
 
 OPEN = "status IN ('pending', 'running')"
 
@@ -19,37 +19,34 @@ EXIT_CODES = {0, 130}
 
 
 def preempt(
-    laboratory: Laboratory, workers: int, pause: float, chance: random.Random, **worker: object
+    laboratory: Laboratory, workers: int, every: int, chance: random.Random, **worker: object
 ) -> Counter[str]:
-    """Run the registered grid on workers of which one is replaced every ``pause`` seconds.
+    """Run the registered grid on workers of which one is replaced after ``every`` trials.
 
     Returns how often each signal was sent.
     """
     sent: Counter[str] = Counter()
-    end = time.monotonic() + PATIENCE_SECONDS + laboratory.order.trials * laboratory.order.seconds
     with ExitStack() as stack:
 
         def start() -> Launched:
             return stack.enter_context(laboratory.launched(worker=worker))
 
         running = [start() for _ in range(workers)]
-        while laboratory.count(OPEN):
-            assert time.monotonic() < end, [one.said + one.errors for one in running]
-            time.sleep(pause)
+        while (left := laboratory.count(OPEN)) > 4 * every:
+            laboratory.gate.let(2 * every)  # so that the victim is at work, and not at its end
+            until(lambda: laboratory.count(OPEN) <= left - every)  # called at once
             victim = chance.choice(running)
+            victim.until(lambda: "trials wait" in victim.said)  # noqa: B023
             number = chance.choice(PREEMPTIONS)
             running[running.index(victim)] = start()
-            if begun(victim):
-                sent[number.name] += 1
-                leave(victim, number)
+            sent[number.name] += 1
+            leave(victim, number)
+            if number == signal.SIGKILL:
+                laboratory.end_lease(victim)
+        laboratory.gate.open()
         codes = [one.end() for one in running]
     assert set(codes) == {0}, codes
     return sent
-
-
-def begun(worker: Launched) -> bool:
-    """Tell whether a worker has looked for trials, and still runs."""
-    return "trials wait" in worker.said and worker.process.is_alive()
 
 
 def leave(worker: Launched, number: signal.Signals) -> None:

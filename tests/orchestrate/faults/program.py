@@ -22,14 +22,16 @@ import psycopg
 
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.runner import launch
+from orchestrate.executors import exit_status
+from orchestrate.runner import launch, stored_chunks, worker
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store, StoreUnavailableError
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
 from tests.orchestrate import lean_ray
-from tests.orchestrate.faults.trials import Standin, grid_of, rest
+from tests.orchestrate.faults.gate import Gate, Gated, rest
+from tests.orchestrate.faults.trials import Standin, grid_of
 
 
 @dataclass(frozen=True)
@@ -42,11 +44,15 @@ class Order:
         Duration of one trial.
     trouble
         What the trial with the broken seed does.
+    gate
+        Folder of the gate that all trials pass.
     pause
         Where the driver stops for ever: before it claims, in the middle of a commit, or
         on PostgreSQL in the middle of what it sends: the steps of a trial, or a claim.
     settings
         Further settings of the launch.
+    tick
+        Seconds by which each trial at the gate sets the clock of a worker on; 0 for a real clock.
     worker
         Settings of a worker, which runs trials that are registered, in place of a launch.
     environment
@@ -58,8 +64,10 @@ class Order:
     trials: int = 40
     seconds: float = 0.05
     trouble: str = ""
+    gate: str = ""
     pause: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    tick: float = 0.0
     worker: Mapping[str, Any] | None = None
     environment: Mapping[str, str] = field(default_factory=dict)
 
@@ -92,7 +100,10 @@ def _start_anew(order: Order, output: Path) -> None:
 def _launch(order: Order) -> int:
     if order.executor == "ray":
         lean_ray.leave_services_out()
-    work = Work(Standin(order.seconds, order.trouble), prepare=lambda: None)
+    # Those of the whole machine, to which another test may add one at any moment.
+    exit_status._kills_for_memory = lambda: 0
+    run = Gated(Standin(order.seconds, order.trouble), Gate(Path(order.gate)))
+    work = Work(run, prepare=lambda: None)
     if order.worker is not None:
         return _pull(order, work)
     launch.WORK = work
@@ -105,7 +116,23 @@ def _launch(order: Order) -> int:
         return ExitCode.INTERRUPTED
 
 
+@dataclass(frozen=True)
+class Clock:
+    """The clock of a worker for which only its trials take time."""
+
+    gate: Gate
+    tick: float
+
+    def monotonic(self) -> float:
+        return self.gate.passed * self.tick
+
+    sleep = staticmethod(time.sleep)
+
+
 def _pull(order: Order, work: Work) -> int:
+    if order.tick:
+        clock = Clock(Gate(Path(order.gate)), order.tick)
+        worker.time = stored_chunks.time = clock  # type: ignore[assignment]
     settings = WorkerSettings(order.url, **{"processes": 2, **dict(order.worker or {})})
     try:
         return run_worker(settings, Output(launch.say, launch.say, sys.stderr), work)

@@ -23,9 +23,7 @@ class Disk:
         self.mount("-t", "tmpfs", "-o", f"size={MEBIBYTES}m", "dopt-test")
 
     def mount(self, *words: str) -> None:
-        subprocess.run(
-            ["mount", *words, str(self.folder)], check=True, capture_output=True, timeout=20
-        )
+        subprocess.run(["mount", *words, str(self.folder)], check=True, capture_output=True)
 
     def fill(self, left: int) -> None:
         """Leave about that many bytes free, as another program would."""
@@ -44,7 +42,7 @@ def disk(tmp_path: Path) -> Iterator[Disk]:
     except (OSError, subprocess.SubprocessError) as error:
         pytest.skip(f"a file system is mounted by root only: {error}")
     yield made
-    subprocess.run(["umount", "--lazy", str(folder)], check=True, timeout=20)
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 @pytest.fixture

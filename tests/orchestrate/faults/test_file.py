@@ -27,6 +27,7 @@ def file_of(laboratory: Laboratory) -> Path:
 
 def test_a_torn_log_costs_the_last_trials_only(file_laboratory: Laboratory) -> None:
     laboratory = file_laboratory
+    laboratory.gate.let(25)
     with laboratory.launched() as launched:
         launched.until(lambda: laboratory.count() >= 15)
         launched.kill()
@@ -58,12 +59,14 @@ def test_a_damaged_file_ends_the_launch_and_stays_as_it_is(file_laboratory: Labo
 
 
 def test_a_reader_that_never_ends_holds_up_nobody(laboratory: Laboratory) -> None:
+    laboratory.gate.let(10)
     with laboratory.launched() as launched:
         launched.until(lambda: laboratory.count() >= 5)
         engine = create_engine(laboratory.url, isolation_level="SERIALIZABLE")
         with engine.connect() as connection:
             connection.execute(text("BEGIN")) if engine.name == "sqlite" else None
             seen = connection.execute(text("SELECT count(*) FROM attempt")).scalar_one()
+            laboratory.gate.open()
             assert launched.end() == 0, launched.errors
             again = connection.execute(text("SELECT count(*) FROM attempt")).scalar_one()
         engine.dispose()

@@ -14,8 +14,8 @@ from tests.orchestrate.faults.laboratory import (
     alive,
     children,
     command_line,
-    until,
 )
+from tests.waiting import until
 
 pytestmark = pytest.mark.xdist_group("ray")
 
@@ -31,18 +31,15 @@ def part(launched: Launched, name: str) -> int:
     return pid
 
 
-def busy_worker(launched: Launched) -> int | None:
-    for pid in children(part(launched, "raylet")):
-        if command_line(pid).startswith("ray::run_chunk"):
-            return pid
-    return None
-
-
 def test_a_killed_worker_costs_nothing(laboratory: Laboratory) -> None:
+    laboratory.gate.let(10)
     with laboratory.launched() as launched:
-        launched.until(lambda: laboratory.count() >= 5)
-        launched.until(lambda: busy_worker(launched) is not None)
-        os.kill(busy_worker(launched) or 0, signal.SIGKILL)
+        launched.until(laboratory.gate.waiting)
+        victim = laboratory.gate.waiting()[0]
+        assert victim in children(part(launched, "raylet"))
+        assert command_line(victim).startswith("ray::run_chunk")
+        os.kill(victim, signal.SIGKILL)
+        laboratory.gate.open()
         assert launched.end() == 0, launched.errors
     laboratory.check()
 
@@ -51,6 +48,7 @@ def test_a_killed_worker_costs_nothing(laboratory: Laboratory) -> None:
 def test_the_end_of_ray_frees_the_claims_and_a_rerun_completes(
     laboratory: Laboratory, name: str, then: str
 ) -> None:
+    laboratory.gate.let(20)
     with laboratory.launched() as launched:
         launched.until(lambda: laboratory.count() >= 5)
         processes = launched.workers()

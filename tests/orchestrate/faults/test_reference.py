@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -14,15 +13,24 @@ import pytest
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from orchestrate.runner import launch
+from orchestrate.runner.run_grid import Work
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.conftest import ROOT
+from tests.orchestrate.faults.gate import Gate, Gated
 from tests.orchestrate.faults.outcome import Rows, flaws, results
+from tests.waiting import until
 
 pytestmark = pytest.mark.xdist_group("reference launches")  # one undisturbed database
 
 EXAMPLE = ROOT / "docs" / "example"
 TRIALS = 6
-PATIENCE_SECONDS = 200.0
+PROGRAM = """
+import sys
+from orchestrate.launch import program
+from tests.orchestrate.faults.test_reference import close_gate
+close_gate(sys.argv.pop(1))
+program()
+"""
 
 
 def words(url: str) -> list[str]:
@@ -37,10 +45,10 @@ def words(url: str) -> list[str]:
     ]
 
 
-def started(url: str) -> subprocess.Popen[str]:
-    """Start a launch with a worker, which takes one trial at a time."""
+def started(url: str, folder: Path) -> subprocess.Popen[str]:
+    """Start a launch with a worker, whose trials pass the gate of a folder."""
     path = os.pathsep.join([str(ROOT), str(EXAMPLE)])
-    program = [sys.executable, str(ROOT / "orchestrate" / "launch.py"), *words(url)]
+    program = [sys.executable, "-c", PROGRAM, str(folder), *words(url)]
     return subprocess.Popen(
         [*program, "executor=local", "launch.workers=1", "launch.chunk_seconds=0.1"],
         env={**os.environ, "PYTHONPATH": path},
@@ -49,6 +57,10 @@ def started(url: str) -> subprocess.Popen[str]:
         text=True,
         start_new_session=True,
     )
+
+
+def close_gate(folder: str) -> None:
+    launch.WORK = Work(Gated(launch.WORK.run, Gate(Path(folder))), launch.WORK.prepare)
 
 
 def launched_here(url: str) -> int:
@@ -87,11 +99,10 @@ def test_a_killed_launch_of_reference_trials_goes_on(
     tmp_path: Path, undisturbed: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     url = f"sqlite:///{tmp_path / 'killed'}.db"
-    process, end = started(url), time.monotonic() + PATIENCE_SECONDS
-    while done(url) < 2:
-        assert process.poll() is None, process.communicate()[0]
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    Gate(tmp_path).let(3)
+    process = started(url, tmp_path)
+    until(lambda: done(url) >= 2 or process.poll() is not None)
+    assert process.poll() is None, process.communicate()[0]
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
     before = done(url)

@@ -10,6 +10,7 @@ import pytest
 
 from tests.orchestrate.faults.laboratory import Laboratory
 from tests.orchestrate.faults.servers import Server
+from tests.waiting import PATIENCE_SECONDS, until
 
 pytestmark = pytest.mark.xdist_group("postgresql-restarts")
 
@@ -23,12 +24,16 @@ def test_connections_that_end_at_random_moments_cost_nothing(
     laboratory: Laboratory, server: Server
 ) -> None:
     moments = random.Random(0)
-    ended = 0
+    done = ended = 0
+    laboratory.gate.let(40)
     with laboratory.launched() as launched:
-        launched.until(lambda: laboratory.count() >= 5)
         while launched.process.is_alive():
+            until(lambda: laboratory.count() > done or not launched.process.is_alive())  # noqa: B023
+            done = laboratory.count()
             time.sleep(moments.uniform(0.0, 0.3))
             ended += server.terminate_backends()
+            if ended:
+                laboratory.gate.open()
         assert launched.end() == 0, launched.errors
     assert ended > 0
     laboratory.check()
@@ -38,10 +43,13 @@ def test_connections_that_end_at_random_moments_cost_nothing(
 def test_a_restart_of_the_server_costs_nothing(
     laboratory: Laboratory, server: Server, mode: str
 ) -> None:
-    with laboratory.launched() as launched:
+    settings = {"patience": PATIENCE_SECONDS}
+    with laboratory.launched(settings=settings) as launched:
         for done in (5, 30):
+            laboratory.gate.let(25)
             launched.until(lambda done=done: laboratory.count() >= done)  # type: ignore[misc]
             server.restart(mode)
+        laboratory.gate.open()
         assert launched.end() == 0, launched.errors
     laboratory.check()
     assert laboratory.count("status = 'running'") == 0
@@ -50,8 +58,8 @@ def test_a_restart_of_the_server_costs_nothing(
 def test_a_server_that_stays_away_ends_the_launch_and_a_rerun_completes(
     laboratory: Laboratory, server: Server
 ) -> None:
-    settings = {"patience": 2, "lease": 4}
-    with laboratory.launched(settings=settings) as launched:
+    laboratory.gate.let(20)
+    with laboratory.launched(settings={"patience": 2}) as launched:
         launched.until(lambda: laboratory.count() >= 5)
         server.stop()
         try:
@@ -63,4 +71,5 @@ def test_a_server_that_stays_away_ends_the_launch_and_a_rerun_completes(
     assert "Traceback" not in launched.errors
     assert 5 <= laboratory.count() < laboratory.order.trials
     laboratory.check_whole()
-    laboratory.complete(settings=settings)
+    laboratory.end_lease(launched)
+    laboratory.complete()

@@ -11,6 +11,10 @@ import pytest
 from sqlalchemy.engine import make_url
 
 from tests.orchestrate.faults.laboratory import Laboratory, Launched
+from tests.waiting import PATIENCE_SECONDS
+
+SHORT = {"lease": 3, "patience": PATIENCE_SECONDS}
+"""Settings of a sleeper, which is alone while it is awake: nobody is there to use a late beat."""
 
 
 def stop_between_transactions(sleeper: Launched, laboratory: Laboratory) -> None:
@@ -30,8 +34,9 @@ def stop_between_transactions(sleeper: Launched, laboratory: Laboratory) -> None
 def test_another_launch_takes_over_and_late_results_are_refused(
     postgresql_url: str, laboratory_at: Callable[..., Laboratory]
 ) -> None:
-    laboratory = laboratory_at(postgresql_url, settings={"lease": 2, "patience": 1})
-    with laboratory.launched() as sleeper:
+    laboratory = laboratory_at(postgresql_url)
+    laboratory.gate.let(20)
+    with laboratory.launched(settings=SHORT) as sleeper:
         sleeper.until(lambda: laboratory.count() >= 5)
         sleeper.send(signal.SIGSTOP)
         laboratory.complete()
@@ -49,8 +54,8 @@ def test_another_launch_takes_over_and_late_results_are_refused(
 def test_a_sleeper_in_a_transaction_holds_up_nobody(
     postgresql_url: str, laboratory_at: Callable[..., Laboratory], moment: str
 ) -> None:
-    laboratory = laboratory_at(postgresql_url, settings={"lease": 2, "patience": 1})
-    with laboratory.launched(pause=moment, executor="inprocess") as sleeper:
+    laboratory = laboratory_at(postgresql_url)
+    with laboratory.launched(pause=moment, executor="inprocess", settings=SHORT) as sleeper:
         sleeper.until(lambda: sleeper.paused)
         sleeper.send(signal.SIGSTOP)
         laboratory.complete(executor="inprocess")
@@ -61,9 +66,11 @@ def test_a_sleeper_keeps_its_claims_where_the_kernel_knows_it(
     sqlite_url: str, laboratory_at: Callable[..., Laboratory]
 ) -> None:
     laboratory = laboratory_at(sqlite_url)
+    laboratory.gate.let(20)
     with laboratory.launched() as sleeper, laboratory.launched() as other:
-        sleeper.until(lambda: laboratory.count() >= 5)
+        sleeper.until(lambda: set(sleeper.workers()) & set(laboratory.gate.waiting()))
         stop_between_transactions(sleeper, laboratory)
+        laboratory.gate.open()
         other.until(lambda: laboratory.count("status = 'pending'") == 0)
         sleeper.send(signal.SIGCONT)
         assert [sleeper.end(), other.end()] == [0, 0], sleeper.errors + other.errors

@@ -12,7 +12,7 @@ from tests.orchestrate.faults.trials import BROKEN_SEED
 RAY = pytest.mark.xdist_group("ray")
 TROUBLES = {
     "kill": ("killed", {}),
-    "hang": ("timeout", {"timeout": 2}),
+    "hang": ("timeout", {"timeout": 10}),
     "memory": ("out of memory", {"memory_gib": 1}),
 }
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import random
 import signal
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import pytest
 
-from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES
+from orchestrate.runner import worker as worker_module
+from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, POLL_SECONDS
+from orchestrate.runner.signals import Interrupt
+from orchestrate.runner.worker import WARNINGS, Leave
 from tests.orchestrate.faults.laboratory import Laboratory
 from tests.orchestrate.faults.preemptions import OPEN, preempt
 from tests.orchestrate.faults.servers import Server
@@ -43,7 +46,7 @@ def test_workers_share_a_grid_and_run_nothing_twice(postgresql_url: str, laborat
 def test_preempted_workers_lose_and_double_nothing(url: str, laboratory_at: At) -> None:
     laboratory = laboratory_at(url, 200, seconds=0.05)
     register(laboratory)
-    sent = preempt(laboratory, workers=3, pause=0.5, chance=random.Random(1), lease=2.0)
+    sent = preempt(laboratory, workers=3, every=20, chance=random.Random(1))
     assert sent.total() >= 2
     laboratory.check()
     assert laboratory.count("status = 'failed'") == 0
@@ -52,31 +55,48 @@ def test_preempted_workers_lose_and_double_nothing(url: str, laboratory_at: At) 
 @pytest.mark.parametrize(
     ("database", "number"), [("sqlite", signal.SIGTERM), ("postgresql", signal.SIGUSR1)]
 )
-def test_a_warned_worker_hands_back_within_five_seconds(
+def test_a_warned_worker_hands_back_what_runs(
     request: pytest.FixtureRequest, laboratory_at: At, database: str, number: signal.Signals
 ) -> None:
     laboratory = laboratory_at(request.getfixturevalue(f"{database}_url"))
     register(laboratory)
-    with laboratory.launched(worker={}, seconds=600.0) as worker:
-        worker.until(lambda: laboratory.count("status = 'running'") > 0)
-        start = time.monotonic()
+    laboratory.gate.let(0)
+    with laboratory.launched(worker={}) as worker:
+        worker.until(lambda: len(laboratory.gate.waiting()) == 2)
         for pid in worker.workers():  # as batch systems do, which know nothing of parents
             os.kill(pid, number)
         worker.send(number)
         worker.send(signal.SIGUSR1)  # the shell of a job passes on what all its processes got
         assert worker.end() == 130, worker.errors
-        assert time.monotonic() - start < 5.0
     assert "0 trials done" in worker.said
     assert laboratory.count("status = 'pending'") == laboratory.order.trials
     assert laboratory.query("SELECT DISTINCT outcome, cause FROM attempt") == [("released", None)]
     assert "Traceback" not in worker.errors
 
 
+def test_a_warned_worker_waits_two_seconds_for_what_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, waited = 100.0, []
+
+    def monotonic() -> float:
+        return now
+
+    monkeypatch.setattr(worker_module, "time", SimpleNamespace(monotonic=monotonic))
+    with Interrupt(WARNINGS) as interrupt:
+        leave = Leave(interrupt, None)
+        assert not leave.at_once
+        signal.raise_signal(signal.SIGUSR1)
+        while not leave.at_once:
+            waited.append(now)
+            now += POLL_SECONDS
+    assert len(waited) * POLL_SECONDS == pytest.approx(2.0)
+
+
 def test_a_warned_worker_does_not_wait_for_its_database(server: Server, laboratory_at: At) -> None:
     laboratory = laboratory_at(server.new_url())
     register(laboratory)
-    with laboratory.launched(worker={}, seconds=600.0) as worker:
-        worker.until(lambda: laboratory.count("status = 'running'") > 0)
+    laboratory.gate.let(0)
+    with laboratory.launched(worker={}) as worker:
+        worker.until(laboratory.gate.waiting)
         server.stop()
         try:
             worker.send(signal.SIGTERM)
@@ -87,12 +107,12 @@ def test_a_warned_worker_does_not_wait_for_its_database(server: Server, laborato
 
 
 def test_a_worker_holds_nothing_at_the_end_of_its_time(sqlite_url: str, laboratory_at: At) -> None:
+    """By its clock: two trials of .05 s at once, which takes no time for anything else."""
     laboratory = laboratory_at(sqlite_url, 1000, seconds=0.05)
     register(laboratory)
-    start = time.monotonic()
-    with laboratory.launched(worker={"seconds": 5.0}) as worker:
+    with laboratory.launched(worker={"seconds": 5.0}, tick=0.025) as worker:
         assert worker.end() == 3, worker.errors
-    assert time.monotonic() - start < 10.0
+    assert laboratory.gate.passed * 0.025 <= 5.0
     assert laboratory.count() > 0
     assert laboratory.count("status = 'running'") == 0
     assert laboratory.query("SELECT outcome FROM attempt WHERE outcome = 'released'") == []

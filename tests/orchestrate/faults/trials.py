@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import select
 import signal
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ import numpy as np
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
+from tests.orchestrate.faults.gate import rest
 from tests.orchestrate.standins import diverged, quick, specification
 
 BROKEN_SEED = 7
@@ -39,11 +39,6 @@ class Standin:
         if self.trouble and spec.seed == BROKEN_SEED:
             _TROUBLES[self.trouble]()
         return outcome(spec)
-
-
-def rest(seconds: float) -> None:
-    """Sleep, also under libfaketime 0.9, which makes an error of every ``time.sleep``."""
-    select.select([], [], [], seconds)
 
 
 def outcome(spec: TrialSpec) -> TrialResult:
