@@ -42,8 +42,10 @@ setup: $(VENV)/dev  ## create .venv with the tested versions and the developers'
 run: $(VENV)/run  ## create .venv with what grids and figures need
 
 # Python writes the bytecode of a library when it is first imported; pip would write all of it.
+# "dopt" was the name of this package for pip, and is the name of another project.
 $(VENV)/run: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip uninstall --yes -qq dopt
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable .
 	touch $@
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from dopt.systems import SYSTEMS as SYSTEMS
     from dopt.systems.plant import Plant as Plant
 
-    __version__: str
+__version__ = "0.1.0"  # also where nothing is installed, as beside PYTHONPATH in the image
 
 __all__ = [
     "LEARNERS",
@@ -78,14 +78,9 @@ _MODULES = {
 
 def _load(name: str) -> object:
     """Import a public name on its first use."""
-    if name == "__version__":
-        from importlib.metadata import version
-
-        value: object = version(__name__)
-    elif name in _MODULES:
-        value = getattr(importlib.import_module(_MODULES[name]), name)
-    else:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value: object = getattr(importlib.import_module(_MODULES[name]), name)
     globals()[name] = value
     return value
 

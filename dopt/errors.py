@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import SequenceMatcher
 
+DISTRIBUTION = "dopt-exploration"
+"""Name of this package for pip, which knows another project by the name of the import."""
+
 SIMILAR = 0.5
 """Names at least so similar, from 0 to 1, are suggested."""
 
@@ -27,6 +30,11 @@ class ExplorationError(DoptError, RuntimeError):
 
 class ScaleWarning(UserWarning):
     """The quantities that a network is to learn are of another size than its outputs."""
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds the libraries of an extra to this installation."""
+    return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
 def unknown_name(kind: str, given: object, valid: Iterable[str]) -> SpecificationError:

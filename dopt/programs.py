@@ -12,6 +12,8 @@ import sys
 from importlib.machinery import PathFinder
 from pathlib import Path
 
+from dopt.errors import DISTRIBUTION
+
 
 def dopt() -> None:
     """Run ``dopt``: commands on stored results."""
@@ -36,6 +38,8 @@ def _take(package: str) -> None:
     """Import the package of that name which lies in the same folder as this one."""
     spec = PathFinder.find_spec(package, [str(Path(__file__).resolve().parents[1])])
     if spec is None or spec.loader is None:
-        raise ModuleNotFoundError(f"{package} is not installed beside dopt: install dopt again.")
+        raise ModuleNotFoundError(
+            f"{package} is not installed beside dopt: install {DISTRIBUTION} again."
+        )
     sys.modules[package] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

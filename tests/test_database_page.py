@@ -73,7 +73,7 @@ def test_every_query_answers_and_mixes_no_configurations(small: str) -> None:
 
 
 def test_every_query_has_the_same_answer_in_duckdb_on_a_bundle(small: str, tmp_path: Path) -> None:
-    duckdb = pytest.importorskip("duckdb", reason="needs the extra: pip install dopt[bundle]")
+    duckdb = pytest.importorskip("duckdb", reason="needs the extra bundle")
     folder = tmp_path / "bundle"
     assert orchestrate.main(["export", "bundle", str(folder), "--db", small]) == 0
     with duckdb.connect() as connection:

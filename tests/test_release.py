@@ -10,10 +10,15 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
+import dopt
+from dopt.errors import DISTRIBUTION, install_command
 from tests.paths import ROOT
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 METADATA = PROJECT["project"]
+WRITTEN = (".ipynb", ".md", ".py", ".sh", ".yaml", ".html")
+"""Endings of the files in which people and machines read commands."""
+
 UNTESTED = {"torch"}
 """Libraries whose lower bound is not tested; constraints-lowest.txt says why."""
 
@@ -27,7 +32,7 @@ def pins(name: str) -> dict[str, str]:
 def lower_bounds() -> dict[str, str]:
     extras = METADATA["optional-dependencies"]
     texts = [*METADATA["dependencies"], *(text for extra in extras.values() for text in extra)]
-    wanted = [Requirement(text) for text in texts if not text.startswith("dopt[")]
+    wanted = [Requirement(text) for text in texts if not text.startswith(f"{METADATA['name']}[")]
     return {
         canonicalize_name(library.name): specifier.version
         for library in wanted
@@ -66,6 +71,7 @@ def test_the_version_is_the_same_wherever_it_is_repeated() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     image = (ROOT / "docker/Dockerfile").read_text()
     assert citation["version"] == version
+    assert dopt.__version__ == version
     assert re.findall(r"^ARG VERSION=(.*)$", image, flags=re.MULTILINE) == [version]
 
 
@@ -75,3 +81,16 @@ def test_the_changelog_has_a_section_for_the_version() -> None:
     )
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert (METADATA["version"], str(citation["date-released"])) in sections
+
+
+def test_no_command_for_pip_names_the_project_that_has_the_name_of_the_import() -> None:
+    """Not in a message, nor on a page, nor in a file for machines."""
+    assert METADATA["name"] == DISTRIBUTION
+    assert install_command("serve") == "pip install 'dopt-exploration[serve]'"
+    by_pip = r"(pip|uv)[^\n]* (install|add|download)[^\n]*[ '\"]dopt\b(?!-)"
+    foreign = re.compile(rf"\bdopt\[[a-z]|{by_pip}")
+    files = [path for path in (*ROOT.glob("*"), ROOT / "docker/Dockerfile") if path.is_file()]
+    for folder in ("analysis", "benchmarks", "conf", "docker", "docs", "dopt", "orchestrate"):
+        files += [path for path in (ROOT / folder).rglob("*") if path.suffix in WRITTEN]
+    assert len(files) > 500
+    assert not [path for path in files if foreign.search(path.read_text(errors="replace"))]

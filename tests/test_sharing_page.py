@@ -22,7 +22,7 @@ def test_its_commands_and_programs_run_in_their_order(
     for library in ("duckdb", "mlflow", "wandb"):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            pytest.importorskip(library, reason="needs the extra: pip install dopt[all]")
+            pytest.importorskip(library, reason="needs the extra all")
     empty_folder(tmp_path, monkeypatch)
     monkeypatch.setattr(cached, "copies_folder", lambda: tmp_path)
     fill("sqlite:///results/results.db", make_grid(("pendulum",), seeds=range(3), **SHORT))

@@ -92,14 +92,72 @@ def test_an_installed_launch_finds_its_settings_and_its_sweeper(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("program", sorted(SCRIPTS))
-def test_an_installed_program_explains_itself(programs: Path, tmp_path: Path, program: str) -> None:
-    """Even where modules of a user's own have the names of our packages, and come before them."""
-    for name in ("analysis", "orchestrate"):
+@pytest.fixture
+def crowded(tmp_path: Path) -> Path:
+    """Return a working folder with modules of a user's own that have the names of our packages."""
+    for name in ("analysis", "orchestrate", "dopt"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('the wrong module')\n")
-    done = run(programs / program, "--help", folder=tmp_path, PYTHONPATH=str(tmp_path))
+    (tmp_path / "first").mkdir()  # on PYTHONPATH, before the installed packages
+    for name in ("analysis", "orchestrate"):
+        shutil.copy(tmp_path / f"{name}.py", tmp_path / "first")
+    return tmp_path
+
+
+@pytest.mark.parametrize("program", sorted(SCRIPTS))
+def test_an_installed_program_explains_itself(programs: Path, crowded: Path, program: str) -> None:
+    done = run(programs / program, "--help", folder=crowded, PYTHONPATH=str(crowded / "first"))
     assert (done.returncode, done.stderr) == (0, "")
     assert len(done.stdout.splitlines()) > 5
-    wrong = run(programs / program, "--nope", folder=tmp_path)
+    wrong = run(programs / program, "--nope", folder=crowded)
     assert wrong.returncode == 2, wrong.stderr
     assert wrong.stderr.startswith("error: ")
+
+
+HELD = """
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from dopt.policies.base import CustomPolicy, Planner
+
+
+class Plan(Planner):
+    def choose(self, view):
+        return np.array([1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Held(CustomPolicy):
+    name: ClassVar[str] = "held"
+    compiled: ClassVar[bool] = False  # nothing is compiled for this test
+
+    def planner(self, system, rng):
+        return Plan()
+"""
+
+
+@pytest.mark.parametrize("executor", ["local", "ray"])
+def test_the_workers_of_an_installed_launch_import_our_packages(
+    programs: Path, crowded: Path, executor: str
+) -> None:
+    (crowded / "first/held.py").write_text(HELD)
+    (crowded / "conf/policy").mkdir(parents=True)
+    (crowded / "conf/policy/held.yaml").write_text("_target_: held.Held\n")
+    words = ("--config-dir", "conf", "-m", "env=pendulum", "env.horizon=5", "policy=held")
+    done = run(
+        programs / "dopt-launch",
+        *(*words, "seed=range(2)", f"executor={executor}", "launch.workers=1"),
+        folder=crowded,
+        PYTHONPATH=str(crowded / "first"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 done, 0 failed" in done.stderr + done.stdout
+
+
+def test_the_wheel_has_a_name_that_pip_knows_for_no_other_project(wheel: Path) -> None:
+    assert wheel.name.startswith("dopt_exploration-")
+    text = zipfile.ZipFile(wheel).read(f"{wheel.stem.split('-py3')[0]}.dist-info/METADATA").decode()
+    wanted = [line for line in text.splitlines() if line.startswith("Requires-Dist: dopt")]
+    assert wanted == [one for one in wanted if one.startswith("Requires-Dist: dopt-exploration[")]
+    assert wanted

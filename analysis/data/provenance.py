@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from analysis.data.trial_selection import Selection
+from dopt import __version__
 from orchestrate.store import Reader
 
-LIBRARIES = ("dopt", "matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")
+LIBRARIES = ("matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")
 PACKAGE = Path(__file__).parents[1]
 """The folder of the analysis."""
 
@@ -22,7 +23,7 @@ PACKAGE = Path(__file__).parents[1]
 @functools.cache
 def versions() -> dict[str, str | None]:
     """Return the versions of Python and the libraries; None where one is not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
+    found: dict[str, str | None] = {"python": platform.python_version(), "dopt": __version__}
     for library in LIBRARIES:
         try:
             found[library] = importlib.metadata.version(library)

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 
 from analysis.errors import AnalysisError
 from analysis.serve.addresses import is_loopback
+from dopt.errors import install_command
 from orchestrate.cli_parser import path
 from orchestrate.store import DEFAULT_URL, default_url
 
@@ -44,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         raise AnalysisError(
             f"The browser needs the library {error.name}: "
-            f"install it with pip install 'dopt[serve]'."
+            f"install it with {install_command('serve')}."
         ) from error
     app = create_app(options.db[0], options.figures, options.host, options.db[1:])
     listening = _listen(options.host, options.port)

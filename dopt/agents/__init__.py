@@ -1,1 +1,1 @@
-"""Agents of reinforcement learning as plans of a trial; they need the extra ``dopt[agents]``."""
+"""Agents of reinforcement learning as plans of a trial; they need the extra ``agents``."""

@@ -1,7 +1,7 @@
 """Gymnasium adapters: its environments as systems, and the systems as its environments.
 
-It needs the extra: ``pip install dopt[gymnasium]``. Importing this package makes the systems known
-to ``gymnasium.make`` as ``dopt/Pendulum-v0`` and so on.
+It needs the extra ``gymnasium``. Importing this package makes the systems known to
+``gymnasium.make`` as ``dopt/Pendulum-v0`` and so on.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from dopt.control.feedback import Feedback
 from dopt.control.task import Control, Goal
 from dopt.declare.kernel_support import PLAN_IN_NUMPY, KernelPart
 from dopt.declare.validated_fields import parameter
-from dopt.errors import IncompatibleError, SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError, install_command
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 
@@ -69,7 +69,7 @@ class Policy(KernelPart):
         if self.library and importlib.util.find_spec(self.library) is None:
             raise SpecificationError(
                 f"policy '{self.name}' needs the library {self.library}, but it is not installed: "
-                f"pip install 'dopt[{self.extra}]', or choose another policy."
+                f"{install_command(self.extra)}, or choose another policy."
             )
 
     def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of policies that keep nothing

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 ONE_THREAD = dict.fromkeys(
@@ -22,6 +23,8 @@ ONE_THREAD = dict.fromkeys(
     "1",
 )
 
+_PACKAGE = __name__.partition(".")[0]
+
 
 def pin_threads() -> None:
     """Pin the numerical libraries of this process, and of those it starts, to one thread.
@@ -34,8 +37,12 @@ def pin_threads() -> None:
 
 
 def module_path() -> dict[str, str]:
-    """Return the environment in which another interpreter finds the modules that this one finds."""
+    """Return the environment in which another interpreter finds the modules that this one finds.
+
+    A folder with another ``orchestrate``, such as a user's script of that name, comes last.
+    """
     root = str(Path(__file__).resolve().parents[2])
     paths = [path for path in sys.path if path]
     first = [] if root in paths else [root]  # an installed copy stays after the standard library
+    paths.sort(key=lambda path: path != root and PathFinder.find_spec(_PACKAGE, [path]) is not None)
     return {"PYTHONPATH": os.pathsep.join([*first, *paths])}

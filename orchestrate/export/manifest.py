@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from importlib import metadata
 from typing import Any
 
+from dopt import __version__
 from orchestrate.queries.status import counts
 from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
@@ -24,7 +24,7 @@ def provenance(
     launches = [asdict(one) for one in reader.launches() if one.launch_id in writers]
     return {
         "written": now(),
-        "program": f"dopt {_version()}",
+        "program": f"dopt {__version__}",
         "database": reader.safe_url,
         "schema_version": reader.schema_version(),
         "filters": {name: list(values) for name, values in filters.items()},
@@ -33,13 +33,6 @@ def provenance(
         "configs": {config.config_key: dict(config.config) for config in configs},
         "launches": [_public(launch) for launch in launches],
     }
-
-
-def _version() -> str:
-    try:
-        return metadata.version("dopt")
-    except metadata.PackageNotFoundError:
-        return "from its source, not installed"
 
 
 def _public(launch: Mapping[str, Any]) -> dict[str, Any]:

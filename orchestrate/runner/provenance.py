@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
+from dopt import __version__
 from orchestrate.redaction import without_password_in_word
 from orchestrate.store import LaunchRecord
 
 LIBRARIES = (
-    "dopt",
     "hydra-core",
     "llvmlite",
     "numba",
@@ -96,7 +96,7 @@ def _content(root: Path, name: bytes) -> bytes:
 
 
 def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
+    versions = {"python": platform.python_version(), "dopt": __version__}
     for name in LIBRARIES:
         try:
             versions[name] = metadata.version(name)

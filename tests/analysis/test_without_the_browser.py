@@ -54,4 +54,4 @@ def test_the_browser_names_the_extra(answers: dict[str, tuple[int, str, str]]) -
     code, _, errors = answers["serve"]
     assert code == 2
     assert errors.count("\n") == 1
-    assert "pip install 'dopt[serve]'" in errors
+    assert "pip install 'dopt-exploration[serve]'" in errors

@@ -17,7 +17,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.paths import EXAMPLE
 
-gymnasium = pytest.importorskip("gymnasium", reason="needs the extra: pip install dopt[gymnasium]")
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gymnasium")
 
 import dopt.gymnasium  # noqa: E402
 from tests.dopt.custom_environments import DRAG  # noqa: E402

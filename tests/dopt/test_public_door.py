@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 import dopt
+from analysis.data.provenance import versions
 from dopt.errors import SpecificationError
+from orchestrate.runner.provenance import launch_record
 from tests.paths import ROOT
 
 HEAVY = {"torch", "ray", "numba", "hydra", "sqlalchemy", "matplotlib", "pandas", "scipy"}
@@ -44,8 +46,17 @@ def test_every_public_name_is_there(name: str) -> None:
     assert getattr(dopt, name) is getattr(dopt, name)
 
 
-def test_the_version_is_that_of_the_distribution() -> None:
-    assert dopt.__version__ == importlib.metadata.version("dopt")
+def test_the_version_is_that_of_the_code_and_not_of_another_project(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Environments may hold a distribution named dopt: a stranger's, or this one's before."""
+    (tmp_path / "dopt-0.0.6.dist-info").mkdir()
+    (tmp_path / "dopt-0.0.6.dist-info/METADATA").write_text("Name: dopt\nVersion: 0.0.6\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert importlib.metadata.version("dopt") == "0.0.6"
+    versions.cache_clear()
+    assert versions()["dopt"] == dopt.__version__
+    assert launch_record([], [], ROOT).versions["dopt"] == dopt.__version__
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

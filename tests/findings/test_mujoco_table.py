@@ -37,7 +37,7 @@ def test_losses_are_those_of_the_report(title: str, measure: str) -> None:
 
 
 def test_the_loss_of_no_model_is_that_of_the_grid() -> None:
-    pytest.importorskip("mujoco", reason="needs the extra: pip install dopt[mujoco]")
+    pytest.importorskip("mujoco", reason="needs the extra mujoco")
     found = [evaluation_set(SIMULATORS[env]()) for env in ENVS]
     squares = [np.sum(one.accelerations[: one.n_grid] ** 2, axis=1) for one in found]
     cells = [number(float(np.sqrt(square.mean()))) for square in squares]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from dopt.declare.validated_fields import parameter
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, install_command
 from dopt.systems.base import Array
 from dopt.systems.black_box import BlackBox, Episode, check_amplitude, check_step
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-MISSING = "needs MuJoCo, which is not installed: pip install 'dopt[mujoco]'."
+MISSING = f"needs MuJoCo, which is not installed: {install_command('mujoco')}."
 
 UNLIMITED = 1e10
 """Range of an actuator that has none."""

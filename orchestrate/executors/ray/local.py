@@ -6,6 +6,7 @@ import os
 from typing import Any
 
 import ray
+from ray.job_config import JobConfig
 
 from dopt.cores import usable_cores
 from orchestrate.errors import InfrastructureError
@@ -40,6 +41,8 @@ class OwnRay(Connection):
             num_cpus=self._workers,
             object_store_memory=OBJECT_STORE_BYTES,
             include_dashboard=False,
+            # Of a client's job Ray's workers look for no modules in the working folder.
+            job_config=JobConfig(_client_job=True),
         )
 
     @property

@@ -13,6 +13,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+from dopt.errors import install_command
 from orchestrate.export.columns import STEP_COLUMNS
 from orchestrate.export.manifest import provenance
 from orchestrate.export.streams import steps
@@ -111,7 +112,7 @@ def missing_library(kind: str, package: str) -> ExportError:
     """Return the error of an export whose library is not installed."""
     return ExportError(
         f"The export {kind} needs the package {package}, which is not installed: run "
-        f"pip install 'dopt[{kind}]'."
+        f"{install_command(kind)}."
     )
 
 

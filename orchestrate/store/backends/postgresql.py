@@ -26,6 +26,7 @@ from sqlalchemy import (
     update,
 )
 
+from dopt.errors import install_command
 from orchestrate.store import database_url
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
 from orchestrate.store.backends.postgresql_backup import copy_schema
@@ -243,5 +244,5 @@ def _engine(url: URL, more: Mapping[str, str] = MappingProxyType({})) -> Engine:
     except ModuleNotFoundError as error:
         raise StoreError(
             f"A PostgreSQL database needs the library {error.name}: "
-            "install it with pip install 'dopt[postgres]'."
+            f"install it with {install_command('postgres')}."
         ) from error

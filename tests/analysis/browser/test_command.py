@@ -55,7 +55,7 @@ def test_without_its_libraries_it_says_which_to_install(
     monkeypatch.delitem(sys.modules, "analysis.serve.server", raising=False)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     assert main(["serve"]) == 2
-    assert "pip install 'dopt[serve]'" in capsys.readouterr().err
+    assert "pip install 'dopt-exploration[serve]'" in capsys.readouterr().err
 
 
 def test_a_kept_value_is_not_computed_again_until_it_is_forgotten() -> None:

@@ -119,7 +119,7 @@ def test_a_system_without_a_task_is_refused() -> None:
 @pytest.mark.parametrize("policy", [SoftActorCritic(), ActiveExploration()])
 def test_a_missing_library_is_said(policy: CustomPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda *_: None)
-    message = r"needs the library stable_baselines3.*pip install 'dopt\[agents\]'"
+    message = r"needs the library stable_baselines3.*pip install 'dopt-exploration\[agents\]'"
     with pytest.raises(SpecificationError, match=message):
         policy.planner(Pendulum(), np.random.default_rng(0))
 

@@ -70,7 +70,7 @@ def test_of_a_network_of_a_users_own_it_is_that_of_the_shipped_one() -> None:
 
 
 def test_of_a_black_box() -> None:
-    pytest.importorskip("gymnasium", reason="needs the extra: pip install dopt[gymnasium]")
+    pytest.importorskip("gymnasium", reason="needs the extra gymnasium")
     env = {"_target_": POINT, "horizon": 30}
     spec = specification("d_optimal", env=env)
     check_sum(spec)

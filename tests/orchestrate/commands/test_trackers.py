@@ -52,7 +52,7 @@ def export(command: Run, kind: str, out: Path) -> None:
 class TestMlflow:
     @pytest.fixture(autouse=True)
     def _installed(self) -> None:
-        pytest.importorskip("mlflow", reason="needs the extra: pip install dopt[mlflow]")
+        pytest.importorskip("mlflow", reason="needs the extra mlflow")
 
     def test_the_client_reads_every_run(self, command: Run, tmp_path: Path) -> None:
         from mlflow import MlflowClient
@@ -106,7 +106,7 @@ class TestMlflow:
 class TestWandb:
     @pytest.fixture(autouse=True)
     def _installed(self) -> None:
-        pytest.importorskip("wandb", reason="needs the extra: pip install dopt[wandb]")
+        pytest.importorskip("wandb", reason="needs the extra wandb")
 
     def test_every_run_is_read_back(self, command: Run, tmp_path: Path) -> None:
         out = tmp_path / "out"
@@ -170,7 +170,7 @@ def test_a_library_that_is_not_installed_is_named(
     assert answer.code == 2
     assert answer.err == (
         f"error: The export {kind} needs the package {package}, which is not installed: "
-        f"run pip install 'dopt[{kind}]'.\n"
+        f"run pip install 'dopt-exploration[{kind}]'.\n"
     )
     assert not (tmp_path / "out").exists()
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, install_command
 from orchestrate.config.grid import Combination, Grid, build_grid
 
 
@@ -38,9 +39,8 @@ def test_a_missing_library_is_refused_with_the_extra(
     grid("random", policy).check_libraries()
     monkeypatch.setattr(importlib.util, "find_spec", without)
     grid("random", "d_optimal").check_libraries()
-    message = (
-        rf"policy '{policy}' needs the library stable_baselines3.*pip install 'dopt\[agents\]'"
-    )
+    command = re.escape(install_command("agents"))
+    message = f"policy '{policy}' needs the library stable_baselines3.*{command}"
     with pytest.raises(SpecificationError, match=message):
         grid("random", policy).check_libraries()
 
