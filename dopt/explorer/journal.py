@@ -4,6 +4,10 @@ Each line is one event as JSON. It is in the file before the exploration goes on
 is on the disk where ``fsync`` is set; a line that a power cut has torn is dropped when the file is
 opened again, the first one only where it is the beginning of the one that would be written. Real
 numbers are written so that they are read back bit for bit.
+
+The entry ``sum`` at the end of a line is the CRC-32 of all bytes of the file before it, so that no
+line can be changed, removed, added or moved without notice. Journals of format 1 have none before
+the line with which a program that writes them has gone on.
 """
 
 from __future__ import annotations
@@ -12,6 +16,8 @@ import contextlib
 import fcntl
 import json
 import os
+import re
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,8 +25,10 @@ from typing import Any
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.given_path import given_path
 
-FORMAT = 1
+FORMAT = 2
 """Version of the lines."""
+
+_SUMMED = re.compile(rb'(.*), "sum": "([0-9a-f]{8})"}\n', re.DOTALL)
 
 Event = Mapping[str, Any]
 
@@ -67,7 +75,7 @@ class Journal:
         self._file = self.path.open("ab", buffering=0)
         try:
             _lock(self._file.fileno(), self.path)
-            self._size, self.events = _read(self.path, _line(self._about))
+            self._size, self._sum, self.events = _read(self.path, _line(self._about, 0))
             self._file.truncate(self._size)
             if self._fsync:
                 for path in new:
@@ -96,7 +104,7 @@ class Journal:
                 f"nothing more is kept: save() what was explored, and begin again with another "
                 f"journal."
             )
-        line = _line(event)
+        line = _line(event, self._sum)
         try:
             if self._file.write(line) != len(line):
                 raise OSError("the disk is full")
@@ -110,7 +118,7 @@ class Journal:
                 f"the journal {self.path} could not be written ({error}), so that the exploration "
                 f"cannot go on: free space on its disk, and open the exploration again."
             ) from error
-        self._size += len(line)
+        self._size, self._sum = self._size + len(line), zlib.crc32(line, self._sum)
 
     def close(self) -> None:
         """Close the file, on the disk."""
@@ -120,8 +128,10 @@ class Journal:
             self._file.close()
 
 
-def _line(event: Event) -> bytes:
-    return f"{json.dumps(event, allow_nan=False)}\n".encode()
+def _line(event: Event, before: int) -> bytes:
+    """Return the line of an event after lines with a checksum."""
+    line = json.dumps(event, allow_nan=False).encode()[:-1]
+    return b'%s, "sum": "%08x"}\n' % (line, zlib.crc32(line, before))
 
 
 def _sync_folder(folder: Path) -> None:
@@ -143,8 +153,8 @@ def _lock(file: int, path: Path) -> None:
         ) from error
 
 
-def _read(path: Path, beginning: bytes) -> tuple[int, list[dict[str, Any]]]:
-    """Return the number of bytes that are whole lines, and their events.
+def _read(path: Path, beginning: bytes) -> tuple[int, int, list[dict[str, Any]]]:
+    """Return the number of bytes that are whole lines, their checksum and their events.
 
     A first line that is not whole has to be part of the beginning.
     """
@@ -154,24 +164,46 @@ def _read(path: Path, beginning: bytes) -> tuple[int, list[dict[str, Any]]]:
     if whole == 0 and not beginning.startswith(torn):
         raise foreign(path, f"it has no whole line, and begins with {torn[:20]!r}")
     events: list[dict[str, Any]] = []
-    for number, line in enumerate(content[:whole].splitlines(), start=1):
-        try:
-            event = json.loads(line)
-        except ValueError as error:
-            raise foreign(path, f"line {number}: {error}") from error
-        if not isinstance(event, dict):
-            raise foreign(path, f"line {number} is no JSON object")
+    before, summed = 0, False
+    for number, line in enumerate(content[:whole].splitlines(keepends=True), start=1):
+        found = _SUMMED.fullmatch(line)
+        if int(found[2], 16) != zlib.crc32(found[1], before) if found else summed:
+            raise _damaged(path, number)
+        event = _event(path, number, line)
+        if not found and event.get("format") == FORMAT:
+            raise _damaged(path, number)
         events.append(event)
+        before, summed = zlib.crc32(line, before), bool(found)
     if events and (
-        events[0].get("format") != FORMAT or not isinstance(events[0].get("trial"), dict)
+        events[0].get("format") not in (1, FORMAT) or not isinstance(events[0].get("trial"), dict)
     ):
         raise foreign(path, "its first line is that of no exploration")
-    return whole, events
+    return whole, before, events
+
+
+def _event(path: Path, number: int, line: bytes) -> dict[str, Any]:
+    try:
+        event = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise foreign(path, f"line {number}: {error}") from error
+    if not isinstance(event, dict):
+        raise foreign(path, f"line {number} is no JSON object")
+    event.pop("sum", None)
+    return event
+
+
+def _damaged(path: Path, number: int) -> SpecificationError:
+    kept = f", or the lines before it alone (head -n {number - 1} {path} > OTHER)"
+    return SpecificationError(
+        f"line {number} of the journal {path} does not have the checksum of what is before it, so "
+        f"that it, or a line before it, was changed, removed, added or moved: give a copy from "
+        f"before that{kept if number > 1 else ''}."
+    )
 
 
 def foreign(path: Path, reason: str) -> SpecificationError:
     """Return the error for a file that is none of this kind."""
     return SpecificationError(
-        f"{path} is no journal of format {FORMAT} ({reason}), but one was expected there: give the "
-        f"path of a journal, or of a file that does not exist."
+        f"{path} is no journal of format 1 or {FORMAT} ({reason}), but one was expected there: "
+        f"give the path of a journal, or of a file that does not exist."
     )
