@@ -5,17 +5,23 @@
 #     DOPT_NODE_IP  address of this container for the others, by default its first one
 #     DOPT_CPUS     trials at once on this node, by default one for each core
 #     DOPT_DB       database, without its password, which is a file: /run/secrets/postgres_password
+#     DOPT_READ_DB  the same for statements of the browser: /run/secrets/postgres_read_password
 set -eu
 
-PASSWORD=/run/secrets/postgres_password
+SECRETS=/run/secrets
 NODE_FILE=/tmp/dopt-node # tells the health check which node of which cluster runs here
 
-# Put the password where PostgreSQL's library looks for it: no command line and no variable has it.
-read_password() {
-    if [ -r "$PASSWORD" ]; then
-        # A line for every server and user; colons and backslashes are escaped.
-        (umask 077 && sed -n '1s/[\\:]/\\&/g; 1s/^/*:*:*:*:/p' "$PASSWORD" >"$HOME/.pgpass")
-    fi
+# Put the passwords where PostgreSQL's library looks for them, which takes the first that fits: no
+# command line and no variable has them.
+read_passwords() {
+    rm -f "$HOME/.pgpass"
+    for entry in dopt_read:postgres_read_password '*:postgres_password'; do
+        if [ -r "$SECRETS/${entry#*:}" ]; then
+            # A line for every server; colons and backslashes are escaped.
+            (umask 077 && sed -n "1s/[\\\\:]/\\\\&/g; 1s/^/*:*:*:${entry%:*}:/p" \
+                "$SECRETS/${entry#*:}" >>"$HOME/.pgpass")
+        fi
+    done
 }
 
 # Start this container's node with the words given and the options of every node.
@@ -43,7 +49,7 @@ worker)
     ;;
 launch)
     shift
-    read_password
+    read_passwords
     if [ -n "${DOPT_HEAD:-}" ]; then
         # A launch reaches the cluster through a node of its own, which runs no trials.
         [ -e "$NODE_FILE" ] || start_node ray start --address="$DOPT_HEAD" --num-cpus=0 >/dev/null
@@ -52,7 +58,7 @@ launch)
     exec python orchestrate/launch.py "$@"
     ;;
 orchestrate | analysis)
-    read_password
+    read_passwords
     exec python -m "$@"
     ;;
 *)

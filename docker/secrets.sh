@@ -1,6 +1,6 @@
 #!/bin/sh
-# Write the two secrets that the containers read: from POSTGRES_PASSWORD and RAY_AUTH_TOKEN where
-# they are set, otherwise new ones. Files that are there already stay.
+# Write the secrets that the containers read: from POSTGRES_PASSWORD, POSTGRES_READ_PASSWORD and
+# RAY_AUTH_TOKEN where they are set, otherwise new ones. Files that are there already stay.
 #
 #     sh docker/secrets.sh
 set -eu
@@ -21,4 +21,5 @@ write() {
 mkdir -p "$folder"
 chmod 700 "$folder"
 write postgres_password "${POSTGRES_PASSWORD:-$(new_secret)}"
+write postgres_read_password "${POSTGRES_READ_PASSWORD:-$(new_secret)}"
 write ray_auth_token "${RAY_AUTH_TOKEN:-$(new_secret)}"

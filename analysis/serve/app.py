@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import threading
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl
 
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from analysis.errors import AnalysisError
 from analysis.serve import compare, control, curves, gallery, grid, launches, sql, trial, trials
-from analysis.serve.errors import BusyError, NotFoundError
+from analysis.serve.addresses import is_loopback
+from analysis.serve.errors import BusyError, ForbiddenError, NotFoundError, RequestError
 from analysis.serve.events import respond
 from analysis.serve.query_params import QueryParams
 from analysis.serve.responses import FOLDER, as_csv, as_json, as_page
-from analysis.serve.security import SecurityMiddleware
+from analysis.serve.security import LONGEST_QUERY, SecurityMiddleware
 from analysis.serve.side_by_side import side_by_side
 from analysis.serve.sites import state_at, states_of
 from analysis.serve.state import ServerState
@@ -35,6 +40,10 @@ from orchestrate.store.errors import (
 )
 
 Numbers = Callable[[ServerState, QueryParams], Mapping[str, Any]]
+Answer = Callable[[ServerState, Request, QueryParams, sql.Stopped], Response]
+
+FORM_SECONDS = 10.0
+"""Time in which a form has to arrive."""
 
 PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/", "grid", grid.grid),
@@ -45,7 +54,7 @@ PAGES: tuple[tuple[str, str, Numbers], ...] = (
     ("/control", "control", control.control),
     ("/launches", "launches", launches.launches),
     ("/figures", "figures", gallery.gallery),
-    ("/sql", "sql", sql.sql),
+    ("/sql", "sql", sql.form),
 )
 DATA: tuple[tuple[str, Numbers], ...] = (
     ("/api/grid", grid.grid),
@@ -58,18 +67,17 @@ DATA: tuple[tuple[str, Numbers], ...] = (
     ("/api/control", control.control),
     ("/api/launches", launches.launches),
     ("/api/figures", gallery.gallery),
-    ("/api/sql", sql.sql),
 )
 TABLES: dict[str, Callable[[ServerState, QueryParams], str]] = {
     "curves": lambda state, params: curves.table(state, params).to_csv(index=False),
     "compare": lambda state, params: compare.table(state, params).to_csv(index=False),
     "control": lambda state, params: control.table(state, params).to_csv(index=False),
-    "sql": sql.table,
 }
 STATES = (
     ((NoDatabaseError, SchemaVersionError, StoreUnavailableError), 503),
     ((BusyError,), 429),
     ((NotFoundError,), 404),
+    ((ForbiddenError,), 403),
     ((AnalysisError, DoptError), 400),
 )
 
@@ -82,7 +90,7 @@ def create_app(
     ``host`` is the address that the server listens at. Raises ``StoreError`` for an invalid
     database URL. A database that does not exist yet gives an error page until it is created.
     """
-    states = states_of([url, *others], figures)
+    states = states_of([url, *others], figures, not is_loopback(host))
     routes = [
         Route("/databases", partial(_both, states)),
         Route("/api/databases", partial(_both_data, states)),
@@ -113,7 +121,7 @@ def create_app(
 
 
 def end_streams(app: Starlette) -> None:
-    """End the event streams, without which open pages keep the server from ending."""
+    """End event streams and statements, with which open pages keep the server from ending."""
     for events in app.state.events:
         events.end()
 
@@ -124,6 +132,7 @@ def _routes(state: ServerState) -> list[Route]:
         *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
         *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
         *(Route(f"/api/{name}.csv", partial(_table, state, name)) for name in TABLES),
+        *(Route(path, partial(_ask, state, to), methods=["POST"]) for path, to in STATEMENTS),
         Route("/api/events", partial(_events, state)),
         Route("/figures/{name}", partial(_file, state)),
     ]
@@ -142,6 +151,49 @@ def _page(state: ServerState, name: str, numbers: Numbers, request: Request) -> 
 def _data(state: ServerState, numbers: Numbers, request: Request) -> Response:
     content = numbers(state, _query_params(request))
     return as_json(content, 400 if content.get("error") else 200)
+
+
+async def _ask(state: ServerState, answer: Answer, request: Request) -> Response:
+    """Run the statement of a form until it ends, its client leaves, or the server ends."""
+    params = await _form(request)
+    left = threading.Event()
+
+    def stopped() -> bool:
+        return left.is_set() or state.events.ended
+
+    work = asyncio.create_task(run_in_threadpool(answer, state, request, params, stopped))
+    leaving = asyncio.create_task(_leaving(request))
+    try:
+        await asyncio.wait((work, leaving), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        left.set()
+        leaving.cancel()
+    return await work
+
+
+async def _form(request: Request) -> QueryParams:
+    body = b""
+    try:
+        async with asyncio.timeout(FORM_SECONDS):
+            async for part in request.stream():
+                body += part
+                if len(body) > LONGEST_QUERY:
+                    raise RequestError(f"The form is too long, at most {LONGEST_QUERY} bytes.")
+    except (TimeoutError, ClientDisconnect) as error:
+        raise RequestError("The form did not arrive whole and in time: send it again.") from error
+    return QueryParams(dict(parse_qsl(body.decode("latin-1"))))
+
+
+async def _leaving(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+STATEMENTS: tuple[tuple[str, Answer], ...] = (
+    ("/sql", lambda state, at, *ask: _page(state, "sql", lambda *_: sql.rows(state, *ask), at)),
+    ("/api/sql", lambda state, at, *ask: _data(state, lambda *_: sql.rows(state, *ask), at)),
+    ("/api/sql.csv", lambda state, _, *ask: as_csv(sql.table(state, *ask), "sql")),
+)
 
 
 def _both(states: Sequence[ServerState], request: Request) -> Response:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import socket
 import sys
 from contextlib import ExitStack
@@ -52,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
     sys.stdout.write(_greeting(options, listening.getsockname()[1]))
     sys.stdout.flush()
     try:
-        Server(app).run(sockets=[listening])
+        Server(app, leave=lambda: os._exit(0)).run(sockets=[listening])
     except KeyboardInterrupt:
         return 0
     finally:

@@ -13,5 +13,9 @@ class NotFoundError(AnalysisError):
     """The trial or file does not exist."""
 
 
+class ForbiddenError(AnalysisError):
+    """The request comes from another site, or needs a right that is not given."""
+
+
 class BusyError(AnalysisError):
     """Too many queries are running."""

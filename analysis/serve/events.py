@@ -33,7 +33,7 @@ class Events:
     database: Database
     _latest: str = ""
     _n_open: int = 0
-    _ended: bool = False
+    ended: bool = False
     _reading: asyncio.Task[None] | None = None
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -42,7 +42,7 @@ class Events:
         self._open()
         try:
             sent = ""
-            while not self._ended:
+            while not self.ended:
                 if self._latest == sent and not await self._change():
                     yield COMMENT
                 elif self._latest != sent:
@@ -53,7 +53,7 @@ class Events:
 
     def end(self) -> None:
         """End all streams, now and later."""
-        self._ended = True
+        self.ended = True
         self._tell()
 
     def _open(self) -> None:

@@ -1,13 +1,15 @@
-"""Security checks of every request: read-only methods, own Host header, no cross-site requests.
+"""Security checks of every request: methods, own Host header, no cross-site requests.
 
 A foreign web site may point a DNS name at 127.0.0.1 (DNS rebinding) or embed URLs of this server.
 The Host header reveals the first, Sec-Fetch-Site the second; the response headers keep pages from
-running or loading foreign content.
+running or loading foreign content. Statements of the SQL page come by POST, from a form of this
+server alone; a link shows a page and runs nothing.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import re
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
@@ -16,6 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from analysis.serve.addresses import is_loopback
 
 METHODS = ("GET", "HEAD")
+_STATEMENTS = re.compile(r"(/db/[^/]+)?(/sql|/api/sql(\.csv)?)")
 LONGEST_QUERY = 16_000
 """Bytes of a query string; a long SQL statement has a few thousand."""
 
@@ -57,27 +60,48 @@ class SecurityMiddleware:
             await send(message)
 
         refusal = self._refusal(scope)
-        answer = self._app if refusal is None else _plain(*refusal)
+        answer = self._app if refusal is None else _plain(scope["path"], *refusal)
         await answer(scope, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> tuple[int, str] | None:
         headers = Headers(scope=scope)
-        if scope["method"] not in METHODS:
-            return 405, f"{scope['method']} is not answered, this server only reads: use GET.\n"
+        method, allowed = scope["method"], _methods(scope["path"])
+        if method not in allowed:
+            return 405, f"{method} is not answered here: use {allowed[0]}.\n"
         if not is_own(headers.getlist("host"), self._host):
             return 421, (
                 "The Host header names another server: open the address that the command printed.\n"
             )
         if headers.get("sec-fetch-site") == "cross-site" and not _is_visit(headers):
             return 403, "Another web site asked for this: open the page itself.\n"
+        if method == "POST" and not _is_own_form(headers):
+            return 403, "Another web site sent this form: open the page SQL and send its own.\n"
         if len(scope["query_string"]) > LONGEST_QUERY:
             return 414, f"The address is too long, at most {LONGEST_QUERY} bytes after the '?'.\n"
         return None
 
 
-def _plain(status: int, text: str) -> PlainTextResponse:
-    headers = {"allow": ", ".join(METHODS)} if status == 405 else None
+def _methods(path: str) -> tuple[str, ...]:
+    found = _STATEMENTS.fullmatch(path)
+    if found is None:
+        return METHODS
+    return (*METHODS, "POST") if found[2] == "/sql" else ("POST",)
+
+
+def _plain(path: str, status: int, text: str) -> PlainTextResponse:
+    headers = {"allow": ", ".join(_methods(path))} if status == 405 else None
     return PlainTextResponse(text, status, headers)
+
+
+def _is_own_form(headers: Headers) -> bool:
+    """Whether a browser says that a page of this server sent the form, or says nothing.
+
+    Under the referrer policy of these pages the origin of a form is "null". The token decides in
+    any case.
+    """
+    site, origin = headers.get("sec-fetch-site"), headers.get("origin", "null")
+    own = f"://{headers['host']}"
+    return site in ("same-origin", "none", None) and (origin == "null" or origin.endswith(own))
 
 
 def _is_visit(headers: Headers) -> bool:

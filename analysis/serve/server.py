@@ -1,26 +1,116 @@
-"""Web server of the results browser."""
+"""Web server of the results browser, which bounds its connections and always ends."""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import socket
+import threading
+import time
+from collections.abc import Callable
 
 import uvicorn
 from starlette.applications import Starlette
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from analysis.serve.app import end_streams
 
+REQUEST_SECONDS = 10.0
+"""Time in which the head of a request has to arrive."""
+
+MAX_WAITING = 32
+"""Connections without a whole request; beyond it the oldest is closed."""
+
+MAX_CONNECTIONS = 128
+"""Connections and requests; beyond it the answer is 503."""
+
+LOG_SECONDS = 60.0
+END_SECONDS = 5.0
+"""Time in which open requests end after Ctrl-C."""
+
+
+class Connection(H11Protocol):
+    """HTTP connection that is closed when its next request does not come whole and in time."""
+
+    _late: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._watch()
+        waiting = {one: one._late for one in self.connections if isinstance(one, Connection)}
+        late = sorted((timer.when(), id(one), one) for one, timer in waiting.items() if timer)
+        for _, _, one in late[:-MAX_WAITING]:
+            one._close()
+
+    def data_received(self, data: bytes) -> None:
+        """Take a part of a request."""
+        super().data_received(data)
+        self._watch()
+
+    def _watch(self) -> None:
+        if not getattr(self.cycle, "response_complete", True):
+            if self._late:
+                self._late.cancel()
+            self._late = None
+        elif self._late is None:  # not again with each part: a slow client sends one at a time
+            self._late = self.loop.call_later(REQUEST_SECONDS, self._close)
+
+    def _close(self) -> None:
+        if not self.transport.is_closing():
+            self.logger.warning("Connections that sent no whole request were closed.")
+            self.transport.abort()
+
+
+class Seldom(logging.Filter):
+    """Passes a warning of each kind once a minute: strangers decide how often it is logged."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._next: dict[object, float] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a record is logged."""
+        place, now = (record.pathname, record.lineno), time.monotonic()
+        if record.levelno <= logging.WARNING and now < self._next.get(place, now):
+            return False
+        self._next[place] = now + LOG_SECONDS
+        return True
+
 
 class Server(uvicorn.Server):
-    """Server that ends the event streams before it waits for open connections to close."""
+    """Server that ends event streams and statements before it waits for connections to close.
 
-    def __init__(self, app: Starlette, port: int = 8000) -> None:
+    ``leave`` is called where a request is still computed long after the end was asked for.
+    """
+
+    def __init__(
+        self, app: Starlette, port: int = 8000, leave: Callable[[], object] = lambda: None
+    ) -> None:
         config = uvicorn.Config(
-            app, port=port, log_level="warning", server_header=False, lifespan="on"
+            app,
+            port=port,
+            log_level="warning",
+            server_header=False,
+            lifespan="on",
+            http=Connection,
+            ws="none",
+            limit_concurrency=MAX_CONNECTIONS,
         )
         super().__init__(config)
+        logging.getLogger("uvicorn.error").addFilter(Seldom())
         self._app = app
+        self._leave = leave
+        self._others = set(threading.enumerate())
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End what is open."""
         end_streams(self._app)
+        last = threading.Timer(END_SECONDS, self._leave_requests)
+        last.daemon = True
+        last.start()
         await super().shutdown(sockets)
+
+    def _leave_requests(self) -> None:
+        if any(not one.daemon for one in {*threading.enumerate()} - self._others):
+            self._leave()

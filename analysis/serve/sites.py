@@ -11,13 +11,16 @@ from analysis.serve.state import Link, ServerState
 from orchestrate.store.database_url import parse
 
 
-def states_of(urls: Sequence[str], figures: Path) -> list[ServerState]:
-    """Return the state of each database; raise ``StoreError`` for an invalid URL."""
+def states_of(urls: Sequence[str], figures: Path, exposed: bool = False) -> list[ServerState]:
+    """Return the state of each database; raise ``StoreError`` for an invalid URL.
+
+    ``exposed`` says whether other machines reach the server.
+    """
     names = _names(urls)
     bases = ["", *(f"/db/{name}" for name in names[1:])]
     links = tuple(map(Link, names, bases))
     return [
-        ServerState(Database(url), figures, link, links)
+        ServerState(Database(url), figures, link, links, exposed)
         for url, link in zip(urls, links, strict=True)
     ]
 

@@ -1,23 +1,25 @@
-"""SQL page: read-only SELECT statements with a limit on rows and time.
+"""SQL page: read-only SELECT statements with limits, run by POST from its own form.
 
-The database connection refuses every statement that writes (see ``Reader.query``). On PostgreSQL,
-the role in the database URL decides about functions such as ``pg_read_file``.
+The process of a statement refuses what writes (see ``Reader.query``). On PostgreSQL the user
+decides about functions such as ``pg_read_file``: it is the one of ``DOPT_READ_DB``, or, where only
+this machine reaches the server, the one of the database.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import secrets
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from analysis.serve.errors import BusyError
+from analysis.serve.errors import BusyError, ForbiddenError
 from analysis.serve.query_params import QueryParams
 from analysis.serve.state import ServerState
-from orchestrate.store import Table
+from orchestrate.store import READ_VARIABLE, Table
 from orchestrate.store.errors import QueryError
 
 MAX_ROWS = 1000
@@ -59,26 +61,33 @@ VIEWS = {
 }
 """Views of the database with a sentence on each."""
 
+Stopped = Callable[[], bool]
+
 _slots = threading.BoundedSemaphore(MAX_CONCURRENT)
 
 
-def sql(state: ServerState, params: QueryParams) -> dict[str, Any]:
-    """Return the rows or the error of the statement ``q``, if one is given."""
-    statement = params.text("q")
-    answer: dict[str, Any] = {
-        "q": statement,
+def form(state: ServerState, params: QueryParams) -> dict[str, Any]:
+    """Return what the form needs, with the statement ``q`` in it, which is not run."""
+    return {
+        "q": params.text("q"),
+        "token": state.token,
+        "access": _access(state),
         "examples": [{"title": title, "q": text} for title, text in EXAMPLES],
         "limits": {"rows": MAX_ROWS, "csv_rows": MAX_CSV_ROWS, "seconds": TIMEOUT_SECONDS},
-        "is_file": state.database.is_file,
         "views": _views(state),
         "error": None,
         "columns": None,
     }
-    if not statement:
+
+
+def rows(state: ServerState, params: QueryParams, stopped: Stopped) -> dict[str, Any]:
+    """Return the form with the rows or the error of its statement, if it holds one."""
+    answer = form(state, params)
+    if not answer["q"]:
         return answer
     start = time.monotonic()
     try:
-        found = _run_query(state, statement, MAX_ROWS)
+        found = _run_query(state, params, MAX_ROWS, stopped)
     except QueryError as error:
         return answer | {"error": str(error)}
     return answer | {
@@ -103,9 +112,9 @@ def _views(state: ServerState) -> list[dict[str, Any]]:
     ]
 
 
-def table(state: ServerState, params: QueryParams) -> str:
+def table(state: ServerState, params: QueryParams, stopped: Stopped) -> str:
     """Return the rows as CSV; a last line says when the rows were cut."""
-    found = _run_query(state, params.text("q"), MAX_CSV_ROWS)
+    found = _run_query(state, params, MAX_CSV_ROWS, stopped)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(found.columns)
@@ -115,17 +124,45 @@ def table(state: ServerState, params: QueryParams) -> str:
     return text.getvalue()
 
 
-def _run_query(state: ServerState, statement: str, rows: int) -> Table:
-    with _slot():
-        return state.database.reader().query(statement, limit=rows, timeout=TIMEOUT_SECONDS)
+def _access(state: ServerState) -> tuple[bool, str]:
+    """Return whether statements are run, and as whom or why not, in a sentence."""
+    database = state.database
+    if database.is_file:
+        return True, ""
+    if database.read_login:
+        return True, f"Statements run as {database.read_login.username}, from {READ_VARIABLE}."
+    lacks = f"{READ_VARIABLE} names no user of this database who can only read (docs/database.md)"
+    if state.exposed:
+        return (
+            False,
+            f"Other machines reach this server, and {lacks}: set it, or use --host 127.0.0.1.",
+        )
+    return True, (
+        f"Statements run as {database.user or 'its owner'}, the user of the launches, because "
+        f"{lacks}: functions such as pg_read_file and pg_terminate_backend have that user's rights."
+    )
+
+
+def _run_query(state: ServerState, params: QueryParams, rows: int, stopped: Stopped) -> Table:
+    if not secrets.compare_digest(params.text("token").encode(), state.token.encode()):
+        raise ForbiddenError("The form is not one of this server: open the page SQL again.")
+    allowed, sentence = _access(state)
+    if not allowed:
+        raise ForbiddenError(sentence)
+    with _slot(stopped):
+        return state.database.reader().query(
+            params.text("q"), rows, TIMEOUT_SECONDS, state.database.read_login, stopped
+        )
 
 
 @contextmanager
-def _slot() -> Iterator[None]:
-    if not _slots.acquire(timeout=TIMEOUT_SECONDS):
-        raise BusyError(
-            f"{MAX_CONCURRENT} queries are running: wait until one ends, then try again."
-        )
+def _slot(stopped: Stopped) -> Iterator[None]:
+    end = time.monotonic() + TIMEOUT_SECONDS
+    while not _slots.acquire(timeout=0.1):
+        if stopped() or time.monotonic() > end:
+            raise BusyError(
+                f"{MAX_CONCURRENT} queries are running: wait until one ends, then try again."
+            )
     try:
         yield
     finally:

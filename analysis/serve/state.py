@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -33,12 +34,18 @@ class ServerState:
         Where the pages of the database are.
     links
         Where those of all databases of the server are, this one included.
+    exposed
+        Whether other machines reach the server.
+    token
+        Secret of the forms of this process, which no page of another site knows.
     """
 
     database: Database
     figures: Path
     link: Link
     links: tuple[Link, ...]
+    exposed: bool = False
+    token: str = field(default_factory=secrets.token_urlsafe)
     cache: Cache = field(default_factory=Cache)
     selections: Cache = field(default_factory=lambda: Cache(6))  # each contains all its trials
 

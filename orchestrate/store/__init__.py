@@ -9,7 +9,7 @@ from __future__ import annotations
 from orchestrate.records import Failure, RunRecord
 from orchestrate.store.backends.open import LEASE_SECONDS
 from orchestrate.store.backup import back_up
-from orchestrate.store.database_url import DEFAULT_URL, URL_VARIABLE, default_url
+from orchestrate.store.database_url import DEFAULT_URL, READ_VARIABLE, URL_VARIABLE, default_url
 from orchestrate.store.doctor.examine import examine
 from orchestrate.store.doctor.findings import Finding
 from orchestrate.store.errors import (
@@ -56,6 +56,7 @@ __all__ = [
     "DEFAULT_URL",
     "FINISHED",
     "LEASE_SECONDS",
+    "READ_VARIABLE",
     "RETRIED",
     "URL_VARIABLE",
     "Assessments",

@@ -17,6 +17,9 @@ DEFAULT_URL = "sqlite:///results/results.db"
 URL_VARIABLE = "DOPT_DB"
 """Environment variable that names another default database; an empty one counts as unset."""
 
+READ_VARIABLE = "DOPT_READ_DB"
+"""Environment variable with the URL of a user that can only read, as which the browser asks."""
+
 BUNDLE = "bundle"
 """Kind of URL that names the folder of a bundle, which is only read."""
 
@@ -44,11 +47,12 @@ def parse(url: str) -> URL:
 
     The path of a folder is taken for a bundle in it, and the path of a file is read as
     :func:`dopt.given_path.given_path` does. The message says whether the URL came from
-    ``DOPT_DB``. It repeats no text other than the path of a SQLite file, because a mistyped URL may
-    hold a password.
+    ``DOPT_DB`` or ``DOPT_READ_DB``. It repeats no text other than the path of a SQLite file,
+    because a mistyped URL may hold a password.
     """
-    source = f" in the environment variable {URL_VARIABLE}"
-    where = source if url.strip() == os.environ.get(URL_VARIABLE, "").strip() else ""
+    variables = (URL_VARIABLE, READ_VARIABLE)
+    names = [name for name in variables if os.environ.get(name, "").strip() == url.strip() != ""]
+    where = f" in the environment variable {names[0]}" if names else ""
     url = stripped(url, f"The database URL{where}", StoreError)
     if "://" not in url and Path(url).is_dir():
         return URL.create(BUNDLE, database=url)

@@ -45,7 +45,7 @@ def of_kind(folder: str, kind: str, name: str) -> Manifest:
 
 def pods(manifest: Manifest) -> list[Manifest]:
     """Return the pod templates of an object."""
-    spec = manifest["spec"]
+    spec = manifest.get("spec", {})  # a ConfigMap has none
     if manifest["kind"] == "RayCluster":
         groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
         return [group["template"] for group in groups]

@@ -50,12 +50,12 @@ def test_no_variable_and_no_word_holds_a_secret(services: dict[str, dict[str, An
 def test_a_secret_reaches_those_alone_who_need_it() -> None:
     readers = {name: set(service.get("secrets", [])) for name, service in SERVICES.items()}
     assert readers == {
-        "db": {"postgres_password"},
+        "db": {"postgres_password", "postgres_read_password"},
         "head": {"ray_auth_token"},
         "worker": {"ray_auth_token"},
         "launch": {"postgres_password", "ray_auth_token"},
         "analysis": {"postgres_password"},
-        "browser": {"postgres_password"},
+        "browser": {"postgres_read_password"},  # it cannot even write
     }
 
 
@@ -117,14 +117,18 @@ def write_secrets(folder: Path, **variables: str) -> dict[str, str]:
 
 
 def test_secrets_come_from_the_environment(tmp_path: Path) -> None:
-    given = write_secrets(tmp_path, POSTGRES_PASSWORD="a b:c", RAY_AUTH_TOKEN="t" * 32)
-    assert given == {"postgres_password": "a b:c", "ray_auth_token": "t" * 32}
+    passwords = {"POSTGRES_PASSWORD": "a b:c", "POSTGRES_READ_PASSWORD": "d\\e"}
+    assert write_secrets(tmp_path, RAY_AUTH_TOKEN="t" * 32, **passwords) == {
+        "postgres_password": "a b:c",
+        "postgres_read_password": "d\\e",
+        "ray_auth_token": "t" * 32,
+    }
 
 
 def test_secrets_are_made_up_once(tmp_path: Path) -> None:
     made = write_secrets(tmp_path)
     assert all(len(secret) >= 32 for secret in made.values())
-    assert len(set(made.values())) == 2
+    assert len(set(made.values())) == 3
     assert write_secrets(tmp_path, POSTGRES_PASSWORD="other") == made
 
 

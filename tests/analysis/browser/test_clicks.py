@@ -154,9 +154,12 @@ def test_sql_answers_refuses_and_downloads(browser: Browser, address: str) -> No
 def use_sql(page: Page) -> None:
     page.goto("/sql")
     page.get_by_role("link", name="Final losses").click()
+    expect(page.get_by_label("Statement")).to_have_value(re.compile("avg"))
+    expect(page.locator("#answer")).to_have_count(0)
+    page.get_by_role("button", name="Run").click()
     expect(page.locator("#answer tbody tr")).to_have_count(12)
     with page.expect_download() as download:
-        page.get_by_role("link", name="Download CSV").click()
+        page.get_by_role("button", name="Download CSV").click()
     assert download.value.path().read_text().startswith("env,policy,width,n,mean")
     box = page.get_by_label("Statement")
     box.fill("DELETE FROM trial")

@@ -11,6 +11,7 @@ from starlette.testclient import TestClient
 
 from analysis.serve import sql
 from orchestrate.store.views import VIEWS
+from tests.analysis.browser.forms import post
 
 Visit = Callable[..., TestClient]
 
@@ -53,7 +54,7 @@ POSTGRESQL_ONLY = (
 
 
 def ask(client: TestClient, statement: str) -> tuple[int, dict[str, object]]:
-    answer = client.get("/api/sql", params={"q": statement})
+    answer = post(client, "/api/sql", statement)
     return answer.status_code, answer.json()
 
 
@@ -62,8 +63,8 @@ def test_every_example_answers(client: TestClient) -> None:
         status, found = ask(client, statement)
         assert status == 200, found
         assert found["columns"]
-        assert client.get("/sql", params={"q": statement}).status_code == 200
-        assert client.get("/api/sql.csv", params={"q": statement}).status_code == 200
+        assert post(client, "/sql", statement).status_code == 200
+        assert post(client, "/api/sql.csv", statement).status_code == 200
 
 
 def test_the_page_names_every_view_with_its_columns(client: TestClient) -> None:
@@ -83,7 +84,7 @@ def test_an_answer_has_columns_rows_and_bytes_in_words(client: TestClient) -> No
     assert len(found["rows"]) == 8  # type: ignore[arg-type]
     _, found = ask(client, "SELECT states FROM trajectory LIMIT 1")
     assert found["rows"] == [["656 bytes"]]
-    text = client.get("/api/sql.csv", params={"q": "SELECT 1 AS one, NULL AS none, 'a,b' AS c"})
+    text = post(client, "/api/sql.csv", "SELECT 1 AS one, NULL AS none, 'a,b' AS c")
     assert text.text == 'one,none,c\n1,,"a,b"\n'
     assert "attachment" in text.headers["content-disposition"]
 
@@ -93,8 +94,8 @@ def test_rows_are_cut_and_the_page_says_so(client: TestClient) -> None:
     _, found = ask(client, statement)
     assert found["cut"] is True
     assert len(found["rows"]) == sql.MAX_ROWS  # type: ignore[arg-type]
-    assert "Only the first 1,000 rows" in client.get("/sql", params={"q": statement}).text
-    assert len(client.get("/api/sql.csv", params={"q": statement}).text.splitlines()) == 2501
+    assert "Only the first 1,000 rows" in post(client, "/sql", statement).text
+    assert len(post(client, "/api/sql.csv", statement).text.splitlines()) == 2501
 
 
 def test_a_slow_query_is_ended(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +114,7 @@ def test_whatever_does_not_only_read_is_refused(client: TestClient, statement: s
     status, found = ask(client, statement)
     assert status == 400, found
     assert found["error"]
-    page = client.get("/sql", params={"q": statement})
+    page = post(client, "/sql", statement)
     assert page.status_code == 400
     assert 'role="alert"' in page.text
     assert client.get("/api/grid").json()["progress"] == before
@@ -142,11 +143,11 @@ def test_too_many_at_once_wait_or_are_told(
     for _ in range(sql.MAX_CONCURRENT):
         assert sql._slots.acquire(blocking=False)
     try:
-        assert client.get("/api/sql?q=SELECT 1").status_code == 429
+        assert post(client, "/api/sql", "SELECT 1").status_code == 429
     finally:
         for _ in range(sql.MAX_CONCURRENT):
             sql._slots.release()
-    assert client.get("/api/sql?q=SELECT 1 AS one").status_code == 200
+    assert post(client, "/api/sql", "SELECT 1 AS one").status_code == 200
 
 
 def test_the_role_is_mentioned_where_it_decides(
