@@ -44,6 +44,12 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
     """Yield the grid in at most ``max_rows`` rows, the failures and the launches."""
     yield grid_table(status.configs, max_rows)
     yield Text(f"\n{summary(status)}", style="bold")
+    if status.mixed:
+        yield Text(
+            f"{_plural(len(status.mixed), 'configuration')} with results of different code "
+            f"(the first is {status.mixed[0][:12]}): python -m orchestrate doctor",
+            style="yellow",
+        )
     if status.explorations:
         yield Text("\nExplorations", style="bold")
         yield from map(_exploration, status.explorations[-_MAX_EXPLORATIONS:])
@@ -116,6 +122,7 @@ def document(status: Status, database: str) -> dict[str, Any]:
         "launches": launches,
         "detached": [one.launch_id for one in status.detached],
         "explorations": [asdict(one) for one in status.explorations],
+        "mixed_code": list(status.mixed),
     }
 
 

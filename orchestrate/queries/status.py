@@ -47,6 +47,8 @@ class Status:
         Trials per second of the living launches over the last minutes.
     detached
         Launches that registered a grid for workers and left.
+    mixed
+        Keys of configurations whose finished trials were run by different code.
     explorations
         Explorations that were saved; they count as done or diverged.
     """
@@ -57,6 +59,7 @@ class Status:
     rate: float
     explorations: Sequence[ExplorationRow] = ()
     detached: Sequence[LaunchRow] = ()
+    mixed: Sequence[str] = ()
 
     @property
     def counts(self) -> Counter[str]:
@@ -96,7 +99,9 @@ def gather(reader: Reader, configs: Sequence[ConfigRow], kinds: int = 10) -> Sta
     detached = [launch for launch in launches if launch.kind == "registration"]
     failures = failure_kinds(reader, by_key, kinds)
     explored = [one for one in explorations(reader) if one.config_key in by_key]
-    return Status(configs, failures, running, _rate(reader, by_key, running), explored, detached)
+    mixed = [key for key in reader.mixed_code() if key in by_key]
+    rate = _rate(reader, by_key, running)
+    return Status(configs, failures, running, rate, explored, detached, mixed)
 
 
 def _rate(reader: Reader, by_key: dict[str, ConfigRow], running: Sequence[LaunchRow]) -> float:

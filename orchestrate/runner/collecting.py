@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.store import StoreError, collect, merge_collected
+from orchestrate.store import DatabaseMovedError, StoreError, collect, merge_collected
 
 REST = 20.0
 """Least time between two copies, as a multiple of the time that a copy takes."""
@@ -49,6 +49,9 @@ def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator
     thread.start()
     try:
         yield
+    except DatabaseMovedError:  # another database may have its name
+        _stop(thread, ended)
+        raise
     except BaseException:
         _stop(thread, ended)
         with suppress(StoreError):  # the first error is the one to report

@@ -12,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 
 from dopt import __version__
+from orchestrate.fingerprint import fingerprint
 from orchestrate.redaction import without_password_in_word
 from orchestrate.store import LaunchRecord
 
@@ -60,6 +61,7 @@ def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> 
         git_dirty=bool(difference) if commit else None,
         git_diff_hash=hashlib.sha256(difference).hexdigest() if difference else None,
         versions={**_versions(), **_processor()},
+        fingerprint=fingerprint(),
     )
 
 

@@ -38,7 +38,14 @@ class RetryingStore:
     ------
     StoreUnavailableError
         From every method, if the database stays unreachable, or at once if waiting cannot help.
+
+    Attributes
+    ----------
+    alike : bool
+        Whether only trials are claimed that code with the fingerprint of this launch registered.
     """
+
+    alike = False
 
     def __init__(self, store: Store, launch: int, seconds: float, say: Say) -> None:
         self._store = store
@@ -54,6 +61,10 @@ class RetryingStore:
     def hurry(self) -> None:
         """Wait no longer for a database that does not answer; a signal handler may call it."""
         self._seconds = 0.0
+
+    def check(self) -> None:
+        """Raise ``DatabaseMovedError`` if the file was removed, renamed or replaced."""
+        self._store.check()
 
     def recover(self) -> None:
         """Put the trials of dead launches back to pending."""
@@ -72,25 +83,34 @@ class RetryingStore:
         return self._persist(lambda: self._store.final_losses(trial_keys))
 
     def open_configs(self) -> list[OpenConfig]:
-        """Return the configurations that have trials without an outcome."""
-        return self._persist(self._store.open_configs)
+        """Return the configurations that have trials without an outcome for this code."""
+        return self._persist(lambda: self._store.open_configs(self._launch))
+
+    def others(self) -> list[tuple[dict[str, str] | None, int]]:
+        """Return the fingerprints of other code that registered open trials, and their counts."""
+        return self._persist(lambda: self._store.others(self._launch))
 
     def open_trials(self, config_id: int, size: int, losses: int) -> list[OpenTrial]:
         """Return some pending trials of a configuration that lost fewer launches."""
-        return self._persist(lambda: self._store.open_trials(config_id, size, losses))
+        words = (self._launch, config_id, size, losses)
+        return self._persist(lambda: self._store.open_trials(*words))
 
     def suspects(self, losses: int) -> list[OpenTrial]:
         """Return the pending trials whose launch was lost that often."""
-        return self._persist(lambda: self._store.suspects(losses))
+        return self._persist(lambda: self._store.suspects(self._launch, losses))
 
     def claim(self, trial_keys: Sequence[str]) -> list[Claim]:
         """Claim the pending ones of the trials, none of which the launch holds."""
+        only = {"alike": True} if self.alike else {}
+
+        def claim() -> list[Claim]:
+            return self._store.claim(self._launch, trial_keys, **only)
 
         def again() -> list[Claim]:
             self._store.release(self._launch, trial_keys)
-            return self._store.claim(self._launch, trial_keys)
+            return claim()
 
-        return self._persist(lambda: self._store.claim(self._launch, trial_keys), again)
+        return self._persist(claim, again)
 
     def commit(self, items: Sequence[tuple[Claim, Result, RunRecord]]) -> list[bool]:
         """Write finished trials; False for each whose claim is lost."""

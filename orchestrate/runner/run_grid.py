@@ -124,7 +124,8 @@ def recorded_launch(
     StoreError, InfrastructureError
         If the database or the workers fail; claims are released if that is possible.
     """
-    with collected(settings, warn), Store.open(settings.store_url, settings.lease) as store:
+    opened = Store.open(settings.store_url, settings.lease, settings.patience)
+    with collected(settings, warn), opened as store:
         launch = store.begin_launch(record)
         try:
             with Heartbeat(store, launch, settings.lease):

@@ -99,6 +99,8 @@ class ExplorationSaver:
         try:
             if launch is not None:
                 store.end_launch(launch, "done", 0)
+        except DatabaseMovedError:
+            pass  # the save has said so
         except (StoreError, ValueError) as error:  # the latter if its row was deleted
             _log.warning("the launch of the saves could not be ended: %s", error)
         finally:

@@ -91,6 +91,7 @@ class Scheduler:
         for event in events:
             if isinstance(event, WorkerLost):
                 self._recover(event)
+        self.store.check()
         return True
 
     def _sample(self, sample: Sample) -> None:

@@ -13,6 +13,7 @@ from dopt.spec.added_fields import completed
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Task
+from orchestrate.fingerprint import differences, fingerprint
 from orchestrate.runner.batching import MAX_CHUNK_TRIALS, Chunks
 from orchestrate.runner.memory_check import BYTES_PER_GIB, memory_of_this_machine
 from orchestrate.runner.retrying_store import RetryingStore
@@ -85,6 +86,7 @@ class StoredChunks(Chunks):
         self._warn = warn
         self._kinds: dict[str, Kind] = {}
         self._refused: set[str] = set()
+        self._left: set[str] = set()
         self._submitted: deque[float] = deque(maxlen=2 * slots)
         self._next_look = 0.0
 
@@ -96,10 +98,23 @@ class StoredChunks(Chunks):
         kinds = (self._kind(config) for config in open_configs)
         self._kinds = {kind.first.config_key: kind for kind in kinds if kind is not None}
         counts = {config.config_key: config.pending + config.running for config in open_configs}
-        self.left = sum(counts.values())
+        self.left = sum(counts.values()) + self._count_others()
         self.left_here = sum(counts[key] for key in self._kinds)
         now = time.monotonic()
         self._next_look = now + max(REFRESH_SECONDS, 20 * (now - start))
+
+    def _count_others(self) -> int:
+        """Return the open trials of other code, and say once what differs."""
+        others = self._store.others()
+        for theirs, count in others:
+            if str(theirs) not in self._left:
+                self._left.add(str(theirs))
+                known = differences(theirs, fingerprint()) if theirs else "an older program"
+                self._warn(
+                    f"{count:,} trials are left, which other code has registered ({known}): run a "
+                    "worker with that code, or give their launch command again with this code."
+                )
+        return sum(count for _, count in others)
 
     def look_for_suspects(self) -> None:
         """Queue the trials whose launches were lost too often; call it while no trial runs."""

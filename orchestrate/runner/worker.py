@@ -165,6 +165,7 @@ def _work(
     output: Output,
     start: float,
 ) -> ExitCode:
+    store.alike = True
     length = _length(settings.seconds, start)
     slots = launch.workers or 1
     chunks = StoredChunks(store, launch.chunk_seconds, slots, length, output.warn)

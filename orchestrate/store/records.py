@@ -82,6 +82,9 @@ class LaunchRecord:
         difference; None outside a repository.
     versions
         Version of the interpreter and of each library that can change a number.
+    fingerprint
+        Digests of the code, and versions, with which alone a worker runs what this launch registers
+        (:func:`orchestrate.fingerprint.fingerprint`); None if unknown.
     """
 
     argv: Sequence[str]
@@ -92,6 +95,7 @@ class LaunchRecord:
     git_dirty: bool | None = None
     git_diff_hash: str | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
+    fingerprint: Mapping[str, str] | None = None
 
 
 @dataclass(frozen=True)

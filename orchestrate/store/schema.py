@@ -20,14 +20,20 @@ from sqlalchemy import (
     Integer,
     LargeBinary,
     MetaData,
+    Select,
     Table,
     Text,
     UniqueConstraint,
+    func,
+    select,
 )
 from sqlalchemy.types import TypeEngine
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Number of the newest script in ``migrations/versions``."""
+
+LOCK_TABLE = "store_lock"
+"""Empty table on PostgreSQL whose lock keeps other launches from registering or recovering."""
 
 STATUSES = ("pending", "running", "done", "diverged", "failed", "cancelled")
 FINISHED = ("done", "diverged")
@@ -124,6 +130,7 @@ launch = _table(
     _text("git_diff_hash", nullable=True),
     _text("versions"),
     Column("exit_code", Integer),
+    _text("fingerprint", nullable=True),  # JSON; NULL of programs before schema 6
     _one_of("state", LAUNCH_STATES),
     Index("launch_by_token", "token", unique=True),
 )
@@ -173,6 +180,7 @@ trial = _table(
     _text("node", nullable=True),
     Column("launch_id", _Long, ForeignKey("launch.launch_id")),  # launch of the outcome
     Column("error_id", _Long, ForeignKey("error.error_id")),
+    Column("registered_by", _Long),  # launch_id of the code that may run it while it is pending
     _one_of("status", STATUSES),
     UniqueConstraint("config_id", "seed"),
     Index("trial_by_owner", "owner"),
@@ -236,6 +244,14 @@ attempt = _table(
     Index("attempt_by_end", "ended"),
     rowid=False,
 )
+
+
+def alike(launch_id: int) -> Select[tuple[int]]:
+    """Return the launches with the fingerprint of this one, as a one-column query for ``IN``."""
+    mine = select(func.coalesce(launch.c.fingerprint, "")).where(launch.c.launch_id == launch_id)
+    same = func.coalesce(launch.c.fingerprint, "") == mine.scalar_subquery()
+    return select(launch.c.launch_id).where(same)
+
 
 derived = MetaData()
 """Tables that repeat others in a form that is faster to read; a database may lack them."""

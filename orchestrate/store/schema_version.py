@@ -8,7 +8,7 @@ from sqlalchemy import Connection, inspect, text
 
 from orchestrate.store import migrations, packed_curves
 from orchestrate.store.errors import SchemaVersionError
-from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, metadata
+from orchestrate.store.schema import LOCK_TABLE, SCHEMA_VERSION, alembic_version, metadata
 
 # Table of the version before the program used Alembic.
 _FIRST_TABLE = "schema_version"
@@ -23,7 +23,7 @@ def create_or_check(connection: Connection, safe_url: str) -> None:
 
 
 def is_empty(connection: Connection) -> bool:
-    return not inspect(connection).get_table_names()
+    return set(inspect(connection).get_table_names()) <= {LOCK_TABLE}
 
 
 def create(connection: Connection) -> None:

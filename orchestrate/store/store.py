@@ -8,7 +8,7 @@ from typing import Self
 from orchestrate.records import Failure, RunRecord, Sample
 from orchestrate.store import database_url, packed_curves, schema_version
 from orchestrate.store.backends.base import Backend
-from orchestrate.store.backends.open import LEASE_SECONDS, make_backend
+from orchestrate.store.backends.open import LEASE_SECONDS, PATIENCE_SECONDS, make_backend
 from orchestrate.store.read import open_trials
 from orchestrate.store.read.final_losses import final_losses
 from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
@@ -41,13 +41,16 @@ class Store:
         self._backend = backend
 
     @classmethod
-    def open(cls, url: str, lease_seconds: float = LEASE_SECONDS) -> Self:
+    def open(
+        cls, url: str, lease_seconds: float = LEASE_SECONDS, patience: float = PATIENCE_SECONDS
+    ) -> Self:
         """Open a database, and create it if there is none.
 
         ``lease_seconds`` is the time after its last heartbeat for which a launch on PostgreSQL is
-        alive; on SQLite a file lock decides. Raises ``SchemaVersionError`` for another version.
+        alive; on SQLite a file lock decides. ``patience`` bounds the wait for a lock of another
+        process [s]. Raises ``SchemaVersionError`` for another version.
         """
-        backend = make_backend(database_url.parse(url), lease_seconds)
+        backend = make_backend(database_url.parse(url), lease_seconds, patience)
         try:
             with backend.creation() as connection:
                 schema_version.create_or_check(connection, backend.safe_url)
@@ -67,6 +70,10 @@ class Store:
     def safe_url(self) -> str:
         """The URL without a password."""
         return self._backend.safe_url
+
+    def check(self) -> None:
+        """Raise ``DatabaseMovedError`` if the file was removed, renamed or replaced."""
+        self._backend.check()
 
     def begin_launch(self, record: LaunchRecord) -> int:
         """Insert a launch that starts now and return its number."""
@@ -109,29 +116,44 @@ class Store:
         with self._backend.transaction() as connection:
             return final_losses(connection, self._backend, trial_keys)
 
-    def open_configs(self) -> list[OpenConfig]:
-        """Return the configurations that have trials without an outcome."""
-        with self._backend.transaction() as connection:
-            return open_trials.open_configs(connection)
+    def open_configs(self, launch: int) -> list[OpenConfig]:
+        """Return the configurations that have trials without an outcome.
 
-    def open_trials(self, config_id: int, size: int, losses: int) -> list[OpenTrial]:
-        """Return some pending trials of a configuration that lost fewer launches than ``losses``.
-
-        They come in a random order, so that workers rarely choose the same ones.
+        Only trials count that a launch with the fingerprint of this one has registered.
         """
         with self._backend.transaction() as connection:
-            return open_trials.open_trials(connection, config_id, size, losses)
+            return open_trials.open_configs(connection, launch)
 
-    def suspects(self, losses: int) -> list[OpenTrial]:
-        """Return the pending trials whose launch was lost at least ``losses`` times."""
+    def others(self, launch: int) -> list[tuple[dict[str, str] | None, int]]:
+        """Return the other fingerprints with which open trials were registered, and their counts.
+
+        None is the fingerprint of a program that stored none.
+        """
         with self._backend.transaction() as connection:
-            return open_trials.suspects(connection, losses)
+            return open_trials.others(connection, launch)
 
-    def claim(self, launch: int, trial_keys: Sequence[str]) -> list[Claim]:
-        """Claim those of the trials that are pending, in the given order."""
+    def open_trials(self, launch: int, config_id: int, size: int, losses: int) -> list[OpenTrial]:
+        """Return some pending trials of a configuration that lost fewer launches than ``losses``.
+
+        A launch with the fingerprint of this one has registered them. They come in a random order,
+        so that workers rarely choose the same ones.
+        """
+        with self._backend.transaction() as connection:
+            return open_trials.open_trials(connection, launch, config_id, size, losses)
+
+    def suspects(self, launch: int, losses: int) -> list[OpenTrial]:
+        """Return the pending trials, as above, whose launch was lost at least ``losses`` times."""
+        with self._backend.transaction() as connection:
+            return open_trials.suspects(connection, launch, losses)
+
+    def claim(self, launch: int, trial_keys: Sequence[str], *, alike: bool = False) -> list[Claim]:
+        """Claim those of the trials that are pending, in the given order.
+
+        ``alike`` leaves out what code with another fingerprint has registered.
+        """
         with self._backend.transaction() as connection:
             launches.renew(connection, self._backend, launch)
-            return claims.claim(connection, self._backend, launch, trial_keys)
+            return claims.claim(connection, self._backend, launch, trial_keys, alike)
 
     def commit(self, claim: Claim, result: Result, run: RunRecord) -> bool:
         """Write a finished trial with its curve and trajectory; return False if the claim is lost.
@@ -157,7 +179,7 @@ class Store:
 
     def holds_more(self, spec: Registrable, result: Result) -> bool:
         """Return whether more steps of an exploration are stored; raises as :meth:`save`."""
-        with self._backend.saving() as connection:
+        with self._backend.transaction() as connection:
             return explorations.is_longer(connection, self._backend, spec, result)
 
     def save(
@@ -174,7 +196,8 @@ class Store:
         appended. Returns None, and writes nothing, if more steps of it are stored. Raises
         ``StoreError`` for another exploration of the same key, and ``InvalidResultError``.
         """
-        with self._backend.saving() as connection:
+        self.check()
+        with self._backend.transaction() as connection:
             return explorations.save(connection, self._backend, launch, spec, result, run, last)
 
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:

@@ -15,6 +15,11 @@ from sqlalchemy import Connection, Engine, Select
 from orchestrate.store.backends.driver_errors import translated
 from orchestrate.store.records import Array
 
+ANNOUNCE_SECONDS = 2.0
+"""Wait for a lock of another process after which a warning says who holds it."""
+
+log = logging.getLogger("dopt.store")
+
 # The operation on a broken connection raises an error; the pool would add a traceback.
 logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
 
@@ -53,14 +58,11 @@ class Backend(ABC):
             self._has_answered = True
             yield connection
 
-    @contextmanager
-    def saving(self) -> Iterator[Connection]:
-        """Run the block in one writing transaction of the database that its URL still names.
+    def check(self) -> None:  # noqa: B027  a server has no file that can be moved
+        """Raise ``DatabaseMovedError`` if the URL names another file than the opened one.
 
-        Raises ``DatabaseMovedError`` if that is another one.
+        What the opened one holds is then saved in another file.
         """
-        with self.transaction() as connection:
-            yield connection
 
     @abstractmethod
     def creation(self) -> AbstractContextManager[Connection]:
@@ -87,8 +89,10 @@ class Backend(ABC):
         """Return the keys as a one-column query, for ``IN``; any number of them."""
 
     @abstractmethod
-    def insert_trials(self, connection: Connection, trials: Sequence[NewTrial]) -> None:
-        """Write pending trials, of which none is in the database."""
+    def insert_trials(
+        self, connection: Connection, trials: Sequence[NewTrial], launch_id: int
+    ) -> None:
+        """Write pending trials of a launch, of which none is in the database."""
 
     @abstractmethod
     def insert_steps(

@@ -4,23 +4,69 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from orchestrate.store.backends.base import ANNOUNCE_SECONDS, log
+from orchestrate.store.errors import StoreUnavailableError
+
+LOCK_TABLE = Path("/proc/locks")
+
+_PAUSE_SECONDS = 0.02
 
 _held: weakref.WeakSet[LaunchLocks] = weakref.WeakSet()
 
 
 @contextmanager
-def file_lock(path: Path) -> Iterator[None]:
-    """Hold the lock of a file, which is created if needed; wait for other holders."""
+def file_lock(path: Path, patience: float) -> Iterator[None]:
+    """Hold the lock of a file, which is created if needed; wait for others as :func:`patiently`."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+
+    def locked(seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while True:
+            with suppress(BlockingIOError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return True
+            if time.monotonic() >= end:
+                return False
+            time.sleep(_PAUSE_SECONDS)
+
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if not patiently(locked, patience, str(path), path):
+            raise StoreUnavailableError(
+                f"The file {path} is locked by {holder(path)} for more than {patience:g} s: end "
+                "it, and run the same command again."
+            )
         yield
     finally:
         os.close(descriptor)
+
+
+def patiently(locked: Callable[[float], bool], patience: float, name: str, path: Path) -> bool:
+    """Return whether ``locked``, which waits for the given seconds, succeeds in time.
+
+    After two seconds a warning says who holds the lock of ``path``.
+    """
+    first = min(ANNOUNCE_SECONDS, patience)
+    if locked(first):
+        return True
+    log.warning("waiting for a lock of %s, which %s holds", name, holder(path))
+    return locked(patience - first)
+
+
+def holder(path: Path) -> str:
+    """Return the process that has locked a file for writing, as far as the kernel tells."""
+    with suppress(OSError):
+        inode = f":{path.stat().st_ino}"
+        for line in LOCK_TABLE.read_text().splitlines():
+            words = line.split()  # 1: POSIX ADVISORY WRITE 4711 08:01:131 120 120
+            if "->" not in words and "WRITE" in words and words[5].endswith(inode):
+                return f"process {words[4]}"
+    return "another process"
 
 
 class LaunchLocks:

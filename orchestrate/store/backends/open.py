@@ -13,9 +13,12 @@ from orchestrate.store.backends.sqlite import SQLiteBackend
 from orchestrate.store.errors import StoreError
 
 LEASE_SECONDS = 60.0
+PATIENCE_SECONDS = 30.0
 
 
-def make_backend(url: URL, lease_seconds: float = LEASE_SECONDS) -> Backend:
+def make_backend(
+    url: URL, lease_seconds: float = LEASE_SECONDS, patience: float = PATIENCE_SECONDS
+) -> Backend:
     """Return the backend of a database, without checking or creating anything in it.
 
     Raises ``StoreError`` for a bundle, which cannot be written.
@@ -28,5 +31,5 @@ def make_backend(url: URL, lease_seconds: float = LEASE_SECONDS) -> Backend:
             "that one."
         )
     if url.get_backend_name() == "sqlite":
-        return SQLiteBackend(url)
-    return PostgreSQLBackend(url, lease_seconds)
+        return SQLiteBackend(url, patience)
+    return PostgreSQLBackend(url, lease_seconds, patience)

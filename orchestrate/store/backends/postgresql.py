@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count, repeat
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
@@ -25,14 +26,15 @@ from sqlalchemy import (
     text,
     update,
 )
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
 from orchestrate.store import database_url
-from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
+from orchestrate.store.backends.base import ANNOUNCE_SECONDS, Backend, LaunchLife, NewTrial, log
 from orchestrate.store.backends.postgresql_backup import copy_schema
-from orchestrate.store.errors import StoreError
+from orchestrate.store.errors import StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
-from orchestrate.store.schema import STEP_VALUES, launch
+from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
 from orchestrate.store.serialization import finite_list
 
 if TYPE_CHECKING:
@@ -55,15 +57,32 @@ _COPY_TYPES = ["int8", "int4", *("float8" for _ in STEP_VALUES)]
 # One statement for many rows: a statement for each takes twice the time, here and on the server.
 _INSERT_TRIALS = text(
     """
-    INSERT INTO trial (trial_key, config_id, seed, status, attempt)
-    SELECT *, 'pending', 0
+    INSERT INTO trial (trial_key, config_id, seed, status, attempt, registered_by)
+    SELECT *, 'pending', 0, CAST(:launch_id AS bigint)
     FROM unnest(CAST(:keys AS text[]), CAST(:config_ids AS bigint[]), CAST(:seeds AS bigint[]))
     """
 )
-_SET_LOCK_TIMEOUT = text("SET LOCAL lock_timeout = '30s'")
-_LOCK = text("SELECT pg_try_advisory_xact_lock(hashtext('dopt.store.' || current_schema()))")
-_LOCK_PAUSE_SECONDS = 0.05
+# No SELECT takes this lock, and none that a reader or VACUUM takes of other tables waits for it.
+_LOCK = text(f"LOCK TABLE {LOCK_TABLE} IN SHARE ROW EXCLUSIVE MODE")
+_HAS_LOCK = text(
+    f"SELECT to_regclass(quote_ident(current_schema()) || '.{LOCK_TABLE}') IS NOT NULL"
+)
+_CREATE_LOCK = text(f"CREATE TABLE {LOCK_TABLE} ()")
+_CREATED_BY_ANOTHER = ("23505", "42P07")
+_WATCH_SECONDS = 0.5
 _SESSION = "dopt launch"
+_BLOCKER = text(
+    f"""
+    SELECT coalesce('process ' || s.pid || ' of the user ' || coalesce(s.usename, '?')
+                    || coalesce(' (' || nullif(s.application_name, '') || ')', ''),
+                    'a prepared transaction') AS name,
+           coalesce(s.application_name LIKE '{_SESSION} %', false) AS is_launch
+    FROM unnest(pg_blocking_pids(:pid)) AS b(pid) LEFT JOIN pg_stat_activity AS s USING (pid)
+    ORDER BY s.xact_start LIMIT 1
+    """
+)
+_CANCEL = text("SELECT pg_cancel_backend(:pid)")
+_HURRY = text("SET LOCAL lock_timeout = '1s'")
 
 # A launch that is suspended while it sends rows of a COPY or statements of a pipeline keeps its
 # locks: no timeout of the server ends a session in the middle of a message from its client. Other
@@ -73,7 +92,8 @@ _EVICT = text(
     SELECT pg_terminate_backend(session.pid)
     FROM pg_stat_activity AS session
     WHERE session.datname = current_database() AND session.usename = current_user
-      AND session.xact_start IS NOT NULL AND session.pid <> pg_backend_pid()
+      AND session.xact_start IS NOT NULL
+      AND session.application_name <> current_setting('application_name')
       AND session.application_name IN (
         SELECT '{_SESSION} ' || split_part(token, '-', 1) FROM launch
         WHERE lease_until < extract(epoch FROM clock_timestamp())
@@ -81,7 +101,9 @@ _EVICT = text(
     """
 )
 _OWN = "FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace(current_schema())"
-_TABLES = text(f"SELECT oid::regclass::text {_OWN} AND relname <> 'alembic_version'")
+_TABLES = text(
+    f"SELECT oid::regclass::text {_OWN} AND relname NOT IN ('alembic_version', '{LOCK_TABLE}')"
+)
 _SIZE = text(f"SELECT coalesce(sum(pg_total_relation_size(oid)), 0) {_OWN}")
 _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
 
@@ -89,10 +111,67 @@ _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
 class PostgreSQLBackend(Backend):
     """Schema of a PostgreSQL database: the first one of the connection's search path."""
 
-    def __init__(self, url: URL, lease_seconds: float) -> None:
+    def __init__(self, url: URL, lease_seconds: float, patience: float) -> None:
         self._session = uuid.uuid4().hex
-        super().__init__(_write_engine(url, lease_seconds, self._session), database_url.safe(url))
+        engine = _write_engine(url, lease_seconds, patience, self._session)
+        super().__init__(engine, database_url.safe(url))
         self._lease_seconds = lease_seconds
+        self._patience = patience
+
+    @contextmanager
+    def transaction(self) -> Iterator[Connection]:
+        given_up: list[str] = []
+        try:
+            with super().transaction() as connection, self._watched(connection, given_up):
+                yield connection
+        except StoreUnavailableError as error:
+            if given_up:
+                raise StoreUnavailableError(given_up[0]) from error
+            raise
+
+    @contextmanager
+    def _watched(self, connection: Connection, given_up: list[str]) -> Iterator[None]:
+        """Watch for locks of others that the block waits for, in a thread."""
+        driver = cast("psycopg.Connection", connection.connection.driver_connection)
+        ended = threading.Event()
+        words = (driver.info.backend_pid, ended, given_up)
+        thread = threading.Thread(target=self._watch, args=words, name="locks", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join(ANNOUNCE_SECONDS)  # it may hold a connection
+
+    def _watch(self, pid: int, ended: threading.Event, given_up: list[str]) -> None:
+        """End launches that hold the lock and are dead; say who holds it; give up in the end.
+
+        A launch that holds it may be dead for a whole lease before the server ends it.
+        """
+        start, said = None, False
+        while not ended.wait(_WATCH_SECONDS):
+            with suppress(SQLAlchemyError), self.engine.begin() as connection:
+                blocker = connection.execute(_BLOCKER, {"pid": pid}).one_or_none()
+                if blocker is None or ended.is_set():
+                    start = None
+                    continue
+                start = start or time.monotonic() - _WATCH_SECONDS
+                waited = time.monotonic() - start
+                if waited >= self._patience + self._lease_seconds * blocker.is_launch:
+                    given_up.append(
+                        f"The results database {self.safe_url} cannot be used: {blocker.name} has "
+                        f"held a lock on it for {waited:.0f} s; end it, and run the same command "
+                        "again."
+                    )
+                    connection.execute(_CANCEL, {"pid": pid})
+                    return
+                if waited >= ANNOUNCE_SECONDS and not said:
+                    said = True
+                    log.warning(
+                        "waiting for a lock of %s, which %s holds", self.safe_url, blocker.name
+                    )
+                connection.execute(_HURRY)
+                _end_dead(connection)
 
     @contextmanager
     def creation(self) -> Iterator[Connection]:
@@ -103,7 +182,6 @@ class PostgreSQLBackend(Backend):
     @contextmanager
     def rebuilding(self) -> Iterator[Connection]:
         with self.creation() as connection:
-            connection.execute(_SET_LOCK_TIMEOUT)
             yield connection
 
     def back_up(self, connection: Connection, version: int) -> str:
@@ -113,17 +191,19 @@ class PostgreSQLBackend(Backend):
         """Do nothing: the copy was made in the transaction that was rolled back."""
 
     def exclusive(self, connection: Connection) -> None:
-        while not connection.execute(_LOCK).scalar_one():
-            self.evict()
-            time.sleep(_LOCK_PAUSE_SECONDS)
+        if not connection.execute(_HAS_LOCK).scalar_one():
+            _create_lock(connection)
+        connection.execute(_LOCK)
 
     def members(self, keys: Sequence[str]) -> Select[Any]:
         listed = bindparam("keys", list(keys), type_=ARRAY(Text), unique=True)
         return select(func.unnest(listed).column_valued("key"))
 
-    def insert_trials(self, connection: Connection, trials: Sequence[NewTrial]) -> None:
+    def insert_trials(
+        self, connection: Connection, trials: Sequence[NewTrial], launch_id: int
+    ) -> None:
         keys, config_ids, seeds = map(list, zip(*trials, strict=True))
-        given = {"keys": keys, "config_ids": config_ids, "seeds": seeds}
+        given = {"keys": keys, "config_ids": config_ids, "seeds": seeds, "launch_id": launch_id}
         connection.execute(_INSERT_TRIALS, given)
 
     def insert_steps(
@@ -165,14 +245,29 @@ class PostgreSQLBackend(Backend):
     def evict(self) -> None:
         # In a short transaction of its own: it reads a table that an upgrade locks.
         with self.transaction() as connection:
-            if connection.execute(_HAS_LAUNCHES).scalar_one():
-                connection.execute(_EVICT)
+            _end_dead(connection)
 
     def forget(self, token: str) -> None:
         """Do nothing: a lease expires by itself."""
 
     def close(self) -> None:
         self.engine.dispose()
+
+
+def _create_lock(connection: Connection) -> None:
+    """Create the table of the lock; a transaction that creates it too waits for this one."""
+    try:
+        with connection.begin_nested():
+            connection.execute(_CREATE_LOCK)
+    except DBAPIError as error:
+        if getattr(error.orig, "sqlstate", None) not in _CREATED_BY_ANOTHER:
+            raise
+
+
+def _end_dead(connection: Connection) -> None:
+    """End the sessions of launches whose lease is over."""
+    if connection.execute(_HAS_LAUNCHES).scalar_one():
+        connection.execute(_EVICT)
 
 
 def dead(_: URL, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
@@ -189,7 +284,7 @@ def _clock(connection: Connection) -> float:
     return float(connection.execute(_NOW).scalar_one())
 
 
-def _write_engine(url: URL, lease_seconds: float, session: str) -> Engine:
+def _write_engine(url: URL, lease_seconds: float, patience: float, session: str) -> Engine:
     engine = _engine(url, {"application_name": f"{_SESSION} {session}"})
 
     @event.listens_for(engine, "connect")
@@ -197,6 +292,9 @@ def _write_engine(url: URL, lease_seconds: float, session: str) -> Engine:
         # A launch that is suspended in a transaction would keep its rows locked.
         milliseconds = max(1, round(1000 * lease_seconds))
         connection.execute(f"SET idle_in_transaction_session_timeout = {milliseconds}")
+        # Longer than the thread that watches a transaction lets it wait.
+        longest = round(1000 * (lease_seconds + patience + 5))
+        connection.execute(f"SET lock_timeout = {longest}")
         # So would one whose machine is lost while it sends steps: the server sends keepalives too.
         connection.execute("; ".join(f"SET tcp_{key} = {n}" for key, n in _KEEPALIVES.items()))
         connection.commit()
@@ -211,7 +309,7 @@ def read_engine(url: URL) -> Engine:
     @event.listens_for(engine, "connect")
     def _forbid_writes(connection: psycopg.Connection, _: object) -> None:
         # For the session, not for one transaction: a COMMIT in a query does not end it.
-        connection.execute("SET default_transaction_read_only = on")
+        connection.execute("SET default_transaction_read_only = on; SET lock_timeout = '30s'")
         connection.commit()
 
     return engine.execution_options(isolation_level="REPEATABLE READ")

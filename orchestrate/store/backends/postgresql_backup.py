@@ -11,6 +11,7 @@ from itertools import chain, count
 from sqlalchemy import Connection, text
 
 from orchestrate.store.errors import StoreError
+from orchestrate.store.schema import LOCK_TABLE
 
 _MAY_CREATE = text("SELECT has_database_privilege(current_database(), 'CREATE')")
 _HERE = text("SELECT current_schema(), current_setting('search_path')")
@@ -20,7 +21,8 @@ _SCHEMAS = text("SELECT nspname FROM pg_namespace")
 # Definitions do not name the schema while it is the first one of the search path.
 _TABLES = text(
     "SELECT quote_ident(relname) FROM pg_class "
-    "WHERE relkind = 'r' AND relnamespace = to_regnamespace(:here) ORDER BY oid"
+    f"WHERE relkind = 'r' AND relnamespace = to_regnamespace(:here) AND relname <> '{LOCK_TABLE}' "
+    "ORDER BY oid"
 )
 _KEYS = text(
     "SELECT conrelid::regclass::text, quote_ident(conname), pg_get_constraintdef(oid) "

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
@@ -18,13 +20,15 @@ from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
 from orchestrate.store.backends.driver_errors import translated, translated_file
 from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
 from orchestrate.store.backends.network_file_systems import refuse_unsafe
-from orchestrate.store.backends.sqlite_backup import copy_file
+from orchestrate.store.backends.sqlite_backup import copy_file, rescue
 from orchestrate.store.backends.sqlite_engine import (
     driver_of,
     existing_path,
     read_address,
     read_engine,
+    watcher,
     write_engine,
+    writer,
 )
 from orchestrate.store.errors import DatabaseMovedError, StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
@@ -35,6 +39,7 @@ __all__ = ["SQLiteBackend", "dead", "existing_path", "read_engine", "request", "
 # Rows in one statement: its 502 parameters stay below the 999 that every SQLite takes.
 _BLOCK = 100
 
+_LOGS = ("-wal", "-shm")
 _SIZE = text("SELECT page_count * page_size FROM pragma_page_count, pragma_page_size")
 _TRUNCATE = "PRAGMA wal_checkpoint(TRUNCATE)"
 
@@ -42,10 +47,18 @@ _TRUNCATE = "PRAGMA wal_checkpoint(TRUNCATE)"
 class SQLiteBackend(Backend):
     """SQLite file, with its locks in the folder ``<file>-locks`` beside it."""
 
-    def __init__(self, url: URL) -> None:
+    def __init__(self, url: URL, patience: float) -> None:
         self._path = database_url.sqlite_path(url)
+        self._given = Path(str(url.database)).absolute()
         self._folder = _locks_folder(self._path)
-        super().__init__(write_engine(self._path), database_url.safe(url))
+        self._patience = patience
+        self._opened: list[tuple[int, int] | None] = []
+        self._watcher: sqlite3.Connection | None = None
+        self._moved = ""
+        self._saved: Path | None = None
+        self._checking = threading.RLock()
+        engine = write_engine(self._connect, self._path, patience)
+        super().__init__(engine, database_url.safe(url))
         refuse_unsafe(self._path, self.safe_url)
         with translated_file(self.safe_url):
             if self._path.is_dir():
@@ -55,31 +68,66 @@ class SQLiteBackend(Backend):
                 )
             self._folder.mkdir(parents=True, exist_ok=True)
         self._locks = LaunchLocks(self._folder)
-        self._opened: tuple[int, int] | None = None
+
+    def _connect(self) -> sqlite3.Connection:
+        new = not self._opened
+        if new and not self._path.exists():  # the log of a removed file is no log of a new one
+            for name in _LOGS:
+                Path(f"{self._path}{name}").unlink(missing_ok=True)
+        return writer(self._path, new, self.check)
+
+    @contextmanager
+    def transaction(self) -> Iterator[Connection]:
+        with super().transaction() as connection:
+            self._remember()
+            yield connection
+        # What was committed went to the opened file, wherever that is, and is saved with the rest.
+        self.check(written=True)
+
+    def _remember(self) -> None:
+        """Note which files are open, and keep a connection to them, at the first transaction."""
+        if not self._opened:
+            self._watcher = watcher(self._path)
+            self._opened = self._files()
+
+    def _files(self) -> list[tuple[int, int] | None]:
+        """Return the identities of the file that the URL names and of the logs in use."""
+        return [_identity(self._given), *(_identity(Path(f"{self._path}{s}")) for s in _LOGS)]
+
+    def check(self, written: bool = False) -> None:
+        with self._checking:
+            moved = self._moved or (self._opened and self._files() != self._opened)
+            if moved and (written or not self._moved):
+                self._moved = self._rescued()
+                self._empty_log()
+            if moved:
+                raise DatabaseMovedError(self._moved)
+
+    def _rescued(self) -> str:
+        """Save what the opened file holds and return a sentence about it."""
+        file, *_ = self._files()
+        what = "was replaced by another file" if file else "was removed or renamed"
+        if file == self._opened[0]:
+            what = f"lost its log {self._path.name}-wal"
+        assert self._watcher is not None
+        try:
+            self._saved = rescue(self._watcher, self._path, self._saved)
+            saved = f"what it held is saved in {self._saved}"
+        except (OSError, sqlite3.Error, StoreUnavailableError) as error:
+            saved = f"what it held cannot be saved beside it or in the temporary folder ({error})"
+        place = _place(self._opened[0])
+        now = f" and is now {place}" if place not in ("", os.path.realpath(self._given)) else ""
+        return (
+            f"The results database {self.safe_url} {what} since it was opened{now}; {saved}: save "
+            "again or run the same command again to write to a new file there, or put the saved "
+            "one in its place first."
+        )
 
     @contextmanager
     def creation(self) -> Iterator[Connection]:
         # The change to WAL is outside transactions and fails if two processes attempt it.
         with self._creation_lock(), self.transaction() as connection:
-            self._opened = _identity(self._path)
             yield connection
-
-    @contextmanager
-    def saving(self) -> Iterator[Connection]:
-        # A write to a file that was removed or renamed succeeds, and nobody finds it.
-        self._require_opened()
-        with self.transaction() as connection:
-            yield connection
-            self._require_opened()
-
-    def _require_opened(self) -> None:
-        found = _identity(self._path)
-        if found != self._opened:
-            what = "was removed or renamed" if found is None else "was replaced by another file"
-            raise DatabaseMovedError(
-                f"The results database {self.safe_url} {what} since it was opened, so that nothing "
-                f"was saved: save again to write everything there anew, or give another path."
-            )
 
     @contextmanager
     def rebuilding(self) -> Iterator[Connection]:
@@ -92,8 +140,10 @@ class SQLiteBackend(Backend):
             # within a transaction.
             driver_of(connection).execute("PRAGMA foreign_keys = OFF")
             with connection.begin():
+                self._remember()
                 yield connection
                 self._check_references(connection)
+        self.check()
 
     def _check_references(self, connection: Connection) -> None:
         broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
@@ -113,7 +163,7 @@ class SQLiteBackend(Backend):
     def _creation_lock(self) -> Iterator[None]:
         with ExitStack() as stack:
             with translated_file(self.safe_url):
-                stack.enter_context(file_lock(self._folder / "create"))
+                stack.enter_context(file_lock(self._folder / "create", self._patience))
             yield
 
     def exclusive(self, connection: Connection) -> None:
@@ -122,8 +172,11 @@ class SQLiteBackend(Backend):
     def members(self, keys: Sequence[str]) -> Select[Any]:
         return select(func.json_each(json.dumps(list(keys))).table_valued("value").c.value)
 
-    def insert_trials(self, connection: Connection, trials: Sequence[NewTrial]) -> None:
-        rows = [{**one._asdict(), "status": "pending", "attempt": 0} for one in trials]
+    def insert_trials(
+        self, connection: Connection, trials: Sequence[NewTrial], launch_id: int
+    ) -> None:
+        more = {"status": "pending", "attempt": 0, "registered_by": launch_id}
+        rows = [{**one._asdict(), **more} for one in trials]
         connection.execute(insert(trial), rows)
 
     def insert_steps(
@@ -149,6 +202,7 @@ class SQLiteBackend(Backend):
         return True
 
     def vacuum(self) -> None:
+        self.check()
         with self.engine.connect() as connection:
             driver = driver_of(connection)
             driver.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 1)  # the new file
@@ -163,12 +217,28 @@ class SQLiteBackend(Backend):
         self._locks.release(token)
 
     def close(self) -> None:
-        if self._opened not in (None, _identity(self._path)):
-            # SQLite leaves the log of a renamed file behind, under the old name.
-            with suppress(SQLAlchemyError, sqlite3.Error), self.engine.connect() as connection:
-                driver_of(connection).execute(_TRUNCATE)
+        with suppress(DatabaseMovedError):
+            self.check()
+        if self._watcher and not self._moved:
+            self._watcher.close()
         self._locks.close()
         self.engine.dispose()
+        if self._watcher:
+            self._watcher.close()  # as the last one: it writes nothing
+
+    def _empty_log(self) -> None:
+        """Empty the log of a file that was renamed or replaced, which the next one would read.
+
+        A log that others have made since may share the memory of this one.
+        """
+        _, log, memory = (a == b for a, b in zip(self._files(), self._opened, strict=True))
+        if log or not memory:
+            failures = suppress(SQLAlchemyError, sqlite3.Error, StoreError)
+            with failures, self.engine.connect() as connection:
+                driver_of(connection).execute(_TRUNCATE)
+        if log and self._saved and self._opened[0] != _identity(self._path):
+            with suppress(OSError):  # no connection of the pool was left
+                os.truncate(f"{self._path}-wal", 0)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -178,6 +248,15 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_dev, found.st_ino
+
+
+def _place(identity: tuple[int, int] | None) -> str:
+    """Return the present path of an open file; empty if it was deleted, or is not known."""
+    with suppress(OSError):
+        for link in Path("/proc/self/fd").iterdir():
+            if _identity(link) == identity and not str(link.readlink()).endswith(" (deleted)"):
+                return str(link.readlink())
+    return ""
 
 
 def _locks_folder(path: Path) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+import tempfile
 from itertools import chain, count
 from pathlib import Path
 
@@ -17,7 +18,7 @@ def copy_file(path: Path, version: int) -> Path:
     The copy is checked and synchronised to disk before it gets its name; an existing file is never
     replaced.
     """
-    target = _free_name(f"{path}.v{version}-backup")
+    target = _free_name(f"{path}.v{version}-backup", "")
     partial = target.with_name(f"{target.name}.partial")
     try:
         copy_checked(path, partial)
@@ -32,18 +33,41 @@ def copy_file(path: Path, version: int) -> Path:
     return target
 
 
-def _free_name(base: str) -> Path:
-    names = map(Path, chain([base], (f"{base}-{i}" for i in count(2))))
-    return next(name for name in names if not name.exists())
+def rescue(opened: sqlite3.Connection, path: Path, before: Path | None) -> Path:
+    """Copy what an open connection sees to a file beside the path that the database had.
+
+    Where that cannot be written, the copy is made in the temporary folder. It replaces the file
+    that was saved before. Raises ``OSError``, ``sqlite3.Error`` or ``StoreUnavailableError`` if
+    neither can be written.
+    """
+    for place in (path, Path(tempfile.gettempdir()) / path.name):
+        target = before or _free_name(f"{place}.saved-{os.getpid()}", ".db")
+        partial = target.with_name(f"{target.name}.partial")
+        try:
+            _copy_from(opened, partial, path)
+            partial.rename(target)
+            return target
+        except (OSError, sqlite3.Error, StoreUnavailableError) as error:
+            failed = error
+            with contextlib.suppress(OSError):
+                partial.unlink()
+    raise failed
+
+
+def _free_name(base: str, suffix: str) -> Path:
+    names = chain([f"{base}{suffix}"], (f"{base}-{i}{suffix}" for i in count(2)))
+    return next(path for path in map(Path, names) if not path.exists())
 
 
 def copy_checked(path: Path, partial: Path) -> None:
     """Copy a SQLite database with its log to one file, and check it."""
+    with contextlib.closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as source:
+        _copy_from(source, partial, path)
+
+
+def _copy_from(source: sqlite3.Connection, partial: Path, path: Path) -> None:
     partial.unlink(missing_ok=True)
-    with (
-        contextlib.closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as source,
-        contextlib.closing(sqlite3.connect(partial)) as copy,
-    ):
+    with contextlib.closing(sqlite3.connect(partial)) as copy:
         source.backup(copy)
         copy.execute("PRAGMA journal_mode = DELETE")  # one file, complete in itself
         (verdict,) = copy.execute("PRAGMA quick_check(1)").fetchone()

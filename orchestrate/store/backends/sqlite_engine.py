@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import quote
@@ -13,6 +14,7 @@ from sqlalchemy.pool import QueuePool
 
 from orchestrate.store import database_url
 from orchestrate.store.backends.driver_errors import translated_file
+from orchestrate.store.backends.file_locks import patiently
 from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
 
 BUSY_TIMEOUT_SECONDS = 30.0
@@ -24,7 +26,7 @@ MAX_LOG_BYTES = 16 * 2**20
 def read_engine(url: URL) -> Engine:
     """Return an engine that cannot write; raise ``NoDatabaseError`` if there is no file."""
     path = existing_path(url)
-    return _engine(lambda: _connect(read_address(path)), "BEGIN")
+    return _engine(lambda: _connect(read_address(path)), _begin)
 
 
 def existing_path(url: URL) -> Path:
@@ -40,9 +42,29 @@ def existing_path(url: URL) -> Path:
     return path
 
 
-def write_engine(path: Path) -> Engine:
-    # A transaction that reads before it writes fails under load unless it locks at its beginning.
-    return _engine(lambda: _writer(path), "BEGIN IMMEDIATE")
+def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience: float) -> Engine:
+    """Return an engine whose connections are made by ``connect``, as by :func:`writer`.
+
+    A transaction that reads before it writes fails under load unless it locks at its beginning.
+    """
+
+    def begin(connection: Connection) -> None:
+        driver = driver_of(connection)
+        seconds = min(patience, BUSY_TIMEOUT_SECONDS)
+
+        def locked(seconds: float) -> bool:
+            driver.execute(f"PRAGMA busy_timeout = {round(1000 * seconds)}")
+            try:
+                driver.execute("BEGIN IMMEDIATE")
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                    raise
+            return driver.in_transaction
+
+        if not patiently(locked, seconds, str(path), path.with_name(f"{path.name}-shm")):
+            driver.execute("BEGIN IMMEDIATE")  # raises the error of SQLite
+
+    return _engine(connect, begin)
 
 
 def filling_engine(path: Path) -> Engine:
@@ -57,16 +79,16 @@ def filling_engine(path: Path) -> Engine:
         connection.execute("PRAGMA synchronous = OFF")
         return connection
 
-    return _engine(connect, "BEGIN")
+    return _engine(connect, _begin)
 
 
-def _engine(connect: Any, begin: str) -> Engine:
+def _begin(connection: Connection) -> None:
+    connection.exec_driver_sql("BEGIN")
+
+
+def _engine(connect: Any, begin: Callable[[Connection], None]) -> Engine:
     engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool)
-
-    @event.listens_for(engine, "begin")
-    def _begin(connection: Connection) -> None:
-        connection.exec_driver_sql(begin)
-
+    event.listen(engine, "begin", begin)
     return engine
 
 
@@ -86,9 +108,12 @@ def _connect(address: str) -> sqlite3.Connection:
     return connection
 
 
-def _writer(path: Path) -> sqlite3.Connection:
+def writer(path: Path, create: bool, check: Callable[[], None]) -> sqlite3.Connection:
+    """Open a file for writing, or create it; ``check`` refuses it before anything is changed."""
     _refuse_read_only(path)
-    connection = _connect(_address(path, "mode=rwc"))
+    check()
+    connection = _connect(_address(path, "mode=rwc" if create else "mode=rw"))
+    check()
     tables = [row[0] for row in connection.execute("SELECT name FROM sqlite_master")]
     if not tables or "trial" in tables:  # a file of another program is not changed
         connection.execute("PRAGMA journal_mode = WAL")
@@ -97,6 +122,16 @@ def _writer(path: Path) -> sqlite3.Connection:
     connection.execute("PRAGMA synchronous = FULL")
     connection.execute(f"PRAGMA journal_size_limit = {MAX_LOG_BYTES}")
     connection.execute("PRAGMA foreign_keys = ON")
+    return connection
+
+
+def watcher(path: Path) -> sqlite3.Connection:
+    """Open a file that a writer has open, so that its content can be read if its name is lost.
+
+    The connection cannot write: closed as the last one, it leaves the files as they are.
+    """
+    connection = _connect(_address(path, "mode=ro"))
+    connection.execute("SELECT count(*) FROM sqlite_master")  # opens the log too
     return connection
 
 

@@ -27,6 +27,9 @@ from orchestrate.store.schema import SCHEMA_VERSION
 CACHE_VARIABLE = "DOPT_CACHE"
 """Environment variable with another cache, which compiled code uses too."""
 
+PATIENCE_SECONDS = 600.0
+"""Longest wait for another process that copies a bundle."""
+
 DAYS_KEPT = 30
 """A copy that was not opened for so many days is deleted when another one is made."""
 
@@ -49,7 +52,7 @@ def database_of(folder: Path, safe_url: str) -> Path:
     _check_version(folder, safe_url)
     copies = copies_folder()
     copy = copies / f"{_identity(expected)}.db"
-    with file_lock(copies / "lock"):
+    with file_lock(copies / "lock", PATIENCE_SECONDS):
         if copy.is_file():
             copy.touch()
         else:

@@ -1,7 +1,7 @@
-"""Examination of a results database by five checks, without changing it.
+"""Examination of a results database by six checks, without changing it.
 
 The checks are: damage to a SQLite file, incomplete results, damaged arrays of packed curves, keys
-that do not match their content, and claims of dead launches.
+that do not match their content, results of different code, and claims of dead launches.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from orchestrate.store import database_url
 from orchestrate.store.doctor.file_damage import RESTORE, damaged_pages, dangling_references
 from orchestrate.store.doctor.findings import Finding
 from orchestrate.store.doctor.keys import TrialKey, wrong_keys
-from orchestrate.store.doctor.launches import dead_launches
+from orchestrate.store.doctor.launches import dead_launches, mixed_code
 from orchestrate.store.doctor.packed_curves import damaged_curves
 from orchestrate.store.doctor.results import incomplete_results
 from orchestrate.store.errors import StoreUnavailableError
@@ -63,6 +63,7 @@ def _checks(moment: Reader, is_file: bool, trial_key: TrialKey | None) -> Iterat
     yield partial(incomplete_results, moment)
     yield partial(damaged_curves, moment)
     yield partial(wrong_keys, moment, trial_key)
+    yield partial(mixed_code, moment)
     yield partial(dead_launches, moment)
 
 

@@ -1,4 +1,4 @@
-"""Check of launches: dead ones, and the trials that they still hold."""
+"""Check of launches: dead ones, the trials that they still hold, and results of different code."""
 
 from __future__ import annotations
 
@@ -6,6 +6,21 @@ from orchestrate.store.doctor.findings import Finding, found
 from orchestrate.store.read.reader import Reader
 
 _NEXT_LAUNCH = "nothing to do: the next launch releases them"
+
+
+_ONE_CODE = (
+    "compare their numbers with care, or prune the trials of one of the two (launch_id of v_trial) "
+    "and give their launch command again"
+)
+
+
+def mixed_code(moment: Reader) -> list[Finding]:
+    """Return a finding of the configurations whose finished trials were run by different code."""
+    keys = moment.mixed_code()
+    if not keys:
+        return []
+    what = "configurations with results of code or libraries with different fingerprints"
+    return [found("note", what, len(keys), keys[0][:12], _ONE_CODE)]
 
 
 def dead_launches(moment: Reader) -> list[Finding]:

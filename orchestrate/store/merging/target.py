@@ -166,7 +166,8 @@ class Target:
         for one in self._added:
             row = one.row
             values = {name: row[name] for name in _COPIED} | {"attempt": one.attempt}
-            values["launch_id"] = self._launches.get(row["launch_id"])
+            for name in ("launch_id", "registered_by"):
+                values[name] = self._launches.get(row[name])
             values["error_id"] = self._error(row["error_hash"])
             if one.here is None:
                 values |= {"trial_key": row["trial_key"], "seed": row["seed"]}

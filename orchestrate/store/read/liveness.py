@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, select, text
 
 from orchestrate.store.backends.base import LaunchLife
 from orchestrate.store.read.rows import LaunchRow
@@ -14,6 +14,11 @@ from orchestrate.store.schema import launch
 
 Dead = Callable[[Connection, Sequence[LaunchLife]], list[LaunchLife]]
 
+_MIXED = text(
+    "SELECT c.config_key FROM trial r JOIN launch l ON l.launch_id = r.launch_id "
+    "JOIN config c ON c.config_id = r.config_id WHERE r.status IN ('done', 'diverged') "
+    "GROUP BY c.config_key HAVING count(DISTINCT l.fingerprint) > 1 ORDER BY c.config_key"
+)
 _ROWS = select(launch).order_by(launch.c.launch_id)
 
 
@@ -46,4 +51,10 @@ def _row(row: Mapping[str, Any], alive: bool) -> LaunchRow:
         git_dirty=None if dirty is None else bool(dirty),
         git_diff_hash=row["git_diff_hash"],
         versions=json.loads(row["versions"]),
+        fingerprint=row["fingerprint"] and json.loads(row["fingerprint"]),
     )
+
+
+def mixed_code(connection: Connection) -> list[str]:
+    """Return the keys of configurations with finished trials of code with several fingerprints."""
+    return list(connection.execute(_MIXED).scalars())

@@ -1,8 +1,11 @@
-"""Trials without an outcome, as workers look for them: by configuration, one after the other."""
+"""Trials without an outcome, as workers look for them: by configuration, one after the other.
+
+A worker looks for trials that a launch with the fingerprint of its own has registered.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, text
@@ -48,14 +51,23 @@ class OpenTrial:
     lone_losses: int = 0
 
 
+_ALIKE = (
+    "registered_by IN (SELECT l.launch_id FROM launch l JOIN launch m "
+    "ON coalesce(m.fingerprint, '') = coalesce(l.fingerprint, '') WHERE m.launch_id = :launch)"
+)
 _CONFIGS = text(
     "SELECT c.config_id, c.config_key, c.config_json, s.pending, s.running, s.mean, s.longest "
-    "FROM (SELECT config_id, count(*) FILTER (WHERE status = 'pending') AS pending, "
-    "count(*) FILTER (WHERE status = 'running') AS running, "
+    f"FROM (SELECT config_id, count(*) FILTER (WHERE status = 'pending' AND {_ALIKE}) AS pending, "
+    f"count(*) FILTER (WHERE status = 'running' AND {_ALIKE}) AS running, "
     "avg(wall_seconds) FILTER (WHERE status IN ('done', 'diverged')) AS mean, "
     "max(wall_seconds) FILTER (WHERE status IN ('done', 'diverged')) AS longest "
     "FROM trial GROUP BY config_id) AS s JOIN config c ON c.config_id = s.config_id "
     "WHERE s.pending + s.running > 0 ORDER BY c.config_id"
+)
+_OTHERS = text(
+    "SELECT l.fingerprint, count(*) FROM trial r LEFT JOIN launch l "
+    "ON l.launch_id = r.registered_by WHERE r.status IN ('pending', 'running') "
+    f"AND (r.registered_by IS NULL OR NOT r.{_ALIKE}) GROUP BY l.fingerprint ORDER BY 2 DESC"
 )
 
 
@@ -84,28 +96,40 @@ _CRASHES = _attempts("r", "a.cause IN ('killed', 'out of memory')")
 _TRIALS = text(
     f"SELECT r.trial_key, r.config_id, r.seed, {_CRASHES} AS crashes FROM trial r "
     "WHERE r.trial_id IN (SELECT p.trial_id FROM trial p "
-    "WHERE p.config_id = :config_id AND p.status = 'pending' "
+    f"WHERE p.config_id = :config_id AND p.status = 'pending' AND p.{_ALIKE} "
     f"AND (p.attempt < :losses OR {_attempts('p', _LOST)} < :losses) "
     "ORDER BY random() LIMIT :size)"
 )
 _SUSPECTS = text(
     f"SELECT r.trial_key, r.config_id, r.seed, 0 AS crashes, {_attempts('r', _LONE)} AS lone "
-    "FROM trial r WHERE r.status = 'pending' AND r.attempt >= :losses "
+    f"FROM trial r WHERE r.status = 'pending' AND r.attempt >= :losses AND r.{_ALIKE} "
     f"AND {_attempts('r', _LOST)} >= :losses ORDER BY r.attempt, r.trial_id"
 )
 
 
-def open_configs(connection: Connection) -> list[OpenConfig]:
-    """Return the configurations that have trials without an outcome."""
-    return [OpenConfig(*row) for row in connection.execute(_CONFIGS)]
+def open_configs(connection: Connection, launch: int) -> list[OpenConfig]:
+    """Return the configurations that have trials without an outcome for the code of a launch."""
+    return [OpenConfig(*row) for row in connection.execute(_CONFIGS, {"launch": launch})]
 
 
-def open_trials(connection: Connection, config_id: int, size: int, losses: int) -> list[OpenTrial]:
+def others(connection: Connection, launch: int) -> list[tuple[dict[str, str] | None, int]]:
+    """Return the fingerprints of other code that registered trials without an outcome, and counts.
+
+    The fingerprint of an older program is None.
+    """
+    rows = connection.execute(_OTHERS, {"launch": launch})
+    return [(stored and json.loads(stored), count) for stored, count in rows]
+
+
+def open_trials(
+    connection: Connection, launch: int, config_id: int, size: int, losses: int
+) -> list[OpenTrial]:
     """Return some pending trials of a configuration that lost fewer launches than ``losses``."""
-    given: Mapping[str, int] = {"config_id": config_id, "size": size, "losses": losses}
+    given = {"launch": launch, "config_id": config_id, "size": size, "losses": losses}
     return [OpenTrial(*row) for row in connection.execute(_TRIALS, given)]
 
 
-def suspects(connection: Connection, losses: int) -> list[OpenTrial]:
+def suspects(connection: Connection, launch: int, losses: int) -> list[OpenTrial]:
     """Return the pending trials whose launch was lost at least ``losses`` times."""
-    return [OpenTrial(*row) for row in connection.execute(_SUSPECTS, {"losses": losses})]
+    given = {"launch": launch, "losses": losses}
+    return [OpenTrial(*row) for row in connection.execute(_SUSPECTS, given)]

@@ -141,6 +141,11 @@ class Reader:
         with self._snapshot() as connection:
             return liveness.launches(connection, partial(self._kind.dead, self._url))
 
+    def mixed_code(self) -> list[str]:
+        """Return the keys of configurations whose finished trials were run by different code."""
+        with self._snapshot() as connection:
+            return liveness.mixed_code(connection)
+
     def trials(self, config_key: str) -> list[TrialRow]:
         """Return the trials of a configuration by seed; none if it is unknown."""
         with self._snapshot() as connection:

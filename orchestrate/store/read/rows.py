@@ -144,6 +144,7 @@ class LaunchRow:
     git_dirty: bool | None
     git_diff_hash: str | None
     versions: Mapping[str, str]
+    fingerprint: Mapping[str, str] | None = None
 
     @property
     def kind(self) -> str:

@@ -14,6 +14,7 @@ from orchestrate.store.schema import (
     OUTCOME_COLUMNS,
     PREQUENTIAL,
     RETRIED,
+    alike,
     assessment,
     attempt,
     config,
@@ -27,14 +28,23 @@ from orchestrate.store.write import live_steps
 
 
 def claim(
-    connection: Connection, backend: Backend, launch_id: int, trial_keys: Sequence[str]
+    connection: Connection,
+    backend: Backend,
+    launch_id: int,
+    trial_keys: Sequence[str],
+    only_alike: bool = False,
 ) -> list[Claim]:
-    """Claim those of the trials that are pending, in the given order."""
+    """Claim those of the trials that are pending, in the given order.
+
+    ``only_alike`` leaves out what code with another fingerprint has registered.
+    """
     free = (
         select(trial.c.trial_id)
         .where(trial.c.trial_key.in_(backend.members(trial_keys)), trial.c.status == "pending")
         .with_for_update(skip_locked=True)
     )
+    if only_alike:
+        free = free.where(trial.c.registered_by.in_(alike(launch_id)))
     statement = (
         update(trial)
         .where(trial.c.trial_id.in_(free))

@@ -32,6 +32,7 @@ def begin(connection: Connection, backend: Backend, record: LaunchRecord, token:
         git_dirty=None if record.git_dirty is None else int(record.git_dirty),
         git_diff_hash=record.git_diff_hash,
         versions=json.dumps(dict(record.versions), sort_keys=True),
+        fingerprint=record.fingerprint and json.dumps(dict(record.fingerprint), sort_keys=True),
     )
     launch_id = int(connection.execute(statement.returning(launch.c.launch_id)).scalar_one())
     backend.hold(connection, launch_id, token)

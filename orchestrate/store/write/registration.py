@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, insert, or_, select, update
 
 from orchestrate.store.backends.base import Backend, NewTrial
 from orchestrate.store.records import Registrable, Registration
-from orchestrate.store.schema import CONFIG_COLUMNS, config, trial
+from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, alike, config, trial
 from orchestrate.store.serialization import plain
 
 _BATCH_ROWS = 10_000
@@ -58,7 +58,8 @@ def register(
         old = [key for key in keys if grid.trials[key][0] in before]
         known = _known_trials(connection, backend, old) if old else {}
         new = [key for key in keys if key not in known]
-        _insert_trials(connection, backend, grid, new, config_ids)
+        _take_over(connection, backend, launch_id, list(known))
+        _insert_trials(connection, backend, grid, new, config_ids, launch_id)
         found.update({key: known.get(key, ("pending", None)) for key in keys})
     return _summary(found, launch_id)
 
@@ -92,17 +93,36 @@ def _known_trials(
     return {key: (status, owner) for key, status, owner in connection.execute(statement)}
 
 
+def _take_over(
+    connection: Connection, backend: Backend, launch_id: int, keys: Sequence[str]
+) -> None:
+    """Let workers with the code of this launch run trials that other code has registered."""
+    if not keys:
+        return
+    ours = trial.c.registered_by.in_(alike(launch_id))
+    others = (
+        select(trial.c.trial_id)
+        .where(trial.c.trial_key.in_(backend.members(keys)))
+        .where(trial.c.status.not_in(("running", *FINISHED)))
+        .where(or_(trial.c.registered_by.is_(None), ~ours))
+        .with_for_update(skip_locked=True)
+    )
+    taken = update(trial).where(trial.c.trial_id.in_(others))
+    connection.execute(taken.values(registered_by=launch_id))
+
+
 def _insert_trials(
     connection: Connection,
     backend: Backend,
     grid: GridRows,
     keys: Sequence[str],
     config_ids: Mapping[str, int],
+    launch_id: int,
 ) -> None:
     placed = ((key, *grid.trials[key]) for key in keys)
     trials = [NewTrial(key, config_ids[config_key], seed) for key, config_key, seed in placed]
     if trials:
-        backend.insert_trials(connection, trials)
+        backend.insert_trials(connection, trials, launch_id)
 
 
 def _summary(found: Mapping[str, tuple[str, int | None]], launch_id: int) -> Registration:

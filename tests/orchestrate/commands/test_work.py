@@ -12,11 +12,14 @@ from orchestrate.__main__ import main
 from orchestrate.cli_parser import UsageError, length_of_time
 from orchestrate.executors.base import Event, Task
 from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.fingerprint import fingerprint
 from orchestrate.runner import worker
 from orchestrate.runner.run_grid import Work
-from orchestrate.store import Claim, Store
+from orchestrate.store import Claim, LaunchRecord, Store
 from tests.orchestrate.runner.test_scheduler import Scripted, finish, keys
 from tests.orchestrate.standins import raising
+from tests.orchestrate.standins import trial_of as short_trial
+from tests.orchestrate.store.places import execute
 
 GRID = ("-m", "env=pendulum", "policy=random,uniform", "seed=range(3)", "env.horizon=5")
 LEAVE = "launch.detach=true"
@@ -196,3 +199,83 @@ def test_a_factor_of_memory_needs_a_limit_and_raises_it(
     code, _, errors = pull("work", *words)
     assert code == 2
     assert sentence in errors
+
+
+DONE = "SELECT count(*) AS n FROM trial WHERE status = 'done'"
+
+
+@pytest.fixture
+def code(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Return a function after which launches and workers of this process run other code."""
+
+    def change(digest: str) -> None:
+        changed = {**fingerprint(), "code of dopt": digest}
+        monkeypatch.setattr("orchestrate.runner.provenance.fingerprint", lambda: changed)
+        monkeypatch.setattr("orchestrate.runner.stored_chunks.fingerprint", lambda: changed)
+
+    return change
+
+
+def test_a_worker_leaves_trials_that_other_code_has_registered(
+    command_line: Run, pull: Run, code: Callable[[str], None]
+) -> None:
+    code("aaaa")
+    command_line(*GRID, LEAVE)
+    code("bbbb")
+    left, out, err = pull("work")
+    assert left == 3
+    assert "0 trials wait" in out
+    assert err.count("6 trials are left, which other code has registered") == 1
+    assert "(the code of dopt is aaaa there and bbbb here): run a worker with that code, or" in err
+    assert "0" in pull("query", DONE)[1]
+    command_line(*GRID, LEAVE)  # the same command with the code of the worker
+    assert pull("work")[0] == 1
+    assert "4" in pull("query", DONE)[1]
+    assert "different code" not in pull("status")[1]
+
+
+def test_a_grid_of_an_older_program_waits_for_its_launch_command(
+    command_line: Run, pull: Run, tmp_path: Path
+) -> None:
+    command_line(*GRID, LEAVE)
+    execute(f"sqlite:///{tmp_path}/results/results.db", "UPDATE launch SET fingerprint = NULL")
+    left, _, err = pull("work")
+    assert left == 3
+    assert "6 trials are left, which other code has registered (an older program): run" in err
+    command_line(*GRID, LEAVE)
+    assert pull("work")[0] == 1
+
+
+def test_trials_of_two_codes_go_to_the_workers_of_each(
+    command_line: Run, pull: Run, code: Callable[[str], None]
+) -> None:
+    code("aaaa")
+    command_line(*GRID, LEAVE)
+    code("bbbb")
+    command_line(*GRID[:-2], "seed=range(1)", GRID[-1], LEAVE)
+    assert pull("work")[0] == 3
+    assert "2" in pull("query", DONE)[1]
+    code("aaaa")
+    assert pull("work")[0] == 1
+    assert "4" in pull("query", DONE)[1]
+    assert "2 configurations with results of different code" in pull("status")[1]
+    found = pull("doctor")[1]
+    assert "results of code or libraries with different fingerprints: 2" in found
+    rows = pull("query", "SELECT trial_key FROM trial WHERE status = 'done'", "--json")[1]
+    code("cccc")
+    command_line(*GRID, LEAVE)
+    pull("work")
+    assert pull("query", "SELECT trial_key FROM trial WHERE status = 'done'", "--json")[1] == rows
+
+
+def test_a_claim_leaves_what_was_taken_over_since_it_was_looked_for(tmp_path: Path) -> None:
+    spec = short_trial("random", seed=0)
+    with Store.open(f"sqlite:///{tmp_path}/results.db") as store:
+        old, new = (
+            store.begin_launch(LaunchRecord([], [], "here", 1, fingerprint={"code": digest}))
+            for digest in "ab"
+        )
+        keys = store.register(old, [spec]).todo
+        store.register(new, [spec])
+        assert store.claim(old, keys, alike=True) == []
+        assert len(store.claim(new, keys, alike=True)) == 1

@@ -1,4 +1,4 @@
-"""The file of a SQLite database is torn or damaged, or somebody reads it for very long."""
+"""The file of a SQLite database is torn, damaged or removed, or somebody reads it for very long."""
 
 from __future__ import annotations
 
@@ -56,6 +56,35 @@ def test_a_damaged_file_ends_the_launch_and_stays_as_it_is(file_laboratory: Labo
     assert launched.errors.count("error:") == 1
     assert "Traceback" not in launched.errors
     assert path.read_bytes() == damaged
+
+
+@pytest.mark.parametrize("seconds", [0.05, 3600.0])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_removed_file_ends_the_launch_and_is_saved(
+    file_laboratory: Laboratory, replaced: bool, seconds: float, tmp_path: Path
+) -> None:
+    """A launch stops where trials end and where none does, and writes nothing to another file."""
+    laboratory, path = file_laboratory, file_of(file_laboratory)
+    with laboratory.launched(executor="inprocess", trials=10, seconds=0.0) as launched:
+        assert launched.end() == 0, launched.errors
+    before, other = laboratory.count(), tmp_path / "other.db"
+    other.write_bytes(path.read_bytes())
+    with laboratory.launched(seconds=seconds) as launched:
+        launched.until(lambda: laboratory.count("status = 'running'") > 0)
+        other.rename(path) if replaced else path.unlink()
+        content = path.read_bytes() if replaced else b""
+        assert launched.end() == 75, launched.said + launched.errors
+        pid = launched.pid
+    assert launched.errors.count("error:") == 1
+    assert "waiting for" not in launched.errors
+    assert "Traceback" not in launched.errors
+    saved = path.with_name(f"{path.name}.saved-{pid}.db")
+    assert f"what it held is saved in {saved}:" in launched.errors
+    assert path.read_bytes() == content if replaced else not path.exists()
+    saved.replace(path)
+    assert laboratory.count() >= before
+    assert laboratory.count("status = 'running'") == 0
+    laboratory.complete()
 
 
 def test_a_reader_that_never_ends_holds_up_nobody(laboratory: Laboratory) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
+from orchestrate import fingerprint
 from orchestrate.runner.provenance import launch_record
+from tests.paths import ROOT
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -84,3 +87,31 @@ def test_untracked_results_and_builds_leave_the_code_clean(tmp_path: Path) -> No
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "boat.yaml").write_text("mass: 1\n")
     assert launch_record([], [], tmp_path).git_dirty
+
+
+def test_the_fingerprint_is_that_of_the_sources_and_libraries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = launch_record([], [], tmp_path).fingerprint
+    assert before is not None
+    assert before == fingerprint.fingerprint()
+    assert fingerprint.differences(before, before) == ""
+    shutil.copytree(ROOT / "dopt", tmp_path / "dopt", ignore=shutil.ignore_patterns("__pycache__"))
+    found = fingerprint.importlib.util.find_spec
+
+    def find(name: str) -> object:
+        spec = found(name)
+        if name == "dopt" and spec is not None:
+            spec.submodule_search_locations = [str(tmp_path / "dopt")]
+        return spec
+
+    monkeypatch.setattr(fingerprint.importlib.util, "find_spec", find)
+    assert fingerprint.fingerprint() == before, "the same sources in another folder"
+    with (tmp_path / "dopt" / "errors.py").open("a") as source:
+        source.write("# one more line\n")
+    after = fingerprint.fingerprint()
+    assert {name for name in after if after[name] != before[name]} == {"code of dopt"}
+    said = fingerprint.differences(before, after)
+    assert said == (
+        f"the code of dopt is {before['code of dopt']} there and {after['code of dopt']} here"
+    )

@@ -39,7 +39,7 @@ def test_a_configuration_with_its_counts_and_times(store: Store, launch: int, ta
     one, two, _ = take(*SPECS[:3])
     store.commit(one, result(), RUN)
     store.commit(two, diverged(2), replace(RUN, wall_seconds=1.5))
-    first, second = sorted(store.open_configs(), key=lambda config: -config.running)
+    first, second = sorted(store.open_configs(launch), key=lambda config: -config.running)
     assert first.config_key == SPECS[0].config_key
     assert first.config_json == SPECS[0].config_json
     assert (first.pending, first.running) == (1, 1)
@@ -47,29 +47,31 @@ def test_a_configuration_with_its_counts_and_times(store: Store, launch: int, ta
     assert (second.pending, second.running, second.mean_seconds) == (1, 0, None)
 
 
-def test_a_finished_configuration_is_not_open(store: Store, take: Take) -> None:
+def test_a_finished_configuration_is_not_open(store: Store, launch: int, take: Take) -> None:
     (claim,) = take(Spec())
     store.commit(claim, result(), RUN)
-    assert store.open_configs() == []
+    assert store.open_configs(launch) == []
 
 
 def test_pending_trials_of_one_configuration(store: Store, launch: int, take: Take) -> None:
     store.register(launch, [*SPECS, Spec(0, policy="other")])
     take(SPECS[0])
-    (config_id,) = {c.config_id for c in store.open_configs() if c.running}
-    found = store.open_trials(config_id, MANY, losses=3)
+    (config_id,) = {c.config_id for c in store.open_configs(launch) if c.running}
+    found = store.open_trials(launch, config_id, MANY, losses=3)
     assert {(one.trial_key, one.seed) for one in found} == {
         (spec.trial_key, spec.seed) for spec in SPECS[1:]
     }
-    assert len(store.open_trials(config_id, 2, losses=3)) == 2
+    assert len(store.open_trials(launch, config_id, 2, losses=3)) == 2
 
 
 def test_a_trial_that_killed_its_process_is_told(store: Store, launch: int, take: Take) -> None:
     take(*SPECS)
     store.release(launch, [SPECS[1].trial_key], KILLED)
     store.release(launch)
-    (config,) = store.open_configs()
-    crashes = {one.seed: one.crashes for one in store.open_trials(config.config_id, MANY, 3)}
+    (config,) = store.open_configs(launch)
+    crashes = {
+        one.seed: one.crashes for one in store.open_trials(launch, config.config_id, MANY, 3)
+    }
     assert crashes == {0: 0, 1: 1, 2: 0, 3: 0}
 
 
@@ -78,9 +80,13 @@ def test_a_trial_whose_launches_were_lost_is_suspect(store: Store, launch: int, 
     lose(store, [SPECS[0].trial_key, SPECS[1].trial_key])
     for _ in range(2):
         lose(store, [SPECS[1].trial_key])
-    (config,) = store.open_configs()
-    assert {one.seed for one in store.open_trials(config.config_id, MANY, losses=3)} == {0, 2, 3}
-    (suspect,) = store.suspects(losses=3)
+    (config,) = store.open_configs(launch)
+    assert {one.seed for one in store.open_trials(launch, config.config_id, MANY, losses=3)} == {
+        0,
+        2,
+        3,
+    }
+    (suspect,) = store.suspects(launch, losses=3)
     assert (suspect.seed, suspect.lone_losses) == (1, 2)
 
 
@@ -91,6 +97,6 @@ def test_a_trial_that_is_retried_is_no_suspect(store: Store, launch: int, lose: 
     (claim,) = store.claim(launch, keys)
     store.fail(claim, Failure("WorkerLost", "lost", "", "node lost"), RUN)
     store.retry("failed", keys)
-    assert store.suspects(losses=3) == []
-    (config,) = store.open_configs()
-    assert len(store.open_trials(config.config_id, MANY, losses=3)) == 1
+    assert store.suspects(launch, losses=3) == []
+    (config,) = store.open_configs(launch)
+    assert len(store.open_trials(launch, config.config_id, MANY, losses=3)) == 1

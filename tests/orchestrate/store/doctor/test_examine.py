@@ -50,6 +50,22 @@ def only(url: str) -> Finding:
     return found
 
 
+def test_results_of_different_code_are_noted(grid: str) -> None:
+    more = "token, state, started, host, pid, argv, overrides, versions"
+    copied = more.replace("token", "'another'")
+    harm(
+        grid,
+        """UPDATE launch SET fingerprint = '{"code of dopt": "a"}'""",
+        f"INSERT INTO launch ({more}) SELECT {copied} FROM launch",
+        "UPDATE trial SET launch_id = 2 WHERE trial_id = 1",
+    )
+    assert examine(grid, key) == [], "the code of an older program is unknown"
+    harm(grid, """UPDATE launch SET fingerprint = '{"code of dopt": "b"}' WHERE launch_id = 2""")
+    one = only(grid)
+    assert (one.severity, one.count) == ("note", 1)
+    assert "with different fingerprints" in one.sentence
+
+
 def test_nothing_is_wrong(grid: str) -> None:
     assert examine(grid, key) == []
 

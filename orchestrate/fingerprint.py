@@ -1,35 +1,27 @@
-"""Fingerprint of code, libraries and settings, compared on each worker of a cluster first.
+"""Fingerprint of the code, libraries and settings that numbers depend on.
 
-Ray finds a function on a worker by its name, in the code installed there. The functions of this
-module are pickled by value instead: they run before any module of this project is imported on the
-worker. Sending all of the code was measured to be no slower (2 s to the first result either way),
-but compiled code is cached by the path of its sources, and Ray unpacks code into a new folder for
-each session, which would compile for a minute.
+Each launch stores its own, and each worker of a Ray cluster is compared first. The module imports
+the standard library only: Ray carries its functions to a worker by value.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import importlib.util
 import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 Fingerprint = Mapping[str, str]
 """Values that must be equal on all nodes, by name."""
 
 _SOURCES = {"dopt": (".",), "orchestrate": ("executors", "records.py")}
 _LIBRARIES = ("llvmlite", "numba", "numpy", "scipy", "torch")
-_SETTING = "RAY_"
-
-_verified: list[bool] = []  # not empty once this process has compared its fingerprint
 
 
-def fingerprint(settings: Sequence[str]) -> dict[str, str]:
+def fingerprint(settings: Sequence[str] = ()) -> dict[str, str]:
     """Return the versions that numbers depend on, and the ``settings`` of the environment."""
     found = {"Python": platform.python_version()}
     found |= {f"code of {package}": _digest(package, parts) for package, parts in _SOURCES.items()}
@@ -37,26 +29,13 @@ def fingerprint(settings: Sequence[str]) -> dict[str, str]:
     return found | {name: os.environ.get(name, "unset") for name in settings}
 
 
-def run_where_alike(
-    expected: Fingerprint, payload: bytes, channel: tuple[float, Any] | None = None
-) -> Iterator[Any]:
-    """Run a chunk, or yield one clause that names the difference.
-
-    ``payload`` holds the pickled arguments of
-    :func:`orchestrate.executors.ray.chunk.run_chunk`, whose outcomes are yielded, but for the
-    channel, which holds an actor.
-    """
-    if not _verified:
-        found = fingerprint([name for name in expected if name.startswith(_SETTING)])
-        for name, value in expected.items():
-            if found[name] != value:
-                yield f"on node {platform.node()} the {name} is {found[name]}, here it is {value}"
-                return
-        _verified.append(True)
-    from ray import cloudpickle
-
-    chunk = importlib.import_module("orchestrate.executors.ray.chunk")
-    yield from chunk.run_chunk(*cloudpickle.loads(payload), channel)
+def differences(one: Fingerprint, other: Fingerprint) -> str:
+    """Return a clause that names the values that differ, here (``other``) after there."""
+    return ", ".join(
+        f"the {name} is {one.get(name, 'unknown')} there and {value} here"
+        for name, value in other.items()
+        if one.get(name) != value
+    )
 
 
 def _digest(package: str, parts: Sequence[str]) -> str:
