@@ -57,6 +57,7 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "node": ("", "host that ran the trial"),
         "launch_id": _LAUNCH_ID,
         "error_id": _ERROR_ID,
+        "registered_by": ("", "number of the launch that registered it"),
     },
     "step": {
         "trial_id": _TRIAL_ID,
@@ -105,6 +106,7 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "git_diff_hash": ("", "SHA-256 of the difference from the commit"),
         "versions": ("", "versions of interpreter, libraries and processor, as JSON"),
         "exit_code": ("", "exit code of the command"),
+        "fingerprint": ("", "digests of the code, and versions of libraries, as JSON"),
     },
     "attempt": {
         "trial_id": _TRIAL_ID,

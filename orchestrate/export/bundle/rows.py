@@ -28,7 +28,10 @@ _JOINS = {
 """Joins of each table with ``config``, of which some rows are selected."""
 
 _REFERENCES = {
-    "launch": (("trial", "owner"), ("trial", "launch_id"), ("attempt", "launch_id")),
+    "launch": (
+        *(("trial", name) for name in ("owner", "launch_id", "registered_by")),
+        ("attempt", "launch_id"),
+    ),
     "error": (("trial", "error_id"), ("attempt", "error_id")),
 }
 """Columns that refer to the rows of a table."""
