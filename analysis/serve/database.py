@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import threading
 
-from sqlalchemy import URL
-
-from orchestrate.store import READ_VARIABLE, Reader
-from orchestrate.store.database_url import parse, safe, sqlite_path
+from orchestrate.store import Reader
+from orchestrate.store.database_url import parse, read_login, safe, sqlite_path
 
 Identity = tuple[int, int] | None
 
@@ -23,8 +20,7 @@ class Database:
         self.is_file = parsed.get_backend_name() != "postgresql"
         """Whether the database is a SQLite file or a bundle, and not on a server."""
         self.user = parsed.username
-        self.read_login = _read_login(parsed)
-        """URL of a user that can only read, None where the environment names none."""
+        self.read_login = read_login(parsed)
         self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
         self._lock = threading.Lock()
         self._reader: Reader | None = None
@@ -56,15 +52,3 @@ class Database:
             self.close()
             return None
         return found.st_dev, found.st_ino
-
-
-def _read_login(url: URL) -> URL | None:
-    """Return the login of ``DOPT_READ_DB`` if it is one of this database, with its schema."""
-    found = parse(text) if (text := os.environ.get(READ_VARIABLE)) else None
-    if found is None or _place(found) != _place(url):
-        return None
-    return found.set(query={**url.query, **found.query})
-
-
-def _place(url: URL) -> tuple[object, ...]:
-    return url.get_backend_name(), url.host, url.port or 5432, url.database

@@ -18,7 +18,7 @@ URL_VARIABLE = "DOPT_DB"
 """Environment variable that names another default database; an empty one counts as unset."""
 
 READ_VARIABLE = "DOPT_READ_DB"
-"""Environment variable with the URL of a user that can only read, as which the browser asks."""
+"""Environment variable with the URL of a user who can only read, as whom the page SQL asks."""
 
 BUNDLE = "bundle"
 """Kind of URL that names the folder of a bundle, which is only read."""
@@ -78,6 +78,18 @@ def parse(url: str) -> URL:
         file = given_path(parsed.database, f"The path in the database URL{where}", StoreError)
         parsed = parsed.set(database=str(file))
     return parsed.set(drivername=backend)
+
+
+def read_login(url: URL) -> URL | None:
+    """Return the URL of the user who can only read, None where no variable names one of ``url``."""
+    found = parse(os.environ[READ_VARIABLE]) if os.environ.get(READ_VARIABLE) else None
+    if found is None or _place(found) != _place(url):
+        return None
+    return found.set(query={**url.query, **found.query})
+
+
+def _place(url: URL) -> tuple[object, ...]:
+    return url.get_backend_name(), url.host, url.port or 5432, url.database
 
 
 def bundle_path(url: URL) -> Path:
