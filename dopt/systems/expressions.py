@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import keyword
 import unicodedata
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from dopt.errors import SpecificationError, unknown_name
 from dopt.systems import elementary
@@ -27,13 +30,21 @@ FUNCTIONS = {
 
 _ARGUMENTS = {"where": 3}  # 1 of the others
 
+_WRITTEN = {"abs": "magnitude(x)", "fabs": "magnitude(x)", "sqrt": "x ** 0.5", "pow": "x ** y"}
+"""What to write in place of functions that people expect."""
+
+_TRIED = 64
+"""Values of each state and input, of all sizes and both signs, at which expressions are tried."""
+
 _OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
 _SIGNS = (ast.USub, ast.UAdd)
 _COMPARISONS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
 
 def compiled_text(
-    expressions: Mapping[str, str], arguments: Mapping[str, Sequence[str]]
+    expressions: Mapping[str, str],
+    arguments: Mapping[str, Sequence[str]],
+    constants: Mapping[str, float] | None = None,
 ) -> Equation:
     """Return a function whose values are those of expressions, in their order.
 
@@ -43,14 +54,18 @@ def compiled_text(
         Name of each expression in messages, and its text, such as ``"-k * x + u / m"``.
     arguments : mapping of str to sequence of str
         Arguments of the function, each a sequence of named quantities.
+    constants : mapping of str to float, optional
+        Values of some of the quantities, with which each part has to be finite somewhere.
 
     Raises
     ------
     SpecificationError
-        If a text is no such expression, or uses a name that is none of the quantities.
+        If a text is no such expression, uses a name that is none of the quantities, or has a part
+        such as ``u / m`` with m = 0.
     """
     names = [name for group in arguments.values() for name in group]
-    texts = [_checked(what, text, names) for what, text in expressions.items()]
+    values = _tried_values(names, constants or {})
+    texts = [_checked(what, text, values) for what, text in expressions.items()]
     given = [f"_{argument}" for argument in arguments]  # no quantity begins with an underscore
     groups = zip(given, arguments.values(), strict=True)
     unpacked = [f"{', '.join(group)}, = {name}" for name, group in groups if group]
@@ -60,6 +75,31 @@ def compiled_text(
     exec(source, namespace)  # of nothing but the expressions that were checked
     equation: Equation = namespace["equation"]
     return equation
+
+
+def _check_finite(tree: ast.expr, what: str, values: Mapping[str, Any]) -> None:
+    """Refuse an expression of which a part is a finite real number at none of the values."""
+    parts = [node for node in ast.walk(tree) if isinstance(node, ast.BinOp | ast.Call)]
+    for part in reversed(parts):  # the innermost first
+        text, found = ast.unparse(part), np.zeros(1)
+        with contextlib.suppress(ArithmeticError), np.errstate(all="ignore"):  # of numbers alone
+            found = np.asarray(eval(text, {**FUNCTIONS, **values}))  # it was checked
+        if np.iscomplexobj(found) or not np.isfinite(found).any():
+            names = {node.id for node in ast.walk(part) if isinstance(node, ast.Name)}
+            given = [f"{k} = {v:g}" for k, v in values.items() if k in names and np.ndim(v) == 0]
+            raise SpecificationError(
+                f"{what} is {ast.unparse(tree)!r}, of which {text} is finite nowhere"
+                f"{' with ' * bool(given)}{', '.join(given)}, but numbers are expected of it: "
+                f"correct the constants or the expression."
+            )
+
+
+def _tried_values(names: Sequence[str], constants: Mapping[str, float]) -> dict[str, Any]:
+    """Return constants, and numbers of all sizes and both signs of the other quantities."""
+    rng = np.random.default_rng(0)
+    sizes = 10.0 ** rng.uniform(-3, 4, (len(names), _TRIED))
+    tried = dict(zip(names, sizes * rng.choice([-1.0, 1.0], sizes.shape), strict=True))
+    return {**tried, **{name: np.float64(value) for name, value in constants.items()}}
 
 
 def check_names(what: str, names: Sequence[Any]) -> None:
@@ -83,16 +123,20 @@ def check_names(what: str, names: Sequence[Any]) -> None:
         )
 
 
-def _checked(what: str, text: str, names: Sequence[str]) -> str:
-    """Return the text of an expression in Python's own form, with real numbers alone."""
+def _checked(what: str, text: str, values: Mapping[str, Any]) -> str:
+    """Return the text of an expression in Python's own form, with real numbers alone.
+
+    It is tried at the values of all quantities.
+    """
     try:
         tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, AttributeError, TypeError, RecursionError) as error:
         raise _refused(what, text, "cannot be read") from error
-    _check(tree, what, text, names)
+    _check(tree, what, text, list(values))
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant):
             node.value = float(node.value)  # type: ignore[arg-type]  # it was checked
+    _check_finite(tree, what, values)
     return ast.unparse(tree)
 
 
@@ -110,6 +154,8 @@ def _check(node: ast.expr, what: str, text: str, names: Sequence[str]) -> None:
         case ast.UnaryOp(op=operator, operand=operand) if isinstance(operator, _SIGNS):
             parts = [operand]
         case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
+            if name in _WRITTEN:
+                raise _refused(what, text, f"holds {name}", _WRITTEN[name])
             if name not in FUNCTIONS:
                 raise unknown_name(f"function of {what}", name, FUNCTIONS)
             wanted = _ARGUMENTS.get(name, 1)
@@ -117,6 +163,8 @@ def _check(node: ast.expr, what: str, text: str, names: Sequence[str]) -> None:
                 raise _refused(what, text, f"gives {name} {len(parts)} arguments, not {wanted}")
             if name == "where":
                 parts = [*_compared(parts[0], what, text), *parts[1:]]
+        case ast.BinOp(op=ast.BitXor()):
+            raise _refused(what, text, f"holds {ast.unparse(node)}", "x ** y for a power")
         case _:
             raise _refused(what, text, f"holds {ast.unparse(node)}")
     for part in parts:
@@ -138,8 +186,9 @@ def _compared(node: ast.expr, what: str, text: str) -> list[ast.expr]:
     )
 
 
-def _refused(what: str, text: object, reason: str) -> SpecificationError:
+def _refused(what: str, text: object, reason: str, instead: str = "") -> SpecificationError:
+    remedy = f"write {instead}" if instead else "write it with these"
     return SpecificationError(
         f"{what} is {text!r}, which {reason}, but numbers, named quantities, sums, products, "
-        f"powers and {', '.join(FUNCTIONS)} are expected: write it with these."
+        f"powers and {', '.join(FUNCTIONS)} are expected: {remedy}."
     )

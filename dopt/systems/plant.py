@@ -226,7 +226,7 @@ class Plant:
             "features": tuple(features),
             "grid_indices": tuple(axes),
             "phase_plane": _phase_plane(axes, names),
-            "known": staticmethod(compiled_text(known, groups)),
+            "known": staticmethod(compiled_text(known, groups, self.constants)),
             "accelerations": staticmethod(unknown_accelerations(len(self.learned))),
         }
         return dataclasses.dataclass(frozen=True, kw_only=True)(

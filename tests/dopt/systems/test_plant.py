@@ -118,6 +118,10 @@ def test_a_plant_is_read_back_from_its_section(plant: Plant) -> None:
         ({"known": {"rate": "__import__('os').system('true')"}}, "holds"),
         ({"known": {"rate": "voltage.real"}}, "holds voltage.real"),
         ({"known": {"rate": "'text'"}}, "holds 'text'"),
+        ({"known": {"rate": "abs(angle) + voltage"}}, "expected: write magnitude(x)."),
+        ({"known": {"rate": "angle^2 + voltage"}}, "holds angle ^ 2 + voltage"),
+        ({"known": {"rate": "angle^2 + voltage"}}, "expected: write x ** y for a power."),
+        ({"known": {"rate": "sqrt(angle) + voltage"}}, "expected: write x ** 0.5."),
         ({"known": {"rate": "voltage +"}}, "cannot be read"),
         ({"angles": [], "box": {}}, "neither a box nor angles"),
     ],
@@ -134,6 +138,42 @@ def test_wrong_declarations_are_refused(changed: dict[str, Any], said: str) -> N
 def test_effects_that_depend_on_the_state_are_accepted(known: str) -> None:
     given = {f.name: getattr(MOTOR, f.name) for f in dataclasses.fields(MOTOR)}
     Plant(**(given | {"known": {"angle": "rate", "rate": known}}))
+
+
+@pytest.mark.parametrize(
+    ("rate", "part", "constants"),
+    [
+        ("voltage/J", "voltage / J", {"J": 0.0}),
+        ("voltage/J", "voltage / J", {"J": 1e-320}),
+        ("voltage*J**-1", "J ** (-1.0)", {"J": 0}),
+        ("voltage/(m*J)", "voltage / (m * J)", {"m": 0.0, "J": 2.0}),
+        ("voltage/(J*cos(angle))", "voltage / (J * cos(angle))", {"J": 0.0}),
+        ("voltage/(J-1)", "voltage / (J - 1.0)", {"J": 1.0}),
+        ("where(angle > 0, voltage/J, voltage)", "voltage / J", {"J": 0.0}),
+        ("k**0.5*voltage", "k ** 0.5", {"k": -1.0}),
+        ("voltage*k*k", "voltage * k * k", {"k": 1e300}),
+        ("voltage/(rate-rate)", "voltage / (rate - rate)", {}),
+        ("0*angle/J+voltage", "0.0 * angle / J", {"J": 0.0}),
+    ],
+)
+def test_constants_with_which_a_part_is_finite_nowhere_are_refused(
+    rate: str, part: str, constants: dict[str, float]
+) -> None:
+    given = {f.name: getattr(MOTOR, f.name) for f in dataclasses.fields(MOTOR)}
+    changed = {"known": {"angle": "rate", "rate": rate}, "constants": constants}
+    named = ", ".join(f"{name} = {value:g}" for name, value in constants.items() if name in part)
+    with pytest.raises(SpecificationError, match=re.escape(f"of which {part} is finite nowhere")):
+        Plant(**(given | changed))
+    with pytest.raises(SpecificationError, match=re.escape(f" with {named}," if named else ",")):
+        Plant(**(given | changed))
+
+
+@pytest.mark.parametrize(
+    "rate", ["voltage/angle", "(angle - 300)**0.5 + voltage", "voltage/(angle - rate)", "voltage/J"]
+)
+def test_poles_and_domains_of_states_are_left_to_the_user(rate: str) -> None:
+    given = {f.name: getattr(MOTOR, f.name) for f in dataclasses.fields(MOTOR)}
+    Plant(**(given | {"known": {"angle": "rate", "rate": rate}, "constants": {"J": 1e-9}}))
 
 
 def test_a_product_of_inputs_is_refused() -> None:
