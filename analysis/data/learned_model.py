@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis.errors import AnalysisError
-from dopt.spec.config import without_versions
-from dopt.spec.prequential import is_prequential, without_mark
+from dopt.spec.prequential import is_prequential, stored_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import ConfigRow, Reader
 
@@ -92,9 +91,7 @@ def _rows(given: npt.ArrayLike, size: int, what: str) -> Array:
 
 def learned_model(reader: Reader, configuration: ConfigRow, seed: int) -> LearnedModel:
     """Read the final parameters of a trial; raise ``QueryError`` where it is not finished."""
-    spec = TrialSpec.from_mapping(
-        {**without_versions(without_mark(configuration.config)), "seed": seed}
-    )
+    spec = stored_trial(configuration.config, seed)
     parameters = reader.trajectory(configuration.config_key, seed).parameters
     return LearnedModel(spec, parameters)
 
@@ -112,4 +109,4 @@ def simulated_trial(configuration: ConfigRow, seed: int) -> TrialSpec:
             f"{configuration.env} × {configuration.policy} is an exploration that was measured, "
             f"but a trial that can be simulated again is needed here: choose another one."
         )
-    return TrialSpec.from_mapping({**without_versions(configuration.config), "seed": seed})
+    return stored_trial(configuration.config, seed)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES
-from dopt.spec.prequential import is_prequential
-from dopt.spec.trial import TrialSpec
+from dopt.spec.prequential import is_prequential, stored_trial
 from dopt.systems import NAMED_SYSTEMS
 from orchestrate.store import ConfigRow
 
@@ -44,7 +43,7 @@ def is_possible(policy: ConfigRow, environment: ConfigRow) -> bool:
     """Whether a policy's configuration makes sense with another environment's section."""
     config = {key: value for key, value in policy.config.items() if key in _SECTIONS}
     try:
-        TrialSpec.from_mapping({**config, "env": environment.config["env"], "seed": 0})
+        stored_trial({**config, "env": environment.config["env"]})
     except IncompatibleError:
         return False
     except SpecificationError:

@@ -7,12 +7,17 @@ defines the class: when the file changes, its trials are other trials.
 
 from __future__ import annotations
 
+import ast
+import codecs
+import contextlib
 import dataclasses
 import hashlib
-import importlib
+import importlib.util
 import inspect
+import sys
 import traceback
 from collections.abc import Mapping
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
@@ -98,7 +103,7 @@ def _shipped(section: str, registry: Mapping[str, type[T]], given: Mapping[str, 
 def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, object]) -> type[T]:
     """Import a class of the user's own and see that it fits."""
     path = str(given[TARGET])
-    cls: Any = imported(section, path)
+    cls: Any = imported(section, path, given)
     wanted = _base(next(iter(registry.values())))
     if not (isinstance(cls, type) and issubclass(cls, wanted) and dataclasses.is_dataclass(cls)):
         raise _unfit(section, path, f"a dataclass derived from dopt's {wanted.__name__}")
@@ -122,10 +127,22 @@ def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obje
 def check_source(section: str, path: str, cls: type, given: Mapping[str, object]) -> None:
     """Refuse a section that was stored when the file of its class was another one."""
     if given.get(SOURCE, source_digest(cls)) != source_digest(cls):
-        raise SpecificationError(
-            f"{section} asks for {path} as it was in another state of its file: "
-            f"leave {section}.{SOURCE} out to take it as it is now, or restore the file."
-        )
+        raise _changed(section, path)
+
+
+def check_stored(config: Mapping[str, object]) -> None:
+    """Refuse a stored configuration that names a class without the digest of its file.
+
+    :func:`imported` compares the digest with the file that is here before any of it runs: so what
+    is stored, by whomever, runs nothing but files that are here, unchanged.
+    """
+    for key, section in config.items():
+        if isinstance(section, Mapping) and TARGET in section and not section.get(SOURCE):
+            raise SpecificationError(
+                f"{key}.{TARGET} is stored as '{section[TARGET]}' without {key}.{SOURCE}, but the "
+                f"digest of the file is expected, as no unknown code is run: register the trial "
+                f"again with a launch of your own."
+            )
 
 
 def _base(cls: type[Validated]) -> type[Validated]:
@@ -133,14 +150,67 @@ def _base(cls: type[Validated]) -> type[Validated]:
     return next(base for base in cls.__mro__ if "section" in base.__dict__)
 
 
-def imported(section: str, path: str) -> object:
-    """Return what a dotted path names, or raise SpecificationError."""
+def imported(section: str, path: str, given: Mapping[str, object] | None = None) -> object:
+    """Return what a dotted path names.
+
+    Raises
+    ------
+    SpecificationError
+        If it cannot be imported, or its section ``given`` has the digest of another file; then
+        nothing of the module runs.
+    """
     module, _, name = path.rpartition(".")
+    if given and SOURCE in given and module not in sys.modules:
+        _check_file(section, path, given[SOURCE])
     found = _module(section, path, module)
     try:
         return getattr(found, name)
     except AttributeError as error:
         raise _absent(section, path, error) from error
+
+
+def _check_file(section: str, path: str, source: object) -> None:
+    """Refuse a class unless its file, or one that its module takes it from, has a digest."""
+    followed, seen = path, set[str]()
+    while followed not in seen:
+        seen.add(followed)
+        module, _, name = followed.rpartition(".")
+        spec = _found(module)
+        if spec is None or not spec.has_location or not spec.origin:
+            raise _absent(section, path, "no file of this name is found")
+        with contextlib.suppress(OSError, SyntaxError, ValueError, ImportError):
+            content = Path(spec.origin).read_bytes()
+            if _digest(content) == source:
+                return
+            package = module if spec.submodule_search_locations else module.rpartition(".")[0]
+            followed = _taken_from(content, package, name) or followed
+    raise _changed(section, path)
+
+
+def _found(module: str) -> ModuleSpec | None:
+    """Return where a module would be imported from, without running its packages."""
+    spec: ModuleSpec | None = None
+    name = ""
+    for part in module.split("."):
+        within = spec.submodule_search_locations if spec else None
+        if not part.isidentifier() or (name and within is None):
+            return None
+        name = f"{name}.{part}".lstrip(".")
+        finders = [one for one in sys.meta_path if hasattr(one, "find_spec")]
+        places = (finder.find_spec(name, within) for finder in finders)
+        spec = getattr(sys.modules.get(name), "__spec__", None) or next(filter(None, places), None)
+    return spec
+
+
+def _taken_from(content: bytes, package: str, name: str) -> str:
+    """Return the path that a module imports a name from, by its text; empty if it does not."""
+    for node in ast.parse(content).body:
+        if isinstance(node, ast.ImportFrom):
+            relative = "." * node.level + (node.module or "")
+            for alias in node.names:
+                if name == (alias.asname or alias.name):
+                    return f"{importlib.util.resolve_name(relative, package)}.{alias.name}"
+    return ""
 
 
 def _module(section: str, path: str, module: str) -> ModuleType:
@@ -167,7 +237,14 @@ def _place(error: Exception) -> tuple[str, int | None] | None:
     return None
 
 
-def _absent(section: str, path: str, error: Exception) -> SpecificationError:
+def _changed(section: str, path: str) -> SpecificationError:
+    return SpecificationError(
+        f"{section} asks for {path} as it was in another state of its file: "
+        f"leave {section}.{SOURCE} out to take it as it is now, or restore the file."
+    )
+
+
+def _absent(section: str, path: str, error: object) -> SpecificationError:
     return SpecificationError(
         f"{section}.{TARGET} is '{path}', which cannot be imported ({error}): give the path of "
         f"a class as module.Class, in a folder that PYTHONPATH names."
@@ -191,9 +268,14 @@ def _origin(cls: type[Validated]) -> dict[str, object]:
 def source_digest(cls: type) -> str:
     """Return the digest of the file that defines a class, as it was when first asked for."""
     if cls not in _digests:
-        content = Path(inspect.getfile(cls)).read_bytes()
-        _digests[cls] = hashlib.sha256(content).hexdigest()[:16]
+        _digests[cls] = _digest(Path(inspect.getfile(cls)).read_bytes())
     return _digests[cls]
+
+
+def _digest(content: bytes) -> str:
+    """Return the digest of a text, which does not depend on how its lines end."""
+    text = content.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    return hashlib.sha256(text).hexdigest()[:16]
 
 
 _digests: dict[type, str] = {}

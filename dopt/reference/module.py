@@ -62,7 +62,7 @@ class Module(Model):
             is nothing that JSON knows.
         """
         target = str(given[TARGET])
-        network = imported("model", target)
+        network = imported("model", target, given)
         if not (isinstance(network, type) and issubclass(network, nn.Module)):
             raise SpecificationError(
                 f"model.{TARGET} is '{target}', but a class derived from torch.nn.Module is "
@@ -84,9 +84,10 @@ class Module(Model):
 
     @property
     def _class(self) -> type[nn.Module]:
-        found: Any = imported("model", self.target)
+        given = {SOURCE: self.source}
+        found: Any = imported("model", self.target, given)
         network: type[nn.Module] = found
-        check_source("model", self.target, network, {SOURCE: self.source})
+        check_source("model", self.target, network, given)
         return network
 
     def module(self, system: System) -> nn.Module:

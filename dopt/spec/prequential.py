@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dopt.declare.registry import check_stored
+from dopt.spec.config import without_versions
 from dopt.spec.label import config_label
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System, system_from_mapping
@@ -28,16 +30,25 @@ def is_prequential(config: Mapping[str, Any]) -> bool:
     return isinstance(section, Mapping) and MARK.items() <= section.items()
 
 
-def without_mark(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a stored configuration as :meth:`dopt.TrialSpec.from_mapping` takes it."""
-    if not is_prequential(config):
-        return dict(config)
-    return {**config, "env": {k: v for k, v in config["env"].items() if k not in MARK}}
+def stored_trial(config: Mapping[str, Any], seed: int = 0) -> TrialSpec:
+    """Return the trial of a stored configuration; raise SpecificationError if none can be made.
+
+    Of classes of a user's own it runs the files of this machine, if they are the stored ones
+    (:func:`dopt.declare.registry.check_stored`).
+    """
+    return TrialSpec.from_mapping({**without_versions(_checked(config)), "seed": seed})
 
 
 def system_of(config: Mapping[str, Any]) -> System:
-    """Return the system of a stored configuration; raise SpecificationError if it is unknown."""
-    return system_from_mapping(without_mark(config)["env"])
+    """Return the system of a stored configuration; raise as :func:`stored_trial`."""
+    return system_from_mapping(_checked(config)["env"])
+
+
+def _checked(config: Mapping[str, Any]) -> dict[str, Any]:
+    check_stored(config)
+    if not is_prequential(config):
+        return dict(config)
+    return {**config, "env": {k: v for k, v in config["env"].items() if k not in MARK}}
 
 
 @dataclass(frozen=True)

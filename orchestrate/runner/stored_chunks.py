@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from dopt.errors import DoptError
 from dopt.spec.added_fields import completed
-from dopt.spec.config import without_versions
+from dopt.spec.prequential import stored_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Task
 from orchestrate.fingerprint import differences, fingerprint
@@ -238,8 +238,7 @@ def trial_of(config: OpenConfig, at_once: int) -> TrialSpec:
         If the code of this machine builds another trial from it or lacks a part of it, or if its
         memory does not hold ``at_once`` of them.
     """
-    stored = json.loads(config.config_json)
-    spec = TrialSpec.from_mapping({**without_versions(completed(stored)), "seed": 0})
+    spec = stored_trial(completed(json.loads(config.config_json)))
     if spec.config_key != config.config_key:
         raise DoptError(
             f"Configuration {config.config_key[:12]} was registered by another version of the "

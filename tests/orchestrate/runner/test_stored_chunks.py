@@ -148,6 +148,16 @@ def test_a_class_that_is_not_here_is_named() -> None:
         trial_of(stored(env=env), 1)
 
 
+@pytest.mark.parametrize("source", [{}, {"source": "0" * 16}])
+def test_a_file_that_is_not_the_stored_one_does_not_run(
+    source: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "never_run.py").write_text("raise SystemExit('it has run')\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(DoptError, match=r"never_run\.Rocket"):
+        trial_of(stored(env={"_target_": "never_run.Rocket", **source}), 1)
+
+
 def test_a_configuration_of_another_version_is_refused() -> None:
     with pytest.raises(DoptError, match="another version of the code"):
         trial_of(stored(code_version=10**6, env={"name": "pendulum", "horizon": 6}), 1)
