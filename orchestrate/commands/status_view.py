@@ -50,6 +50,11 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
             f"(the first is {status.mixed[0][:12]}): python -m orchestrate doctor",
             style="yellow",
         )
+    if status.rounded:
+        yield Text(
+            f"{_plural(status.rounded, 'trial')} of ranges of an earlier version, with values such "
+            f"as 0.30000000000000004: the same range now gives 0.3, and runs other trials"
+        )
     if status.explorations:
         yield Text("\nExplorations", style="bold")
         yield from map(_exploration, status.explorations[-_MAX_EXPLORATIONS:])

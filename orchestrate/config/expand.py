@@ -77,7 +77,7 @@ class _Expansion:
     check: Check
     keys: UnusedKeys = dataclasses.field(default_factory=UnusedKeys)
 
-    def combinations(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> Iterator[Combination]:
+    def combinations(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> Iterator[Combination]:
         """Yield the combinations of one choice of all overrides except swept scalars."""
         first, lacking = self._compose(axes, fixed)
         self.check(first)
@@ -86,7 +86,7 @@ class _Expansion:
         used = tuple(axis.key for axis in kept if axis.replaces)
         self.keys.note(first, used, unused)
         scalars = [axis for axis in kept if axis.kind == "scalar" and axis.swept]
-        overrides = tuple(fixed[axis.key] for axis in kept if axis.swept and axis.key in fixed)
+        overrides = tuple(fixed[axis.place] for axis in kept if axis.swept and axis.place in fixed)
         overlay = ScalarOverrides(first, [axis.key for axis in scalars], self.sections)
         if overlay.applicable:
             found = _overlaid(overlay, scalars, overrides, self.grouped)
@@ -95,7 +95,7 @@ class _Expansion:
         yield from (dataclasses.replace(one, used=used, unused=unused) for one in found)
 
     def _compose(
-        self, axes: Sequence[Axis], fixed: Mapping[str, str]
+        self, axes: Sequence[Axis], fixed: Mapping[int, str]
     ) -> tuple[DictConfig, list[Axis]]:
         """Return the configuration, and the axes whose key this choice lacks."""
         overrides = _in_order(axes, fixed)
@@ -106,32 +106,32 @@ class _Expansion:
             composed = self.composer.compose(_in_order(kept, fixed))
         return composed or self.composer.like_hydra(overrides), lacking
 
-    def _lacking(self, axes: Sequence[Axis], fixed: Mapping[str, str]) -> list[Axis]:
+    def _lacking(self, axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[Axis]:
         replacing = [axis for axis in axes if axis.replaces]
         others = [axis for axis in axes if axis not in replacing]
         bare = self.composer.attempt(_in_order(others, fixed))
         return [axis for axis in replacing if bare and not has_key(bare, axis.key)]
 
     def _one_by_one(
-        self, axes: Sequence[Axis], fixed: Mapping[str, str], scalars: Sequence[Axis]
+        self, axes: Sequence[Axis], fixed: Mapping[int, str], scalars: Sequence[Axis]
     ) -> Iterator[Combination]:
         """Compose each combination with Hydra: a swept key holds a typed or structured value."""
         for picks in itertools.product(*(range(len(axis.texts)) for axis in scalars)):
             every = {**fixed, **_arguments(scalars, picks)}
             composed = self.composer.compose(_in_order(axes, every))
-            overrides = tuple(every[axis.key] for axis in axes if axis.swept)
+            overrides = tuple(every[axis.place] for axis in axes if axis.swept)
             yield Combination(
                 ScalarOverrides(composed, [], self.sections).settings([]), None, overrides
             )
 
 
-def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[str, str]:
-    return {axis.key: axis.argument(pick) for axis, pick in zip(axes, picks, strict=True)}
+def _arguments(axes: Sequence[Axis], picks: Sequence[int]) -> dict[int, str]:
+    return {axis.place: axis.argument(pick) for axis, pick in zip(axes, picks, strict=True)}
 
 
-def _in_order(axes: Sequence[Axis], fixed: Mapping[str, str]) -> list[str]:
+def _in_order(axes: Sequence[Axis], fixed: Mapping[int, str]) -> list[str]:
     """Return an override for each axis: the one in ``fixed``, or the first value."""
-    return [fixed.get(axis.key) or axis.argument(0) for axis in axes]
+    return [fixed.get(axis.place) or axis.argument(0) for axis in axes]
 
 
 def _overlaid(

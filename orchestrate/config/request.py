@@ -20,6 +20,7 @@ from orchestrate.config.argv import OTHER_SWEEPER
 from orchestrate.config.deferred_overrides import apply_deferred, hold_back
 from orchestrate.config.grid import TRIAL_SECTIONS, Combination
 from orchestrate.config.multirun_check import require_multirun
+from orchestrate.config.sweep_axes import parsed_overrides
 from orchestrate.config.unknown_keys import reject_unknown
 
 CONFIGURATION = Path(__file__).resolve().parents[1] / "conf"
@@ -89,6 +90,7 @@ def _single_request(
     if hydra_config.mode == RunMode.MULTIRUN:
         raise UsageError(OTHER_SWEEPER)
     require_multirun(overrides, hydra_config, CONFIGURATION)
+    parsed_overrides(overrides)
     reject_unknown(config)
     combination = Combination(_plain(config, TRIAL_SECTIONS))
     return Request([combination], _plain(config, LAUNCH_SECTIONS), overrides, single=True)

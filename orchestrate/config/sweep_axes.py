@@ -1,16 +1,32 @@
-"""Axes of a grid: one for each override, with its values."""
+"""Axes of a grid: one for each override, with its values.
+
+The values are those that the words say, also where stock Hydra has others: those of a sorted range,
+the nearest decimals of a range of real numbers, and the same order each time of a shuffled sweep.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Sequence
-from typing import Literal
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Any, Literal
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.grammar import grammar_functions
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, Override, OverrideType, QuotedString
+from hydra.core.override_parser.types import (
+    ChoiceSweep,
+    Glob,
+    Override,
+    OverrideType,
+    Quote,
+    QuotedString,
+    RangeSweep,
+    Sweep,
+    Transformer,
+)
 from hydra.errors import ConfigCompositionException
 
 from dopt.errors import SpecificationError, suggestion, unknown_name
@@ -38,12 +54,15 @@ class Axis:
     kind
         ``choice`` of a group, ``scalar`` that replaces a value, or ``edit``: any other change of
         the composed configuration, such as ``+k=1``, a list or a deletion.
+    place
+        Number of the override in its order.
     """
 
     key: str
     texts: tuple[str, ...]
     values: tuple[object, ...]
     kind: Literal["choice", "scalar", "edit"]
+    place: int = 0
 
     @property
     def swept(self) -> bool:
@@ -60,7 +79,9 @@ class Axis:
 
 
 def read_axes(loader: ConfigLoader, arguments: Sequence[str]) -> list[Axis]:
-    """Return the axes that the overrides span; a later override of a key replaces an earlier one.
+    """Return the axes that the overrides span.
+
+    A later override of a key replaces earlier ones, but mappings are merged, as in a single trial.
 
     Raises
     ------
@@ -69,10 +90,90 @@ def read_axes(loader: ConfigLoader, arguments: Sequence[str]) -> list[Axis]:
     SpecificationError
         If a glob matches nothing.
     """
-    parsed = OverridesParser.create(config_loader=loader).parse_overrides(list(arguments))
-    last = {override.get_key_element(): override for override in parsed}
-    axes = [_axis(loader, override) for override in last.values()]
+    kept: list[Override] = []
+    for one in parsed_overrides(arguments, loader):
+        key = one.get_key_element()
+        merged = _is_mapping(one)
+        kept = [k for k in kept if k.get_key_element() != key or (merged and _is_mapping(k))]
+        kept.append(one)
+    axes = [dataclasses.replace(_axis(loader, one), place=i) for i, one in enumerate(kept)]
     return [_without_clash(axis, axes) for axis in axes]
+
+
+def parsed_overrides(
+    arguments: Sequence[str], loader: ConfigLoader | None = None
+) -> list[Override]:
+    """Return overrides by Hydra's grammar.
+
+    Raises
+    ------
+    HydraException
+        If one does not follow it, shuffles a list, or has a sweep within a list or a mapping.
+    """
+    parser = OverridesParser.create(config_loader=loader)
+    parser.functions.functions |= {"sort": _sorted, "shuffle": _unshuffled}
+    parsed = parser.parse_overrides(list(arguments))
+    for one in parsed:
+        if not isinstance(one._value, Sweep) and _holds_sweep(one._value):
+            raise ConfigCompositionException(
+                f"'{one.input_line}' has a sweep within a list or a mapping, but a sweep of whole "
+                "values is expected: write each list or mapping, with commas between them."
+            )
+    return parsed
+
+
+def _sorted(*args: Any, sweep: Any = None, reverse: bool = False, **named: Any) -> Any:
+    """Sort as Hydra does, but the values of a range, which Hydra makes another range."""
+    ranges = [one for one in (*args, sweep) if isinstance(one, RangeSweep)]
+    if ranges:
+        return ChoiceSweep(list=[*sorted(_range_values(ranges[0]), reverse=reverse)])
+    return grammar_functions.sort(*args, sweep=sweep, reverse=reverse, **named)
+
+
+def _unshuffled(*args: Any, **named: Any) -> Any:
+    """Leave a sweep in its order, of which no result depends, and refuse to shuffle a value."""
+    shuffled = grammar_functions.shuffle(*args, **named)
+    if not isinstance(shuffled, Sweep):
+        raise ValueError("a shuffled list is another value each time: write it in its order")
+    shuffled.shuffle = False
+    return shuffled
+
+
+def _holds_sweep(value: object) -> bool:
+    parts = [*value.values()] if isinstance(value, Mapping) else value
+    return isinstance(value, Sweep) or (isinstance(parts, list) and any(map(_holds_sweep, parts)))
+
+
+def _is_mapping(override: Override) -> bool:
+    values = _values(override._value)
+    return override.type != OverrideType.DEL and all(isinstance(one, dict) for one in values)
+
+
+def _values(value: object) -> list[Any]:
+    """Return the values of a sweep of choices and ranges, or the one that is given."""
+    if isinstance(value, ChoiceSweep):
+        return [one for part in value.list for one in _values(part)]
+    return _range_values(value) if isinstance(value, RangeSweep) else [value]
+
+
+def _range_values(sweep: RangeSweep) -> list[int] | list[float]:
+    """Return start + k · step before stop: whole numbers, or the nearest decimals."""
+    bounds = sweep.start, sweep.stop, sweep.step
+    given = f"range({','.join(map(str, bounds))})"
+    try:
+        start, stop, step = (Fraction(repr(bound)) for bound in bounds)
+        count = math.ceil((stop - start) / step)
+    except (ValueError, ZeroDivisionError) as error:
+        raise ConfigCompositionException(
+            f"{given} has no finite list of values: give finite numbers, and a step other than 0."
+        ) from error
+    if count > MAX_VALUES:
+        raise ConfigCompositionException(
+            f"{given} has more than {MAX_VALUES:,} values: check its bounds, or sweep in parts."
+        )
+    values = [start + k * step for k in range(count)]
+    whole = all(isinstance(bound, int) for bound in bounds)
+    return [int(value) for value in values] if whole else [float(value) for value in values]
 
 
 def _axis(loader: ConfigLoader, override: Override) -> Axis:
@@ -89,9 +190,9 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
             raise _no_match(loader, override, value)
     else:
         _check_key(override)
-        _check_count(override)
-        texts = tuple(override.sweep_string_iterator())
-        values = tuple(_unquoted(value) for value in override.sweep_iterator())
+        found = _swept_values(override)
+        texts = tuple(map(_text, found))
+        values = tuple(map(_unquoted, found))
     options = _options(loader, override.key_or_group)
     if options and not any(isinstance(value, dict) for value in values):
         if None in values:
@@ -115,21 +216,17 @@ def _check_key(override: Override) -> None:
         )
 
 
-def _check_count(override: Override) -> None:
-    line = override.input_line
-    if not override.is_discrete_sweep():
+def _swept_values(override: Override) -> list[Any]:
+    line, found = override.input_line, _values(override._value)
+    if any(isinstance(one, Sweep) for one in found):
         raise ConfigCompositionException(
             f"'{line}' has no finite list of values: use a choice a,b or range(start,stop,step)."
         )
-    count = sum(1 for _ in itertools.islice(override.sweep_iterator(), MAX_VALUES + 1))
-    if count == 0:
+    if not found:
         raise ConfigCompositionException(
             f"'{line}' has no values, at least one is expected: check its bounds."
         )
-    if count > MAX_VALUES:
-        raise ConfigCompositionException(
-            f"'{line}' has more than {MAX_VALUES:,} values: check its bounds, or sweep in parts."
-        )
+    return found
 
 
 def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception:
@@ -143,6 +240,14 @@ def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception
         f"'{override.input_line}' is a glob, but '{key}' is not a group: groups are "
         f"{', '.join(names)}."
     )
+
+
+def _text(value: Any) -> str:
+    """Return a value as an override has it; a text that would be read as a number is quoted."""
+    text = Transformer.str(value)
+    if isinstance(value, str) and parsed_overrides([f"k={text}"])[0].value() != value:
+        return QuotedString(value, Quote.single).with_quotes()
+    return text
 
 
 def _unquoted(value: object) -> object:
