@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from dopt.errors import SpecificationError
 from dopt.evaluation import random_transitions
 from dopt.policies.base import ball_norms, on_sphere
 from dopt.randomness import process_noise, stream
@@ -80,7 +81,17 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
     known part at x_t and u_t, in the learned rows. With the integrator of Runge and Kutta they are
     taken in the middle of the step, without what the learner's model adds to them. Where states are
     measured with noise they are those of the true states, which the learner was not given.
+
+    Raises
+    ------
+    SpecificationError
+        If the trial may have begun anew in its course: its record does not say where.
     """
+    if getattr(system, "restarts", False):
+        raise SpecificationError(
+            f"env.restarts of {system.name} is true, but the samples of a trial in one piece are "
+            f"expected, as its record does not say where it began anew: leave such trials out."
+        )
     at = system.sampled_states(states)
     known = system.known(tuple(at.T), tuple(inputs.T), system.parameters)
     flow = np.stack(np.broadcast_arrays(*known, at[:, 0])[:-1], axis=-1)

@@ -76,9 +76,9 @@ def parameter(
     return dataclasses.field(default=default, metadata=about)
 
 
-def unvalidated(default: Any) -> Any:
-    """Declare a field that its class checks by itself."""
-    return dataclasses.field(default=default, metadata={"validated": False})
+def unvalidated(default: Any, *, added: bool = False) -> Any:
+    """Declare a field that its class checks by itself; see :func:`parameter` for ``added``."""
+    return dataclasses.field(default=default, metadata={"validated": False, "added": added})
 
 
 @dataclasses.dataclass(frozen=True)

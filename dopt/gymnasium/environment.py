@@ -12,10 +12,17 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
-from dopt.declare.validated_fields import parameter
-from dopt.errors import SpecificationError
+from dopt.declare.validated_fields import parameter, unvalidated
+from dopt.errors import DoptError, SpecificationError
+from dopt.policies.base import on_sphere
 from dopt.systems.base import Array
-from dopt.systems.black_box import BlackBox, Episode, check_amplitude, check_step
+from dopt.systems.black_box import ROUNDING, BlackBox, check_amplitude, check_step
+
+TRIED_STEPS = 10_000
+"""Most steps of the run in which an environment is tried out before the first trial."""
+
+REPEATED_STEPS = 20
+"""First steps of that run, which are taken again by another environment with the same seed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +35,32 @@ class Environment(BlackBox):
     in ``angle_indices`` are followed over the full turn.
 
     ``dt`` has to be the time between two steps of the environment, γ within the box of its actions.
-    An input beyond the box is cut to it, and what was applied is what counts. An episode that the
-    environment terminates ends the trial as diverged; its limit of time is lifted.
+    An input beyond the box is cut to it, and to a whole number towards 0 in a box of integers: what
+    was applied is recorded, and is what counts. An episode that the environment terminates ends the
+    trial as diverged; its limit of time is lifted.
+
+    Before the first trial a run of random inputs is tried out. An environment that truncates its
+    episodes within the horizon is refused, unless ``restarts`` is true: then it is reset each time,
+    with a seed that follows from the trial's, and the step is taken from there with the same input.
+    The truncated step itself is left out: nothing is learned from it.
 
     Parameters
     ----------
     id : str
         Its name for ``gymnasium.make``, such as ``Pendulum-v1``.
+    restarts : bool
+        Whether it is explored in pieces where it truncates its episodes.
     """
 
     id: str = parameter("")
+    restarts: bool = unvalidated(False, added=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.restarts, bool):
+            raise SpecificationError(
+                f"env.restarts is {self.restarts!r}, but true or false is expected: set it to one."
+            )
 
     @staticmethod
     @abstractmethod
@@ -48,7 +71,7 @@ class Environment(BlackBox):
         """Return a new environment without a limit of time."""
         return gymnasium.make(self.id, max_episode_steps=-1, disable_env_checker=True)
 
-    def episode(self, seed: int) -> Episode:
+    def episode(self, seed: int) -> _Episode:
         """Start a run; see :class:`BlackBox`.
 
         Raises
@@ -64,12 +87,49 @@ class Environment(BlackBox):
                 f"environment that is installed."
             ) from error
         _check_actions(self, environment)
-        check_step(self, getattr(environment.unwrapped, "dt", self.dt), self.id)
+        declared = (getattr(environment.unwrapped, name, None) for name in ("dt", "tau"))
+        seconds = (float(one) for one in declared if isinstance(one, int | float | np.number))
+        check_step(self, next(seconds, self.dt), self.id)
         return _Episode(self, environment, seed)
+
+    def try_out(self) -> None:
+        """Take the steps of a run twice; see :class:`BlackBox`.
+
+        Raises
+        ------
+        SpecificationError
+            If the environment is not what was declared, or fails, or its seed does not decide
+            about its states.
+        """
+        try:
+            states = _tried_states(self, min(self.horizon, TRIED_STEPS))
+            again = _tried_states(self, min(self.horizon, REPEATED_STEPS))
+        except DoptError:
+            raise
+        except Exception as error:
+            raise SpecificationError(
+                f"{self.id} fails when it is tried out ({type(error).__name__}: {error}), but "
+                f"reset(seed=...) with an observation and info is expected, and step(action) with "
+                f"an observation, a reward, terminated, truncated and info: correct it, or wrap it "
+                f"if it is older than Gymnasium 0.26."
+            ) from error
+        if not np.allclose(states[: len(again)], again, rtol=ROUNDING, atol=ROUNDING):
+            raise SpecificationError(
+                f"{self.id} reaches other states with the same seed and inputs, but the seed of "
+                f"reset() has to decide about them: draw its random numbers from self.np_random."
+            )
 
 
 class _Episode:
-    """An episode of an environment, with its angles over the full turn."""
+    """An episode of an environment, with its angles over the full turn.
+
+    Attributes
+    ----------
+    new_start : (d,) or None
+        See :class:`dopt.systems.black_box.Episode`.
+    over : bool
+        Whether the environment has terminated it.
+    """
 
     def __init__(self, system: Environment, environment: gymnasium.Env, seed: int) -> None:
         self._system, self._environment = system, environment
@@ -77,25 +137,50 @@ class _Episode:
         box = environment.action_space
         assert isinstance(box, Box)
         self._low, self._high, self._kind = box.low, box.high, box.dtype
-        observation, _ = environment.reset(seed=seed % 2**31)
-        self._state = self._read(observation)
-        self._over = False
+        self._seed, self._pieces, self._steps = seed, 0, 0
+        self._state = self._reset(seed)
+        self.new_start: Array | None = None
+        self.over = False
 
     @property
     def state(self) -> Array:
         return self._state.copy()
 
     def step(self, inputs: Array) -> Array:
-        applied: Array = np.clip(inputs, self._low, self._high)
-        if self._over or not np.isfinite(applied).all():
+        self.new_start = None
+        if self.over or not np.isfinite(inputs).all():
             self._state = np.full_like(self._state, np.nan)
-            return applied
-        observation, _, self._over, _, _ = self._environment.step(applied.astype(self._kind))
-        reached = self._read(observation)
+            return inputs
+        sent = np.clip(inputs, self._low, self._high).astype(self._kind)
+        applied: Array = sent.astype(np.float64)
+        reached, truncated = self._advance(sent)
+        if truncated:
+            self._begin_anew()
+            reached, truncated = self._advance(sent)
+        if truncated:
+            raise self._truncated("its first step")
+        self._steps += 1
         turns = (self._state - reached)[self._angles] / (2 * math.pi)
         reached[self._angles] += 2 * math.pi * np.round(turns)
-        self._state = np.full_like(reached, np.nan) if self._over else reached
+        self._state = np.full_like(reached, np.nan) if self.over else reached
         return applied
+
+    def _advance(self, action: Any) -> tuple[Array, bool]:
+        """Return the state that follows, (d,), and whether the episode is cut short."""
+        observation, _, self.over, truncated, _ = self._environment.step(action.copy())
+        return self._read(observation), bool(truncated) and not self.over
+
+    def _begin_anew(self) -> None:
+        if not self._system.restarts:
+            raise self._truncated(f"step {self._steps + 1}")
+        self._pieces, self._steps = self._pieces + 1, 0
+        drawn = np.random.SeedSequence(self._seed, spawn_key=(self._pieces,))
+        self._state = self._reset(int(drawn.generate_state(1)[0]))
+        self.new_start = self._state.copy()
+
+    def _reset(self, seed: int) -> Array:
+        observation, _ = self._environment.reset(seed=seed % 2**31)
+        return self._read(observation)
 
     def _read(self, observation: Any) -> Array:
         state = np.array(self._system.state(observation), dtype=np.float64)
@@ -105,6 +190,33 @@ class _Episode:
                 f"observation, but {(self._system.n_states,)} is expected: correct its state()."
             )
         return state
+
+    def _truncated(self, when: str) -> SpecificationError:
+        return SpecificationError(
+            f"{self._system.id} truncates its episode at {when}, but a trial takes "
+            f"{self._system.horizon}, and cannot learn across a restart: set env.horizon below "
+            f"that, or give ++env.restarts=true to explore in pieces."
+        )
+
+
+def _tried_states(system: Environment, steps: int) -> Array:
+    """Return the states that follow, (steps, d), under random inputs, in as many runs as needed."""
+    inputs = np.random.default_rng(0).standard_normal((steps, system.n_inputs))
+    states = np.empty((steps, system.n_states))
+    episode, seed = system.episode(0), 0
+    for t, u in enumerate(on_sphere(inputs, system.gamma)):
+        episode.step(u)
+        states[t] = episode.state
+        if not (episode.over or np.isfinite(states[t]).all()):
+            raise SpecificationError(
+                f"{system.id} shows the state {states[t]} after {t + 1} random inputs of norm "
+                f"{system.gamma:g}, but finite numbers are expected until it terminates: correct "
+                f"it, or lower env.gamma."
+            )
+        if not np.all(np.abs(states[t]) <= system.state_limit):
+            seed += 1
+            episode, states[t] = system.episode(seed), 0.0
+    return states
 
 
 def _check_actions(system: Environment, environment: gymnasium.Env) -> None:

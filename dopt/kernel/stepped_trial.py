@@ -18,7 +18,7 @@ from dopt.kernel.steps import KernelSteps
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.randomness import episode_seed
 from dopt.spec.trial import TrialSpec
-from dopt.systems.black_box import BlackBox
+from dopt.systems.black_box import BlackBox, new_start
 
 
 def is_stepped(spec: TrialSpec) -> bool:
@@ -71,6 +71,8 @@ class SteppedTrial(KernelSteps):
         if self._episode is None:
             return bool(self._act(self._held, t))
         self.inputs[t] = self._episode.step(self.inputs[t].copy())
+        if (start := new_start(self._episode)) is not None:
+            self.begin(t, start)
         following = self.record.states[t + 1]
         following[:] = self._episode.state
         return bool(np.all(np.abs(following) <= self.spec.system.state_limit))  # false for NaN

@@ -58,7 +58,7 @@ class Lockstep(BatchSteps):
         """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""
         x = self.true_states[:, t]
         if self.episodes:
-            u, following = stepped(self.episodes, u)
+            u, following = stepped(self.episodes, x, u)
         else:
             following = self._following(t, x, u) + self.noise[:, t]
         self.inputs[:, t] = u

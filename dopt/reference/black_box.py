@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dopt.randomness import episode_seed
 from dopt.spec.trial import TrialSpec
-from dopt.systems.black_box import BlackBox, Episode
+from dopt.systems.black_box import BlackBox, Episode, new_start
 
 
 def episodes_for(specs: Sequence[TrialSpec]) -> list[Episode]:
@@ -26,9 +26,15 @@ def initial_states(episodes: Sequence[Episode]) -> Tensor:
     return torch.tensor(np.stack([episode.state for episode in episodes]))
 
 
-def stepped(episodes: Sequence[Episode], u: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply inputs (n, m); return what was applied, (n, m), and the next states, (n, d)."""
+def stepped(episodes: Sequence[Episode], x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Apply inputs (n, m); return what was applied, (n, m), and the next states, (n, d).
+
+    Where a run has begun anew, the state before the step, in x (n, d), becomes its start.
+    """
     inputs = u.cpu().numpy()
     applied = [episode.step(row) for episode, row in zip(episodes, inputs, strict=True)]
+    for row, episode in zip(x, episodes, strict=True):
+        if (start := new_start(episode)) is not None:
+            row.copy_(torch.tensor(start))
     states = [episode.state for episode in episodes]
     return torch.tensor(np.stack(applied)).to(u), torch.tensor(np.stack(states)).to(u)

@@ -32,7 +32,7 @@ _SEED = 20_240_601
 
 @functools.lru_cache(maxsize=64)
 def check_system(system: System) -> None:
-    """Try a system's declarations and equations; of a black box, begin a run in vain.
+    """Try a system's declarations and equations; try out a black box.
 
     Raises
     ------
@@ -40,14 +40,14 @@ def check_system(system: System) -> None:
         If a declared index is none of a state's, or the equations fail, return something else than
         was declared, are not finite where a trial begins or is evaluated, depend on the inputs or
         the linear parameters in another way than an affine one, or have a wrong derivative by a
-        complex step; if a run of a black box says so.
+        complex step; if a black box says so.
     """
     check_names(system)
     _check_indices(system)
     if isinstance(system, BlackBox) and system.measured:
         return  # nothing may run on it
     if isinstance(system, BlackBox):
-        system.episode(0)
+        system.try_out()
         return
     rng = np.random.default_rng(_SEED)
     states = rng.uniform(-1, 1, (system.n_states, STATES))

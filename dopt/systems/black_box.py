@@ -31,8 +31,15 @@ class Episode(Protocol):
     def step(self, inputs: Array) -> Array:
         """Apply what is possible of an input (m,), and return what was applied, (m,).
 
-        The state is NaN once the run is over.
+        The state is NaN once the run is over. Where a run begins anew before the step, in another
+        state than the last one, an attribute ``new_start`` holds that state, (d,), until the next.
         """
+
+
+def new_start(episode: Episode) -> Array | None:
+    """Return where the last step of a run began, (d,), if the run had begun anew; else None."""
+    start: Array | None = getattr(episode, "new_start", None)
+    return start
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +96,10 @@ class BlackBox(System):
     def episode(self, seed: int) -> Episode:
         """Start a run; the seed decides about all that is random in it."""
 
+    def try_out(self) -> None:
+        """Raise SpecificationError if runs of it cannot be those of trials: begin one in vain."""
+        self.episode(0)
+
     def true_accelerations(self, states: Array, inputs: Array) -> Array | None:  # noqa: ARG002  # of most, nothing is known
         """Return the accelerations, (N, r), at states (N, d) under inputs (N, m).
 
@@ -128,6 +139,11 @@ def check_step(system: BlackBox, seconds: float, model: str) -> None:
 def check_amplitude(system: BlackBox, low: Array, high: Array, inputs: str) -> None:
     """Raise SpecificationError if γ is beyond the bounds, (m,) each, of inputs with some name."""
     bound = float(np.min([-low, high]))
+    if bound <= 0:
+        raise SpecificationError(
+            f"the {inputs} go from {low} to {high}, but ranges with 0 inside are expected, as "
+            f"inputs of all directions are applied: shift what the inputs mean."
+        )
     if system.gamma > bound * (1 + ROUNDING):
         raise SpecificationError(
             f"env.gamma is {system.gamma:g}, but the {inputs} go to {bound:g} only: set env.gamma "
@@ -152,15 +168,19 @@ def transitions(
 ) -> tuple[Array, Array, Array, npt.NDArray[np.bool_]]:
     """Run an episode under inputs (T, m).
 
-    Returned are states (T, d), applied inputs (T, m), accelerations (T, r) and which there are.
+    Returned are states (T, d), applied inputs (T, m), accelerations (T, r) and which there are: not
+    those of steps before which or after which the run had ended or begun anew.
     """
     episode = system.episode(seed)
     states = np.empty((len(inputs) + 1, system.n_states))
     applied = np.empty_like(inputs)
     states[0] = episode.state
+    joined = np.ones(len(inputs), dtype=np.bool_)
     for t, u in enumerate(inputs):
         applied[t] = episode.step(u)
+        if (start := new_start(episode)) is not None:
+            states[t], joined[max(t - 1, 0)] = start, t == 0
         states[t + 1] = episode.state
     seen = system.observed(states, applied)
     inside = np.all(np.abs(states) <= system.state_limit, axis=1)
-    return system.sampled_states(states), applied, seen, inside[:-1] & inside[1:]
+    return system.sampled_states(states), applied, seen, joined & inside[:-1] & inside[1:]
