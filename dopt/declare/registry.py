@@ -239,8 +239,8 @@ def _place(error: Exception) -> tuple[str, int | None] | None:
 
 def _changed(section: str, path: str) -> SpecificationError:
     return SpecificationError(
-        f"{section} asks for {path} as it was in another state of its file: "
-        f"leave {section}.{SOURCE} out to take it as it is now, or restore the file."
+        f"{section} asks for {path} as it was in another state of its file: restore the file, or "
+        f"leave {section}.{SOURCE} out of a launch to take it as it is now."
     )
 
 

@@ -30,7 +30,7 @@ AGREEMENT = 1e-3
 _SEED = 20_240_601
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=1024)
 def check_system(system: System) -> None:
     """Try a system's declarations and equations; try out a black box.
 
