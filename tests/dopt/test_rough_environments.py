@@ -15,7 +15,7 @@ from dopt.run import run_trial
 from dopt.samples import recorded_samples
 from dopt.spec.trial import TrialSpec
 
-pytest.importorskip("gymnasium", reason="needs the extra: pip install dopt[gymnasium]")
+pytest.importorskip("gymnasium", reason="needs the extra gymnasium")
 
 from tests.dopt.custom_environments import DRAG
 from tests.dopt.rough_environments import PIECE, SEEN, TAKEN
