@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dopt.given_path import given_path
 from orchestrate.cli_parser import UsageError
 from orchestrate.commands.command import Command
+from orchestrate.commands.doctor import trial_key
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
 from orchestrate.store import Merged, TrialName, merge, merge_collected
@@ -26,23 +27,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> ExitCode:
-    """Merge and print the counts; exit code 1 if there are conflicts or incomplete trials."""
+    """Merge and print the counts; exit code 1 if trials that have an outcome were left out."""
     merged = _merge(arguments.db, arguments.other)
     if arguments.json:
         say_json({**_plain(merged), "changed": merged.changed})
     else:
         say("\n".join(_lines(merged)))
-    return ExitCode.SOME_FAILED if merged.conflicts or merged.incomplete else ExitCode.DONE
+    refused = merged.conflicts or merged.incomplete or merged.contradictory
+    return ExitCode.SOME_FAILED if refused else ExitCode.DONE
 
 
 def _merge(url: str, other: str) -> Merged:
     if "://" in other:
-        return merge(url, other)
+        return merge(url, other, trial_key)
     place = given_path(other, "OTHER", UsageError)
     if not any(place.glob("*.db")):  # a bundle has other files
-        return merge(url, f"{'bundle' if place.is_dir() else 'sqlite'}:///{place.absolute()}")
+        kind = "bundle" if place.is_dir() else "sqlite"
+        return merge(url, f"{kind}:///{place.absolute()}", trial_key)
     total = Merged()
-    for merged in merge_collected(url, place):
+    for merged in merge_collected(url, place, trial_key=trial_key):
         total.include(merged)
     return total
 
@@ -62,6 +65,8 @@ def _lines(merged: Merged) -> list[str]:
     lines += [line for line, count in told.items() if count]
     lines += _listed("have different numbers here and were not copied", merged.conflicts)
     lines += _listed("are incomplete there and were not copied", merged.incomplete)
+    what = "contradict their keys or the shapes of their arrays there and were not copied"
+    lines += _listed(what, merged.contradictory)
     return lines
 
 

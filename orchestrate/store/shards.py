@@ -15,6 +15,7 @@ from pathlib import Path
 from orchestrate.store import database_url
 from orchestrate.store.backends.driver_errors import translated, translated_file
 from orchestrate.store.backends.sqlite_backup import copy_checked
+from orchestrate.store.doctor.keys import TrialKey
 from orchestrate.store.errors import NoDatabaseError
 from orchestrate.store.merging.merge import Merged, merge
 
@@ -46,7 +47,9 @@ def collect(url: str, folder: Path) -> None:
             partial.unlink(missing_ok=True)
 
 
-def merge_collected(url: str, folder: Path, pattern: str = f"*{SUFFIX}") -> Iterator[Merged]:
+def merge_collected(
+    url: str, folder: Path, pattern: str = f"*{SUFFIX}", trial_key: TrialKey | None = None
+) -> Iterator[Merged]:
     """Merge the copies in a folder into a database, one after the other.
 
     Raises ``NoDatabaseError`` if there is none, and as :func:`merge` does.
@@ -62,4 +65,4 @@ def merge_collected(url: str, folder: Path, pattern: str = f"*{SUFFIX}") -> Iter
             copy = Path(local) / path.name
             with translated_file(str(path)):
                 shutil.copyfile(path, copy)
-            yield merge(url, f"sqlite:///{copy}")
+            yield merge(url, f"sqlite:///{copy}", trial_key)

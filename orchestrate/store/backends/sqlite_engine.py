@@ -16,6 +16,7 @@ from orchestrate.store import database_url
 from orchestrate.store.backends.driver_errors import translated_file
 from orchestrate.store.backends.file_locks import patiently
 from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
+from orchestrate.store.views import VIEWS
 
 BUSY_TIMEOUT_SECONDS = 30.0
 
@@ -26,7 +27,14 @@ MAX_LOG_BYTES = 16 * 2**20
 def read_engine(url: URL) -> Engine:
     """Return an engine that cannot write; raise ``NoDatabaseError`` if there is no file."""
     path = existing_path(url)
-    return _engine(lambda: _connect(read_address(path)), _begin)
+    return _engine(lambda: _reader(path), _begin)
+
+
+def _reader(path: Path) -> sqlite3.Connection:
+    connection = _connect(read_address(path))
+    for name, query in VIEWS.items():  # before those of the file, which a stranger may have made
+        connection.execute(f"CREATE TEMP VIEW {name} AS {query}")
+    return connection
 
 
 def existing_path(url: URL) -> Path:

@@ -15,6 +15,7 @@ from sqlalchemy import Row
 
 from orchestrate.store import database_url
 from orchestrate.store.backends import sqlite
+from orchestrate.store.doctor.keys import TrialKey
 from orchestrate.store.errors import StoreError
 from orchestrate.store.merging.source import Page, Source
 from orchestrate.store.merging.target import Target, add_launches
@@ -52,6 +53,9 @@ class Merged:
         Trials finished in both databases with different numbers, which were not copied.
     incomplete
         Trials with missing rows there, which were not copied.
+    contradictory
+        Trials there whose key is not that of their configuration and seed, or whose arrays have
+        other shapes than they say, which were not copied.
     launches
         New launches.
     """
@@ -62,13 +66,14 @@ class Merged:
     running: int = 0
     conflicts: list[TrialName] = field(default_factory=list)
     incomplete: list[TrialName] = field(default_factory=list)
+    contradictory: list[TrialName] = field(default_factory=list)
     launches: int = 0
 
     def include(self, other: Merged) -> None:
         """Add the counts of one more merge into the same database."""
         for status, count in other.added.items():
             self.added[status] = self.added.get(status, 0) + count
-        for name in ("identical", "kept", "running", "launches", "conflicts", "incomplete"):
+        for name in vars(self).keys() - {"added"}:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     @property
@@ -76,17 +81,18 @@ class Merged:
         return bool(self.added or self.launches)
 
 
-def merge(url: str, other_url: str) -> Merged:
+def merge(url: str, other_url: str, trial_key: TrialKey | None = None) -> Merged:
     """Bring the trials with an outcome of ``other_url`` into ``url``, and what belongs to them.
 
     Either may be SQLite or PostgreSQL; the first is created where there is none, the other is only
-    read. Raises ``StoreError`` as the opening of a store and of a reader do.
+    read. ``trial_key`` is as in :func:`orchestrate.store.examine`. Raises ``StoreError`` as the
+    opening of a store and of a reader do.
     """
     _refuse_itself(url, other_url)
     merged = Merged()
     with Reader.open(other_url) as reader, reader.moment() as moment, Store.open(url) as store:
         store.recover()
-        source = Source(moment)
+        source = Source(moment, trial_key)
         with store._backend.transaction() as connection:
             store._backend.exclusive(connection)
             launches, merged.launches = add_launches(connection, source.launches())
@@ -113,6 +119,8 @@ def _merge_page(target: Target, page: Page) -> Found:
 
 def _merge_trial(target: Target, page: Page, row: dict[str, Any], here: Row[Any] | None) -> str:
     """Copy one trial if it is new here; return the outcome as a field of :class:`Merged`."""
+    if row["trial_id"] in page.contradictory:
+        return "contradictory"
     finished = row["status"] in FINISHED
     if here is not None and here.status == "running":
         return "running"
@@ -143,8 +151,8 @@ def _count(merged: Merged, found: Found) -> None:
             merged.added[row["status"]] = merged.added.get(row["status"], 0) + 1
         elif fate == "conflict":
             merged.conflicts.append(_named(row))
-        elif fate == "incomplete":
-            merged.incomplete.append(_named(row))
+        elif fate in ("incomplete", "contradictory"):
+            getattr(merged, fate).append(_named(row))
         else:
             setattr(merged, fate, getattr(merged, fate) + 1)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from itertools import accumulate, groupby
 from operator import itemgetter
@@ -11,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from orchestrate.store.doctor.keys import TrialKey
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.records import Array
 from orchestrate.store.schema import N_ROWS, PREQUENTIAL, STEP_VALUES
+from orchestrate.store.serialization import DTYPE, unpack
 
 PAGE = 50
 """Trials in one transaction, so that a concurrent launch waits for less than a second."""
@@ -85,18 +89,22 @@ class Page:
         Finished attempts at a trial, the oldest first.
     curves
         Rows of the finished trials; none for a trial of which some are missing.
+    contradictory
+        Trials whose key is not that of their configuration, or whose arrays have other shapes.
     """
 
     trials: list[dict[str, Any]]
     attempts: Mapping[int, list[dict[str, Any]]]
     curves: Mapping[int, Curve]
+    contradictory: Set[int]
 
 
 class Source:
-    """Queries to a snapshot of the source database."""
+    """Queries to a snapshot of the source database; ``trial_key`` is as in :func:`merge`."""
 
-    def __init__(self, moment: Reader) -> None:
-        self._moment = moment
+    def __init__(self, moment: Reader, trial_key: TrialKey | None = None) -> None:
+        self._moment, self._trial_key = moment, trial_key
+        self._texts: dict[int, str] = {}  # JSON of configurations, empty for another than its key
         self._expected = dict(map(tuple, moment.rows(_EXPECTED)))
 
     def launches(self) -> list[dict[str, Any]]:
@@ -110,7 +118,23 @@ class Source:
             attempts = defaultdict(list)
             for row in self._dicts(_ATTEMPTS, first=first, last=last):
                 attempts[row["trial_id"]].append(row)
-            yield Page(trials, attempts, self._curves(trials))
+            curves = self._curves(trials)
+            wrong = {
+                row["trial_id"]
+                for row in trials
+                if not (self._has_its_key(row) and _agree(row, curves.get(row["trial_id"])))
+            }
+            yield Page(trials, attempts, curves, wrong)
+
+    def _has_its_key(self, row: Mapping[str, Any]) -> bool:
+        """Return whether keys are hashes of what is stored: no specification is built of it."""
+        if (config_id := row["config_id"]) not in self._texts:
+            text = self.config(config_id)["config_json"]
+            same = hashlib.sha256(text.encode()).hexdigest() == row["config_key"]
+            self._texts[config_id] = text if same else ""
+        text = self._texts[config_id]
+        key = self._trial_key(text, row["seed"]) if self._trial_key else row["trial_key"]
+        return bool(text) and key == row["trial_key"]
 
     def config(self, config_id: int) -> dict[str, Any]:
         (row,) = self._dicts("SELECT * FROM config WHERE config_id = :id", id=config_id)
@@ -144,6 +168,23 @@ class Source:
     def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
         table = self._moment.rows(sql, **values)
         return [dict(zip(table.columns, row, strict=True)) for row in table]
+
+
+def _agree(row: Mapping[str, Any], curve: Curve | None) -> bool:
+    """Return whether the arrays of a trial have their shapes, and as many steps as the trial."""
+    if curve is None:
+        return True
+    packed, names = curve.trajectory, ("states", "inputs", "parameters")
+    try:
+        arrays = [unpack(DTYPE, packed[f"{name}_shape"], packed[name]) for name in names]
+        states, inputs, parameters = arrays
+        sizes = states.ndim, inputs.ndim, parameters.ndim, len(states), packed["dtype"]
+        steps = len(inputs)
+    except (ValueError, TypeError, RecursionError):
+        return False
+    same = all(packed[f"{names[i]}_shape"] == json.dumps(arrays[i].shape) for i in range(3))
+    fits = row["grows"] or row["n_rows"] == steps
+    return bool(same and fits and sizes == (2, 2, 1, steps + 1, DTYPE))
 
 
 def _first(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -75,7 +75,7 @@ class Spec:
 
     @property
     def trial_key(self) -> str:
-        return _digest(f"{self.config_json} {int(self.seed)}")
+        return _digest(f'{self.config_json[:-1]},"seed":{int(self.seed)}}}')
 
 
 @dataclass(frozen=True)

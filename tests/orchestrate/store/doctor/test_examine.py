@@ -21,7 +21,7 @@ Take = Callable[..., list[Claim]]
 
 
 def key(config_json: str, seed: int) -> str:
-    return hashlib.sha256(f"{config_json} {seed}".encode()).hexdigest()
+    return hashlib.sha256(f'{config_json[:-1]},"seed":{seed}}}'.encode()).hexdigest()
 
 
 @pytest.fixture
