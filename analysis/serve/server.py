@@ -18,13 +18,16 @@ from analysis.serve.app import end_streams
 REQUEST_SECONDS = 10.0
 """Time in which the head of a request has to arrive."""
 
-MAX_WAITING = 32
+MAX_WAITING = 64
 """Connections without a whole request; beyond it the oldest is closed."""
 
 MAX_CONNECTIONS = 128
 """Connections and requests; beyond it the answer is 503."""
 
 LOG_SECONDS = 60.0
+_next: dict[tuple[str, int], float] = {}
+"""When the next warning of a place in the code is logged."""
+
 END_SECONDS = 5.0
 """Time in which open requests end after Ctrl-C."""
 
@@ -62,20 +65,13 @@ class Connection(H11Protocol):
             self.transport.abort()
 
 
-class Seldom(logging.Filter):
-    """Passes a warning of each kind once a minute: strangers decide how often it is logged."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._next: dict[object, float] = {}
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a record is logged."""
-        place, now = (record.pathname, record.lineno), time.monotonic()
-        if record.levelno <= logging.WARNING and now < self._next.get(place, now):
-            return False
-        self._next[place] = now + LOG_SECONDS
-        return True
+def seldom(record: logging.LogRecord) -> bool:
+    """Let a warning of each kind pass once a minute: strangers decide how often it is logged."""
+    place, now = (record.pathname, record.lineno), time.monotonic()
+    if record.levelno <= logging.WARNING and now < _next.get(place, now):
+        return False
+    _next[place] = now + LOG_SECONDS
+    return True
 
 
 class Server(uvicorn.Server):
@@ -98,7 +94,7 @@ class Server(uvicorn.Server):
             limit_concurrency=MAX_CONNECTIONS,
         )
         super().__init__(config)
-        logging.getLogger("uvicorn.error").addFilter(Seldom())
+        logging.getLogger("uvicorn.error").addFilter(seldom)
         self._app = app
         self._leave = leave
         self._others = set(threading.enumerate())
@@ -112,5 +108,6 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
     def _leave_requests(self) -> None:
-        if any(not one.daemon for one in {*threading.enumerate()} - self._others):
+        busy = self.server_state.connections or self.server_state.tasks
+        if busy or any(not one.daemon for one in {*threading.enumerate()} - self._others):
             self._leave()

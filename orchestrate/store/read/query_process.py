@@ -14,6 +14,7 @@ import resource
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import islice
 from typing import Any
 
@@ -41,7 +42,8 @@ def main() -> None:
     request: Request = pickle.load(sys.stdin.buffer)
     _thread.start_new_thread(_end_with_parent, ())
     for kind in (resource.RLIMIT_AS, resource.RLIMIT_FSIZE):
-        resource.setrlimit(kind, (MEMORY_BYTES, MEMORY_BYTES))
+        with suppress(ValueError):  # a smaller limit stays
+            resource.setrlimit(kind, (MEMORY_BYTES, MEMORY_BYTES))
     sys.path += request["path"]
     error = None
     with os.fdopen(1, "wb") as out:
@@ -109,7 +111,7 @@ def _postgresql(request: Request) -> Iterator[Any]:
 
         try:
             # A server-side cursor accepts one SELECT only; a plain statement may be several.
-            with connection.transaction(), connection.cursor("query") as cursor:
+            with connection.transaction(force_rollback=True), connection.cursor("query") as cursor:
                 limit_time()
                 connection.execute("SELECT 1")  # now no statement can make the transaction writable
                 cursor.execute(request["sql"].encode())

@@ -49,12 +49,13 @@ def run_select(
     with translated_query(safe_url, timeout):
         with _process(request) as process:
             answer = _read(process, timeout, stopped)
-        *parts, end = _unpickled(answer) or [None]
+        parts = [None, *_unpickled(answer)]
+        end = parts.pop()
         if not isinstance(end, dict):
             raise QueryError("The process of the query was killed before its end: run it again.")
         if end["error"] is not None:
             raise _failure(end["error"], sql, safe_url)
-    _, columns, *rows = parts
+    _, _, columns, *rows = parts
     if columns is None:
         raise QueryError("The query returns no rows: give one SELECT.")
     return Table(columns, rows[:limit], cut=limit is not None and len(rows) > limit)
@@ -112,14 +113,11 @@ def _read(
     raise QueryError("The query was cancelled, because nobody waits for it: run it again.")
 
 
-def _unpickled(answer: bytes) -> list[Any]:
-    stream, parts = io.BytesIO(answer), []
-    while stream.tell() < len(answer):
-        try:
-            parts.append(pickle.load(stream))
-        except (EOFError, pickle.UnpicklingError):
-            break
-    return parts
+def _unpickled(answer: bytes) -> Iterator[Any]:
+    stream = io.BytesIO(answer)
+    with suppress(EOFError, pickle.UnpicklingError):
+        while True:
+            yield pickle.load(stream)
 
 
 def _failure(error: Exception, sql: str, safe_url: str) -> Exception:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from decimal import Decimal
 from pathlib import Path
 
@@ -270,6 +270,20 @@ def test_a_statement_cannot_lift_its_limit(on_server: Reader) -> None:
         )
     running = "SELECT 1 FROM pg_stat_activity WHERE query LIKE 'FETCH%query%' AND state = 'active'"
     until(lambda: not on_server.rows(running))
+
+
+def test_what_a_statement_made_is_rolled_back(on_server: Reader) -> None:
+    with suppress(QueryError):  # from PostgreSQL 16 on
+        on_server.query("SELECT lo_create(0)")
+    assert on_server.rows("SELECT * FROM pg_largeobject_metadata") == []
+
+
+def test_a_smaller_limit_of_the_shell_stays(sqlite_url: str) -> None:
+    Store.open(sqlite_url).close()
+    words = f"{sys.executable} -m orchestrate query 'SELECT 41 + 1' --csv --db {sqlite_url}"
+    limited = ["sh", "-c", f"ulimit -f 100000; {words}"]
+    done = subprocess.run(limited, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines()[1:] == ["42"], done.stderr
 
 
 def test_its_process_imports_the_driver_alone(
