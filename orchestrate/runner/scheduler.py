@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -140,11 +141,12 @@ class Scheduler:
                 self.chunks.add(self._release([event.key], OUT_OF_MEMORY), alone=True)
                 continue
             claim, trial = self._running.pop(event.key)
-            self.chunks.observe(trial.config_key, event.run.wall_seconds)
+            run = _on_this_clock(event.run)
+            self.chunks.observe(trial.config_key, run.wall_seconds)
             if isinstance(event.outcome, Failure):
-                self._fail(claim, event.outcome, event.run)
+                self._fail(claim, event.outcome, run)
             else:
-                results.append((claim, event.outcome, event.run))
+                results.append((claim, event.outcome, run))
         if results:
             self._write(results)
 
@@ -239,6 +241,17 @@ def _summary(failure: Failure) -> str:
     """Return the type and the first line of a failure."""
     first = next(iter(failure.message.splitlines()), "")
     return first if failure.cause == "timeout" else f"{failure.type}: {first}"
+
+
+def _on_this_clock(run: RunRecord) -> RunRecord:
+    """Return a run that has just ended with its times by the clock that its claim has.
+
+    The clock of another machine may differ.
+    """
+    if run.node == socket.gethostname():
+        return run
+    now = datetime.now(UTC)
+    return replace(run, started=now - abs(run.ended - run.started), ended=now)
 
 
 def _last_run(lost: WorkerLost) -> RunRecord:

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from sqlalchemy import Case, ColumnElement, case
 
 from orchestrate.store.records import Array
 
@@ -51,6 +52,11 @@ def utc_text(moment: datetime) -> str:
 
 def now() -> str:
     return utc_text(datetime.now(UTC))
+
+
+def not_before(column: ColumnElement[str], moment: Any) -> Case[str]:
+    """Return a time for SQL that is not before the one in the column, however clocks differ."""
+    return case((column > moment, column), else_=moment)
 
 
 def pack(array: Array) -> tuple[str, bytes]:

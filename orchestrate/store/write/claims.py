@@ -23,7 +23,7 @@ from orchestrate.store.schema import (
     trajectory,
     trial,
 )
-from orchestrate.store.serialization import now
+from orchestrate.store.serialization import not_before, now
 from orchestrate.store.write import live_steps
 
 
@@ -99,7 +99,7 @@ def free_claims(
     # Trials first, as a commit does, so that the two cannot wait for each other.
     freed = connection.execute(update(trial).where(held).values(status="pending", owner=None))
     over = open_attempt & attempt.c.trial_id.not_in(still_held)
-    end = {"outcome": outcome, "cause": cause, "ended": now()}
+    end = {"outcome": outcome, "cause": cause, "ended": not_before(attempt.c.claimed, now())}
     connection.execute(update(attempt).where(over).values(end))
     live_steps.clear(connection)
     return freed.rowcount

@@ -10,7 +10,7 @@ from orchestrate.store.backends.base import Backend, LaunchLife
 from orchestrate.store.errors import LaunchAliveError
 from orchestrate.store.records import LaunchRecord
 from orchestrate.store.schema import LAUNCH_STATES, launch, trial
-from orchestrate.store.serialization import now
+from orchestrate.store.serialization import not_before, now
 from orchestrate.store.write.claims import free_claims
 
 
@@ -48,7 +48,7 @@ def end(connection: Connection, launch_id: int, state: str, exit_code: int | Non
         .where(launch.c.launch_id == launch_id)
         .values(
             state=state,
-            ended=now(),
+            ended=not_before(launch.c.started, now()),
             lease_until=None,
             exit_code=None if exit_code is None else int(exit_code),
         )
@@ -91,7 +91,7 @@ def recover(connection: Connection, backend: Backend) -> tuple[int, list[str]]:
     connection.execute(
         update(launch)
         .where(launch.c.launch_id.in_(ids), launch.c.state == "running")
-        .values(state="lost", ended=now())
+        .values(state="lost", ended=not_before(launch.c.started, now()))
     )
     return freed, [one.token for one in dead]
 

@@ -32,7 +32,15 @@ from orchestrate.store.schema import (
     trajectory,
     trial,
 )
-from orchestrate.store.serialization import DTYPE, finite, pack, plain, storable, utc_text
+from orchestrate.store.serialization import (
+    DTYPE,
+    finite,
+    not_before,
+    pack,
+    plain,
+    storable,
+    utc_text,
+)
 from orchestrate.store.write.result_validation import check_horizon, check_result
 
 _RUN_COLUMNS = ("node", "wall_seconds", "cpu_seconds", "peak_memory_bytes")
@@ -75,7 +83,8 @@ _END_ATTEMPT = (
         outcome=bindparam("status"),
         cause=bindparam("cause"),
         error_id=bindparam("error_id"),
-        **{name: bindparam(name) for name in (*_RUN_COLUMNS, "pid", "started", "ended")},
+        **{name: bindparam(name) for name in (*_RUN_COLUMNS, "pid")},
+        **{name: not_before(attempt.c.claimed, bindparam(name)) for name in ("started", "ended")},
     )
 )
 _SET_ERROR = (
@@ -151,7 +160,7 @@ def _run_row(run: RunRecord) -> dict[str, Any]:
         "cpu_seconds": finite(run.cpu_seconds),
         "peak_memory_bytes": int(run.peak_memory_bytes),
         "started": utc_text(run.started),
-        "ended": utc_text(run.ended),
+        "ended": utc_text(max(run.started, run.ended)),
     }
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -13,6 +15,7 @@ from orchestrate.executors.base import Event, Executor, Task, WorkerLost
 from orchestrate.executors.task import run_task
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
 from orchestrate.store import Claim, Store, StoreUnavailableError
+from orchestrate.store.serialization import utc_text
 from tests.orchestrate.conftest import Launches
 from tests.orchestrate.losses import lose
 from tests.orchestrate.standins import BROKEN_SEED, quick, raising
@@ -100,6 +103,30 @@ def test_a_trial_whose_node_is_lost_runs_again_free_of_charge(
         f"WHERE seed = {BROKEN_SEED} GROUP BY outcome ORDER BY outcome"
     )
     assert outcomes == [("done", 1), ("released", losses)]
+
+
+@pytest.mark.parametrize("hours", [-3, 3])
+def test_times_are_those_of_the_clock_of_the_launch(
+    scripted: Launch, launches: Launches, hours: int
+) -> None:
+    """The clock of the machine that runs the trials is some hours off."""
+    off = timedelta(hours=hours)
+
+    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
+        done = [run_task(quick, task) for task in chunk]
+        times = [{"started": one.run.started + off, "ended": one.run.ended + off} for one in done]
+        return [
+            replace(one, run=replace(one.run, node="elsewhere", **both))
+            for one, both in zip(done, times, strict=True)
+        ]
+
+    assert scripted(fate)[0] == ExitCode.DONE
+    now = utc_text(datetime.now(UTC))
+    rows = launches.query("SELECT claimed, started, ended, node FROM attempt")
+    assert rows
+    for claimed, started, ended, node in rows:
+        assert claimed <= started <= ended <= now
+        assert node == "elsewhere"
 
 
 def test_a_trial_that_takes_every_node_down_runs_last_and_is_given_up(

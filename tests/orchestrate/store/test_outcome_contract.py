@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ from tests.orchestrate.store.fakes import (
     diverged,
     result,
 )
+from tests.orchestrate.store.places import execute
 
 Take = Callable[..., list[Claim]]
 
@@ -108,8 +109,8 @@ class TestCommit:
         self, store: Store, launch: int, take: Take, reader: Reader
     ) -> None:
         (claim,) = take(Spec())
-        sent = result()
-        store.commit(claim, sent, RUN)
+        sent, later = result(), datetime(2126, 1, 31, 12, 0, 0, 250, tzinfo=UTC)
+        store.commit(claim, sent, replace(RUN, started=later, ended=later))
         (row,) = reader.trials(Spec().config_key)
         assert (row.status, row.n_steps, row.diverged_at) == ("done", HORIZON, None)
         assert (row.final_loss, row.best_loss) == (sent.final_loss, sent.best_loss)
@@ -117,7 +118,32 @@ class TestCommit:
         assert (row.peak_memory_bytes, row.node, row.launch) == (2**33, "here", launch)
         assert reader.query("SELECT owner FROM trial")[0].owner is None
         (attempt,) = reader.query("SELECT outcome, pid, started, launch_id FROM attempt")
-        assert tuple(attempt) == ("done", 18, "2026-01-31T12:00:00.000250Z", launch)
+        assert tuple(attempt) == ("done", 18, "2126-01-31T12:00:00.000250Z", launch)
+
+    @pytest.mark.parametrize("fate", ["done", "failed", "released", "lost", "saved"])
+    def test_no_end_stands_before_a_beginning(
+        self, store: Store, launch: int, take: Take, reader: Reader, url: str, fate: str
+    ) -> None:
+        """The clocks of two machines differ, or one was set back, by hours."""
+        (claim,) = take(Spec())
+        ahead = "2126-01-31T12:00:00.000000Z"
+        execute(url, f"UPDATE attempt SET claimed = '{ahead}'")
+        execute(url, f"UPDATE launch SET started = '{ahead}'")
+        if fate == "done":
+            assert store.commit(claim, result(), RUN)
+        elif fate == "failed":
+            backwards = replace(RUN, ended=RUN.started - timedelta(hours=1))
+            assert store.fail(claim, Failure("E", "m", "t"), backwards)
+        elif fate == "released":
+            assert store.release(launch) == 1
+        elif fate == "saved":
+            store.release(launch)
+            assert store.save(launch, Spec(), result(), RUN)
+        store.end_launch(launch, "lost" if fate == "lost" else "done")
+        for row in reader.query("SELECT claimed, started, ended FROM attempt"):
+            assert row.claimed <= (row.started or row.claimed) <= row.ended
+        (row,) = reader.query("SELECT started, ended FROM launch")
+        assert row.started <= row.ended
 
     @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
     @pytest.mark.parametrize("at", [0, 3])
