@@ -113,14 +113,15 @@ class SQLiteBackend(Backend):
         try:
             self._saved = rescue(self._watcher, self._path, self._saved)
             saved = f"what it held is saved in {self._saved}"
+            more = "put the saved file in its place and "
         except (OSError, sqlite3.Error, StoreUnavailableError) as error:
             saved = f"what it held cannot be saved beside it or in the temporary folder ({error})"
+            more = ""
         place = _place(self._opened[0])
         now = f" and is now {place}" if place not in ("", os.path.realpath(self._given)) else ""
         return (
             f"The results database {self.safe_url} {what} since it was opened{now}; {saved}: save "
-            "again or run the same command again to write to a new file there, or put the saved "
-            "one in its place first."
+            f"again to write everything there, or {more}run the same command again to continue."
         )
 
     @contextmanager
@@ -219,12 +220,12 @@ class SQLiteBackend(Backend):
     def close(self) -> None:
         with suppress(DatabaseMovedError):
             self.check()
-        if self._watcher and not self._moved:
-            self._watcher.close()
         self._locks.close()
-        self.engine.dispose()
+        if self._moved:
+            self.engine.dispose()  # first, as the watcher writes nothing when it is the last one
         if self._watcher:
-            self._watcher.close()  # as the last one: it writes nothing
+            self._watcher.close()
+        self.engine.dispose()
 
     def _empty_log(self) -> None:
         """Empty the log of a file that was renamed or replaced, which the next one would read.

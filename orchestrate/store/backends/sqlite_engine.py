@@ -14,7 +14,7 @@ from sqlalchemy.pool import QueuePool
 
 from orchestrate.store import database_url
 from orchestrate.store.backends.driver_errors import translated_file
-from orchestrate.store.backends.file_locks import patiently
+from orchestrate.store.backends.file_locks import holder, patiently
 from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
 from orchestrate.store.views import VIEWS
 
@@ -69,8 +69,15 @@ def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience
                     raise
             return driver.in_transaction
 
-        if not patiently(locked, seconds, str(path), path.with_name(f"{path.name}-shm")):
-            driver.execute("BEGIN IMMEDIATE")  # raises the error of SQLite
+        memory = path.with_name(f"{path.name}-shm")
+        if patiently(locked, seconds, str(path), memory):
+            return
+        if seconds < patience:
+            driver.execute("BEGIN IMMEDIATE")  # raises the error of SQLite, after which one waits
+        raise StoreUnavailableError(
+            f"The results database {path} cannot be used: {holder(memory)} has locked it for more "
+            f"than {patience:g} s; end it, and run the same command again."
+        )
 
     return _engine(connect, begin)
 

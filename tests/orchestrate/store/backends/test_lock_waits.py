@@ -149,8 +149,10 @@ def test_a_locked_file_is_said_and_ends_the_wait(
     with Store.open(sqlite_url, patience=PATIENCE) as store:
         with closing(sqlite3.connect(file_of(sqlite_url), isolation_level=None)) as meddler:
             meddler.execute("BEGIN IMMEDIATE")
-            with pytest.raises(StoreUnavailableError, match="another process has locked it"):
+            named = rf"process {os.getpid()} has locked it for more than 0.6 s; end it"
+            with pytest.raises(StoreUnavailableError, match=named) as caught:
                 store.begin_launch(LAUNCH)
+        assert not caught.value.transient, "it has waited long enough"
         (said,) = warnings(caplog)
         assert said.startswith("waiting for a lock of ")
         assert said.endswith(f"which process {os.getpid()} holds")
