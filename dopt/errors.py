@@ -28,6 +28,10 @@ class ExplorationError(DoptError, RuntimeError):
     """An exploration of a plant cannot go on, or was asked for out of order."""
 
 
+class UnusableEnvironmentError(DoptError, RuntimeError):
+    """Variables, folders or limits of the process let no trial run: that is no trial's failure."""
+
+
 class ScaleWarning(UserWarning):
     """The quantities that a network is to learn are of another size than its outputs."""
 

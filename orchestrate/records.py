@@ -8,6 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 
+ENVIRONMENT = "environment"
+"""Cause of a failure that is not the trial's: the launch ends, and the trial waits."""
+
 
 @dataclass(frozen=True)
 class RunRecord:
@@ -53,7 +56,7 @@ class Failure:
     type, message, traceback
         Name of the exception class, its message, and the stack where it was raised.
     cause
-        "exception", "timeout", "out of memory", "killed", "node lost" or "malformed".
+        "exception", "timeout", "out of memory", "killed", "node lost", "malformed", ENVIRONMENT.
     """
 
     type: str

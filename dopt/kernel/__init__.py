@@ -20,10 +20,16 @@ def warm_up(everything: bool = False) -> None:
     everything : bool
         Whether to compile every policy, learner and form of the information matrix, which
         otherwise happens when a trial first needs it.
-    """
-    from dopt.kernel.cache import is_complete, mark_complete
 
-    if is_complete(MARKS[everything]):
+    Raises
+    ------
+    UnusableEnvironmentError
+        If nothing can be compiled here.
+    """
+    from dopt.kernel import cache
+
+    cache.check_environment()
+    if cache.is_complete(MARKS[everything]):
         return
     from dopt.kernel.compilation import compile_missing
     from dopt.kernel.warming import kernel_parts
@@ -33,4 +39,4 @@ def warm_up(everything: bool = False) -> None:
     for part in parts.values():  # also what no other process could compile
         part()
     for mark in {False, everything}:
-        mark_complete(MARKS[mark])
+        cache.mark_complete(MARKS[mark])

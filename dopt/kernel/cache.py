@@ -1,7 +1,10 @@
-"""Folder of compiled code for each state of the sources, and messages while it is filled.
+"""Cache of compiled code: where it is, what may be done with it, and messages while it is filled.
 
-All checkouts with the same sources share it. This module does not import Numba, which takes a
-second: a launch that only wants to know whether there is anything to compile does not pay for it.
+Each state of the sources, the libraries and Numba's settings has a folder, which all checkouts
+share. A file begins with a digest of the rest: what a loss of power or a full disk has left damaged
+is dropped, and compiled again. No two signatures share a file, and a file is replaced as a whole,
+so that locks only save work. This module does not import Numba, which takes a second: a launch that
+only wants to know whether there is anything to compile does not pay for it.
 """
 
 from __future__ import annotations
@@ -12,60 +15,120 @@ import fcntl
 import hashlib
 import logging
 import os
+import pwd
 import shutil
+import sys
 import tempfile
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
 import llvmlite.binding
 
+from dopt.errors import UnusableEnvironmentError
 from dopt.given_path import given_path
 
 CACHE_VARIABLE = "DOPT_CACHE"
 _PACKAGE = Path(__file__).resolve().parent.parent
 COMPILED_SOURCES = ("algorithm.py", "kernel", "systems", "math")
 
+OTHER_SETTINGS = tuple(
+    f"NUMBA_{name}" for name in ("CACHE", "CPU", "CUDA", "NUM_THREADS", "THREAD")
+)
+"""Beginnings of Numba's variables that do not change the code, and of the processor's."""
+
+
+def check_environment(disabled: object = None) -> None:
+    """Raise UnusableEnvironmentError if Numba is disabled, by default by its variable."""
+    given = os.environ.get("NUMBA_DISABLE_JIT") if disabled is None else disabled
+    if str(given or 0).strip() != "0":
+        raise UnusableEnvironmentError(
+            f"NUMBA_DISABLE_JIT is {given}, with which Numba compiles nothing, but trials run as "
+            f"compiled code: unset it, also in .numba_config.yaml, and run the same command again."
+        )
+
+
+@contextlib.contextmanager
+def errors_of_the_system() -> Iterator[None]:
+    """Raise UnusableEnvironmentError where the system fails, and not what is compiled."""
+    try:
+        yield
+    except OSError as error:
+        raise UnusableEnvironmentError(
+            f"The kernel can be neither loaded nor compiled here ({error}): mend what the system "
+            f"says, or set {CACHE_VARIABLE} to another folder, and run the same command again."
+        ) from error
+
 
 def _source_digest() -> str:
-    """Return a digest of every source that ends up in compiled code.
+    """Return a digest of every source that ends up in compiled code, and of what compiles it.
 
     Numba checks only the file of the outermost function of what it finds in its cache, so a change
     in a file further in would go unnoticed: each state of the sources, and each kind of processor,
     gets a folder of its own.
     """
-    digest = hashlib.sha256(version("numba").encode())
-    digest.update(llvmlite.binding.get_host_cpu_name().encode())
-    # Two virtual machines may name one processor and offer different parts of it.
-    digest.update(llvmlite.binding.get_host_cpu_features().flatten().encode())
+    libraries = [version(library) for library in ("numba", "llvmlite", "numpy")]
+    names = sorted(name for name in os.environ if name.startswith("NUMBA_"))
+    settings = [(n, os.environ[n]) for n in names if not n.startswith(OTHER_SETTINGS)]
+    name, features = os.environ.get("NUMBA_CPU_NAME"), os.environ.get("NUMBA_CPU_FEATURES")
+    if features is None and str(name).lower() != "generic":
+        # Two virtual machines may name one processor and offer different parts of it.
+        features = llvmlite.binding.get_host_cpu_features().flatten()
+    if name is None:
+        name = llvmlite.binding.get_host_cpu_name()
+    facts = (sys.version_info[:2], sys.abiflags, libraries, settings, name, features or "")
+    digest = hashlib.sha256(str(facts).encode())
     for source in COMPILED_SOURCES:
         top = _PACKAGE / source
         for path in [top] if top.is_file() else sorted(top.rglob("*.py")):
             digest.update(path.read_bytes())
+    with contextlib.suppress(OSError):  # settings of Numba, too
+        digest.update(Path(".numba_config.yaml").read_bytes())
     return digest.hexdigest()[:16]
 
 
 def _cache_folder() -> Path:
-    """Return a writable folder for compiled code.
-
-    Where the cache cannot be written it is a temporary one, for this process and those it starts.
-    """
-    base = os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME")
-    root = given_path(base, CACHE_VARIABLE) if base else Path.home() / ".cache"
-    folder = root / "dopt" / f"kernel-{_source_digest()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    """Return the folder of compiled code: a temporary one where the cache cannot be written."""
+    name = f"kernel-{_source_digest()}"
+    for root in _roots():
+        folder = root / "dopt" / name
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
             return folder
-    except OSError:
-        pass
-    temporary = Path(tempfile.mkdtemp(prefix="dopt-"))
-    os.environ[CACHE_VARIABLE] = str(temporary)
-    atexit.register(_remove, temporary, os.getpid())
-    folder = temporary / folder.relative_to(root)
-    folder.mkdir(parents=True)
-    return folder
+        if os.access(folder, os.R_OK):
+            return _temporary(folder) or folder
+    nowhere = Path(os.devnull, "dopt", name)
+    return _temporary(nowhere) or nowhere
+
+
+def _roots() -> list[Path]:
+    """Return the folders in which the cache may be: the one given, or that of each home."""
+    given = os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME")
+    if given:
+        return [given_path(given, CACHE_VARIABLE).absolute()]
+    homes = [os.environ.get("HOME")]
+    with contextlib.suppress(KeyError):  # a container may run under a number without a name
+        homes.append(pwd.getpwuid(os.getuid()).pw_dir)
+    return [Path(home, ".cache") for home in homes if home]
+
+
+def _temporary(other: Path) -> Path | None:
+    """Return a folder of this process and those it starts, with links to what another one holds."""
+    for place in (None, "/dev/shm"):  # a container may have no other
+        with contextlib.suppress(OSError):
+            root = Path(tempfile.mkdtemp(prefix="dopt-", dir=place))
+            atexit.register(_remove, root, os.getpid())
+            folder = root / "dopt" / other.name
+            folder.mkdir(parents=True)
+            for path in (*other.rglob("*.nbi"), *other.rglob("*.complete")):
+                link = folder / path.relative_to(other)
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to(path)
+            os.environ[CACHE_VARIABLE] = str(root)
+            _temporaries[folder] = other
+            return folder
+    return None
 
 
 def _remove(folder: Path, maker: int) -> None:
@@ -74,7 +137,68 @@ def _remove(folder: Path, maker: int) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+_temporaries: dict[Path, Path] = {}  # with the folders in whose place they are
 CACHE_FOLDER = _cache_folder()
+_used: list[str] = []  # names of files that were read or written, in their order
+_intact: set[Path] = set()  # marks whose files were checked
+_dropped: list[str] = []  # names of damaged files
+_not_stored: list[OSError] = []  # why nothing is stored any more
+_log = logging.getLogger("dopt.kernel")
+
+
+def read(name: str) -> bytes | None:
+    """Return the content of a file of the cache; None where there is none, or it was damaged."""
+    try:
+        stored = (CACHE_FOLDER / name).read_bytes()
+    except OSError:
+        return None
+    content = stored[32:]
+    if hashlib.sha256(content).digest() != stored[:32]:
+        drop(name)
+        return None
+    _used.append(name)
+    return content
+
+
+def drop(name: str) -> None:
+    """Remove a damaged file; say so of the first."""
+    if not _dropped:
+        _log.warning("%s is damaged: what was lost is compiled again", CACHE_FOLDER / name)
+    _dropped.append(name)
+    with contextlib.suppress(OSError):
+        (CACHE_FOLDER / name).unlink()
+
+
+def write(name: str, content: bytes) -> None:
+    """Store a file as a whole, or not at all, in a temporary folder where the cache takes none."""
+    global CACHE_FOLDER
+    while not _not_stored:
+        try:
+            _replace(CACHE_FOLDER / name, hashlib.sha256(content).digest() + content)
+        except OSError as error:
+            other = None if CACHE_FOLDER in _temporaries else _temporary(CACHE_FOLDER)
+            if other is None:
+                _not_stored.append(error)
+                _log.warning("compiled code is not kept for other processes: %s", error)
+            CACHE_FOLDER = other or CACHE_FOLDER
+        else:
+            _used.append(name)
+            return
+
+
+def _replace(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{os.urandom(8).hex()}.partial")
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def can_be_filled() -> bool:
+    """Return whether what a process compiles is there for others."""
+    return not _not_stored and os.access(CACHE_FOLDER, os.W_OK)
 
 
 @contextlib.contextmanager
@@ -82,53 +206,56 @@ def one_compiler_at_a_time(what: str) -> Iterator[None]:
     """Let one process at a time put ``what`` into the cache; once it is there, all read freely.
 
     ``what`` is the name of a function, and what tells its signature from its others after a hyphen.
-    Numba numbers the files of a function without a lock: of two processes that compile it at once,
-    one can overwrite the other's signature, and later processes then run the wrong one.
+    The message goes to the logger ``dopt.kernel``. Its level is that of a warning, which Python
+    shows on standard error where a program has set up no logging: somebody waits for it.
     """
-    if is_complete(what):
+    name, _, _ = what.partition("-")
+    with errors_of_the_system(), contextlib.ExitStack() as held:
+        if not is_complete(what):
+            with contextlib.suppress(OSError):  # not every file system has locks
+                lock = held.enter_context((CACHE_FOLDER / f"{name}.lock").open("w"))
+                fcntl.flock(lock, fcntl.LOCK_EX)
+        before, there = len(_used), is_complete(what)
+        if not there:
+            _log.warning("compiling the kernel, %s: %s", for_whom(), name)
         yield
-        return
-    with (CACHE_FOLDER / f"{what.partition('-')[0]}.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with said(what) if not is_complete(what) else contextlib.nullcontext():
-            yield
-        mark_complete(what)
+        if not there:
+            mark_complete(what, _used[before:])
 
 
-@contextlib.contextmanager
-def said(what: str) -> Iterator[None]:
-    """Say at once that a part of the kernel is compiled, and how long all parts have taken.
-
-    The logger is ``dopt.kernel``. Its level is that of a warning, which Python shows on standard
-    error where a program has set up no logging: somebody waits for it.
-    """
-    start = time.perf_counter()
-    _said["parts"] += 1
-    _log.warning(
-        "compiling the kernel, once per machine: part %d, %s, %.0f s so far",
-        _said["parts"],
-        what.partition("-")[0],
-        _said["seconds"],
-    )
-    yield
-    _said["seconds"] += time.perf_counter() - start
-
-
-_log = logging.getLogger("dopt.kernel")
-_said = {"parts": 0, "seconds": 0.0}
+def for_whom() -> str:
+    """Return for whom code is compiled now."""
+    if CACHE_FOLDER not in _temporaries:
+        return "once per machine"
+    return f"for this command alone, as {_temporaries[CACHE_FOLDER]} cannot be written"
 
 
 def is_complete(what: str) -> bool:
-    """Tell whether ``what`` is in the cache."""
-    return (CACHE_FOLDER / f"{what}.complete").exists()
+    """Return whether ``what`` is in the cache, undamaged."""
+    name = f"{what}.complete"
+    if CACHE_FOLDER / name in _intact:
+        return True
+    files = read(name)
+    if files is None:
+        return False
+    if None in [*map(read, files.decode().splitlines())]:  # all are looked at
+        drop(name)
+        return False
+    _intact.add(CACHE_FOLDER / name)
+    return True
 
 
-def mark_complete(what: str) -> None:
-    """Remember that ``what`` is in the cache."""
-    (CACHE_FOLDER / f"{what}.complete").touch()
+def mark_complete(what: str, files: Sequence[str] | None = None) -> None:
+    """Remember that ``what`` is in the cache, in these files: all that this process has used."""
+    used = dict.fromkeys(_used if files is None else files)
+    there = [name for name in used if (CACHE_FOLDER / name).exists()]
+    write(f"{what}.complete", "\n".join(there).encode())
 
 
-def complete_names() -> set[str]:
-    """Return the names of the functions that are in the cache, for some signature."""
-    there = {path.stem for path in CACHE_FOLDER.glob("*.complete")}
-    return there | {stem.rpartition("-")[0] for stem in there}
+def missing(names: Sequence[str]) -> list[str]:
+    """Return the names of the functions of which the cache holds nothing, or something damaged."""
+    marks: dict[str, list[str]] = {name: [] for name in names}
+    for stem in [path.stem for path in CACHE_FOLDER.glob("*.complete")]:
+        for name in marks.keys() & {stem, stem.rpartition("-")[0]}:
+            marks[name].append(stem)
+    return [name for name in names if not marks[name] or not all(map(is_complete, marks[name]))]

@@ -13,8 +13,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
+from dopt.kernel.cache import check_environment
 from dopt.kernel.stored_code import stored
 from dopt.types import NumbaType, Vector
+
+check_environment(numba.config.DISABLE_JIT)
 
 F = TypeVar("F", bound=Callable[..., object])
 

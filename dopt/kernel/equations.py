@@ -8,7 +8,6 @@ once for all systems.
 from __future__ import annotations
 
 import cmath
-import contextlib
 import functools
 import itertools
 import math
@@ -24,7 +23,7 @@ from numba.extending import overload
 from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from dopt.errors import SpecificationError
-from dopt.kernel.cache import one_compiler_at_a_time
+from dopt.kernel.cache import errors_of_the_system, one_compiler_at_a_time
 from dopt.kernel.compiler import compilable
 from dopt.kernel.stored_code import stored
 from dopt.systems import elementary
@@ -143,7 +142,7 @@ def _compiled_functions(
 ) -> Equations:
     name, n_read = _name(known, n_states), n_states + n_inputs_read
     known, accelerations = compilable(known), compilable(accelerations)
-    with one_compiler_at_a_time(name) if _shipped(known) else contextlib.nullcontext():
+    with one_compiler_at_a_time(name) if _shipped(known) else errors_of_the_system():
         return Equations(
             _known_into(known, n_states, n_inputs, n_parameters),
             _accelerations_into(accelerations, n_read, n_parameters, ACCELERATIONS),
@@ -215,6 +214,8 @@ def _compiled_for(
         stored(compiled)
     try:
         compiled.compile(signature.args)
+    except (OSError, MemoryError):
+        raise  # the system's, not an equation's
     except Exception as error:  # also what the compiler raises on Python that it does not know
         raise _refused(function, sizes, signature.args[0].dtype) from error
     compiled.disable_compile()

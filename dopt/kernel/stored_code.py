@@ -14,53 +14,34 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from numba import types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.caching import FunctionCache
+from numba.core.compiler import CompileResult
 from numba.core.runtime import rtsys
+from numba.core.serialize import dumps
 from numba.core.targetconfig import ConfigStack
 
-from dopt.kernel.cache import CACHE_FOLDER
+from dopt.kernel import cache
 from dopt.types import NumbaType
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-class Place(_CacheLocator):  # type: ignore[misc]  # numba has no types
-    """Folder of a function's machine code, named by its file's path within the package."""
+class StoredCode(FunctionCache):  # type: ignore[misc]  # numba has no types
+    """Machine code of a function, in one file of a folder of the cache for each signature."""
 
-    def __init__(self, function: Callable[..., Any], file: str) -> None:
-        self._py_file = file  # a warning of numba's names it
-        self._line = function.__code__.co_firstlineno
+    def __init__(self, function: Callable[..., Any], folder: str) -> None:
+        self._name, self._py_func, self._folder = repr(function), function, folder
+        self.enable()
 
-    def get_cache_path(self) -> str:
-        path = Path(self._py_file).resolve().relative_to(_PACKAGE)
-        return str(CACHE_FOLDER / path.with_suffix(""))
-
-    def get_source_stamp(self) -> str:
-        return hashlib.sha256(Path(self._py_file).read_bytes()).hexdigest()
-
-    def get_disambiguator(self) -> str:
-        return str(self._line)
-
-    @classmethod
-    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> Self:
-        place = cls(py_func, py_file)
-        place.ensure_cache_path()
-        return place
-
-
-class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = (Place,)
-
-
-class StoredCode(FunctionCache):  # type: ignore[misc]
-    """Machine code of one function of the package for each of its signatures."""
-
-    _impl_class = _Implementation
+    @property
+    def cache_path(self) -> str:
+        return str(cache.CACHE_FOLDER / self._folder)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load what is stored without first loading all that Numba can compile.
@@ -69,12 +50,27 @@ class StoredCode(FunctionCache):  # type: ignore[misc]
         there is something to compile. Machine code needs the runtime library alone.
         """
         rtsys.initialize(target_context)
-        return self._load_overload(sig, target_context)
+        name = self._file(sig, target_context.codegen())
+        code = cache.read(name)
+        try:
+            return code and CompileResult._rebuild(target_context, *pickle.loads(code))
+        except MemoryError:
+            raise
+        except Exception:  # written whole, by a program that had other classes
+            return cache.drop(name)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Store a function that Python calls; one compiled on the way is part of its caller."""
-        if not len(ConfigStack()) and not any(map(_holds_compiled, data.signature.args)):
-            super().save_overload(sig, data)
+        inner = len(ConfigStack()) or any(map(_holds_compiled, data.signature.args))
+        if not (inner or data.lifted or data.library.has_dynamic_globals):
+            cache.write(self._file(sig, data.codegen), dumps(data._reduce()))
+
+    def _file(self, sig: Any, codegen: Any) -> str:
+        code = self._py_func.__code__
+        name = self._py_func.__qualname__.replace("<", "").replace(">", "")
+        key = hashlib.sha256(str(self._index_key(sig, codegen)).encode()).hexdigest()[:16]
+        stem = Path(code.co_filename).stem
+        return f"{self._folder}/{stem}.{name}-{code.co_firstlineno}.{key}.nbi"
 
 
 def _holds_compiled(kind: NumbaType) -> bool:
@@ -86,6 +82,8 @@ def _holds_compiled(kind: NumbaType) -> bool:
 
 def stored(dispatcher: Any) -> Any:
     """Let a compiled function keep its machine code on disk, if the package's sources hold it."""
-    if Path(inspect.getfile(dispatcher.py_func)).resolve().is_relative_to(_PACKAGE):
-        dispatcher._cache = StoredCode(dispatcher.py_func)
+    path = Path(inspect.getfile(dispatcher.py_func)).resolve()
+    if path.is_relative_to(_PACKAGE):
+        folder = path.relative_to(_PACKAGE).with_suffix("")
+        dispatcher._cache = StoredCode(dispatcher.py_func, str(folder))
     return dispatcher

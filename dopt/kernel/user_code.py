@@ -13,11 +13,10 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core.caching import CompileResultCacheImpl
 
-from dopt.kernel.cache import CACHE_FOLDER, COMPILED_SOURCES, one_compiler_at_a_time
+from dopt.kernel.cache import COMPILED_SOURCES, errors_of_the_system, one_compiler_at_a_time
 from dopt.kernel.compiler import compilable
-from dopt.kernel.stored_code import Place, StoredCode
+from dopt.kernel.stored_code import StoredCode
 from dopt.types import CompiledFunction, NumbaType
 
 LIBRARIES = ("numpy", "math", "cmath", "builtins")
@@ -31,7 +30,8 @@ def compiled_own(function: Callable[..., None], signature: NumbaType) -> Compile
     compiled = _dispatcher(function)
     digest = content_digest(function)
     if digest is None:
-        compiled.compile(signature)
+        with errors_of_the_system():
+            compiled.compile(signature)
         return compiled
     kind = hashlib.sha256(f"{digest}{signature}".encode()).hexdigest()[:16]
     with one_compiler_at_a_time(f"{function.__module__}.{function.__qualname__}-{kind}"):
@@ -42,8 +42,9 @@ def compiled_own(function: Callable[..., None], signature: NumbaType) -> Compile
 @functools.cache
 def _dispatcher(function: Callable[..., None]) -> CompiledFunction:
     compiled = numba.njit(error_model="numpy", fastmath=False)(compilable(function))
-    if content_digest(function) is not None:
-        compiled._cache = _OwnCode(function)
+    digest = content_digest(function)
+    if digest is not None:
+        compiled._cache = StoredCode(function, f"own/{digest}")
     return compiled
 
 
@@ -100,22 +101,3 @@ def _content(value: Any, own: str) -> str | None:
     if module == own or module.startswith(_SOURCES) or module.partition(".")[0] in LIBRARIES:
         return module
     return None
-
-
-class _OwnPlace(Place):
-    """Folder of the machine code of a user's function, named by its content."""
-
-    def __init__(self, function: Callable[..., Any], file: str) -> None:
-        super().__init__(function, file)
-        self._digest = content_digest(function)
-
-    def get_cache_path(self) -> str:
-        return str(CACHE_FOLDER / "own" / str(self._digest))
-
-
-class _OwnImplementation(CompileResultCacheImpl):  # type: ignore[misc]  # numba has no types
-    _locator_classes = (_OwnPlace,)
-
-
-class _OwnCode(StoredCode):
-    _impl_class = _OwnImplementation

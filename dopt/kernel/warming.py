@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from dopt.garbage_collection import collect_rarely
-from dopt.kernel import absent_steps
+from dopt.kernel import absent_steps, cache
 from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
 from dopt.kernel.loop import advance, evaluate_next
@@ -86,11 +86,15 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
 def compile_parts(end: str, names: Container[str]) -> None:
     """Compile the parts of the kernel with these names, beginning at one end of their list.
 
-    Two processes meet: what the other has compiled is only loaded.
+    Two processes meet: what the other has compiled is only loaded. Where the cache takes no more
+    they end, since nobody would find what they compile.
     """
+    folder = cache.CACHE_FOLDER
     parts = [part for name, part in kernel_parts(everything=True).items() if name in names]
     for part in parts if end == "first" else reversed(parts):
         part()
+        if folder != cache.CACHE_FOLDER or not cache.can_be_filled():
+            return
 
 
 if __name__ == "__main__":

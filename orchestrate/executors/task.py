@@ -9,11 +9,12 @@ import time
 import traceback
 from datetime import UTC, datetime
 
+from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from orchestrate.executors.base import Run, Task, TaskDone
 from orchestrate.executors.limits import NO_LIMITS, Limits, TrialTimeoutError, interrupted_after
 from orchestrate.executors.live import Live, sampled
-from orchestrate.records import Failure, RunRecord
+from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 
 BYTES_PER_KIB = 1024
 
@@ -58,6 +59,8 @@ def _cause(error: BaseException) -> str:
     # torch.OutOfMemoryError, raised for a GPU, is not a MemoryError.
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return "out of memory"
+    if isinstance(error, UnusableEnvironmentError):
+        return ENVIRONMENT
     return "malformed" if isinstance(error, _NoResultError) else "exception"
 
 

@@ -8,6 +8,7 @@ import sys
 import traceback
 from pathlib import Path
 
+from dopt.errors import DoptError
 from dopt.kernel import warm_up
 from dopt.run import run_trial
 from orchestrate.cli_parser import discard_output
@@ -26,7 +27,7 @@ from orchestrate.runner.provenance import launch_record
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.runner.run_single import launch_trial
 from orchestrate.runner.seed_plan import SeedPlan
-from orchestrate.store import URL_VARIABLE, StoreError, StoreUnavailableError
+from orchestrate.store import URL_VARIABLE, StoreUnavailableError
 
 ROOT = Path(__file__).resolve().parents[2]
 WORK = Work(run_trial, warm_up)
@@ -58,7 +59,7 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
     grid = build_grid(request.combinations, single=request.single)
     settings = LaunchSettings.from_mapping(request.launch)
     check_launch(request.launch, CONFIGURATION)
-    from dopt.kernel import cache  # noqa: F401  refuses a path of the cache that cannot be meant
+    from dopt.kernel import cache  # refuses a path of the cache that cannot be meant
 
     path = executor_factory(settings).path
     if path != "kernel":
@@ -66,6 +67,8 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
     if settings.share:
         grid = grid.only(settings.share.holds)
     if not settings.detach:  # workers may run on other machines
+        if any(trial.config.path == "kernel" for trial in grid.trials):
+            cache.check_environment()
         check_memory(grid, settings)
         grid.check_libraries()
     _check_kind(settings, single=request.single)
@@ -125,7 +128,7 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
         return code
     except (StoreUnavailableError, InfrastructureError) as error:
         return _refuse(str(error), ExitCode.INFRASTRUCTURE)
-    except (StoreError, LaunchError) as error:
+    except DoptError as error:
         return _refuse(str(error), ExitCode.BAD_REQUEST)
     except Exception:
         sys.stderr.write(without_password(traceback.format_exc()))

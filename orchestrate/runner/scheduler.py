@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Protocol
 
+from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
-from orchestrate.records import Failure, RunRecord, Sample
+from orchestrate.records import ENVIRONMENT, Failure, RunRecord, Sample
 from orchestrate.runner.batching import Chunks
 from orchestrate.runner.live_samples import LiveSamples
 from orchestrate.runner.progress import Tally
@@ -82,7 +83,10 @@ class Scheduler:
         self.executor.listener = self._sample
 
     def step(self) -> bool:
-        """Submit waiting trials and commit finished ones; return False when none is left."""
+        """Submit waiting trials and commit finished ones; return False when none is left.
+
+        Raises UnusableEnvironmentError if a trial found that none can run; then it has no outcome.
+        """
         self._fill()
         if not self.executor.pending:
             return False
@@ -135,7 +139,11 @@ class Scheduler:
 
     def _commit(self, events: Sequence[TaskDone]) -> None:
         results: list[tuple[Claim, TrialResult, RunRecord]] = []
+        unusable = ""
         for event in events:
+            if isinstance(event.outcome, Failure) and event.outcome.cause == ENVIRONMENT:
+                unusable = event.outcome.message
+                continue
             if self._wants_more_memory(event):
                 self._out_of_memory.add(event.key)
                 self.chunks.add(self._release([event.key], OUT_OF_MEMORY), alone=True)
@@ -149,6 +157,8 @@ class Scheduler:
                 results.append((claim, event.outcome, run))
         if results:
             self._write(results)
+        if unusable:
+            raise UnusableEnvironmentError(unusable)
 
     def _wants_more_memory(self, event: TaskDone) -> bool:
         """Return whether a trial ran out of memory, and has not had more of it yet."""

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
@@ -57,6 +58,13 @@ def slow(spec: TrialSpec) -> TrialResult:
 def raising(spec: TrialSpec) -> TrialResult:
     if spec.seed == BROKEN_SEED:
         raise ZeroDivisionError("the seed is broken")
+    return quick(spec)
+
+
+def unusable(spec: TrialSpec) -> TrialResult:
+    """Find, as the kernel does, that the machine runs no trial."""
+    if spec.seed == BROKEN_SEED:
+        raise UnusableEnvironmentError("the machine has no compiler: install one")
     return quick(spec)
 
 

@@ -19,7 +19,7 @@ from orchestrate.runner import run_grid
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import Reader
 from tests.orchestrate.conftest import ROOT
-from tests.orchestrate.standins import quick, raising
+from tests.orchestrate.standins import quick, raising, unusable
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -196,6 +196,28 @@ def test_a_slow_preparation_is_announced_also_for_a_single_trial(
     monkeypatch.setattr("orchestrate.runner.launch.WORK", Work(quick, prepare))
     code, _, errors = command_line(*SHORT)
     assert (code, errors.startswith("compiling the kernel")) == (0, True)
+
+
+@pytest.mark.parametrize("words", [("seed=2",), ("-m", "seed=1,2")])
+def test_where_numba_is_disabled_nothing_is_registered(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    code, output, errors = command_line(*words, *SHORT)
+    assert (code, output) == (2, "")
+    assert errors.startswith("error: NUMBA_DISABLE_JIT is 1")
+    assert (len(errors.splitlines()), "unset it" in errors) == (1, True)
+    assert not (tmp_path / "results").exists()
+    assert command_line(*words, *SHORT, "launch.dry_run=true")[0] == 2
+
+
+def test_a_trial_that_finds_the_machine_unusable_ends_the_launch_with_its_sentence(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("orchestrate.runner.launch.WORK", Work(unusable, prepare=lambda: None))
+    code, _, errors = command_line("seed=2", *SHORT)
+    assert (code, errors) == (2, "error: the machine has no compiler: install one\n")
+    assert command_line("-m", "seed=2,3", *SHORT)[0] == 2
 
 
 def test_flags_may_stand_anywhere(command_line: Command) -> None:

@@ -17,7 +17,7 @@ from orchestrate.runner import worker
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import Claim, LaunchRecord, Store
 from tests.orchestrate.runner.test_scheduler import Scripted, finish, keys
-from tests.orchestrate.standins import raising
+from tests.orchestrate.standins import quick, raising, unusable
 from tests.orchestrate.standins import trial_of as short_trial
 from tests.orchestrate.store.places import execute
 
@@ -58,6 +58,17 @@ def test_a_launch_leaves_its_grid_to_workers(command_line: Run, pull: Run) -> No
     assert "2 failed: ZeroDivisionError" in out
     assert pull("work")[0] == 0
     assert "registered a grid for workers" not in pull("status")[1]
+
+
+def test_a_worker_that_can_run_no_trial_hands_back_what_it_holds(
+    command_line: Run, pull: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command_line(*GRID, LEAVE)
+    monkeypatch.setattr(worker, "WORK", Work(unusable, prepare=lambda: None))
+    code, _, errors = pull("work", "--processes", "1")
+    assert (code, errors.splitlines()[-1]) == (2, "error: the machine has no compiler: install one")
+    monkeypatch.setattr(worker, "WORK", Work(quick, prepare=lambda: None))
+    assert pull("work")[0] == 0
 
 
 def test_results_that_come_too_late_are_counted(

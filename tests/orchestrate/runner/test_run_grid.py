@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dopt.errors import SpecificationError
+from dopt.errors import SpecificationError, UnusableEnvironmentError
 from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
@@ -23,6 +23,7 @@ from tests.orchestrate.standins import (
     quick,
     raising,
     specification,
+    unusable,
 )
 
 
@@ -70,6 +71,20 @@ def test_a_trial_that_leaves_ends_neither_the_launch_nor_its_worker(
     assert launches(exiting, executor=executor) == ExitCode.SOME_FAILED
     assert launches.statuses() == {0: "done", 1: "done", 2: "failed", 3: "done", 4: "done"}
     assert launches.query("SELECT cause, type FROM v_failures") == [("exception", "SystemExit")]
+
+
+@pytest.mark.parametrize("executor", ["inprocess", "local"])
+def test_what_no_trial_can_run_on_ends_the_launch_and_fails_no_trial(
+    launches: Launches, executor: str
+) -> None:
+    with pytest.raises(UnusableEnvironmentError, match="no compiler: install one"):
+        launches(unusable, executor=executor, workers=1)
+    statuses = launches.statuses()  # a worker may have been a step ahead
+    assert (statuses[1], statuses[BROKEN_SEED]) == ("done", "pending")
+    assert set(statuses.values()) == {"done", "pending"}
+    assert launches.query("SELECT state, exit_code FROM launch") == [("failed", 2)]
+    assert not launches.query("SELECT * FROM v_failures")
+    assert launches(quick, executor=executor) == ExitCode.DONE
 
 
 def test_a_failure_is_tried_again_only_when_asked(launches: Launches) -> None:
