@@ -11,7 +11,6 @@ from benchmarks.rows import Anchor
 
 _AUTHORS = "authors' released code"
 _LOCKSTEP = "torch.func, 100 trials in lockstep"
-_SCAN = "JAX lax.scan, whole trial compiled"
 
 STEP = Anchor(12_600, _AUTHORS)
 """Plan, step, learn from a window of 100, update M⁻¹ [µs]."""
@@ -24,6 +23,3 @@ EVALUATION = Anchor(870, _AUTHORS)
 
 LOCKSTEP = Anchor(342, _LOCKSTEP)
 """The step of :data:`STEP`, for each trial of the batch [µs]."""
-
-SCAN, SCAN_ONE_SAMPLE = Anchor(160, _SCAN), Anchor(136, _SCAN)
-"""The step of :data:`STEP`, and the same learning from one sample [µs]."""

@@ -63,7 +63,7 @@ def main(arguments: Sequence[str]) -> int:
             rows = [Row("failed", None, note=_first_line(error))]
         lines += [[question, row.what, *row.cells()] for row in rows]
     table = tabulate(lines, headers=HEADERS, tablefmt="github", disable_numparse=True)
-    mode = "quick, for a look only" if options.quick else "medians"
+    mode = "quick, for a look only" if options.quick else "means, quickest of several runs"
     seconds = f"{time.perf_counter() - start:.0f} s in all"
     _say("\n".join([*about, f"{mode}, {seconds}", "", table, "", LEGEND]))
     _keep(options.history, run)
@@ -84,7 +84,7 @@ def _ask_for(run: Run, question: str, quick: bool) -> list[Row]:
     """Return the rows of one question, and add them to a run."""
     before = calibration.seconds()
     rows = ask(question, quick)
-    run.add(question, rows, (before + calibration.seconds()) / 2)
+    run.add(question, rows, min(before, calibration.seconds()))
     return rows
 
 
@@ -118,7 +118,8 @@ def parser() -> argparse.ArgumentParser:
         "--against",
         type=Path,
         metavar="FILE",
-        help=f"history of earlier runs: fail if a row takes {history.SLOWER:g} times its median",
+        help=f"history of earlier runs: fail if a row takes {history.SLOWER:g} times its median on "
+        f"the same processor, {history.SLOWER_ELSEWHERE:g} times on others",
     )
     return parser
 

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from benchmarks.rows import Row
-from benchmarks.trials import cartpole, median_of, run_in_turn, settled
+from benchmarks.trials import cartpole, cost, run_in_turn
 from dopt.kernel.information.primal import quadratic_forms
 from dopt.kernel.learners.adam import adam_step
 from dopt.kernel.learners.samples import store_sample
@@ -75,7 +75,7 @@ def measure(quick: bool) -> list[Row]:
     """Return planning and learning times of shipped and own classes, and their ratios."""
     rounds = 2 if quick else 15
     shipped = cartpole()
-    results = run_in_turn(
+    results, _ = run_in_turn(
         {
             "shipped": shipped,
             "policy": _with(shipped, "policy", OwnDOptimal),
@@ -84,11 +84,11 @@ def measure(quick: bool) -> list[Row]:
         rounds,
     )
     plan = {
-        name: median_of(results[name], lambda result: settled(result.plan_us))
+        name: cost(results[name], lambda result: result.plan_us).mean
         for name in ("shipped", "policy")
     }
     learn = {
-        name: median_of(results[name], lambda result: settled(result.learn_us))
+        name: cost(results[name], lambda result: result.learn_us).mean
         for name in ("shipped", "learner")
     }
     ratio = "a user's own takes {:.2f} times the shipped one's time"

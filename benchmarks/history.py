@@ -12,38 +12,15 @@ from statistics import median
 
 from benchmarks.machine import describe, processor
 from benchmarks.processes import ROOT
-from benchmarks.rows import Row
+from benchmarks.rows import TIMES, Row, Timing
 
 FEWEST = 3
 """Runs of a row before its median says anything."""
 
-SLOWER = 1.5
-"""Times the median at which a row counts as slower."""
-
-TIMES = frozenset({"µs", "ms", "s", "min"})
-
-
-@dataclass(frozen=True)
-class Timing:
-    """One row of a run.
-
-    Attributes
-    ----------
-    value, unit
-        Measured quantity: a time, or a rate in a unit that ends in ``/s``.
-    calibration
-        Seconds that the fixed work took around it (:mod:`benchmarks.calibration`).
-    """
-
-    value: float
-    unit: str
-    calibration: float
-
-    @property
-    def cost(self) -> float:
-        """Time in times of the fixed work, up to a factor that depends on the unit alone."""
-        time = self.value if self.unit in TIMES else 1.0 / self.value
-        return time / self.calibration
+SLOWER, SLOWER_ELSEWHERE = 1.2, 2.0
+"""Times the median at which a row counts as slower: on the same processor, where the medians of
+runs on an idle and on a busy machine differ by a few per cent; beside other processors, where rows
+took up to 1.7 times as long beside the calibration."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +46,7 @@ class Run:
         """Take in those rows of a question that are times or rates."""
         for row in rows:
             if row.value and (row.unit in TIMES or row.unit.endswith("/s")):
-                timing = Timing(row.value, row.unit, calibration)
+                timing = row.timing or Timing(row.value, row.unit, calibration)
                 self.rows[f"{question}: {row.what}"] = timing
 
 
@@ -118,8 +95,7 @@ def costs(runs: Sequence[Run]) -> Mapping[str, list[float]]:
 def slower(runs: Sequence[Run], run: Run) -> list[Slower]:
     """Return the rows of a run that take so many times the median of earlier ones, or longer.
 
-    A row is compared with runs on the same kind of processor, or with all where these are too few:
-    vector units differ, and made a row take 1.7 times as long beside the calibration.
+    A row is compared with runs on the same kind of processor, or with all where these are too few.
     """
     here = costs([past for past in runs if past.processor == run.processor])
     anywhere, found = costs(runs), []
@@ -129,7 +105,7 @@ def slower(runs: Sequence[Run], run: Run) -> list[Slower]:
         if len(past) < FEWEST:
             continue
         row = Slower(name, timing.cost / median(past), len(past), elsewhere)
-        if row.times >= SLOWER:
+        if row.times >= (SLOWER_ELSEWHERE if elsewhere else SLOWER):
             found.append(row)
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 import tempfile
@@ -22,8 +23,8 @@ class Finished:
     ----------
     started
         Seconds since 1970 at which it was started.
-    seconds
-        Until its end.
+    seconds, cpu_seconds
+        Until its end; of the processor, its children included.
     peak_mebibytes
         Largest resident memory of the process itself, without its children (Linux; else NaN).
     output
@@ -32,6 +33,7 @@ class Finished:
 
     started: float
     seconds: float
+    cpu_seconds: float
     peak_mebibytes: float
     output: str
 
@@ -45,7 +47,7 @@ def run(*arguments: str) -> Finished:
         If the process fails; the message holds the end of its output.
     """
     with tempfile.TemporaryFile("w+") as output:
-        started, clock = time.time(), time.perf_counter()
+        started, clock, cpu = time.time(), time.perf_counter(), _children_cpu_seconds()
         process = subprocess.Popen(
             [sys.executable, *arguments], stdout=output, stderr=subprocess.STDOUT, cwd=ROOT
         )
@@ -61,7 +63,12 @@ def run(*arguments: str) -> Finished:
             f"'{' '.join(arguments)}' ended with {process.returncode}, but 0 is expected; its last "
             f"line is: {text.strip().splitlines()[-1:]}"
         )
-    return Finished(started, seconds, peak, text)
+    return Finished(started, seconds, _children_cpu_seconds() - cpu, peak, text)
+
+
+def _children_cpu_seconds() -> float:
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _peak_mebibytes(pid: int, before: float) -> float:

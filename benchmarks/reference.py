@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from benchmarks import anchors
 from benchmarks.rows import Row
 from benchmarks.trials import cartpole
@@ -50,4 +48,4 @@ def _settled(result: TrialResult) -> list[float]:
     """Return microseconds for one trial of the batch: to plan and inform, to learn, to evaluate."""
     last = slice(max(SKIPPED, len(result.loss) - 20), None)
     parts = result.plan_us, result.learn_us, result.evaluate_us
-    return [float(np.median(part[last])) for part in parts]
+    return [float(part[last].mean()) for part in parts]

@@ -41,9 +41,39 @@ class Anchor:
     source: str
 
 
+TIMES = frozenset({"µs", "ms", "s", "min"})
+
+
+@dataclass(frozen=True)
+class Timing:
+    """A time that the history keeps.
+
+    Attributes
+    ----------
+    value, unit
+        Quickest section, or CPU seconds, of what was measured; or a rate, whose unit ends in
+        ``/s``.
+    calibration
+        Seconds of the quickest section of the fixed work beside it (:mod:`benchmarks.calibration`).
+    """
+
+    value: float
+    unit: str
+    calibration: float
+
+    @property
+    def cost(self) -> float:
+        """Time in times of the fixed work, up to a factor that depends on the unit alone."""
+        time = self.value if self.unit in TIMES else 1.0 / self.value
+        return time / self.calibration
+
+
 @dataclass(frozen=True)
 class Row:
-    """One line of the table; a value of None is a measurement that was left out, see ``note``."""
+    """One line of the table; a value of None is a measurement that was left out, see ``note``.
+
+    ``timing`` is what the history keeps, where that is more robust than the value.
+    """
 
     what: str
     value: float | None
@@ -51,6 +81,7 @@ class Row:
     target: Target | None = None
     anchor: Anchor | None = None
     note: str = ""
+    timing: Timing | None = None
 
     def cells(self) -> list[str]:
         """Return measured value, target, ratio to it, anchor, ratio to it and note as texts."""

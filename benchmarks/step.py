@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from benchmarks import anchors
-from benchmarks.rows import Row, Target
-from benchmarks.trials import TINY_GRID, cartpole, median_of, run_in_turn, settled, step_us
+from benchmarks.rows import Anchor, Row, Target, Timing, number
+from benchmarks.trials import TINY_GRID, cartpole, cost, run_in_turn, step_us
+from dopt.run import run_trial
 
 
 def measure(quick: bool) -> list[Row]:
@@ -19,14 +20,21 @@ def measure(quick: bool) -> list[Row]:
         "random": cartpole("random", "adam"),
         "alone": cartpole(grid=TINY_GRID),
     }
-    results = run_in_turn(specs, rounds=2 if quick else 15)
-    cost = {name: median_of(trials, step_us) for name, trials in results.items()}
-    plan = median_of(results["window"], lambda result: settled(result.plan_us))
-    learn = median_of(results["window"], lambda result: settled(result.learn_us))
-    parts = f"plan and inform {plan:.0f} µs, learn {learn:.0f} µs"
+    results, fixed = run_in_turn(specs, 4 if quick else 15, run_trial)
+    plan = cost(results["window"], lambda result: result.plan_us).mean
+    learn = cost(results["window"], lambda result: result.learn_us).mean
+
+    parts = f"; plan and inform {plan:.0f} µs, learn {learn:.0f} µs"
+    found = {name: cost(trials, step_us) for name, trials in results.items()}
+
+    def row(what: str, name: str, target: float, anchor: Anchor | None, note: str = "") -> Row:
+        mean, note = found[name].mean, f"p99 {number(found[name].p99)} µs{note}"
+        timing = Timing(found[name].quickest, "µs", fixed)
+        return Row(what, mean, "µs", Target(1, target), anchor, note, timing)
+
     return [
-        Row("D-optimal, window of 100", cost["window"], "µs", Target(1, 125), anchors.STEP, parts),
-        Row("D-optimal, one sample", cost["one"], "µs", Target(1, 80)),
-        Row("random policy, one sample", cost["random"], "µs", Target(1, 10), anchors.RANDOM_STEP),
-        Row("D-optimal, window of 100, evaluated on 520 points", cost["alone"], "µs"),
+        row("D-optimal, window of 100", "window", 125, anchors.STEP, parts),
+        row("D-optimal, one sample", "one", 80, None),
+        row("random policy, one sample", "random", 10, anchors.RANDOM_STEP),
+        row("D-optimal, window of 100, evaluated on 520 points", "alone", 125, None),
     ]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import time
 
-import numpy as np
-
-from benchmarks import anchors
-from benchmarks.rows import Anchor, Row, Target
+from benchmarks import anchors, calibration
+from benchmarks.rows import Anchor, Row, Target, Timing
 from benchmarks.trials import LARGE_GRID, cartpole
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
@@ -22,13 +20,13 @@ def measure(quick: bool) -> list[Row]:
     code: how long it takes for so few points is not known.
     """
     specs = {"default": cartpole(), "large": cartpole(grid=LARGE_GRID)}
-    rounds = 2 if quick else 6
-    seconds: dict[str, list[float]] = {name: [] for name in specs}
+    rounds = 4 if quick else 6
+    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in specs}
+    fixed = []
     for seed in range(-1, rounds):
         for name, spec in specs.items():
-            taken = _seconds(spec.with_seed(max(seed, 0)))
-            if seed >= 0:
-                seconds[name].append(taken)
+            taken[name].append(_seconds(spec.with_seed(max(seed, 0))))
+        fixed.append(calibration.seconds())
     step, evaluation = anchors.STEP.value, anchors.EVALUATION.value
     microseconds = {"default": step, "large": step + evaluation}
     rows = []
@@ -36,11 +34,14 @@ def measure(quick: bool) -> list[Row]:
         steps = specs[name].system.horizon
         anchor = Anchor(1e-6 * steps * microseconds[name], anchors.STEP.source)
         target = Target(2, anchor.value / TIMES_FASTER) if name == "default" else None
-        rows.append(Row(what, float(np.median(seconds[name])), "s", target, anchor))
+        wall, cpu = map(min, zip(*taken[name][1:], strict=True))
+        timing = Timing(cpu, "s", min(fixed))
+        rows.append(Row(what, wall, "s", target, anchor, f"{cpu:.4f} s of CPU", timing))
     return rows
 
 
-def _seconds(spec: TrialSpec) -> float:
-    start = time.perf_counter()
+def _seconds(spec: TrialSpec) -> tuple[float, float]:
+    """Return the seconds of a trial, and those of the processor."""
+    wall, cpu = time.perf_counter(), time.process_time()
     run_trial(spec)
-    return time.perf_counter() - start
+    return time.perf_counter() - wall, time.process_time() - cpu
