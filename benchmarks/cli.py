@@ -28,6 +28,7 @@ QUESTIONS = (
     "adaptive_seeds",
     "evaluation",
     "trial",
+    "step_times",
     "width",
     "long_trials",
     "store",
