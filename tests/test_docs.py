@@ -266,7 +266,6 @@ def test_every_benchmark_exists() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(600)
 def test_the_tutorial_runs_from_its_first_command_to_its_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

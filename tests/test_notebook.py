@@ -30,7 +30,7 @@ def test_the_notebook_of_a_plant_runs_in_ten_cells_without_a_database(tmp_path: 
     text = " ".join(cell.source for cell in PLANT.cells)
     assert not re.search(r"\b(hydra|ray|sql)", text, re.IGNORECASE)
     place = {"metadata": {"path": str(tmp_path)}}
-    done = NotebookClient(nbformat.from_dict(PLANT), timeout=200, resources=place).execute()
+    done = NotebookClient(nbformat.from_dict(PLANT), resources=place).execute()
     [error] = [cell.outputs[0] for cell in done.cells if "free_run_error" in cell.source]
     assert float(error["data"]["text/plain"]) < 0.05
 
@@ -53,7 +53,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_it_runs_in_docs(root: Path) -> None:
     place = {"metadata": {"path": str(root / "docs")}}
-    client = NotebookClient(nbformat.from_dict(NOTEBOOK), timeout=200, resources=place)
+    client = NotebookClient(nbformat.from_dict(NOTEBOOK), resources=place)
     client.execute()  # raises what a cell raises
 
 

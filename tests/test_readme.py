@@ -25,7 +25,6 @@ def test_it_is_short() -> None:
     assert len(README.split()) <= LONGEST
 
 
-@pytest.mark.timeout(600)  # the first trial compiles the kernel
 def test_its_example_runs() -> None:
     (example,) = blocks(README, "python")
     assert len(example.strip().splitlines()) <= 10

@@ -172,7 +172,6 @@ def test_a_class_does_not_inherit_that_it_is_compiled() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(600)
 def test_the_commands_of_the_page_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

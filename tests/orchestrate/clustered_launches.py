@@ -30,6 +30,7 @@ from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord
 from tests.orchestrate.standins import quick, specification
 from tests.paths import ROOT
+from tests.waiting import PATIENCE_SECONDS, until
 
 RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
 ADDRESSES = [f"10.77.1.{number}" for number in range(1, 17)]
@@ -38,8 +39,6 @@ LOSSES = 2
 NEW_CORES = 2
 CORES = 1 + NEW_CORES
 """More than the chunks that are handed out ahead to one node of one core."""
-
-SECONDS = 60.0
 
 
 class Notes:
@@ -80,16 +79,8 @@ def one_takes_long(notes: Notes, spec: TrialSpec) -> TrialResult:
     if spec.seed == LONG_SEED:
         notes.add("long")
         if len(notes.nodes("long")) <= LOSSES:
-            time.sleep(SECONDS)
+            time.sleep(PATIENCE_SECONDS)
     return quick(spec)
-
-
-def until(condition: Callable[[], object]) -> None:
-    end = time.monotonic() + SECONDS
-    while not condition():
-        if time.monotonic() > end:
-            raise TimeoutError("it did not happen in time")
-        time.sleep(0.02)
 
 
 class Nodes:

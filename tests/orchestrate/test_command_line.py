@@ -267,7 +267,7 @@ def test_it_runs_from_any_folder_without_being_installed(tmp_path: Path) -> None
     done = subprocess.run(
         [sys.executable, str(ROOT / "orchestrate/launch.py"), "-m", "env=glob(*)", "seed=0",
          "launch.dry_run=true"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120,
+        cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""

@@ -10,8 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -22,6 +21,7 @@ from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 from analysis.serve.app import create_app
 from analysis.serve.server import Server
 from tests.paths import ROOT
+from tests.waiting import PATIENCE_SECONDS, until
 
 PROGRAMS = ("chromium-headless-shell", "chromium")
 """Debian's packages; the first draws the same pages in half of the time."""
@@ -35,8 +35,6 @@ FLAGS = [
     "--disable-sync",
     "--no-first-run",
 ]
-PATIENCE = 45.0
-"""Seconds for something to appear on a loaded machine."""
 
 
 def find() -> str:
@@ -69,12 +67,13 @@ def served(url: str, figures: Path, port: int = 0, others: Sequence[str] = ()) -
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
-        wait_until(lambda: server.started, "the start of the server")
+        until(lambda: server.started)
         port = server.servers[0].sockets[0].getsockname()[1]
         yield f"http://127.0.0.1:{port}"
     finally:
         server.should_exit = True
-        thread.join(PATIENCE)
+        thread.join(PATIENCE_SECONDS)
+        assert not thread.is_alive(), "the server does not end"
 
 
 @contextmanager
@@ -84,14 +83,14 @@ def commanded(url: str) -> Iterator[str]:
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
-        ready, _, _ = select.select([process.stdout], [], [], PATIENCE)
+        ready, _, _ = select.select([process.stdout], [], [], PATIENCE_SECONDS)
         assert ready, "the server says nothing"
         found = re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline())
         assert found
         yield found[0]
     finally:
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=PATIENCE) == 0
+        assert process.wait(timeout=PATIENCE_SECONDS) == 0
         process.stdout.close()
 
 
@@ -105,7 +104,7 @@ def strict_page(
     """
     faults: list[str] = []
     context = browser.new_context(base_url=address, **options)  # type: ignore[arg-type]
-    context.set_default_timeout(1000 * PATIENCE)
+    context.set_default_timeout(1000 * PATIENCE_SECONDS)
     page = context.new_page()
     host = urlsplit(address).netloc
 
@@ -124,11 +123,3 @@ def strict_page(
     yield page
     context.close()
     assert not faults
-
-
-def wait_until(true: Callable[[], object], what: str) -> None:
-    """Wait until a function says so."""
-    end = time.monotonic() + PATIENCE
-    while not true():
-        assert time.monotonic() < end, f"{what} did not happen"
-        time.sleep(0.1)

@@ -1,34 +1,28 @@
-"""A real launch of stand-in trials that take a moment each: ``python -m ... URL SEEDS SECONDS``."""
+"""A real launch of stand-in trials that pass a gate: ``python -m ... URL SEEDS FOLDER``."""
 
 from __future__ import annotations
 
 import sys
-import time
+from pathlib import Path
 
-from dopt.result import TrialResult
-from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord
 from tests.analysis.browser.grids import SHORT
 from tests.analysis.synthetic import fake_result, make_grid
+from tests.orchestrate.faults.gate import Gate, Gated
 
 
-def main(url: str, seeds: int, seconds: float) -> int:
+def main(url: str, seeds: int, folder: Path) -> int:
     """Launch pendulum trials of two policies into a database."""
-
-    def run(spec: TrialSpec) -> TrialResult:
-        time.sleep(seconds)
-        return fake_result(spec)
-
     specs = make_grid(("pendulum",), ("d_optimal", "random"), range(seeds), **SHORT)
     settings = LaunchSettings(executor="inprocess", store_url=url, workers=1)
     record = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
-    work = Work(run, prepare=lambda: None)
+    work = Work(Gated(fake_result, Gate(folder)), prepare=lambda: None)
     grid = Grid(specs, n_jobs=len(specs), left_out={})
     return int(launch_grid(grid, settings, record, work, lambda _: None, stream=None))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], int(sys.argv[2]), float(sys.argv[3])))
+    sys.exit(main(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])))

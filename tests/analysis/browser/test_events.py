@@ -22,14 +22,14 @@ from analysis.serve.progress import read_progress
 from orchestrate.records import Sample
 from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
-from tests.analysis.browser.chromium import PATIENCE
 from tests.analysis.synthetic import fake_result, make_grid
+from tests.waiting import PATIENCE_SECONDS
 
 
 @contextmanager
 def heard(address: str) -> Iterator[Iterator[tuple[str, Any]]]:
     """Yield the events of a server, each with its content."""
-    with httpx.stream("GET", f"{address}/api/events", timeout=PATIENCE) as answer:
+    with httpx.stream("GET", f"{address}/api/events", timeout=PATIENCE_SECONDS) as answer:
         assert answer.status_code == 200
         assert answer.headers["content-type"].startswith("text/event-stream")
         lines = (line for line in answer.iter_lines() if line and not line.startswith(":"))
@@ -73,8 +73,6 @@ def test_an_open_stream_does_not_keep_the_server(sqlite_grid: str, figures: Path
         with chromium.served(sqlite_grid, figures) as address:
             stream = stack.enter_context(heard(address))
             assert next(stream)[0] == "progress"
-            start = time.monotonic()
-        assert time.monotonic() - start < 5
         assert list(stream) == []
 
 

@@ -32,6 +32,7 @@ from orchestrate.store import Reader
 from tests.analysis.conftest import limited
 from tests.analysis.synthetic import fill
 from tests.paths import ROOT
+from tests.waiting import PATIENCE_SECONDS
 
 QUICK = ("figure2_spectrum", "comparison")
 
@@ -212,7 +213,7 @@ def test_an_interruption_ends_all_processes(url: str, tmp_path: Path) -> None:
         assert process.stdout is not None
         process.stdout.readline()  # the first output has been written, and others are being
         os.killpg(process.pid, signal.SIGINT)
-        said, errors = process.communicate(timeout=60)
+        said, errors = process.communicate(timeout=PATIENCE_SECONDS)
     assert process.returncode == 130, errors
     assert "Traceback" not in said + errors
     with pytest.raises(ProcessLookupError):

@@ -19,6 +19,7 @@ from dopt.trial_view import TrialView
 from dopt.types import Array
 from tests.dopt.explorer.plants import MOTOR, following
 from tests.dopt.explorer.test_explorer import SHORT, explored
+from tests.waiting import PATIENCE_SECONDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +62,7 @@ def test_episodes_are_planned_before_the_first_question() -> None:
     assert abs(explorer.ask(x)[0]) > 0.1
 
 
-@pytest.mark.parametrize("deadline", [None, 20.0])
+@pytest.mark.parametrize("deadline", [None, PATIENCE_SECONDS])
 def test_a_plan_that_fails_is_said_once_and_costs_no_state(deadline: float | None) -> None:
     explorer = Explorer(MOTOR, policy="d_optimal", steps=30, deadline=deadline)
     x = explored(explorer, 3)

@@ -20,6 +20,7 @@ import pytest
 from dopt import Explorer
 from dopt.errors import ExplorationError
 from tests.dopt.explorer.plants import HOVERCRAFT, steered
+from tests.waiting import PATIENCE_SECONDS
 
 SHORT = {"name": "icem", "lookahead": 6, "hold": 3, "stride": 3, "plans": 8, "elites": 3}
 
@@ -27,7 +28,7 @@ SETTINGS: dict[str, Any] = {
     "policy": SHORT,
     "learner": "gauss_newton",
     "steps": 80,
-    "deadline": 20.0,
+    "deadline": PATIENCE_SECONDS,
     "fallback": [0.25, -0.25],
 }
 
@@ -59,7 +60,7 @@ def slow_plans(explorer: Explorer) -> Iterator[None]:
     before = planner._make, planner._deadline
 
     def slow() -> None:
-        may_end.wait(20.0)
+        may_end.wait(PATIENCE_SECONDS)
         plan()
 
     planner._make, planner._deadline = slow, 0.001

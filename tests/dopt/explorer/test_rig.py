@@ -7,7 +7,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import pytest
 from dopt import Explorer
 from orchestrate.store import Reader
 from tests.paths import EXAMPLE, ROOT
+from tests.waiting import PATIENCE_SECONDS, until
 
 
 @pytest.fixture
@@ -37,13 +37,12 @@ def reopened(rig: object, journal: Path) -> Explorer:
 
 def wait_for_steps(journal: Path, count: int, after: str = "") -> None:
     """Wait until the journal has so many learned steps after a text."""
-    end = time.monotonic() + 60.0
-    while time.monotonic() < end:
+
+    def are_there() -> bool:
         content = journal.read_text() if journal.exists() else ""
-        if after in content and content[content.find(after) :].count('"learn"') >= count:
-            return
-        time.sleep(0.01)
-    raise AssertionError(f"there were no {count} steps after '{after}' in a minute")
+        return after in content and content[content.find(after) :].count('"learn"') >= count
+
+    until(are_there, lambda: f"there are no {count} steps after '{after}'")
 
 
 def test_either_end_is_killed_and_the_exploration_goes_on(rig: object, tmp_path: Path) -> None:
@@ -60,14 +59,17 @@ def test_either_end_is_killed_and_the_exploration_goes_on(rig: object, tmp_path:
         running.append(started(*motor))
         wait_for_steps(journal, 101, after="resets")
         running[1].send_signal(signal.SIGKILL)
-        running[1].communicate(timeout=10.0)
+        running[1].communicate(timeout=PATIENCE_SECONDS)
         with reopened(rig, journal) as after:
             told, parameters = after.n_steps, after.parameters
         assert told > 200, after.counts
         assert after.counts["resets"] == 1
         assert after.counts["gaps"] > 0  # where datagrams were lost
-        last = started(*explorer, "--seconds", "1")
-        said = last.communicate(timeout=60.0)[0]
+        learned = journal.read_text().count('"learn"')
+        running.append(started(*explorer, "--seconds", "600"))
+        wait_for_steps(journal, learned + 1)
+        running[-1].kill()
+        said = running[-1].communicate(timeout=PATIENCE_SECONDS)[0]
         assert f"{told} steps in the journal" in said
     finally:
         for process in running:
@@ -83,7 +85,7 @@ def test_it_is_saved_and_its_answers_are_drawn(rig: object, tmp_path: Path) -> N
     url, picture = f"sqlite:///{tmp_path}/results.db", tmp_path / "answers.png"
     journal = ["--journal", str(tmp_path / "rig.jsonl")]
     process = started("--seconds", "3", *journal, "--save", url, "--histogram", str(picture))
-    said = process.communicate(timeout=120.0)[0]
+    said = process.communicate(timeout=PATIENCE_SECONDS)[0]
     with reopened(rig, tmp_path / "rig.jsonl") as after, Reader.open(url) as reader:
         [config] = reader.configs()
         curves = reader.curves(config.config_key)
@@ -95,7 +97,7 @@ def test_it_is_saved_and_its_answers_are_drawn(rig: object, tmp_path: Path) -> N
 def test_a_database_that_fails_does_not_end_it(tmp_path: Path) -> None:
     journal = ["--journal", str(tmp_path / "rig.jsonl")]
     process = started("--seconds", "1", *journal, "--save", "sqlite:////dev/null/results.db")
-    said = process.communicate(timeout=120.0)[0]
+    said = process.communicate(timeout=PATIENCE_SECONDS)[0]
     assert process.returncode == 0
     assert "answers: " in said
 

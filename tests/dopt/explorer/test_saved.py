@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,7 +22,6 @@ from analysis.tables.comparisons import compare_policies
 from dopt import Explorer, TrialSpec
 from orchestrate.__main__ import main
 from orchestrate.commands.doctor import trial_key
-from orchestrate.runner import saving
 from orchestrate.store import (
     Reader,
     Store,
@@ -34,6 +32,7 @@ from orchestrate.store import (
 )
 from tests.dopt.explorer.saves import content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN
+from tests.orchestrate.store.test_heartbeat import wait_for_renewals
 
 
 def test_it_runs_until_it_is_closed(url: str, run: Explorer) -> None:
@@ -52,14 +51,11 @@ def test_an_exploration_lives_between_two_saves(
     postgresql_url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A launch whose lease has run out is taken for lost, and its session ended in a save."""
-    lease = 3.0
-    monkeypatch.setattr(saving, "LEASE_SECONDS", lease)
+    monkeypatch.setattr("orchestrate.runner.heartbeat.HEARTBEATS_PER_LEASE", 600)
     assert run.save(postgresql_url)
-    with Store.open(postgresql_url, lease) as others, Reader.open(postgresql_url) as reader:
-        end = time.monotonic() + 1.5 * lease
-        while time.monotonic() < end:
-            assert others.recover() == 0
-            time.sleep(0.2)
+    wait_for_renewals(postgresql_url)
+    with Store.open(postgresql_url) as others, Reader.open(postgresql_url) as reader:
+        assert others.recover() == 0
         [launch] = reader.launches()
         assert launch.state == "running"
         drive(run, 2)

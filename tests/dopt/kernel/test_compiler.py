@@ -26,6 +26,7 @@ from dopt.learning import LEARNERS
 from dopt.policies import POLICIES
 from dopt.spec.trial import TrialSpec
 from tests.paths import ROOT
+from tests.waiting import PATIENCE_SECONDS
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ def test_a_second_compiler_of_a_function_waits_for_the_first(folder: Path) -> No
         assert not second_entered.wait(0.2)
         with one_compiler_at_a_time("equations"):
             first_ended.set()
-    thread.join(10.0)
+    thread.join(PATIENCE_SECONDS)
     assert after_first == [True]
 
 

@@ -22,6 +22,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.store import Store
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.paths import ROOT
+from tests.waiting import PATIENCE_SECONDS
 
 READING = [
     ["status"],
@@ -195,7 +196,7 @@ def test_a_reader_that_has_seen_enough_ends_it_quietly(sqlite_url: str) -> None:
     running.stdout.close()
     assert running.stderr.read() == b""
     running.stderr.close()
-    assert running.wait(timeout=60) == 0
+    assert running.wait(timeout=PATIENCE_SECONDS) == 0
 
 
 def test_ctrl_c_ends_a_watch_with_130(sqlite_url: str) -> None:
@@ -213,6 +214,6 @@ def test_ctrl_c_ends_a_watch_with_130(sqlite_url: str) -> None:
         assert b"0 of 1 trials" in running.stdout.readline()
         time.sleep(0.2)
         running.send_signal(signal.SIGINT)
-        _, err = running.communicate(timeout=60)
+        _, err = running.communicate(timeout=PATIENCE_SECONDS)
     assert running.returncode == ExitCode.INTERRUPTED
     assert err == b""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -172,11 +172,12 @@ class TestWatch:
         for claim in store.claim(launch, [*keys, Spec(0, env="cartpole", width=8).trial_key]):
             store.commit(claim, result(), run_now())
 
-    def test_it_ends_when_the_grid_is_complete(self, command: Run, store: Store, grid: int) -> None:
-        later = threading.Timer(1.0, self.finish, [store, grid])
-        later.start()
+    def test_it_ends_when_the_grid_is_complete(
+        self, command: Run, store: Store, grid: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        pause = SimpleNamespace(sleep=lambda _: self.finish(store, grid))
+        monkeypatch.setattr(watching, "time", pause)
         answer = command("status", "--watch", "0.2")
-        later.join()
         first, *_, last = answer.out.splitlines()
         assert "6 of 9 trials have an outcome" in first
         assert "9 of 9 trials have an outcome" in last

@@ -142,7 +142,6 @@ def test_what_does_not_go_with_leaving_is_refused(
     assert named in err
 
 
-@pytest.mark.timeout(60)
 def test_a_worker_ends_when_the_rest_cannot_run_here(
     command_line: Run, pull: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,6 @@ import importlib
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -23,6 +22,7 @@ from orchestrate.executors.local import LocalExecutor
 from orchestrate.records import Failure
 from tests.orchestrate.executors.names import ALL, WITH_PROCESSES, WORKERS
 from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
+from tests.waiting import until
 
 Make = Callable[[Run], Executor]
 
@@ -38,12 +38,14 @@ def seed_of(key: str, among: int = 20) -> int:
     return {specification(seed).trial_key: seed for seed in range(among)}[key]
 
 
-def drain(executor: Executor, seconds: float = 60.0) -> list[Event]:
+def drain(executor: Executor) -> list[Event]:
     events: list[Event] = []
-    end = time.monotonic() + seconds
-    while executor.pending:
-        assert time.monotonic() < end, f"after {seconds} s there is only {events}"
-        events += executor.wait(0.5)
+
+    def is_idle() -> bool:
+        events.extend(executor.wait(0.5) if executor.pending else [])
+        return not executor.pending
+
+    until(is_idle, lambda: f"there is only {events}")
     return events
 
 

@@ -24,6 +24,7 @@ from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.lean_ray import leave_services_out
 from tests.orchestrate.standins import BROKEN_SEED, slow
 from tests.orchestrate.unruly import hanging
+from tests.waiting import PATIENCE_SECONDS
 
 pytestmark = ON_RAY  # after the tests that share the instance which this ends
 
@@ -45,7 +46,7 @@ def test_the_end_of_ray_itself_is_no_fault_of_a_trial(monkeypatch: pytest.Monkey
 def test_a_launch_without_a_parent_outlives_its_raylet() -> None:
     command = f"{sys.executable} -m tests.orchestrate.orphaned_driver $$ &"
     # The driver holds the pipe too: this returns when both have ended.
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
     assert done.stdout.splitlines()[1:] == [
         "Ray's raylet has ended: run the same command again to continue.",
         "processes of Ray: 0",
@@ -104,7 +105,10 @@ def test_a_failed_start_of_ray_is_ended_and_tried_once_more() -> None:
         InfrastructureError, match=r"Ray timed out\. It was tried 2 times; the load"
     ):
         start(fail)
-    assert [process.wait(10) for process in started] == [-signal.SIGKILL, -signal.SIGKILL]
+    assert [process.wait(PATIENCE_SECONDS) for process in started] == [
+        -signal.SIGKILL,
+        -signal.SIGKILL,
+    ]
 
 
 def test_a_worker_is_given_the_number_of_its_raylet() -> None:

@@ -12,12 +12,11 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import create_engine, text
-
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.faults.gate import Gate
 from tests.orchestrate.faults.outcome import Rows, flaws, results
 from tests.orchestrate.faults.program import Order, carry_out, errors_beside
+from tests.orchestrate.store.places import execute
 from tests.orchestrate.store.processes import CLEAN
 from tests.waiting import PATIENCE_SECONDS, until
 
@@ -152,13 +151,8 @@ class Laboratory:
 
     def end_lease(self, launched: Launched) -> None:
         """Let the lease of a dead launch run out, as time does; SQLite has none."""
-        engine = create_engine(self.url)
-        with engine.begin() as connection:
-            connection.execute(
-                text("UPDATE launch SET lease_until = 0 WHERE pid = :pid AND lease_until > 0"),
-                {"pid": launched.pid},
-            )
-        engine.dispose()
+        dead = f"pid = {launched.pid} AND lease_until > 0"
+        execute(self.url, f"UPDATE launch SET lease_until = 0 WHERE {dead}")
 
     def query(self, sql: str) -> list[tuple[Any, ...]]:
         with Reader.open(self.url) as reader:

@@ -19,12 +19,12 @@ from orchestrate.store import Claim, Store, merge, migrations, upgrade
 from orchestrate.store.merging import merge as merging
 from orchestrate.store.merging import source as merge_source
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
+from tests.waiting import PATIENCE_SECONDS
 
 # Forked from a process that has imported everything and opened nothing: starts in milliseconds.
 CLEAN = multiprocessing.get_context("forkserver")
 _LATER = ("llvmlite.binding", "numpy.random")  # a launch imports them on its way
 CLEAN.set_forkserver_preload(["pytest", "psycopg", "orchestrate.runner.launch", *_LATER, __name__])
-PATIENCE_SECONDS = 60.0
 NOBODY = 65534
 
 

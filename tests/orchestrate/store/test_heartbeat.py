@@ -2,26 +2,48 @@
 
 from __future__ import annotations
 
+import signal
 import threading
-import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection as Pipe
 
 import pytest
 
+from dopt.kernel.run import KernelTrial
 from dopt.run import run_trial
 from orchestrate.executors.base import Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.task import run_task
+from orchestrate.records import Failure
 from orchestrate.runner.heartbeat import Heartbeat
 from orchestrate.store import Store
+from orchestrate.store.backends.open import LEASE_SECONDS
 from tests.dopt.trials import trial
 from tests.orchestrate.losses import lose
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.places import execute
 from tests.orchestrate.store.processes import hear, running
+from tests.waiting import PATIENCE_SECONDS, until
 
-LEASE = 2.0
-LONG_LEASE = 3.0
+LEASE = 4.0
+
+
+@pytest.fixture
+def many_beats(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let ten heartbeats come in a second, and a lease last as long as ever."""
+    monkeypatch.setattr("orchestrate.runner.heartbeat.HEARTBEATS_PER_LEASE", 600)
+
+
+def wait_for_renewals(url: str, count: int = 3) -> None:
+    """Wait until the lease of the only launch was renewed so many times."""
+    for _ in range(count):
+        before = lease_of(url)
+        until(lambda before=before: lease_of(url) > before)  # type: ignore[misc]
+
+
+def lease_of(url: str) -> float:
+    [(end,)] = execute(url, "SELECT lease_until FROM launch")
+    return float(str(end))
 
 
 @pytest.fixture
@@ -30,17 +52,17 @@ def url(postgresql_url: str) -> str:
     return postgresql_url
 
 
+@pytest.mark.usefixtures("many_beats")
 def test_the_lease_is_renewed_while_the_main_thread_does_nothing(
-    open_store: Callable[..., Store], monkeypatch: pytest.MonkeyPatch
+    url: str, open_store: Callable[..., Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mine, others = open_store(LEASE), open_store(LEASE)
+    mine, others = open_store(), open_store()
     launch = mine.begin_launch(LAUNCH)
     [claim] = mine.claim(launch, mine.register(launch, [Spec(0)]).todo)
     lose(monkeypatch, ["question", "answer"], ["heartbeat"])
-    with Heartbeat(mine, launch, LEASE):
-        for _ in range(6):
-            time.sleep(LEASE / 4)
-            assert others.recover() == 0
+    with Heartbeat(mine, launch, LEASE_SECONDS):
+        wait_for_renewals(url)
+        assert others.recover() == 0
     assert mine.commit(claim, result(), RUN)
 
 
@@ -51,37 +73,55 @@ def test_without_it_the_trials_are_taken(open_store: Callable[..., Store]) -> No
     with Heartbeat(mine, launch, LEASE):
         assert [thread.name for thread in threading.enumerate()].count("heartbeat") == 1
     assert "heartbeat" not in [thread.name for thread in threading.enumerate()]
-    end = time.monotonic() + 60.0
-    while not others.recover():
-        assert time.monotonic() < end, "the lease does not end"
-        time.sleep(0.1)
+    until(others.recover, lambda: "the lease does not end")
     assert not mine.commit(claim, result(), RUN)
 
 
 def take_what_is_free(pipe: Pipe, url: str) -> None:
     """Recover again and again until told to stop; then say how many trials were free."""
     freed = 0
-    with Store.open(url, lease_seconds=LONG_LEASE) as store:
+    with Store.open(url) as store:
         pipe.send("watching")
         while not pipe.poll(0.2):
             freed += store.recover()
     pipe.send(freed)
 
 
+@pytest.mark.usefixtures("many_beats")
 def test_a_trial_in_compiled_code_does_not_silence_it(
-    url: str, open_store: Callable[..., Store]
+    url: str, open_store: Callable[..., Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It would hold the interpreter's lock for minutes if it did not give it away."""
+    """It would hold the interpreter's lock for minutes if it did not give it away.
+
+    The trial is interrupted after some heartbeats in compiled code, and would last long without.
+    """
     run_trial(trial("quadrotor", "d_optimal", env={"horizon": 3}))  # to load what is compiled
     spec = trial("quadrotor", "d_optimal", env={"horizon": 5000}, model={"width": 64})
-    limits = Limits(seconds=1.5 * LONG_LEASE)
-    store = open_store(LONG_LEASE)
+    store = open_store()
     launch = store.begin_launch(LAUNCH)
-    with Heartbeat(store, launch, LONG_LEASE), running(take_what_is_free, url) as (_, pipe):
+    heartbeat, advance = store.heartbeat, KernelTrial.advance
+    compiled, beats, main = threading.Event(), list[int](), threading.get_ident()
+
+    def compiled_advance(kernel: KernelTrial, last: int) -> None:
+        compiled.set()
+        advance(kernel, last)
+        compiled.clear()
+
+    def counted(launch: int) -> None:
+        heartbeat(launch)
+        if compiled.is_set():
+            beats.append(launch)
+            if len(beats) == 3:
+                signal.pthread_kill(main, signal.SIGALRM)
+
+    monkeypatch.setattr(KernelTrial, "advance", compiled_advance)
+    monkeypatch.setattr(store, "heartbeat", counted)
+    with Heartbeat(store, launch, LEASE_SECONDS), running(take_what_is_free, url) as (_, pipe):
         [claim] = store.claim(launch, store.register(launch, [Spec(0)]).todo)
         assert hear(pipe) == "watching"
-        ran = run_task(run_trial, Task(spec.trial_key, spec), limits)
+        ran = run_task(run_trial, Task(spec.trial_key, spec), Limits(seconds=PATIENCE_SECONDS))
         pipe.send("stop")
         assert hear(pipe) == 0
-    assert ran.run.wall_seconds >= 1.5 * LONG_LEASE
+    assert isinstance(ran.outcome, Failure)
+    assert "in advance" in ran.outcome.traceback
     assert store.commit(claim, result(), RUN)

@@ -13,6 +13,7 @@ from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
 from orchestrate.store import StoreUnavailableError as UnavailableError
 from tests.orchestrate.losses import lose
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.waiting import PATIENCE_SECONDS
 
 FAILURE = Failure("ZeroDivisionError", "no", "here")
 LOSSES = (
@@ -39,7 +40,7 @@ def said() -> list[str]:
 
 @pytest.fixture
 def patient(store: Store, launch: int, said: list[str]) -> RetryingStore:
-    return RetryingStore(store, launch, 10.0, said.append)
+    return RetryingStore(store, launch, PATIENCE_SECONDS, said.append)
 
 
 @losses
@@ -137,7 +138,7 @@ def test_it_says_once_that_it_waits_and_for_how_long(
 ) -> None:
     lose(monkeypatch, ["question"] * 3)
     patient.recover()
-    assert said[0] == "waiting for up to 10 s: recover was lost."
+    assert said[0] == "waiting for up to 600 s: recover was lost."
     assert said[1].startswith("the database is back after ")
     assert len(said) == 2
 
