@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,12 +98,11 @@ def test_rows_are_cut_and_the_page_says_so(client: TestClient) -> None:
 
 
 def test_a_slow_query_is_ended(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sql, "TIMEOUT_SECONDS", 0.5)
-    start = time.monotonic()
-    status, found = ask(client, SERIES.format(10**12) + "SELECT count(*) FROM s")
+    with monkeypatch.context() as patch:
+        patch.setattr(sql, "TIMEOUT_SECONDS", 0.5)
+        status, found = ask(client, SERIES.format(10**12) + "SELECT count(*) FROM s")
     assert status == 400
     assert "longer than 0.5 s" in str(found["error"])
-    assert time.monotonic() - start < 30
     assert ask(client, "SELECT 1 AS one")[0] == 200
 
 

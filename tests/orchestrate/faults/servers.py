@@ -13,6 +13,8 @@ from typing import Any
 
 import psycopg
 
+from tests.waiting import PATIENCE_SECONDS
+
 ACCOUNT = "postgres"
 """User of the system that the server runs as where we are root, which it refuses to be."""
 
@@ -72,7 +74,7 @@ class Server:
 
     def query(self, sql: str) -> list[tuple[Any, ...]]:
         address = f"host=127.0.0.1 port={self.port} user={ACCOUNT} dbname=postgres"
-        with psycopg.connect(address, autocommit=True, connect_timeout=10) as connection:
+        with psycopg.connect(address, autocommit=True, connect_timeout=60) as connection:
             cursor = connection.execute(sql)  # type: ignore[arg-type]
             return cursor.fetchall() if cursor.description else []
 
@@ -83,7 +85,7 @@ class Server:
         return " ".join([f"-p {self.port}", f"-k {self.folder}", *words])
 
     def _control(self, *arguments: str) -> None:
-        self._run("pg_ctl", "-w", "-t", "60", "-D", self._data, *arguments)
+        self._run("pg_ctl", "-w", "-t", f"{PATIENCE_SECONDS:.0f}", "-D", self._data, *arguments)
 
     def _run(self, program: str, *arguments: str) -> None:
         command = [str(self._bin / program), *arguments]
@@ -91,9 +93,7 @@ class Server:
             command = ["runuser", "-u", ACCOUNT, "--", *command]
         # Into a file: the server inherits it, and a pipe would not end before the server does.
         with (self.folder / f"{program}.txt").open("w+") as output:
-            done = subprocess.run(
-                command, cwd=self.folder, stdout=output, stderr=output, timeout=90
-            )
+            done = subprocess.run(command, cwd=self.folder, stdout=output, stderr=output)
             output.seek(0)
             assert done.returncode == 0, output.read()
 

@@ -80,7 +80,7 @@ def test_a_lock_that_ends_in_time_costs_nothing(
         while not warnings(caplog):
             assert thread.is_alive()
         meddler.rollback()
-        thread.join(30)
+        thread.join()
         assert store.register(launch, [Spec()]).todo == [Spec().trial_key]
     assert len(warnings(caplog)) == 1
 
@@ -92,7 +92,7 @@ def test_a_launch_that_holds_it_gets_its_whole_lease(
     store = Store.open(postgresql_url, lease_seconds=2.0, patience=0.3)
     with store, session(postgresql_url, "dopt launch 123") as sleeper:
         sleeper.execute(LOCKED)  # type: ignore[arg-type]
-        with pytest.raises(StoreUnavailableError, match=r"has held a lock on it for [2-9]"):
+        with pytest.raises(StoreUnavailableError, match=r"has held a lock on it for ([2-9]|\d\d)"):
             store.recover()
     assert len(warnings(caplog)) == 1
 
