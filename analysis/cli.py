@@ -32,7 +32,7 @@ from analysis.tables.rendering import TextTable, gaps_table
 from analysis.workers_option import add_workers
 from analysis.yardsticks import command as yardsticks
 from dopt.errors import DoptError
-from orchestrate.cli_parser import Parser, discard_output, path
+from orchestrate.cli_parser import Parser, discard_output, path, tell
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
 COLUMNS = ("loss", "reachable_loss")
@@ -47,10 +47,10 @@ def main(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
         return code
     except IncompleteError as error:
-        sys.stderr.write(f"{error}\n")
+        tell(sys.stderr, f"{error}\n")
         return 3
     except (AnalysisError, DoptError) as error:
-        sys.stderr.write(f"error: {error}\n")
+        tell(sys.stderr, f"error: {error}\n")
         return 2
     except BrokenPipeError:
         discard_output()
@@ -69,7 +69,7 @@ def _run(options: argparse.Namespace) -> int:
         selection = select(reader, _filter(options))
         _check_complete(selection, options.allow_partial)
         for note in selection.notes:
-            sys.stderr.write(f"note: {note}\n")  # the output may be a CSV
+            tell(sys.stderr, f"note: {note}\n")  # the output may be a CSV
         return int(options.run(reader, selection, options))
 
 
@@ -261,7 +261,7 @@ def _calibration(reader: Reader, selection: Selection, options: argparse.Namespa
 
 def _floor(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
     text_table, table = offline.run(reader, selection, options)
-    sys.stdout.write(_text(text_table, table, options.format))
+    tell(sys.stdout, _text(text_table, table, options.format), exact=options.format == "csv")
     return 0
 
 
@@ -270,8 +270,8 @@ def _print_table(
 ) -> int:
     table = kind.measure(reader, selection, plot_options)
     if selection.gaps:
-        sys.stderr.write(f"{partial_warning(selection)}\n")
-    sys.stdout.write(_text(kind.render(table, plot_options), table, form))
+        tell(sys.stderr, f"{partial_warning(selection)}\n")
+    tell(sys.stdout, _text(kind.render(table, plot_options), table, form), exact=form == "csv")
     return 0
 
 
@@ -283,5 +283,4 @@ def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:
 
 def say(text: str) -> None:
     """Print one line of progress."""
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
+    tell(sys.stdout, f"{text}\n")

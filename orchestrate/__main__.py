@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from dopt.errors import DoptError, unknown_name
-from orchestrate.cli_parser import discard_output
+from orchestrate.cli_parser import discard_output, tell
 from orchestrate.commands import COMMANDS
 from orchestrate.commands.command import PROGRAM
 from orchestrate.commands.output import say
@@ -54,7 +54,7 @@ def _run(name: str, words: Sequence[str]) -> int:
 
 
 def _refuse(error: DoptError, code: ExitCode) -> ExitCode:
-    sys.stderr.write(f"error: {without_password(str(error))}\n")
+    tell(sys.stderr, f"error: {without_password(str(error))}\n")
     return code
 
 

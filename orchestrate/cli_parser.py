@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from dopt.errors import DoptError, unknown_name
 from dopt.given_path import given_path
@@ -52,6 +52,23 @@ class Parser(argparse.ArgumentParser):
             name = max(action.option_strings, key=len, default=action.metavar or action.dest)
             names = [str(choice) for choice in action.choices]
             raise UsageError(f"{unknown_name(str(name).lower(), value, names)}")
+
+
+_UNSEEN = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+"""Control characters but for the tab and the newline, and what changes the direction of text."""
+
+
+def visible(text: str) -> str:
+    """Return a text for a terminal: what would command it, such as an escape, as its code."""
+    return _UNSEEN.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def tell(stream: TextIO, text: str, *, exact: bool = False) -> None:
+    """Write a text that may come from a database; an ``exact`` one as it is for programs."""
+    stream.write(text if exact and not stream.isatty() else visible(text))
+    stream.flush()
 
 
 def discard_output() -> None:

@@ -22,7 +22,7 @@ from analysis.units import loss_unit
 from analysis.workers_option import add_workers
 from dopt.offline_fit import RIDGE
 from dopt.spec.prequential import system_of
-from orchestrate.cli_parser import path
+from orchestrate.cli_parser import path, tell
 from orchestrate.store import Reader
 
 HELP = "fit the models of stored trials offline: how much exploration and learner lose"
@@ -99,4 +99,4 @@ def _units(selection: Selection) -> dict[str, str]:
 
 
 def _progress(text: str) -> None:
-    sys.stderr.write(f"{text}\n")  # the output may be a CSV
+    tell(sys.stderr, f"{text}\n")  # the output may be a CSV

@@ -256,7 +256,7 @@ def _error_response(states: Sequence[ServerState], request: Request, error: Exce
 
 
 def _server_error(states: Sequence[ServerState], request: Request, error: Exception) -> Response:
-    logging.getLogger(__name__).error("%s failed", request.scope["path"], exc_info=error)
+    logging.getLogger(__name__).error("%r failed", request.scope["path"], exc_info=error)
     return _message(
         states,
         request,

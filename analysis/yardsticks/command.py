@@ -17,7 +17,7 @@ from analysis.errors import AnalysisError, IncompleteError
 from analysis.outputs import publish
 from analysis.tables.rendering import TextTable
 from analysis.yardsticks import disk_rows, pendulum_rows, star_rows, swing_up_rows
-from orchestrate.cli_parser import path
+from orchestrate.cli_parser import path, tell
 from orchestrate.store import Reader
 
 HELP = "published tables, run here, beside the published numbers"
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         for one, entries in found:
             _check_finished(one, entries, allowed=options.allow_partial)
         parts = [table for each in found for table in _written(moment, *each, options.out)]
-    sys.stdout.write("\n".join(part.markdown() for part in parts))
+    tell(sys.stdout, "\n".join(part.markdown() for part in parts))
     return 0
 
 

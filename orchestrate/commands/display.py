@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
-from rich.console import Console, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
+from orchestrate.cli_parser import visible
+
 _UNLIMITED_WIDTH = 100_000  # characters: no line is folded or cut
+
+
+class _Console(Console):
+    """Console that shows the control characters of texts, and sends its own."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterator[Segment]:
+        for one in super().render(renderable, options):
+            yield one if one.control else Segment(visible(one.text), one.style)
 
 
 def console() -> Console:
     """Return a console on the standard output; colours follow NO_COLOR and the terminal."""
     width = None if sys.stdout.isatty() else _UNLIMITED_WIDTH
-    return Console(file=sys.stdout, width=width, highlight=False, markup=False, emoji=False)
+    return _Console(file=sys.stdout, width=width, highlight=False, markup=False, emoji=False)
 
 
 def show(*parts: RenderableType) -> None:

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from orchestrate.cli_parser import tell
+
 
 def say(text: str) -> None:
     """Print a line and flush it."""
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
+    tell(sys.stdout, f"{text}\n")
 
 
 def say_json(document: Any) -> None:

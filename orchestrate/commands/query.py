@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import csv
+import io
 import sys
 
-from orchestrate.cli_parser import positive
+from orchestrate.cli_parser import positive, tell
 from orchestrate.commands.command import Command
 from orchestrate.commands.display import plain, show, table
 from orchestrate.commands.output import jsonable, say_json
@@ -54,9 +55,11 @@ def run(arguments: argparse.Namespace) -> ExitCode:
 
 
 def _write_csv(rows: Table) -> None:
-    writer = csv.writer(sys.stdout, lineterminator="\n")
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
     writer.writerow(rows.columns)
     writer.writerows([jsonable(value) for value in row] for row in rows)
+    tell(sys.stdout, out.getvalue(), exact=True)
 
 
 def _show(rows: Table) -> None:

@@ -6,7 +6,7 @@ import argparse
 import sys
 from functools import partial
 
-from orchestrate.cli_parser import length_of_time, positive
+from orchestrate.cli_parser import length_of_time, positive, tell
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
@@ -64,16 +64,15 @@ def run(arguments: argparse.Namespace) -> ExitCode:
     names = ("processes", "timeout", "memory_gib", "retry_memory", "live")
     given = {name: getattr(arguments, name) for name in names}
     settings = WorkerSettings(arguments.db, arguments.until, lease=arguments.lease, **given)
-    tell = _to_stderr if arguments.json else say
-    code = run_worker(settings, Output(tell, _to_stderr, sys.stderr))
+    answer = _to_stderr if arguments.json else say
+    code = run_worker(settings, Output(answer, _to_stderr, sys.stderr))
     if arguments.json:
         say_json({"exit_code": code.value, "complete": code in (0, ExitCode.SOME_FAILED)})
     return code
 
 
 def _to_stderr(line: str) -> None:
-    sys.stderr.write(f"{without_password(line)}\n")
-    sys.stderr.flush()
+    tell(sys.stderr, f"{without_password(line)}\n")
 
 
 COMMAND = Command("work", "run registered trials on this machine", add_arguments, run)

@@ -11,7 +11,7 @@ from pathlib import Path
 from dopt.errors import DoptError
 from dopt.kernel import warm_up
 from dopt.run import run_trial
-from orchestrate.cli_parser import discard_output
+from orchestrate.cli_parser import discard_output, tell
 from orchestrate.config.argv import normalize
 from orchestrate.config.error_messages import format_error
 from orchestrate.config.grid import Grid, build_grid
@@ -131,7 +131,7 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
     except DoptError as error:
         return _refuse(str(error), ExitCode.BAD_REQUEST)
     except Exception:
-        sys.stderr.write(without_password(traceback.format_exc()))
+        tell(sys.stderr, without_password(traceback.format_exc()))
         sentence = "this is a defect of the program (traceback above); committed trials are kept"
         return _refuse(f"{sentence}: report it, and run the same command again.", ExitCode.DEFECT)
 
@@ -139,12 +139,11 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
 def say(text: str) -> None:
     """Print a line and flush it; the trials go on although nobody reads the output any longer."""
     try:
-        sys.stdout.write(f"{without_password(text)}\n")
-        sys.stdout.flush()
+        tell(sys.stdout, f"{without_password(text)}\n")
     except BrokenPipeError:
         discard_output()
 
 
 def _refuse(sentence: str, code: ExitCode) -> ExitCode:
-    sys.stderr.write(f"error: {without_password(sentence)}\n")
+    tell(sys.stderr, f"error: {without_password(sentence)}\n")
     return code

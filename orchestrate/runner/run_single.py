@@ -6,6 +6,7 @@ import dataclasses
 import sys
 
 from dopt.spec.trial import TrialSpec
+from orchestrate.cli_parser import tell
 from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
@@ -31,7 +32,7 @@ def launch_trial(
         if row is None:  # interrupted before it was registered
             return code, f"{_name(trial)} · not started · {reader.safe_url}"
         if row.status == "failed":
-            sys.stderr.write(_traceback(reader, trial))
+            tell(sys.stderr, _traceback(reader, trial))
         was_done = row.attempt == before and row.status != "pending"
         outcome = f"{_already_run(row)} · {_outcome(row)}" if was_done else _outcome(row)
         return code, f"{_name(trial)} · {outcome} · {reader.safe_url}"
@@ -57,8 +58,7 @@ def _ignore(_: str) -> None:
 
 
 def _warn(text: str) -> None:
-    sys.stderr.write(f"{text}\n")
-    sys.stderr.flush()
+    tell(sys.stderr, f"{text}\n")
 
 
 def _name(trial: TrialSpec) -> str:
