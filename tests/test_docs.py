@@ -276,7 +276,7 @@ def test_the_tutorial_runs_from_its_first_command_to_its_last(
         if "serve" not in line:  # which does not end; its own tests start it
             run_typed(line, monkeypatch, capsys)
     for snippet in blocks(PAGES[TUTORIAL], "python"):
-        exec(compile(snippet, TUTORIAL, "exec"), {})
+        exec(compile(snippet, TUTORIAL, "exec", dont_inherit=True), {})
         assert capsys.readouterr().out, snippet
     written = {str(path.relative_to(tmp_path)) for path in (tmp_path / "figures").rglob("*.*")}
     assert {

@@ -11,6 +11,7 @@ import pytest
 from nbclient import NotebookClient
 
 from tests.analysis.synthetic import fill, make_grid
+from tests.pages import PAGES, blocks
 from tests.paths import ROOT
 
 NOTEBOOK, PLANT = (
@@ -65,3 +66,14 @@ def test_its_cells_run_in_the_root(root: Path, monkeypatch: pytest.MonkeyPatch) 
             exec(cell.source, names)
     assert len(plt.get_fignums()) >= 1
     plt.close("all")
+
+
+def test_a_policy_of_a_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    [defined] = [text for text in blocks(PAGES["docs/tutorial.md"], "python") if "Halves" in text]
+    asked = "spec.to_mapping()['policy']['_target_'], spec.trial_key"
+    cells = [nbformat.v4.new_code_cell(text) for text in (defined, asked)]
+    notebook = nbformat.v4.new_notebook(cells=cells)
+    place = {"metadata": {"path": str(tmp_path)}}
+    done = NotebookClient(notebook, timeout=200, resources=place).execute()
+    assert "'__main__.Alternating'" in done.cells[1].outputs[0]["data"]["text/plain"]

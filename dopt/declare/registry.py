@@ -14,6 +14,8 @@ import dataclasses
 import hashlib
 import importlib.util
 import inspect
+import linecache
+import re
 import sys
 import traceback
 from collections.abc import Mapping
@@ -31,17 +33,24 @@ T = TypeVar("T", bound=Validated)
 TARGET = "_target_"
 SOURCE = "source"
 
+Part = Mapping[str, object] | Validated
+"""A section of a configuration, or an object in its place."""
+
 _ABOUT = ("name", TARGET, SOURCE)
 
 
-def build(section: str, registry: Mapping[str, type[T]], given: Mapping[str, object]) -> T:
-    """Return the dataclass that ``given`` names, filled with its other entries.
+def build(section: str, registry: Mapping[str, type[T]], given: Part) -> T:
+    """Return the dataclass that ``given`` names, filled with its other entries; or an object.
 
     Raises
     ------
     SpecificationError
         If the class or a field is unknown, or a value does not fit.
     """
+    if isinstance(given, Validated):
+        if type(given) not in registry.values():
+            source_digest(_fitting(section, registry, _target(type(given)), type(given)))
+        return cast("T", given)
     cls = _own(section, registry, given) if TARGET in given else _shipped(section, registry, given)
     fields = [field.name for field in dataclasses.fields(cls)]
     for key in given:
@@ -103,7 +112,19 @@ def _shipped(section: str, registry: Mapping[str, type[T]], given: Mapping[str, 
 def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, object]) -> type[T]:
     """Import a class of the user's own and see that it fits."""
     path = str(given[TARGET])
-    cls: Any = imported(section, path, given)
+    own = _fitting(section, registry, path, imported(section, path, given))
+    name = own.__dict__["name"]
+    if given.get("name", name) != name:
+        raise SpecificationError(
+            f"{section}.name is '{given['name']}', but {path} is called '{name}': "
+            f"leave {section}.name out, or correct it."
+        )
+    check_source(section, path, own, given)
+    return own
+
+
+def _fitting(section: str, registry: Mapping[str, type[T]], path: str, cls: Any) -> type[T]:
+    """Return a class of the user's own that fits into a section."""
     wanted = _base(next(iter(registry.values())))
     if not (isinstance(cls, type) and issubclass(cls, wanted) and dataclasses.is_dataclass(cls)):
         raise _unfit(section, path, f"a dataclass derived from dopt's {wanted.__name__}")
@@ -115,12 +136,6 @@ def _own(section: str, registry: Mapping[str, type[T]], given: Mapping[str, obje
     name = own.__dict__.get("name")
     if not isinstance(name, str) or name in registry:
         raise _unfit(section, path, "a class with a 'name' of its own, which no other has")
-    if given.get("name", name) != name:
-        raise SpecificationError(
-            f"{section}.name is '{given['name']}', but {path} is called '{name}': "
-            f"leave {section}.name out, or correct it."
-        )
-    check_source(section, path, own, given)
     return own
 
 
@@ -245,6 +260,7 @@ def _changed(section: str, path: str) -> SpecificationError:
 
 
 def _absent(section: str, path: str, error: object) -> SpecificationError:
+    check_importable(section, {TARGET: path})
     return SpecificationError(
         f"{section}.{TARGET} is '{path}', which cannot be imported ({error}): give the path of "
         f"a class as module.Class, in a folder that PYTHONPATH names."
@@ -262,13 +278,39 @@ def _origin(cls: type[Validated]) -> dict[str, object]:
     """Return what identifies a class of the user's own; nothing for one of this package."""
     if cls.__module__.partition(".")[0] == __name__.partition(".")[0]:
         return {}
-    return {TARGET: f"{cls.__module__}.{cls.__qualname__}", SOURCE: source_digest(cls)}
+    return {TARGET: _target(cls), SOURCE: source_digest(cls)}
+
+
+def _target(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def check_importable(section: str, given: object) -> None:
+    """Raise SpecificationError if a section names a class that no other process can import."""
+    path = str(given.get(TARGET, "")) if isinstance(given, Mapping) else ""
+    if path.startswith(_TYPED) or ".<locals>." in path:
+        raise SpecificationError(
+            f"{section} is of the class {path} of a notebook, a script or a function, which no "
+            f"other process can import: put it into a file of its own, and import it from there."
+        )
+
+
+_TYPED = ("__main__.", "builtins.")
+"""Modules of what is typed into a notebook or a script, or executed as text."""
 
 
 def source_digest(cls: type) -> str:
-    """Return the digest of the file that defines a class, as it was when first asked for."""
+    """Return the digest of the file that defines a class, as it was when first asked for.
+
+    Of a class that is typed into a notebook it is the digest of its cell and its bases' cells.
+
+    Raises
+    ------
+    SpecificationError
+        If the source cannot be read, as that of an interpreter's lines.
+    """
     if cls not in _digests:
-        _digests[cls] = _digest(Path(inspect.getfile(cls)).read_bytes())
+        _digests[cls] = _digest(_source(cls))
     return _digests[cls]
 
 
@@ -276,6 +318,29 @@ def _digest(content: bytes) -> str:
     """Return the digest of a text, which does not depend on how its lines end."""
     text = content.removeprefix(codecs.BOM_UTF8).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     return hashlib.sha256(text).hexdigest()[:16]
+
+
+def _source(cls: type) -> bytes:
+    """Return the text of the file that defines a class, or of the cells of a notebook."""
+    try:
+        return Path(inspect.getfile(cls)).read_bytes()
+    except (OSError, TypeError):
+        typed = [base for base in cls.__mro__[:-1] if _target(base).startswith(_TYPED)]
+    cells = [_cell(base) for base in typed]
+    if not (cells and all(cells)):
+        raise SpecificationError(
+            f"the source of the class {cls.__name__}, which identifies its trials, cannot be read: "
+            f"put it into a file of its own, and import it from there."
+        )
+    return "".join(cells).encode()
+
+
+def _cell(cls: type) -> str:
+    """Return the text of the cell that defines a class, empty where it is not known."""
+    functions = filter(inspect.isfunction, map(inspect.unwrap, vars(cls).values()))
+    names = [*(one.__code__.co_filename for one in functions), *reversed(linecache.cache)]
+    texts = ("".join(linecache.getlines(name)) for name in names)
+    return next((text for text in texts if re.search(rf"class {cls.__name__}\b", text)), "")
 
 
 _digests: dict[type, str] = {}

@@ -21,6 +21,9 @@ from dopt.explorer.planner import PunctualPlanner, may_remember_plans
 from dopt.explorer.saving import SavedExplored
 from dopt.explorer.state import difference
 from dopt.explorer.unlearned_states import UnlearnedStates
+from dopt.learning import Learner
+from dopt.models import Model
+from dopt.policies import Policy
 from dopt.spec.added_fields import completed
 from dopt.spec.config import LARGEST_HORIZON
 from dopt.spec.trial import TrialSpec
@@ -71,8 +74,8 @@ class Explorer(SavedExplored):
     plant : Plant or System
         The plant; a system, such as one of ``dopt.SYSTEMS`` or an environment of Gymnasium, says by
         its horizon how many steps there are.
-    policy, model, learner : str or mapping
-        As those of :meth:`dopt.TrialSpec.from_names`.
+    policy, model, learner : str, mapping or object
+        As those of :meth:`dopt.TrialSpec.of_system`.
     limits : mapping, optional
         Bounds of states and inputs that inputs are to heed, and rates of inputs, such as
         ``{"bounds": {"angle": [-2, 2], "voltage": [-5, 5]}, "rates": {"voltage": 100}}``
@@ -106,9 +109,9 @@ class Explorer(SavedExplored):
         self,
         plant: Plant | System,
         *,
-        policy: str | Mapping[str, object] = "d_optimal",
-        model: str | Mapping[str, object] = "mlp",
-        learner: str | Mapping[str, object] = "adam_window",
+        policy: str | Mapping[str, object] | Policy = "d_optimal",
+        model: str | Mapping[str, object] | Model = "mlp",
+        learner: str | Mapping[str, object] | Learner = "adam_window",
         limits: Mapping[str, object] | None = None,
         seed: int = 0,
         steps: int = STEPS,

@@ -13,7 +13,7 @@ import numpy as np
 
 from dopt.control import Control, task_from
 from dopt.declare.kernel_support import default_path
-from dopt.declare.registry import TARGET, build
+from dopt.declare.registry import TARGET, Part, build
 from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError, unknown_name
 from dopt.learning import LEARNERS, Learner
@@ -85,7 +85,7 @@ class TrialSpec(Validated):
     def _of_parts(
         cls,
         system: System,
-        sections: Mapping[str, Mapping[str, object]],
+        sections: Mapping[str, Part],
         given: Mapping[str, object],
     ) -> TrialSpec:
         policy = build("policy", POLICIES, sections["policy"])
@@ -133,25 +133,32 @@ class TrialSpec(Validated):
     def of_system(
         cls,
         system: System,
-        policy: str | Mapping[str, object],
+        policy: str | Mapping[str, object] | Policy,
         *,
-        model: str | Mapping[str, object] = "mlp",
-        learner: str | Mapping[str, object] = "adam_window",
+        model: str | Mapping[str, object] | Model = "mlp",
+        learner: str | Mapping[str, object] | Learner = "adam_window",
         limits: Mapping[str, object] | None = None,
         seed: int = 0,
         path: str | None = None,
     ) -> TrialSpec:
-        """Return the trial of a system, with the other parts as in :meth:`from_names`.
+        """Return the trial of a system, with the other parts as in :meth:`from_names`, or objects.
+
+        An object may be of a class that a notebook or a script defines: :func:`dopt.run_trial` runs
+        it, and its cell or file is part of the key. A launch takes classes of other files alone.
 
         ``path`` is the execution path; without one it is chosen as in :meth:`from_mapping`.
 
         Raises
         ------
         SpecificationError, IncompatibleError
-            If the system is no object of a class of systems, or as :meth:`from_mapping`.
+            If the system is no object of a class of systems, a class has no source, or as
+            :meth:`from_mapping`.
         """
         given = _sections({"policy": policy, "model": model, "learner": learner})
-        parts = {key: _section(given, key) for key in given}
+        parts = {
+            key: part if isinstance(part, Validated) else _section(given, key)
+            for key, part in given.items()
+        }
         rest: dict[str, object] = {"seed": seed, "limits": limits}
         rest |= {"path": path} if path else {}
         _check_system(system)
@@ -231,14 +238,14 @@ class TrialSpec(Validated):
 
 
 def _sections(
-    parts: Mapping[str, str | Mapping[str, object]],
-) -> dict[str, Mapping[str, object]]:
+    parts: Mapping[str, str | Part],
+) -> dict[str, Part]:
     return {key: {"name": part} if isinstance(part, str) else part for key, part in parts.items()}
 
 
-def _model(section: Mapping[str, object]) -> Model:
+def _model(section: Part) -> Model:
     """Return a registered model, or a network of the user's own, for which torch is loaded."""
-    if TARGET not in section:
+    if isinstance(section, Validated) or TARGET not in section:
         return build("model", MODELS, section)
     from dopt.reference.module import Module
 
@@ -265,10 +272,11 @@ def _check_system(system: object) -> None:
 
 def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:
     section = given.get(key)
-    if isinstance(section, System):
+    kind = section if isinstance(section, type) else type(section)
+    if issubclass(kind, Validated):
         raise SpecificationError(
-            f"configuration key '{key}' is a {type(section).__name__}, but a name or a section is "
-            f"expected: give an object of a class of systems to TrialSpec.of_system."
+            f"configuration key '{key}' is {section!r}, but a name or a section is expected: give "
+            f"objects, such as {kind.__name__}(), to TrialSpec.of_system."
         )
     if not isinstance(section, Mapping):
         raise SpecificationError(

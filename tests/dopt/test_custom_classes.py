@@ -2,27 +2,78 @@
 
 from __future__ import annotations
 
+import linecache
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
 from dopt.control.task import GOAL_FIELDS
-from dopt.declare.registry import source_digest
+from dopt.declare.registry import check_importable, source_digest
 from dopt.errors import SpecificationError
-from dopt.policies.base import ClosedLoop
+from dopt.learning import LEARNERS
+from dopt.models import MODELS
+from dopt.policies import POLICIES
+from dopt.policies.base import ClosedLoop, CustomPolicy, Planner
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS, System
 from tests.paths import EXAMPLE
 
 
 @dataclass(frozen=True, kw_only=True)
 class Nameless(ClosedLoop):
     pass
+
+
+TYPED = """
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from dopt.declare.validated_fields import parameter
+from dopt.policies.base import CustomPolicy, Planner
+
+
+class Constant(Planner):
+    def __init__(self, u):
+        self._u = u
+
+    def choose(self, view):
+        return self._u
+
+
+@dataclass(frozen=True, kw_only=True)
+class Held(CustomPolicy):
+    name: ClassVar[str] = "held"
+    gain: float = parameter(0.5)
+
+    def planner(self, system, rng):
+        return Constant(np.array([self.gain * system.gamma]))
+"""
+
+DERIVED = """
+@dataclass(frozen=True, kw_only=True)
+class Derived(Held):
+    name: ClassVar[str] = "derived"
+"""
+
+
+def typed(*cells: str, known: bool = True) -> Any:
+    """Return the last class of some cells as a notebook leaves it: with names but without files."""
+    names: dict[str, Any] = {}
+    for text in cells or (TYPED,):
+        cell = f"<cell {len(linecache.cache)}>"
+        if known:
+            linecache.cache[cell] = (len(text), None, text.splitlines(keepends=True), cell)
+        exec(compile(text, cell, "exec", dont_inherit=True), names)
+    return list(names.values())[-1]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +89,9 @@ class Thief(ClosedLoop):
 @pytest.fixture(autouse=True)
 def on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(EXAMPLE))
+    monkeypatch.setattr(linecache, "cache", {})
     yield
-    for name in ("vehicle", "batch_gauss_newton"):
+    for name in ("vehicle", "batch_gauss_newton", "curiosity"):
         sys.modules.pop(name, None)
 
 
@@ -190,3 +242,97 @@ def test_a_control_task_for_a_system_of_ones_own_can_be_solved() -> None:
     assert rows[0, "true_model_success"] == 1
     assert rows[200, "free_run_error"] < 0.5 * rows[0, "free_run_error"]
     assert rows[200, "coverage"] > rows[50, "coverage"] > 0
+
+
+# Objects in the place of names
+
+
+def test_objects_of_shipped_classes_are_the_trial_of_their_sections() -> None:
+    system = SYSTEMS["pendulum"](horizon=5)
+    policy = POLICIES["d_optimal"](regularization=0.1)  # type: ignore[call-arg]
+    objects = TrialSpec.of_system(
+        system, policy, model=MODELS["mlp"](width=8), learner=LEARNERS["adam"]()
+    )
+    sections = {"name": "d_optimal", "regularization": 0.1}, {"name": "mlp", "width": 8}
+    named = TrialSpec.of_system(system, sections[0], model=sections[1], learner="adam")
+    assert objects.trial_key == named.trial_key
+
+
+def test_an_object_of_a_class_in_a_file_is_the_trial_of_its_path() -> None:
+    from curiosity import Curiosity
+
+    system = SYSTEMS["pendulum"]()
+    spec = TrialSpec.of_system(system, Curiosity(candidates=4))
+    path = {"_target_": "curiosity.Curiosity", "candidates": 4}
+    assert spec.trial_key == TrialSpec.of_system(system, path).trial_key
+    check_importable("policy", spec.to_mapping()["policy"])
+
+
+def test_an_object_of_a_typed_class_runs_with_its_values() -> None:
+    system = SYSTEMS["pendulum"](horizon=5)
+    half, whole = (TrialSpec.of_system(system, typed()(gain=gain)) for gain in (0.5, 1.0))
+    assert half.trial_key != whole.trial_key
+    for spec, size in ((half, 0.5), (whole, 1.0)):
+        result = run_trial(spec, path="reference")
+        np.testing.assert_allclose(result.inputs[1:], size * system.gamma)
+
+
+def test_the_identity_of_a_typed_class_is_that_of_its_cell() -> None:
+    def key(*cells: str) -> str:
+        return TrialSpec.of_system(SYSTEMS["pendulum"](), typed(*cells)()).trial_key
+
+    assert key() == key()
+    assert key(TYPED.replace("* system", "* 0.9 * system")) != key()
+
+
+def test_the_cells_of_its_bases_are_part_of_its_identity() -> None:
+    """Also where it has no function, which would name its cell."""
+    texts = (
+        (TYPED, DERIVED),
+        (TYPED.replace("* system", "* 0.9 * system"), DERIVED),
+        (TYPED, f"{DERIVED}    gain: float = parameter(0.1)"),
+    )
+    assert len({source_digest(typed(*cells)) for cells in texts}) == len(texts)
+
+
+def test_a_typed_class_is_refused_where_others_have_to_import_it() -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Local(CustomPolicy):
+        name: ClassVar[str] = "local"
+
+        def planner(self, system: System, rng: np.random.Generator) -> Planner:
+            raise NotImplementedError
+
+    for policy in (typed()(), Local()):
+        section = TrialSpec.of_system(SYSTEMS["pendulum"](), policy).to_mapping()["policy"]
+        with pytest.raises(SpecificationError, match=r"policy is of the class .*into a file"):
+            check_importable("policy", section)
+    with pytest.raises(SpecificationError, match=r"policy is of the class .*into a file"):
+        specification(policy={"_target_": "__main__.Nowhere"})
+
+
+@pytest.mark.parametrize(
+    ("policy", "sentence"),
+    [
+        (
+            Nameless,
+            r"'policy' is <class '.*Nameless'>, .*, such as Nameless\(\), to TrialSpec.of_system",
+        ),
+        (Nameless(), "a class with a 'name' of its own"),
+        (SYSTEMS["arm"](), "a dataclass derived from dopt's Policy"),
+        (3, "'policy' is 3, but a section"),
+    ],
+)
+def test_another_object_is_refused_in_a_sentence(policy: Any, sentence: str) -> None:
+    with pytest.raises(SpecificationError, match=sentence):
+        TrialSpec.of_system(SYSTEMS["pendulum"](), policy)
+
+
+def test_a_class_whose_source_is_unknown_is_refused_in_a_sentence() -> None:
+    with pytest.raises(SpecificationError, match=r"the class Held, .* cannot be read: put it into"):
+        TrialSpec.of_system(SYSTEMS["pendulum"](), typed(known=False)())
+
+
+def test_names_take_no_objects() -> None:
+    with pytest.raises(SpecificationError, match=r"'policy' is Held.*TrialSpec.of_system"):
+        TrialSpec.from_names("pendulum", typed()())

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
 
 from sqlalchemy import Connection, insert, or_, select, update
 
+from dopt.declare.registry import check_importable
 from orchestrate.store.backends.base import Backend, NewTrial
 from orchestrate.store.records import Registrable, Registration
-from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, alike, config, trial
+from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, PREQUENTIAL, alike, config, trial
 from orchestrate.store.serialization import plain
 
 _BATCH_ROWS = 10_000
@@ -41,6 +43,9 @@ def _config_row(spec: Registrable) -> dict[str, Any]:
             f"A configuration has the columns {', '.join(columns)}: "
             f"expected {', '.join(CONFIG_COLUMNS)}."
         )
+    if PREQUENTIAL.strip("%") not in spec.config_json:  # what was measured is not run again
+        for key, section in json.loads(spec.config_json).items():
+            check_importable(key, section)
     values = {name: plain(value) for name, value in columns.items()}
     return {"config_key": spec.config_key, "config_json": spec.config_json, **values}
 

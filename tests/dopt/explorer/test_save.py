@@ -7,7 +7,9 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -16,6 +18,9 @@ from sqlalchemy.exc import OperationalError
 import dopt
 from dopt import Explorer, TrialSpec
 from dopt.errors import DoptError, SpecificationError
+from dopt.policies.base import OpenLoop
+from dopt.systems import System
+from dopt.types import Array
 from orchestrate.commands.doctor import trial_key
 from orchestrate.store import (
     Reader,
@@ -48,6 +53,22 @@ def test_what_is_stored_is_what_was_explored(url: str, run: Explorer) -> None:
     assert (config.env, config.horizon) == ("plant", STEPS)
     assert config.label == "random, prequential loss"
     assert config.config["env"]["loss"] == "prequential"
+
+
+def test_an_exploration_by_a_policy_of_a_script_is_saved(url: str) -> None:
+    """Nobody runs again what was measured: its class need not be importable."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Typed(OpenLoop):
+        name: ClassVar[str] = "typed"
+
+        def inputs(self, system: System, rng: np.random.Generator) -> Array:
+            return rng.uniform(-1.0, 1.0, (system.horizon, system.n_inputs))
+
+    with explorer(policy=Typed()) as one:
+        drive(one, 3)
+        assert one.save(url)
+    assert content(url)["n_steps"] == 3
 
 
 def test_saved_twice_is_saved_once(url: str, run: Explorer) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dopt.errors import SpecificationError
 from orchestrate.store import Claim, Failure, Reader, Store
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
 
@@ -53,6 +54,19 @@ class TestRegistration:
 
     def test_of_an_empty_grid(self, store: Store, launch: int) -> None:
         assert store.register(launch, []).total == 0
+
+    def test_refuses_a_class_that_no_worker_can_import(
+        self, store: Store, launch: int, reader: Reader
+    ) -> None:
+        class Typed(Spec):
+            @property
+            def config_json(self) -> str:
+                return '{"env": {"name": "pendulum"}, "policy": {"_target_": "__main__.Held"}}'
+
+        message = r"policy is of the class __main__\.Held, .*: put it into a file"
+        with pytest.raises(SpecificationError, match=message):
+            store.register(launch, [Spec(1), Typed(1)])
+        assert reader.query("SELECT * FROM trial") == []
 
     def test_refuses_a_configuration_without_its_columns(self, store: Store, launch: int) -> None:
         class Incomplete(Spec):
