@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -11,6 +10,7 @@ from dopt.limits import VIOLATIONS, WORST
 from dopt.spec.added_fields import completed
 from orchestrate.redaction import without_password
 from orchestrate.store import ExplorationRow, Reader, explorations
+from orchestrate.store.serialization import stored_json
 
 _TRIAL = "SELECT * FROM v_trial WHERE trial_id = :trial_id"
 _CONFIG = "SELECT config_json FROM config WHERE config_key = :config_key"
@@ -65,9 +65,10 @@ def report(reader: Reader, trial_id: int) -> TrialReport:
     trial = reader.rows(_TRIAL, trial_id=trial_id)[0]._asdict()
     attempts = [row._asdict() for row in reader.rows(_ATTEMPTS, trial_id=trial_id)]
     tried = {attempt["launch_id"] for attempt in attempts}
+    ((text,),) = reader.rows(_CONFIG, config_key=trial["config_key"])
     return TrialReport(
         trial=trial,
-        config=completed(json.loads(reader.rows(_CONFIG, config_key=trial["config_key"])[0][0])),
+        config=completed(stored_json(text, dict)),
         launches=[
             {name: _public(value) for name, value in asdict(launch).items()}
             for launch in reader.launches()

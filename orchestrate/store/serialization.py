@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Case, ColumnElement, case
 
+from orchestrate.store.errors import StoreError
 from orchestrate.store.records import Array
 
 DTYPE = "<f8"
@@ -74,5 +75,23 @@ def stacked(arrays: Sequence[Array]) -> Array:
 
 
 def unpack(dtype: str, shape: str, data: bytes) -> Array:
-    """Return the packed array in native byte order, writable."""
-    return np.frombuffer(data, dtype=dtype).reshape(json.loads(shape)).astype(np.float64)
+    """Return the packed array in native byte order, writable; raise ``StoreError`` without one."""
+    try:
+        numbers = np.frombuffer(data, dtype=dtype).reshape(stored_json(shape, list))
+        return numbers.astype(np.float64)
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"An array of the database is damaged ({error}): {_RESTORE}.") from error
+
+
+def stored_json(text: str, kind: type) -> Any:
+    """Return the list or dict of a stored text; raise ``StoreError`` if it holds none."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        found = error
+    if isinstance(found, kind):
+        return found
+    raise StoreError(f"The database holds {text[:40]!r} in the place of JSON: {_RESTORE}.")
+
+
+_RESTORE = "it was changed by hand, so restore a copy, or give another database"

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate, groupby
 from operator import itemgetter
@@ -14,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from orchestrate.store.doctor.keys import TrialKey
+from orchestrate.store.errors import StoreError
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.records import Array
 from orchestrate.store.schema import N_ROWS, PREQUENTIAL, STEP_VALUES
-from orchestrate.store.serialization import DTYPE, unpack
+from orchestrate.store.serialization import DTYPE, stored_json, unpack
 
 PAGE = 50
 """Trials in one transaction, so that a concurrent launch waits for less than a second."""
@@ -108,6 +110,7 @@ class Source:
         self._expected = dict(map(tuple, moment.rows(_EXPECTED)))
 
     def launches(self) -> list[dict[str, Any]]:
+        self._moment.launches()  # refuses texts that the readers of the target could not read
         return self._dicts("SELECT * FROM launch ORDER BY launch_id")
 
     def pages(self) -> Iterator[Page]:
@@ -131,8 +134,10 @@ class Source:
         if (config_id := row["config_id"]) not in self._texts:
             text = self.config(config_id)["config_json"]
             same = hashlib.sha256(text.encode()).hexdigest() == row["config_key"]
-            self._texts[config_id] = text if same else ""
-        text = self._texts[config_id]
+            with suppress(StoreError):
+                stored_json(text, dict)
+                self._texts[config_id] = text if same else ""
+        text = self._texts.get(config_id, "")
         key = self._trial_key(text, row["seed"]) if self._trial_key else row["trial_key"]
         return bool(text) and key == row["trial_key"]
 
@@ -180,7 +185,7 @@ def _agree(row: Mapping[str, Any], curve: Curve | None) -> bool:
         states, inputs, parameters = arrays
         sizes = states.ndim, inputs.ndim, parameters.ndim, len(states), packed["dtype"]
         steps = len(inputs)
-    except (ValueError, TypeError, RecursionError):
+    except (StoreError, TypeError):
         return False
     same = all(packed[f"{names[i]}_shape"] == json.dumps(arrays[i].shape) for i in range(3))
     fits = row["grows"] or row["n_rows"] == steps

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ from sqlalchemy import Connection, select, text
 from orchestrate.store.backends.base import LaunchLife
 from orchestrate.store.read.rows import LaunchRow
 from orchestrate.store.schema import launch
+from orchestrate.store.serialization import stored_json
 
 Dead = Callable[[Connection, Sequence[LaunchLife]], list[LaunchLife]]
 
@@ -45,13 +45,13 @@ def _row(row: Mapping[str, Any], alive: bool) -> LaunchRow:
         ended=row["ended"],
         host=row["host"],
         pid=row["pid"],
-        argv=json.loads(row["argv"]),
-        overrides=json.loads(row["overrides"]),
+        argv=stored_json(row["argv"], list),
+        overrides=stored_json(row["overrides"], list),
         git_commit=row["git_commit"],
         git_dirty=None if dirty is None else bool(dirty),
         git_diff_hash=row["git_diff_hash"],
-        versions=json.loads(row["versions"]),
-        fingerprint=row["fingerprint"] and json.loads(row["fingerprint"]),
+        versions=stored_json(row["versions"], dict),
+        fingerprint=row["fingerprint"] and stored_json(row["fingerprint"], dict),
     )
 
 

@@ -5,10 +5,11 @@ A worker looks for trials that a launch with the fingerprint of its own has regi
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, text
+
+from orchestrate.store.serialization import stored_json
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def others(connection: Connection, launch: int) -> list[tuple[dict[str, str] | N
     The fingerprint of an older program is None.
     """
     rows = connection.execute(_OTHERS, {"launch": launch})
-    return [(stored and json.loads(stored), count) for stored, count in rows]
+    return [(stored and stored_json(stored, dict), count) for stored, count in rows]
 
 
 def open_trials(

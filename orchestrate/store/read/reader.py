@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -39,7 +38,7 @@ from orchestrate.store.schema import (
     trajectory,
     trial,
 )
-from orchestrate.store.serialization import unpack
+from orchestrate.store.serialization import stored_json, unpack
 
 _CONFIGS = text(
     "SELECT p.config_key, p.env, p.policy, p.model, p.learner, p.width, p.depth, p.horizon, p.dt, "
@@ -251,7 +250,7 @@ def _kind(url: URL) -> ModuleType:
 
 
 def _config_row(*values: Any) -> ConfigRow:
-    return ConfigRow(*values[:-1], completed(json.loads(values[-1])))  # type: ignore[call-arg]
+    return ConfigRow(*values[:-1], completed(stored_json(values[-1], dict)))  # type: ignore[call-arg]
 
 
 def _names(row: ConfigRow) -> tuple[str | int, ...]:

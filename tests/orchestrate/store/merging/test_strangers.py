@@ -135,3 +135,34 @@ def test_a_configuration_that_is_not_that_of_its_key_stays_out(
     output = capsys.readouterr().out
     assert "copied 1 trials (1 done)\n2 contradict their keys or the shapes of" in output
     assert execute(url, "SELECT policy FROM config") == [("d_optimal",)]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "launch SET argv = 'x'",
+        "launch SET versions = '[]'",
+        f"launch SET overrides = '{50_000 * '['}'",
+        "config SET config_json = '{'",
+    ],
+    ids=lambda change: change[:30],
+)
+def test_a_text_that_is_no_json_is_a_sentence(
+    sqlite_url: str, tmp_path: Path, change: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill(sqlite_url)
+    execute(sqlite_url, f"UPDATE {change}")
+    for words in (["status"], ["show", "--seed", "2"]):
+        assert main([*words, "--db", sqlite_url]) == 2
+        assert "in the place of JSON: it was changed by hand" in capsys.readouterr().err
+    code = main(["merge", sqlite_url, "--db", f"sqlite:///{tmp_path}/mine.db"])
+    assert code == (1 if change.startswith("config") else 2)
+
+
+def test_an_array_that_is_damaged_is_a_sentence(
+    sqlite_url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill(sqlite_url)
+    execute(sqlite_url, "UPDATE trajectory SET states_shape = '[1]'")
+    assert main(["export", "trajectories", f"{tmp_path}/x.npz", "--db", sqlite_url]) == 2
+    assert "An array of the database is damaged (cannot reshape" in capsys.readouterr().err
