@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-
-from analysis.cli import main
 from dopt.garbage_collection import collect_rarely
+from orchestrate.program import run
 
 
 def program() -> None:
     """Run the command line as a program of its own: ``dopt-analysis``."""
     collect_rarely()
-    sys.exit(main(sys.argv[1:]))
+    run("analysis.cli")
 
 
 if __name__ == "__main__":

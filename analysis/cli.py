@@ -31,35 +31,22 @@ from analysis.tables.registry import TABLES, TableKind, comparison
 from analysis.tables.rendering import TextTable, gaps_table
 from analysis.workers_option import add_workers
 from analysis.yardsticks import command as yardsticks
-from dopt.errors import DoptError
-from orchestrate.cli_parser import Parser, discard_output, path, tell
+from orchestrate.cli_parser import Parser, path, tell
+from orchestrate.program import answered
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
 COLUMNS = ("loss", "reachable_loss")
 FORMATS = ("markdown", "latex", "csv")
 
 
-def main(arguments: Sequence[str]) -> int:
+@answered
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     try:
-        options = parser().read(arguments)
-        code = _run(options)
-        sys.stdout.flush()
-        return code
+        return _run(parser().read(sys.argv[1:] if arguments is None else arguments))
     except IncompleteError as error:
         tell(sys.stderr, f"{error}\n")
         return 3
-    except (AnalysisError, DoptError) as error:
-        tell(sys.stderr, f"error: {error}\n")
-        return 2
-    except BrokenPipeError:
-        discard_output()
-        return 0
-    except KeyboardInterrupt:
-        return 130
-    except OSError as error:
-        sys.stderr.write(f"error: {error.filename}: {error.strerror}: choose another --out.\n")
-        return 2
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dopt.errors import DoptError
 
-class AnalysisError(Exception):
+
+class AnalysisError(DoptError):
     """The request cannot be answered: unknown name, nothing stored, ambiguous choice."""
 
 

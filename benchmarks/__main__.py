@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-
 from orchestrate.executors.worker_environment import pin_threads
-
-pin_threads()
-
-from benchmarks.cli import main  # noqa: E402  # the libraries read the pins when imported
+from orchestrate.program import run
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    pin_threads()  # the libraries read the pins when imported
+    run("benchmarks.cli")

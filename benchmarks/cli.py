@@ -48,7 +48,7 @@ LEGEND = (
 )
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Ask the questions and print the answers; 1 if one failed, or a row has become slower."""
     options = parser().parse_args(arguments)
     known = history.read(options.against) if options.against else []

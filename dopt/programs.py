@@ -18,7 +18,7 @@ from dopt.errors import DISTRIBUTION
 def dopt() -> None:
     """Run ``dopt``: commands on stored results."""
     _take("orchestrate")
-    sys.exit(importlib.import_module("orchestrate.__main__").main())
+    importlib.import_module("orchestrate.program").run("orchestrate.__main__")
 
 
 def dopt_analysis() -> None:

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from dopt.errors import DoptError, unknown_name
 from dopt.given_path import given_path
+
+_INSTALLED = {
+    "dopt": "python -m orchestrate",
+    "dopt-analysis": "python -m analysis",
+    "dopt-launch": "python orchestrate/launch.py",
+}
 
 
 class UsageError(DoptError):
@@ -26,7 +34,9 @@ class Parser(argparse.ArgumentParser):
     """Parser that raises ``UsageError`` instead of exiting, and rejects abbreviated options."""
 
     def __init__(self, prog: str, description: str | None = None, **options: Any) -> None:
-        super().__init__(prog=prog, description=description, allow_abbrev=False, **options)
+        super().__init__(
+            prog=as_started(prog), description=description, allow_abbrev=False, **options
+        )
 
     def read(self, words: Sequence[str], *, mixed: bool = False) -> argparse.Namespace:
         """Return the arguments; raise ``UsageError`` for a surplus one.
@@ -73,7 +83,16 @@ def tell(stream: TextIO, text: str, *, exact: bool = False) -> None:
 
 def discard_output() -> None:
     """Leave out the rest of the output, whose reader, such as ``head``, has closed it."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    with suppress(io.UnsupportedOperation):  # it is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def as_started(text: str) -> str:
+    """Return a text with the names of the installed programs, if one of them is running."""
+    if Path(sys.argv[0]).name in _INSTALLED:
+        for name, command in _INSTALLED.items():
+            text = text.replace(command, name)
+    return text
 
 
 def _options(parser: argparse.ArgumentParser, words: Sequence[str]) -> Iterator[str]:

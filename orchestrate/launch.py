@@ -10,24 +10,18 @@ from pathlib import Path
 
 if __package__ in (None, ""):
     # Python puts a script's own folder first; the packages are in the folder above it.
-    sys.path[0] = str(Path(__file__).resolve().parents[1])
+    sys.path[: not sys.flags.safe_path] = [str(Path(__file__).resolve().parents[1])]
 
 from dopt.garbage_collection import collect_rarely
 from orchestrate.executors.worker_environment import pin_threads
-
-pin_threads()
-collect_rarely()
-
-from orchestrate.errors import ExitCode  # noqa: E402
-from orchestrate.runner.launch import main  # noqa: E402
+from orchestrate.program import run
 
 
 def program() -> None:
     """Run the command line as a program of its own: ``dopt-launch``."""
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        sys.exit(ExitCode.INTERRUPTED)
+    pin_threads()
+    collect_rarely()
+    run("orchestrate.runner.launch")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from analysis.animation.axes import Stage, build
 from analysis.animation.replay_data import Story
 from analysis.errors import AnalysisError
 from analysis.figures.style import styled
+from orchestrate.files import whole
 
 Picture = npt.NDArray[np.uint8]
 
@@ -35,13 +36,10 @@ def shoot(story: Story, target: Path, frames_per_second: int) -> None:
         If the ending of the file is neither ``.gif`` nor ``.mp4``, or ffmpeg is missing.
     """
     _check(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    part = target.with_name(f".{target.stem}.part{target.suffix}")
-    with styled():
+    with whole(target) as part, styled():
         frames = pictures(build(story), len(story.steps))
         write = _write_gif if target.suffix == ".gif" else _write_mp4
         write(frames, part, frames_per_second)
-    part.replace(target)
 
 
 def pictures(stage: Stage, n: int) -> Iterator[Picture]:

@@ -7,12 +7,12 @@ import hashlib
 import importlib.metadata
 import os
 import platform
-import subprocess
 from pathlib import Path
 from typing import Any
 
 from analysis.data.trial_selection import Selection
 from dopt import __version__
+from orchestrate.program import COMMIT_VARIABLE, commit_of, git
 from orchestrate.store import Reader
 
 LIBRARIES = ("matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")
@@ -39,25 +39,13 @@ def git_state() -> dict[str, str | bool | None]:
     A repository that merely holds an installed copy is another one; ``DOPT_COMMIT`` then gives the
     commit. As at the first call: code that changes later does not run in this process.
     """
-    top = _git("rev-parse", "--show-toplevel")
-    if top is None or Path(top).resolve() != PACKAGE.parent.resolve():
-        return {"commit": os.environ.get("DOPT_COMMIT") or None, "dirty": None}
-    changes = _git("status", "--porcelain", "--untracked-files=no")
-    return {"commit": _git("rev-parse", "HEAD"), "dirty": bool(changes)}
-
-
-def _git(*arguments: str) -> str | None:
-    try:
-        done = subprocess.run(
-            ["git", "-C", PACKAGE, *arguments],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=20,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()
+    commit = commit_of(PACKAGE.parent)
+    if commit is None:
+        return {"commit": os.environ.get(COMMIT_VARIABLE) or None, "dirty": None}
+    return {
+        "commit": commit,
+        "dirty": bool(git(PACKAGE.parent, "status", "--porcelain", "--untracked-files=no")),
+    }
 
 
 def code_hash() -> str:

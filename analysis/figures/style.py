@@ -51,8 +51,10 @@ _RC: dict[Any, Any] = {
 
 
 def styled() -> AbstractContextManager[None]:
-    """Return the context in which figures are made and written."""
-    return matplotlib.rc_context(_RC)
+    """Return the context in which figures are made and written, whatever a matplotlibrc says."""
+    defaults: dict[Any, Any] = {**matplotlib.rcParamsDefault}
+    del defaults["backend"]  # none is needed, and to ask for it looks for one
+    return matplotlib.rc_context({**defaults, **_RC})
 
 
 def mathematical(label: str) -> str:

@@ -23,6 +23,7 @@ from analysis.workers_option import add_workers
 from dopt.offline_fit import RIDGE
 from dopt.spec.prequential import system_of
 from orchestrate.cli_parser import path, tell
+from orchestrate.files import make_folder
 from orchestrate.store import Reader
 
 HELP = "fit the models of stored trials offline: how much exploration and learner lose"
@@ -58,7 +59,7 @@ def run(
     found = budgets(trials)
     request = {"ridge": options.ridge}
     facts = provenance.describe(reader, fitted) | {"request": request, "name": NAME}
-    options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)
     publish.write_table(trials, options.out, TRIALS)
     facts |= _draw(found, fitted, options, facts)
     table = tabulate(found)

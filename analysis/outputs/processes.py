@@ -40,9 +40,12 @@ def written(
         _deferred_interrupt() as raise_interrupt,
         ProcessPoolExecutor(processes, context, _ignore_interrupt) as pool,
     ):
-        futures = {
-            name: pool.submit(_write, write, reader.url, task) for name, task in tasks.items()
-        }
+        try:
+            futures = {name: pool.submit(_write, write, reader.url, tasks[name]) for name in tasks}
+        except (OSError, RuntimeError):  # no further process or thread
+            for process in multiprocessing.active_children():
+                process.kill()  # it would wait for work for ever
+            raise
 
         def wait(name: str) -> None:
             raise_interrupt()

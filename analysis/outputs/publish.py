@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from orchestrate.files import whole
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -43,10 +45,8 @@ def write_pictures(figure: Figure, folder: Path, name: str, title: str, mark: st
         layout.execute(figure)
         figure.set_layout_engine(None)
     for ending in PICTURES:
-        target = folder / f"{name}.{ending}"
-        part = folder / f".{name}.part.{ending}"
-        figure.savefig(part, format=ending, metadata=_metadata(ending, title, mark))
-        part.replace(target)
+        with whole(folder / f"{name}.{ending}") as part:
+            figure.savefig(part, format=ending, metadata=_metadata(ending, title, mark))
 
 
 def _metadata(ending: str, title: str, mark: str) -> dict[str, Any]:
@@ -73,6 +73,5 @@ def write_provenance(content: Mapping[str, Any], folder: Path, name: str) -> Non
 
 def write_text(text: str, target: Path) -> None:
     """Write a file whole or not at all."""
-    part = target.with_name(f".{target.name}.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(target)
+    with whole(target) as part:
+        part.write_text(text, encoding="utf-8")

@@ -26,6 +26,7 @@ from analysis.outputs.page import NAME as PAGE
 from analysis.outputs.page import write_page
 from analysis.plot_options import PlotOptions
 from analysis.tables.registry import TABLES, TableKind
+from orchestrate.files import make_folder
 from orchestrate.store import Reader
 
 PLOTS: dict[str, Plot[Any]] = {
@@ -85,7 +86,7 @@ def build(
 
     ``workers`` outputs are written at a time, each in a process of its own if there are several.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     planned = {name: _plan(name, reader, selection, options, folder, force) for name in names}
     tasks = {name: one for name, one in planned.items() if isinstance(one, Task)}
     with processes.written(_write, reader, tasks, workers) as write:

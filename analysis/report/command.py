@@ -16,6 +16,7 @@ from analysis.report import control, page, variant_table
 from analysis.report.variants import VariantGroup, variant_groups
 from analysis.tables.rendering import gaps_table
 from orchestrate.cli_parser import path
+from orchestrate.files import make_folder
 from orchestrate.store import Reader
 
 HELP = "compare every policy, model and learner with the reference, on one page"
@@ -45,7 +46,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         controlled = control.tabulate(moment, found)
         selection = Selection(tuple(one for group in found for one in group.variants))
         facts = provenance.describe(moment, selection)
-    options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)
     pictures = {}
     with styled():
         mark = publish.fingerprint({"cells": facts["cells"], "selection": facts["selection"]})

@@ -21,7 +21,6 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from analysis.errors import AnalysisError
 from analysis.serve import compare, control, curves, gallery, grid, launches, sql, trial, trials
 from analysis.serve.addresses import is_loopback
 from analysis.serve.errors import BusyError, ForbiddenError, NotFoundError, RequestError
@@ -78,7 +77,7 @@ STATES = (
     ((BusyError,), 429),
     ((NotFoundError,), 404),
     ((ForbiddenError,), 403),
-    ((AnalysisError, DoptError), 400),
+    ((DoptError,), 400),
 )
 
 
@@ -109,7 +108,6 @@ def create_app(
         routes=routes,
         middleware=[Middleware(SecurityMiddleware, host=host)],
         exception_handlers={
-            AnalysisError: partial(_error_response, states),
             DoptError: partial(_error_response, states),
             HTTPException: partial(_error_response, states),
             Exception: partial(_server_error, states),

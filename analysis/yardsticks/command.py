@@ -80,7 +80,6 @@ def _written(
     """Write the table of trials, that of the page and the provenance; return what is shown."""
     trials = one.measure(reader, entries)
     table = one.tabulate(trials)
-    folder.mkdir(parents=True, exist_ok=True)
     publish.write_table(trials, folder, f"{one.name}_trials")
     publish.write_table(table, folder, one.name)
     facts = provenance.describe(reader, Selection(tuple(entries))) | {"name": one.name}

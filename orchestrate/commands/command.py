@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from orchestrate.cli_parser import Parser
+from orchestrate.cli_parser import Parser, as_started
 from orchestrate.errors import ExitCode
 from orchestrate.store import DEFAULT_URL, URL_VARIABLE, default_url
 
-PROGRAM = "python -m orchestrate"
+PROGRAM = as_started("python -m orchestrate")
 
 
 @dataclass(frozen=True)

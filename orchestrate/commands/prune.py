@@ -7,7 +7,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 
 from orchestrate.cli_parser import UsageError, length_of_time
-from orchestrate.commands.command import Command
+from orchestrate.commands.command import PROGRAM, Command
 from orchestrate.commands.filtering import add_filters, chosen
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
@@ -86,7 +86,7 @@ def _sentence(found: Prunable, deleted: int, *, dry: bool) -> str:
     if dry:
         trials = f"{len(found.keys):,} trials would be deleted ({kinds})"
         return f"{trials}: {size}; nothing was changed.{rest}"
-    space = "python -m orchestrate vacuum gives the space back"
+    space = f"{PROGRAM} vacuum gives the space back"
     return f"{deleted:,} trials were deleted ({kinds}): {size}; {space}.{rest}"
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import RenderableType
 from rich.text import Text
 
+from orchestrate.cli_parser import as_started
 from orchestrate.commands.configs_table import grid_table
 from orchestrate.commands.display import plain
 from orchestrate.queries.status import STATES, Status, seconds_since
@@ -17,7 +18,7 @@ from orchestrate.redaction import without_password
 from orchestrate.runner.progress import duration
 from orchestrate.store import ExplorationRow, FailureKind, LaunchRow
 
-WORK = "python -m orchestrate work"
+WORK = as_started("python -m orchestrate work")
 _NAMES = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
 _CONFIG = ("config_key", *_NAMES, "n", *(f"n_{state}" for state in STATES))
 _LAUNCH = ("launch_id", "alive", "host", "pid", "started", "argv")

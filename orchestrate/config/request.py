@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from orchestrate.cli_parser import UsageError
+from orchestrate.cli_parser import UsageError, as_started
 from orchestrate.config.argv import OTHER_SWEEPER
 from orchestrate.config.deferred_overrides import apply_deferred, hold_back
 from orchestrate.config.grid import TRIAL_SECTIONS, Combination
@@ -58,9 +60,14 @@ def read_command_line() -> Request | None:
         else:
             requests.append(partial(_single_request, task, cast(DictConfig, HydraConfig.get())))
 
+    answer = io.StringIO()
     with _errors_let_through():
-        with hold_back() as overrides:
-            capture()
+        try:
+            with hold_back() as overrides, redirect_stdout(answer):
+                capture()
+        finally:
+            if text := answer.getvalue():
+                sys.stdout.write(as_started(text))
         return requests[0](overrides) if requests else None
 
 

@@ -11,17 +11,20 @@ import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 
 from dopt.cores import usable_cores
-from orchestrate.errors import InfrastructureError
+from dopt.errors import DoptError
+from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.exit_status import CrashReport, ExitStatus
 from orchestrate.executors.factory import ExecutorFactory, limits_of
 from orchestrate.executors.limits import NO_LIMITS, Limits
 from orchestrate.executors.live import Report
 from orchestrate.executors.worker_environment import ONE_THREAD, module_path
+from orchestrate.program import LIMITS, hiding
 from orchestrate.records import Sample
 
 PREFETCHED_CHUNKS = 2
@@ -29,6 +32,10 @@ PREFETCHED_CHUNKS = 2
 
 MAX_FAILED_STARTS = 3
 """Consecutive workers that may die before they are ready; then the launch fails."""
+
+
+DYING_SECONDS = 5.0
+"""Time for a worker that has closed its socket to end by itself, with its exit code."""
 
 
 class Worker:
@@ -39,8 +46,8 @@ class Worker:
         ours, theirs = socket.socketpair()
         self._crash_report = CrashReport()
         try:
-            with theirs:
-                self.process = _start(theirs.fileno(), self._crash_report.descriptor)
+            with theirs, _standard_error() as errors:
+                self.process = _start(theirs.fileno(), self._crash_report.descriptor, errors)
         except BaseException:
             ours.close()
             self._crash_report.close()
@@ -90,9 +97,11 @@ class Worker:
         else:
             self.ready = True
 
-    def end(self) -> ExitStatus:
-        """Kill the process if it still runs, and return its exit status."""
+    def end(self, seconds: float = 0.0) -> ExitStatus:
+        """Kill the process if it still runs after some time, and return its exit status."""
         self.connection.close()
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(seconds)
         self.process.kill()
         return self._crash_report.explain(self.process.wait())
 
@@ -163,13 +172,10 @@ class LocalExecutor(Executor):
     def _replace(self, worker: Worker) -> list[Event]:
         """Replace a dead process; only the chunk that it was running is lost."""
         self._workers.remove(worker)
-        end = worker.end()
+        end = worker.end(DYING_SECONDS)
         self._failed_starts = 0 if worker.ready else self._failed_starts + 1
         if self._failed_starts >= MAX_FAILED_STARTS:
-            raise InfrastructureError(
-                f"{self._failed_starts} workers in a row died before they were ready "
-                f"(last: {end.reason}): see their output above, then run the same command again."
-            )
+            raise self._no_start(end, worker.process.returncode)
         chunks = [tuple(chunk) for chunk in worker.chunks]
         running = chunks.pop(0) if worker.ready and chunks else ()
         reason = end.reason
@@ -185,10 +191,23 @@ class LocalExecutor(Executor):
             WorkerLost(keys, reason, False, end.cause, end.traceback, socket.gethostname(), pid)
         ]
 
+    def _no_start(self, end: ExitStatus, code: int) -> DoptError:
+        """Return the error for workers that do not become ready: what they printed is its cause."""
+        printed = end.traceback.strip()
+        if printed and code > 0:
+            remedy = hiding(printed) or "mend the environment of this program."
+            return LaunchError(f"Workers cannot start ({printed.splitlines()[-1]}): {remedy}")
+        return InfrastructureError(
+            f"{self._failed_starts} workers in a row died before they were ready "
+            f"(last: {end.reason}): run the same command again."
+        )
+
     def _worker(self) -> Worker:
         try:
             return Worker(self._run, self._limits, self._live, self.report)
         except OSError as error:
+            if error.errno not in LIMITS:
+                raise
             raise InfrastructureError(
                 f"A worker process cannot be started ({error.strerror or error}): set "
                 "launch.workers lower or raise the system's limits, and run the same command again."
@@ -200,18 +219,24 @@ def _start(*descriptors: int) -> subprocess.Popen[bytes]:
         [sys.executable, "-P", "-m", "orchestrate.executors.worker", *map(str, descriptors)],
         pass_fds=descriptors,
         stdin=subprocess.DEVNULL,
-        stdout=sys.stderr.fileno() if _has_descriptor() else subprocess.DEVNULL,
+        stdout=descriptors[1],
+        stderr=descriptors[1],
         env={**os.environ, **ONE_THREAD, **module_path()},
         process_group=0,  # Ctrl-C in a terminal reaches the driver only
     )
 
 
-def _has_descriptor() -> bool:
+@contextmanager
+def _standard_error() -> Iterator[int]:
+    """Yield a descriptor of the standard error, or of nothing where it is no file."""
     try:
-        sys.stderr.fileno()
+        descriptor = os.dup(sys.stderr.fileno())
     except (OSError, ValueError):
-        return False
-    return True
+        descriptor = os.open(os.devnull, os.O_WRONLY)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 FACTORY = ExecutorFactory(

@@ -1,8 +1,9 @@
-"""Worker process of the local pool: ``python -m orchestrate.executors.worker SOCKET CRASH_REPORT``.
+"""Worker process of the local pool: ``python -m orchestrate.executors.worker`` and descriptors.
 
 Chunks arrive on a socket, and outcomes are sent on it one by one. A thread reads, so that neither
 side blocks on a full pipe, and so that the worker ends with its driver. A dying process writes its
-stack to the second descriptor.
+stack to the second descriptor, and until it is ready whatever it prints; then that goes to the
+third one.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import queue
 import signal
 import sys
 import threading
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from dopt.garbage_collection import collect_rarely
@@ -22,11 +24,11 @@ from orchestrate.executors.live import Live
 from orchestrate.executors.task import run_task
 from orchestrate.executors.worker_environment import pin_threads
 
-HANDLED_BY_DRIVER = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+HANDLED_BY_DRIVER = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 """Ctrl-C, and warnings before a preemption, which some batch systems send to every process."""
 
 
-def main(descriptor: int, crash_report: int) -> None:
+def main(descriptor: int, crash_report: int, errors: int) -> None:
     """Run chunks until the driver closes the socket."""
     for number in HANDLED_BY_DRIVER:
         signal.signal(number, signal.SIG_IGN)
@@ -44,6 +46,9 @@ def main(descriptor: int, crash_report: int) -> None:
     live = None if seconds is None else Live(seconds, connection.send)
     chunks: queue.SimpleQueue[list[Task]] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(connection, chunks), daemon=True).start()
+    with ended_after(limits, crash_report):
+        pass  # a thread that the system does not give fails the start, and no trial
+    _hand_over(crash_report, errors)
     connection.send(None)  # ready
     while True:
         for task in chunks.get():
@@ -52,6 +57,18 @@ def main(descriptor: int, crash_report: int) -> None:
                 finished = run_task(run, task, limits, live)
             connection.send(finished)
         connection.send(None)
+
+
+def _hand_over(crash_report: int, errors: int) -> None:
+    """Print to the standard error of the driver from now on; begin with what was printed so far."""
+    sys.stdout.flush()
+    printed = os.pread(crash_report, os.fstat(crash_report).st_size, 0)
+    os.ftruncate(crash_report, 0)
+    os.lseek(crash_report, 0, os.SEEK_SET)
+    for stream in (sys.stdout, sys.stderr):
+        os.dup2(errors, stream.fileno())
+    with suppress(OSError):  # nobody reads it any longer
+        os.write(errors, printed)
 
 
 def _read(connection: Connection, chunks: queue.SimpleQueue[list[Task]]) -> None:
@@ -66,6 +83,6 @@ def _read(connection: Connection, chunks: queue.SimpleQueue[list[Task]]) -> None
 
 if __name__ == "__main__":
     try:
-        main(int(sys.argv[1]), int(sys.argv[2]))
-    except (EOFError, OSError):
+        main(*map(int, sys.argv[1:]))
+    except (EOFError, ConnectionError):
         os._exit(0)

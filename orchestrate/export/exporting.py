@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from orchestrate.export import matrices, streams, tables
-from orchestrate.export.atomic import whole
 from orchestrate.export.manifest import provenance
 from orchestrate.export.wanted import Export, ExportError
+from orchestrate.files import whole
 from orchestrate.store import ConfigRow, Reader
 
 _STREAMS: dict[str, Callable[[Reader, Sequence[ConfigRow]], streams.Stream]] = {
@@ -36,27 +36,20 @@ def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict
     """Write the file, and after it its manifest; return what the manifest says.
 
     Both appear whole or not at all. ``reader`` sees one moment, that of ``configs``. Raises
-    ``ExportError``.
+    ``ExportError``, or ``OutputError`` if they cannot be written.
     """
     _expect_trials(reader, configs, wanted)
-    try:
-        wanted.out.parent.mkdir(parents=True, exist_ok=True)
-        with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
-            content = _write(reader, configs, wanted, out)
-            about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": _hash(out)}
-            document = {
-                "kind": wanted.kind,
-                "format": wanted.format,
-                **about,
-                **content,
-                **provenance(reader, configs, wanted.filters),
-            }
-            manifest.write_text(json.dumps(document, indent=2) + "\n")
-    except OSError as error:
-        raise ExportError(
-            f"{wanted.out} cannot be written ({error.strerror or error}): make room and check "
-            f"that its folder is yours, or choose another --out."
-        ) from error
+    with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
+        content = _write(reader, configs, wanted, out)
+        about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": _hash(out)}
+        document = {
+            "kind": wanted.kind,
+            "format": wanted.format,
+            **about,
+            **content,
+            **provenance(reader, configs, wanted.filters),
+        }
+        manifest.write_text(json.dumps(document, indent=2) + "\n")
     return document
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from orchestrate.export.wanted import ExportError, FolderExport
+from orchestrate.export.wanted import FolderExport
 from orchestrate.store import ConfigRow, Reader
 
 
@@ -14,18 +14,9 @@ def export_folder(
 ) -> dict[str, Any]:
     """Write the folder, whole or not at all; return what is said of it.
 
-    ``reader`` sees one moment, that of ``configs``. Raises ``ExportError``.
+    ``reader`` sees one moment, that of ``configs``. Raises ``ExportError``, or ``OutputError`` if
+    it cannot be written.
     """
-    try:
-        return _write(reader, configs, wanted)
-    except OSError as error:
-        raise ExportError(
-            f"{wanted.out} cannot be written ({error.strerror or error}): make room and check "
-            f"that its folder is yours, or choose another one."
-        ) from error
-
-
-def _write(reader: Reader, configs: Sequence[ConfigRow], wanted: FolderExport) -> dict[str, Any]:
     # Each needs libraries that the others do not.
     if wanted.kind == "mlflow":
         from orchestrate.export.trackers.mlflow_store import write_mlflow

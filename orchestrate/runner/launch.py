@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
-import io
 import os
 import sys
-import traceback
-from pathlib import Path
 
-from dopt.errors import DoptError
 from dopt.kernel import warm_up
 from dopt.run import run_trial
-from orchestrate.cli_parser import discard_output, tell
+from orchestrate.cli_parser import UsageError
 from orchestrate.config.argv import normalize
 from orchestrate.config.error_messages import format_error
 from orchestrate.config.grid import Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.request import CONFIGURATION, Request, read_command_line
 from orchestrate.config.unknown_keys import check_launch
-from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
+from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.registry import executor_factory, make_job
-from orchestrate.redaction import without_password
+from orchestrate.program import ROOT, answered, say
 from orchestrate.runner.dry_run import preview
 from orchestrate.runner.memory_check import check_memory
 from orchestrate.runner.provenance import launch_record
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.runner.run_single import launch_trial
 from orchestrate.runner.seed_plan import SeedPlan
-from orchestrate.store import URL_VARIABLE, StoreUnavailableError
+from orchestrate.store import URL_VARIABLE
 
-ROOT = Path(__file__).resolve().parents[2]
 WORK = Work(run_trial, warm_up)
 
 
+@answered
 def main() -> int:
     """Run the command line and return the exit code."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        # An exception message may hold characters that the terminal cannot encode.
-        sys.stdout.reconfigure(errors="backslashreplace")
-    debug = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    if sys.flags.optimize:
+        raise UsageError(
+            "Python runs without assertions (PYTHONOPTIMIZE, -O), but Hydra reads no override "
+            "without them: unset PYTHONOPTIMIZE."
+        )
     if not os.environ.get(URL_VARIABLE):
         os.environ.pop(URL_VARIABLE, None)  # oc.env of the configuration takes "" as a URL
     try:
@@ -48,9 +45,9 @@ def main() -> int:
             return ExitCode.DONE
         grid, settings = _checked(request)
     except Exception as error:
-        if debug:
-            raise
-        return _refuse(format_error(error), ExitCode.BAD_REQUEST)
+        if getattr(error, "errno", None) or isinstance(error, MemoryError):
+            raise  # the system refuses something
+        raise LaunchError(format_error(error)) from error
     return run(request, grid, settings)
 
 
@@ -108,42 +105,21 @@ def _leaving(settings: LaunchSettings) -> str:
     return f"executor={settings.executor}" if make_job(settings) else ""
 
 
+@answered
 def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
     """Run a checked grid and return the exit code."""
-    try:
-        for note in grid.notes:
-            say(note)
-        if settings.dry_run:
-            say(preview(grid, settings.store_url, settings.retry))
-            if settings.until:
-                say("launch.until may need fewer of these seeds: they are run in batches")
-            if job := make_job(settings):
-                say(job.text(len(grid.trials)))
-            return ExitCode.DONE
-        record = launch_record(sys.argv, request.overrides, ROOT)
-        if not request.single:
-            return launch_grid(grid, settings, record, WORK, say=say)
-        code, line = launch_trial(grid.trials[0], settings, record, WORK)
-        say(line)
-        return code
-    except (StoreUnavailableError, InfrastructureError) as error:
-        return _refuse(str(error), ExitCode.INFRASTRUCTURE)
-    except DoptError as error:
-        return _refuse(str(error), ExitCode.BAD_REQUEST)
-    except Exception:
-        tell(sys.stderr, without_password(traceback.format_exc()))
-        sentence = "this is a defect of the program (traceback above); committed trials are kept"
-        return _refuse(f"{sentence}: report it, and run the same command again.", ExitCode.DEFECT)
-
-
-def say(text: str) -> None:
-    """Print a line and flush it; the trials go on although nobody reads the output any longer."""
-    try:
-        tell(sys.stdout, f"{without_password(text)}\n")
-    except BrokenPipeError:
-        discard_output()
-
-
-def _refuse(sentence: str, code: ExitCode) -> ExitCode:
-    tell(sys.stderr, f"error: {without_password(sentence)}\n")
+    for note in grid.notes:
+        say(note)
+    if settings.dry_run:
+        say(preview(grid, settings.store_url, settings.retry))
+        if settings.until:
+            say("launch.until may need fewer of these seeds: they are run in batches")
+        if job := make_job(settings):
+            say(job.text(len(grid.trials)))
+        return ExitCode.DONE
+    record = launch_record(sys.argv, request.overrides, ROOT)
+    if not request.single:
+        return launch_grid(grid, settings, record, WORK, say=say)
+    code, line = launch_trial(grid.trials[0], settings, record, WORK)
+    say(line)
     return code

@@ -6,13 +6,13 @@ import hashlib
 import os
 import platform
 import socket
-import subprocess
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
 from dopt import __version__
 from orchestrate.fingerprint import fingerprint
+from orchestrate.program import COMMIT_VARIABLE, commit_of, git
 from orchestrate.redaction import without_password_in_word
 from orchestrate.store import LaunchRecord
 
@@ -28,9 +28,6 @@ LIBRARIES = (
     "sqlalchemy",
     "torch",
 )
-
-COMMIT_VARIABLE = "DOPT_COMMIT"
-"""Environment variable with the commit of code outside a repository, as in a container."""
 
 LARGEST_FILE_BYTES = 16 * 2**20
 """Largest untracked file that is hashed; of a larger one the size is taken."""
@@ -50,7 +47,7 @@ def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> 
         Folder of the code, whose commit is noted if it is a git repository of its own, otherwise
         the one that ``DOPT_COMMIT`` gives.
     """
-    commit = _commit(root)
+    commit = commit_of(root)
     difference = _difference(root) if commit else None
     return LaunchRecord(
         argv=[without_password_in_word(word) for word in argv],
@@ -65,22 +62,13 @@ def launch_record(argv: Sequence[str], overrides: Sequence[str], root: Path) -> 
     )
 
 
-def _commit(root: Path) -> str | None:
-    """Return the commit of the code; a repository that merely holds an installed copy has none."""
-    top = _git(root, "rev-parse", "--show-toplevel")
-    if top is None or Path(os.fsdecode(top.strip())).resolve() != root.resolve():
-        return None
-    commit = _git(root, "rev-parse", "HEAD")
-    return commit.decode().strip() if commit else None
-
-
 def _difference(root: Path) -> bytes:
     """Return the difference of the working tree from its commit, with untracked sources.
 
     Untracked files of other kinds, such as exported results, change no number and do not count.
     """
-    changed = _git(root, "diff", "--binary", "--no-ext-diff", "--no-textconv", "HEAD") or b""
-    added = _git(root, "ls-files", "--others", "--exclude-standard", "-z", "--", *SOURCES) or b""
+    changed = git(root, "diff", "--binary", "--no-ext-diff", "--no-textconv", "HEAD") or b""
+    added = git(root, "ls-files", "--others", "--exclude-standard", "-z", "--", *SOURCES) or b""
     new = [name + b"\0" + _content(root, name) for name in sorted(added.split(b"\0")) if name]
     return b"\0".join([changed, *new]) if changed or new else b""
 
@@ -127,14 +115,3 @@ def _cpu_model() -> str:
         lines = []
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.processor() or platform.machine())
-
-
-def _git(root: Path, *arguments: str) -> bytes | None:
-    """Return what git prints, or None outside a repository and without git."""
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(root), *arguments], capture_output=True, check=True, timeout=20
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout

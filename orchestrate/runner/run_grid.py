@@ -11,13 +11,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TextIO
 
-from dopt.errors import DoptError
 from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.errors import ExitCode, InfrastructureError
+from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Prepare, Run
 from orchestrate.executors.registry import executor_factory, make_executor, make_job
+from orchestrate.program import exit_code
 from orchestrate.runner.batching import Chunks
 from orchestrate.runner.collecting import collected
 from orchestrate.runner.heartbeat import Heartbeat
@@ -135,7 +135,8 @@ def recorded_launch(
         except BaseException as error:
             # Try once more to release the claims; the error itself is reported by the caller.
             with suppress(StoreUnavailableError):
-                store.end_launch(launch, "failed", _code_of(error))
+                known = exit_code(error) if isinstance(error, Exception) else None
+                store.end_launch(launch, "failed", known)
             raise
     return code
 
@@ -145,15 +146,6 @@ _STATES = {
     ExitCode.INTERRUPTED: "interrupted",
     ExitCode.UNFINISHED: "interrupted",
 }
-
-
-def _code_of(error: BaseException) -> ExitCode | None:
-    """Return the exit code for an exception, None for an interrupt or exit."""
-    if isinstance(error, StoreUnavailableError | InfrastructureError):
-        return ExitCode.INFRASTRUCTURE
-    if isinstance(error, DoptError):
-        return ExitCode.BAD_REQUEST
-    return ExitCode.DEFECT if isinstance(error, Exception) else None
 
 
 def _interruptible(

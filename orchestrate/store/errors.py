@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dopt.errors import DoptError
+from orchestrate.errors import InfrastructureError
 
 
 class StoreError(DoptError):
     """Base of all errors of the results database."""
 
 
-class StoreUnavailableError(StoreError):
+class StoreUnavailableError(StoreError, InfrastructureError):
     """Database that cannot be reached, or is full, locked or damaged.
 
     ``transient`` is True if waiting may help: after a lost server or connection, or a lock that was

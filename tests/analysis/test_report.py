@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from analysis.__main__ import main
+from analysis.cli import main
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import select
 from analysis.errors import AnalysisError

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.__main__ import main
+from analysis.cli import main
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Selection
 from analysis.formatting import number

@@ -14,6 +14,7 @@ from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
+from orchestrate.program import readable_streams
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord, Reader
 from tests.hydra_files import parse_once
@@ -65,6 +66,7 @@ def command_line(
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["launch.py", *arguments])
+        readable_streams()  # as the frame of every program does
         try:
             code = int(launch.main())
         except SystemExit as end:

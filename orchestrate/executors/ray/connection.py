@@ -9,10 +9,12 @@ from typing import Any
 
 import ray
 
-from orchestrate.errors import InfrastructureError
+from dopt.errors import DoptError
+from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.ray.samples import Channel
+from orchestrate.program import exit_code
 
 TASK_OPTIONS: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "num_returns": "streaming"}
 """One core for each chunk; Ray never repeats it, and streams its outcomes."""
@@ -28,7 +30,7 @@ class Connection(ABC):
 
     @abstractmethod
     def connect(self) -> None:
-        """Connect, or raise ``InfrastructureError``."""
+        """Connect, or raise ``InfrastructureError``, or ``LaunchError`` where nothing can start."""
 
     @property
     @abstractmethod
@@ -59,8 +61,14 @@ class Connection(ABC):
             raise unreachable(address, error) from None
 
 
-def unreachable(address: str, error: Exception) -> InfrastructureError:
+def unreachable(address: str, error: Exception) -> DoptError:
     """Return the error for a failed connection to Ray."""
+    wait = isinstance(error, ConnectionError | TimeoutError) or exit_code(error) != 2
+    if address == "local" and isinstance(error, OSError) and not wait:
+        return LaunchError(
+            f"Ray cannot start ({first_line(error)}): set RAY_TMPDIR, or TMPDIR, to a folder with "
+            "a short path that can be written, such as /tmp, or use executor=local."
+        )
     return InfrastructureError(
         f"Ray cannot be reached at '{address}' ({first_line(error)}): check launch.ray.address, "
         "or use executor=local."

@@ -14,6 +14,7 @@ from typing import Any
 from ray._private import services
 
 from dopt.cores import usable_cores
+from dopt.errors import DoptError
 from orchestrate.errors import InfrastructureError
 
 START_SECONDS = 120.0
@@ -25,7 +26,8 @@ ATTEMPTS = 2
 def start(begin: Callable[[], None]) -> None:
     """Call ``begin``, which starts Ray, and once more if it fails.
 
-    Raises ``InfrastructureError`` with the last reason and the load of the machine.
+    Raises ``InfrastructureError`` with the last reason and the load of the machine, and at once
+    what is no ``InfrastructureError``.
     """
     for attempt in range(1, ATTEMPTS + 1):
         before = _children()
@@ -33,8 +35,10 @@ def start(begin: Callable[[], None]) -> None:
             with _long_start():
                 begin()
             return
-        except InfrastructureError as error:
+        except DoptError as error:
             _kill(_children() - before)  # what has started, which would keep the cores busy
+            if not isinstance(error, InfrastructureError):
+                raise
             if attempt == ATTEMPTS:
                 raise InfrastructureError(
                     f"{error} It was tried {ATTEMPTS} times; {_load()}: run the same command again "

@@ -10,13 +10,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from orchestrate.export.atomic import whole_folder
 from orchestrate.export.bundle import parquet
 from orchestrate.export.bundle.card import card
 from orchestrate.export.bundle.rows import Source
 from orchestrate.export.bundle.views import VIEWS_FILE, views_sql
 from orchestrate.export.manifest import provenance
 from orchestrate.export.wanted import ExportError, FolderExport
+from orchestrate.files import whole_folder
 from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store.bundles import checksums

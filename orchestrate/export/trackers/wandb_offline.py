@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrate.export.atomic import whole_folder
 from orchestrate.export.trackers import runs
 from orchestrate.export.trackers.runs import TrackedRun
 from orchestrate.export.wanted import FolderExport
+from orchestrate.files import whole_folder
 from orchestrate.store import ConfigRow, Reader
 
 if TYPE_CHECKING:

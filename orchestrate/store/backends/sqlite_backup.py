@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sqlite3
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain, count
 from pathlib import Path
 
@@ -54,20 +57,48 @@ def rescue(opened: sqlite3.Connection, path: Path, before: Path | None) -> Path:
     raise failed
 
 
+_OF_THE_COPY = {
+    "SQLITE_FULL": errno.ENOSPC,
+    "SQLITE_READONLY": errno.EROFS,
+    "SQLITE_CANTOPEN": errno.EACCES,
+    "SQLITE_IOERR_WRITE": errno.EIO,
+}
+"""Errors of a copy whose source is opened to be read alone."""
+
+
+@contextmanager
+def _of_the_copy(partial: Path) -> Iterator[None]:
+    """Raise ``OSError`` for the errors of a copy that are not those of its source."""
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        code = _OF_THE_COPY.get(error.sqlite_errorname)
+        if code is None:
+            raise
+        raise OSError(code, os.strerror(code), str(partial)) from error
+
+
 def _free_name(base: str, suffix: str) -> Path:
     names = chain([f"{base}{suffix}"], (f"{base}-{i}{suffix}" for i in count(2)))
     return next(path for path in map(Path, names) if not path.exists())
 
 
 def copy_checked(path: Path, partial: Path) -> None:
-    """Copy a SQLite database with its log to one file, and check it."""
+    """Copy a SQLite database with its log to one file, and check it.
+
+    Raises
+    ------
+    OSError
+        If the copy cannot be written.
+    """
     with contextlib.closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as source:
+        source.execute("PRAGMA schema_version").fetchone()  # the source can be opened
         _copy_from(source, partial, path)
 
 
 def _copy_from(source: sqlite3.Connection, partial: Path, path: Path) -> None:
     partial.unlink(missing_ok=True)
-    with contextlib.closing(sqlite3.connect(partial)) as copy:
+    with _of_the_copy(partial), contextlib.closing(sqlite3.connect(partial)) as copy:
         source.backup(copy)
         copy.execute("PRAGMA journal_mode = DELETE")  # one file, complete in itself
         (verdict,) = copy.execute("PRAGMA quick_check(1)").fetchone()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from analysis.__main__ import main
+from analysis.cli import main
 from analysis.data.config_matching import Filter, defaults, nearness
 from analysis.data.latest_configs import newest
 from analysis.data.trial_selection import select

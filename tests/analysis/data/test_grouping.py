@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.__main__ import main
+from analysis.cli import main
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Entry, Selection, select
 from analysis.errors import AnalysisError

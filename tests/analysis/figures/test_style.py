@@ -4,6 +4,7 @@ import itertools
 import math
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 
 from analysis.figures.axes import angle_text, log_limits, log_text, log_ticks, rows_and_columns
 from analysis.figures.input_spectrum.plot import GREYS
-from analysis.figures.style import mathematical
+from analysis.figures.style import mathematical, styled
 from analysis.line_styles import SEQUENCE, policy_style, sequence_style
 from dopt.policies import POLICIES
 
@@ -135,3 +136,15 @@ def test_log_limits_ignore_what_a_logarithm_cannot_show() -> None:
 )
 def test_rows_and_columns(panels: int, widest: int, grid: tuple[int, int]) -> None:
     assert rows_and_columns(panels, widest) == grid
+
+
+def test_a_matplotlibrc_changes_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that asks for LaTeX made every figure fail where that is not installed."""
+    with styled():
+        expected = {**matplotlib.rcParams}
+    given = {"text.usetex": True, "font.serif": ["Times"], "figure.constrained_layout.use": True}
+    for key, value in given.items():
+        monkeypatch.setitem(matplotlib.rcParams, key, value)
+    with styled():
+        assert {**matplotlib.rcParams} == expected
+    assert matplotlib.rcParams["text.usetex"]

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +26,14 @@ TABLES = ("trial", "step", "curve", "trajectory", "attempt", "config", "error")
 
 def counts(url: str) -> dict[str, object]:
     return {name: execute(url, f"SELECT count(*) FROM {name}")[0][0] for name in TABLES}
+
+
+def short(*words: Any, connect: Any = sqlite3.connect, **options: Any) -> sqlite3.Connection:
+    """Open a SQLite database that has no room for a third page."""
+    opened: sqlite3.Connection = connect(*words, **options)
+    if not options:  # the copy
+        opened.execute("PRAGMA max_page_count = 2")
+    return opened
 
 
 @pytest.fixture
@@ -45,6 +55,27 @@ class TestBackup:
         store.end_launch(grid, "done")
         assert everything(_restored(copy, url)) == before
         assert [path.name for path in copy.parent.iterdir()] == ["copy"]
+
+    def test_a_full_disk_names_the_copy_and_not_the_database(
+        self, grid: int, command: Run, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        if url.startswith("sqlite"):
+            monkeypatch.setattr("orchestrate.store.backends.sqlite_backup.sqlite3.connect", short)
+        else:
+            said = "pg_dump: error: could not write to file: No space left on device"
+            program = tmp_path / "bin" / "pg_dump"
+            program.parent.mkdir()
+            program.write_text(f"#!/bin/sh\necho {said!r} >&2\nexit 1\n")
+            program.chmod(0o755)
+            monkeypatch.setenv("PATH", str(program.parent), prepend=os.pathsep)
+        copy = tmp_path / "new" / "copy"
+        answer = command("backup", str(copy))
+        assert grid
+        assert answer.code == 2
+        assert f"error: {copy} cannot be written (" in answer.err
+        assert "No space left on device" in answer.err
+        assert "results database" not in answer.err
+        assert list(copy.parent.iterdir()) == []
 
     def test_no_file_is_replaced(self, grid: int, command: Run, tmp_path: Path) -> None:
         copy = tmp_path / "copy"

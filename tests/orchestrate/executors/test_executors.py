@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,11 @@ import pytest
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.errors import InfrastructureError
+from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
 from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.executors.local import LocalExecutor
+from orchestrate.program import exit_code
 from orchestrate.records import Failure
 from tests.orchestrate.executors.names import ALL, WITH_PROCESSES, WORKERS
 from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
@@ -141,8 +143,44 @@ def test_the_chunk_of_a_killed_worker_is_lost_and_the_others_are_not(make: Make)
 def test_workers_that_cannot_even_start_are_no_fault_of_a_trial() -> None:
     with LocalExecutor(_unknown_elsewhere(), 1) as executor:
         executor.submit(tasks([0]))
-        with pytest.raises(InfrastructureError, match="before they were ready"):
+        with pytest.raises(LaunchError, match=r"cannot start \(AttributeError: .*getpid_of_nobody"):
             drain(executor)
+
+
+def test_a_module_that_hides_one_of_the_standard_library_is_no_reason_to_try_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file of classes that is named as a module that only the workers import."""
+    (tmp_path / "queue.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    with LocalExecutor(quick, 1) as executor:
+        executor.submit(tasks([0]))
+        with pytest.raises(LaunchError, match=r"SimpleQueue.*/queue\.py hides the module queue"):
+            drain(executor)
+
+
+def test_what_a_worker_prints_before_it_is_ready_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys; sys.stderr.write('hear me\\n')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with LocalExecutor(quick, 1) as executor:
+        executor.submit(tasks([0]))
+        assert len(drain(executor)) == 1
+    assert "hear me" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("code", [errno.ENOENT, errno.E2BIG])
+def test_what_another_launch_cannot_mend_is_not_tried_again(
+    code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    with pytest.raises(OSError, match=os.strerror(code)) as refused, LocalExecutor(quick, 1):
+        pass
+    assert exit_code(refused.value) == ExitCode.BAD_REQUEST
 
 
 def _unknown_elsewhere() -> Run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
@@ -14,9 +15,10 @@ import pytest
 import ray
 from ray._private import services
 
-from orchestrate.errors import InfrastructureError
+from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import WorkerLost
 from orchestrate.executors.ray import start as ray_start
+from orchestrate.executors.ray.connection import unreachable
 from orchestrate.executors.ray.executor import RayExecutor
 from orchestrate.executors.ray.start import start
 from tests.orchestrate.executors.names import ON_RAY, WORKERS
@@ -109,6 +111,23 @@ def test_a_failed_start_of_ray_is_ended_and_tried_once_more() -> None:
         -signal.SIGKILL,
         -signal.SIGKILL,
     ]
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.ENOSPC, None])
+def test_a_folder_that_ray_cannot_use_is_named_and_not_tried_again(code: int | None) -> None:
+    """TMPDIR of a job may be too long for the name of a socket."""
+    tries: list[int] = []
+    reason = "AF_UNIX path length cannot exceed 107 bytes"
+
+    def fail() -> None:
+        tries.append(1)
+        raise unreachable("local", OSError(code, reason) if code else OSError(reason))
+
+    with pytest.raises(LaunchError, match=f"{reason}.*set RAY_TMPDIR, or TMPDIR"):
+        start(fail)
+    assert len(tries) == 1
+    for error in (TimeoutError("late"), BlockingIOError(errno.EAGAIN, "no process"), ValueError()):
+        assert isinstance(unreachable("local", error), InfrastructureError)
 
 
 def test_a_worker_is_given_the_number_of_its_raylet() -> None:

@@ -1,0 +1,280 @@
+"""Frame of every program: its streams and signals, ``--version``, and the exit code of an error."""
+
+from __future__ import annotations
+
+import codecs
+import errno
+import functools
+import importlib
+import io
+import logging
+import os
+import signal
+import subprocess
+import sys
+import traceback
+import unicodedata
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, NoReturn, ParamSpec
+
+import dopt
+from dopt.errors import DoptError
+from orchestrate.cli_parser import as_started, discard_output, tell
+from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
+from orchestrate.redaction import without_password
+
+ROOT = Path(__file__).resolve().parents[1]
+
+COMMIT_VARIABLE = "DOPT_COMMIT"
+"""Environment variable with the commit of code outside a repository, as in a container."""
+
+LIMITS = (errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
+"""Errors of a system that gives no more; it may at another time."""
+
+_ASCII = {
+    **dict(zip("·–—−×∝▁▂▃▄▅▆▇█", "----x~_.:-=+*#", strict=True)),
+    **{"±": "+-", "≤": "<=", "≥": ">=", "≠": "!=", "‖": "||", "°": "deg"},
+    "\N{COMBINING DOT ABOVE}": "'",
+}
+
+Parameters = ParamSpec("Parameters")
+
+
+def run(module: str) -> NoReturn:
+    """Run the function ``main`` of a module as a program of its own, and exit with its code."""
+    _open_streams()
+    readable_streams()
+    _tolerate_warnings()
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # nohup has it ignored
+        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGTERM))
+    logging.raiseExceptions = False  # a log that cannot be written is lost
+    os.environ["MPLBACKEND"] = "agg"  # another one may not be there
+    sys.exit(_main(module))
+
+
+def answered(main: Callable[Parameters, int]) -> Callable[Parameters, int]:
+    """Return a function that prints what an exception of ``main`` says, and returns its code.
+
+    :func:`exit_code` alone decides which code that is. ``HYDRA_FULL_ERROR=1`` shows the traceback.
+    """
+
+    @functools.wraps(main)
+    def guarded(*arguments: Parameters.args, **options: Parameters.kwargs) -> int:
+        try:
+            return main(*arguments, **options)
+        except KeyboardInterrupt:
+            return ExitCode.INTERRUPTED
+        except BrokenPipeError:
+            discard_output()
+            return ExitCode.DONE
+        except Exception as error:
+            return _answer(error)
+
+    return guarded
+
+
+def exit_code(error: Exception) -> ExitCode:
+    """Return the exit code that an exception becomes.
+
+    2 is for what the user can mend, 75 for what the same command may do later, 70 for a defect.
+    """
+    if isinstance(error, InfrastructureError) or _at_a_limit(error):
+        return ExitCode.INFRASTRUCTURE
+    kinds = (DoptError, OSError, ImportError, UnicodeDecodeError)
+    return ExitCode.BAD_REQUEST if isinstance(error, kinds) else ExitCode.DEFECT
+
+
+def _at_a_limit(error: BaseException | None) -> bool:
+    if error is None or isinstance(error, DoptError):
+        return False
+    thread = isinstance(error, RuntimeError) and "can't start new thread" in str(error)
+    one = thread or isinstance(error, MemoryError) or getattr(error, "errno", None) in LIMITS
+    return one or _at_a_limit(error.__context__)  # what is cleaned up then may fail, too
+
+
+def _answer(error: Exception) -> ExitCode:
+    code, full = exit_code(error), without_password(traceback.format_exc())
+    hidden = "" if isinstance(error, DoptError | OSError) else hiding(full)
+    if hidden:
+        code = ExitCode.BAD_REQUEST
+    if code == ExitCode.DEFECT or os.environ.get("HYDRA_FULL_ERROR") == "1":
+        tell(sys.stderr, full)
+    if isinstance(error, OSError) and not error.filename:
+        discard_output()  # which may be what cannot be written
+    sentence = without_password(as_started(_sentence(error, code, hidden)))
+    tell(sys.stderr, f"error: {sentence}\n")
+    return code
+
+
+def _sentence(error: Exception, code: ExitCode, hidden: str) -> str:
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    if isinstance(error, DoptError):
+        return str(error)
+    if isinstance(error, UnicodeDecodeError):
+        return f"A file is no text in UTF-8 ({error}): mend it, such as a matplotlibrc."
+    if hidden or isinstance(error, ImportError):
+        return (
+            f"{type(error).__name__}: {error}: {hidden or 'install dopt and its libraries again.'}"
+        )
+    if code == ExitCode.INFRASTRUCTURE:
+        return (
+            f"The system gives this process no further process, thread, file or memory ({reason}): "
+            "raise its limits (ulimit, pids.max) or use fewer workers, and run the same command "
+            "again."
+        )
+    if isinstance(error, OSError):
+        return (
+            f"{error.filename or 'The output, or a file,'} cannot be used ({reason}): check the "
+            "path, its permissions and the room on its disk, or give another one."
+        )
+    return (
+        "this is a defect of the program (traceback above); committed trials are kept: report it, "
+        "and run the same command again."
+    )
+
+
+def say(text: str) -> None:
+    """Print a line and flush it; the trials go on although nobody reads the output any longer."""
+    try:
+        tell(sys.stdout, f"{without_password(as_started(text))}\n")
+    except OSError as error:
+        discard_output()
+        if not isinstance(error, BrokenPipeError):
+            sys.stderr.write(f"note: the output is lost from here on ({error.strerror}).\n")
+
+
+def hiding(text: str) -> str:
+    """Return a clause on the file that hides a module of the standard library, or nothing.
+
+    Python finds a module in the folders of ``PYTHONPATH`` first. ``text`` is a traceback, which
+    names the module or the file.
+    """
+    for path in _before_the_standard_library():
+        name = path.parent.name if path.name == "__init__.py" else path.stem
+        if name in sys.stdlib_module_names and (str(path) in text or f"'{name}'" in text):
+            return f"{path} hides the module {name} of the standard library: rename this file."
+    return ""
+
+
+def _before_the_standard_library() -> Iterator[Path]:
+    for folder in sys.path:
+        if folder == str(Path(os.__file__).parent):
+            return
+        yield from (*Path(folder).glob("*.py"), *Path(folder).glob("*/__init__.py"))
+
+
+@answered
+def _main(module: str) -> int:
+    try:
+        _check_folder()
+        if "--version" in sys.argv[1:]:
+            say(version())
+            return ExitCode.DONE
+        return int(importlib.import_module(module).main())
+    finally:
+        sys.stdout.flush()
+
+
+def _check_folder() -> None:
+    try:
+        Path.cwd()
+    except OSError as error:
+        folder = str(Path("/proc/self/cwd").readlink()).removesuffix(" (deleted)")
+        raise LaunchError(
+            f"The current folder {folder} cannot be used ({error.strerror}), it may have been "
+            "deleted: change to another one."
+        ) from error
+
+
+def version() -> str:
+    """Return the version of dopt, with its commit where that is known."""
+    try:
+        number = dopt.__version__
+    except ModuleNotFoundError:  # run from its sources
+        number = "(not installed)"
+    commit = commit_of(ROOT) or os.environ.get(COMMIT_VARIABLE)
+    return f"dopt {number}" + (f", commit {commit}" if commit else "")
+
+
+def commit_of(root: Path) -> str | None:
+    """Return the commit of the code; a repository that merely holds an installed copy has none."""
+    top = git(root, "rev-parse", "--show-toplevel")
+    if top is None or Path(os.fsdecode(top.strip())).resolve() != root.resolve():
+        return None
+    commit = git(root, "rev-parse", "HEAD")
+    return commit.decode().strip() if commit else None
+
+
+def git(root: Path, *arguments: str) -> bytes | None:
+    """Return what git prints, or None outside a repository and without git."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(root), *arguments], capture_output=True, check=True, timeout=20
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout
+
+
+class _Lossy(io.FileIO):
+    """Standard error that loses what cannot be written, as when its terminal is gone."""
+
+    def write(self, data: object, /) -> int:
+        try:
+            return super().write(data)  # type: ignore[arg-type]
+        except OSError:
+            return len(memoryview(data))  # type: ignore[arg-type]
+
+
+def _open_streams() -> None:
+    """Open the streams that are closed: the next files that are opened would take their place."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w" if number else "r", closefd=False))
+    raw: IO[bytes] = io.BufferedWriter(_Lossy(2, "w", closefd=False))
+    sys.stderr = io.TextIOWrapper(raw, encoding=sys.stderr.encoding, line_buffering=True)
+
+
+def readable_streams() -> None:
+    """Let letters that a terminal does not know be written in ASCII."""
+    codecs.register_error("readable", _in_ascii)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="readable")
+
+
+def _in_ascii(error: UnicodeError) -> tuple[str, int]:
+    """Return ``+-`` for ±, ``^2`` for ², ``theta`` for θ; an escape for what has no such form."""
+    assert isinstance(error, UnicodeEncodeError)
+    text, raised = "", False
+    for char in error.object[error.start : error.end]:
+        before, raised = raised, unicodedata.decomposition(char).startswith("<super>")
+        text += ("^" if raised and not before else "") + _plain(char)
+    return text, error.end
+
+
+def _plain(char: str) -> str:
+    if char in _ASCII or char.isascii():
+        return _ASCII.get(char, char)
+    words = unicodedata.name(char, "").split()
+    if words[:1] == ["GREEK"] and "LETTER" in words:
+        return words[-1].capitalize() if "CAPITAL" in words else words[-1].lower()
+    parts = unicodedata.normalize("NFKD", char)
+    if parts != char:
+        return "".join(map(_plain, parts))
+    return "" if unicodedata.combining(char) else ascii(char)[1:-1]
+
+
+def _tolerate_warnings() -> None:
+    """Print the warnings that PYTHONWARNINGS makes errors: those of libraries end no program."""
+    if any(action == "error" for action, *_ in warnings.filters):
+        warnings.resetwarnings()
+        warnings.simplefilter("default")
+        given = os.environ.get("PYTHONWARNINGS", "")
+        os.environ["PYTHONWARNINGS"] = given.replace("error", "default")  # of workers, too

@@ -1,0 +1,251 @@
+"""Frame of every program: streams, signals, warnings, versions, and the exit code of an error."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import dopt
+from dopt.errors import DoptError
+from orchestrate import program
+from orchestrate.cli_parser import as_started
+from orchestrate.errors import ExitCode, InfrastructureError
+from orchestrate.store import StoreUnavailableError
+from tests.paths import ROOT, without_coverage
+
+PROGRAMS = (["orchestrate/launch.py"], ["-m", "orchestrate"], ["-m", "analysis"])
+WORDS = {"orchestrate/launch.py": "env=pendulum", "orchestrate": "status", "analysis": "summary"}
+
+Capture = pytest.CaptureFixture[str]
+
+
+def started(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the program of the tests."""
+    return subprocess.run(
+        [sys.executable, "-m", "tests.orchestrate.framed", *words],
+        cwd=ROOT, env={**without_coverage(), **environment},
+        capture_output=True, encoding="latin-1", timeout=60, check=False,
+    )  # fmt: skip
+
+
+# Which exception becomes which exit code
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (DoptError("width is wide."), 2, "error: width is wide."),
+        (InfrastructureError("Ray is gone."), 75, "error: Ray is gone."),
+        (StoreUnavailableError("The disk is full."), 75, "error: The disk is full."),
+        (BlockingIOError(errno.EAGAIN, "Try again"), 75, "no further process.*Try again.*pids.max"),
+        (OSError(errno.EMFILE, "Too many open files"), 75, "Too many open files"),
+        (RuntimeError("can't start new thread"), 75, "no further process.*can't start new thread"),
+        (MemoryError(), 75, "MemoryError"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "a/b"), 2, "a/b cannot be used"),
+        (OSError(errno.ENOSPC, "No space left"), 2, r"The output, .* \(No space left\)"),
+        (ModuleNotFoundError("No module named 'numba'"), 2, "No module named 'numba': install"),
+        (UnicodeDecodeError("utf-8", b"\xee", 0, 1, "invalid"), 2, "no text in UTF-8"),
+    ],
+)
+def test_what_a_user_meets_is_one_sentence_without_a_traceback(
+    error: Exception, code: int, words: str, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(program, "discard_output", lambda: None)
+    assert program.answered(raising(error))() == code == program.exit_code(error)
+    said = capsys.readouterr().err
+    assert re.fullmatch("error: [^\n]+\n", said), said
+    assert re.search(words, said), said
+
+
+def raising(error: BaseException) -> Callable[[], int]:
+    def main() -> int:
+        raise error
+
+    return main
+
+
+def test_a_defect_has_a_traceback_and_70(capsys: Capture) -> None:
+    assert program.answered(raising(KeyError("x")))() == ExitCode.DEFECT
+    assert "Traceback" in capsys.readouterr().err
+    assert program.answered(raising(KeyboardInterrupt()))() == ExitCode.INTERRUPTED
+    assert capsys.readouterr().err == ""
+
+
+def test_the_traceback_of_a_sentence_is_shown_on_request(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    assert program.answered(raising(DoptError("no")))() == 2
+    said = capsys.readouterr().err
+    assert "Traceback" in said
+    assert said.endswith("error: no\n")
+
+
+@pytest.mark.parametrize("place", ["queue.py", "queue/__init__.py"])
+def test_a_module_that_hides_one_of_the_standard_library_is_named(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    (tmp_path / "queue").mkdir()
+    (tmp_path / place).write_text("")
+    (tmp_path / "json.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    error = AttributeError("module 'queue' has no attribute 'SimpleQueue'")
+    assert program.answered(raising(error))() == ExitCode.BAD_REQUEST
+    assert f"{tmp_path}/{place} hides the module queue" in capsys.readouterr().err
+    assert program.hiding("AttributeError: module 'csv' has no attribute 'x'") == ""
+
+
+# Streams and signals
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_closed_stream_is_no_place_for_a_file(closed: str, tmp_path: Path) -> None:
+    """Cron and daemons start programs without streams."""
+    out = tmp_path / "out"
+    command = f"{sys.executable} -m tests.orchestrate.framed"
+    for words, expected in ((f"open {out}", 5), ("child", 5), ("letters", 5)):
+        done = subprocess.run(
+            f"{command} {words} {closed}", shell=True, cwd=ROOT, timeout=60, check=False,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+        assert done.returncode == expected
+    assert int(out.read_text()) > 2
+
+
+@pytest.mark.parametrize(("redirected", "code"), [(">/dev/full", 2), ("2>/dev/full", 5)])
+def test_an_output_on_a_full_disk_is_a_sentence_and_lost_errors_end_nothing(
+    redirected: str, code: int
+) -> None:
+    command = f"{sys.executable} -m tests.orchestrate.framed letters {redirected}"
+    done = subprocess.run(
+        command, shell=True, cwd=ROOT, timeout=60, check=False, text=True, capture_output=True
+    )
+    assert done.returncode == code
+    assert ("No space left on device" in done.stderr) == (code == 2)
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_hang_up_is_a_request_to_end(number: signal.Signals) -> None:
+    with waiting() as running:
+        running.send_signal(number)
+        out, err = running.communicate(timeout=60)
+    assert running.returncode == 5, out + err
+    assert "finishing running trials" in err
+
+
+def test_a_hang_up_that_nohup_ignores_stays_ignored() -> None:
+    with waiting(lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)) as running:
+        running.send_signal(signal.SIGHUP)
+        with pytest.raises(subprocess.TimeoutExpired):
+            running.wait(0.5)
+        running.send_signal(signal.SIGTERM)
+        assert running.wait(60) == 5
+
+
+def waiting(before: Callable[[], Any] | None = None) -> subprocess.Popen[str]:
+    """Start the program of the tests; it waits for a signal."""
+    running = subprocess.Popen(
+        [sys.executable, "-m", "tests.orchestrate.framed", "wait"],
+        cwd=ROOT, env=without_coverage(), text=True, preexec_fn=before,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert running.stdout is not None
+    assert running.stdout.readline() == "ready\n"
+    return running
+
+
+def test_letters_that_a_terminal_does_not_know_are_written_in_ascii() -> None:
+    plain = "0 - +- 2 degC, m/s^2, 10^-12, theta' <= gamma, Omega, e, \\u6771"
+    done = started("letters", PYTHONIOENCODING="ascii:strict")
+    assert (done.returncode, done.stdout) == (5, plain)
+    assert done.stderr == f"{plain}\n"
+    done = started("letters", LC_ALL="POSIX", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
+    assert (done.returncode, done.stdout) == (5, plain)
+    done = started("letters", PYTHONIOENCODING="latin-1")
+    assert done.returncode == 5
+
+
+def test_warnings_as_errors_end_no_program() -> None:
+    done = started("warn", PYTHONWARNINGS="error")
+    assert done.returncode == 5, done.stderr
+    assert "a library is old" in done.stderr
+
+
+# The programs
+
+
+def run_program(words: list[str], cwd: Path, **environment: str) -> tuple[int, str, str]:
+    first = [str(ROOT / words[0])] if words[0].endswith(".py") else words
+    done = subprocess.run(
+        [sys.executable, *first, *words[len(first) :]], cwd=cwd,
+        env={**without_coverage(), "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("words", PROGRAMS, ids=lambda words: words[-1])
+def test_a_deleted_folder_is_named(words: list[str], tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    first = str(ROOT / words[0]) if len(words) == 1 else " ".join(words)
+    command = f"rmdir {gone}; exec {sys.executable} {first} {WORDS[words[-1]]}"
+    done = subprocess.run(
+        command, shell=True, cwd=gone, env={**without_coverage(), "PYTHONPATH": str(ROOT)},
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert re.fullmatch(f"error: [^\n]*{gone} [^\n]*deleted[^\n]*\n", done.stderr), done.stderr
+
+
+@pytest.mark.parametrize("words", [*PROGRAMS, ["-m", "benchmarks"]], ids=lambda words: words[-1])
+def test_every_program_says_its_version_and_commit(words: list[str], tmp_path: Path) -> None:
+    code, out, err = run_program([*words, "--version"], tmp_path, DOPT_COMMIT="")
+    commit = program.commit_of(ROOT)
+    known = f", commit {commit}" if commit else ""
+    assert (code, out, err) == (0, f"dopt {dopt.__version__}{known}\n", "")
+
+
+def test_a_version_loads_no_library() -> None:
+    loaded = "import sys, orchestrate.program; print(sorted(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", loaded], cwd=ROOT, env=without_coverage(), capture_output=True,
+        text=True, check=True,
+    )  # fmt: skip
+    assert not {"numpy", "hydra", "sqlalchemy", "pandas"} & set(re.findall(r"'(\w+)'", done.stdout))
+
+
+def test_outside_a_repository_the_version_has_the_commit_of_the_image(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(program, "ROOT", tmp_path)
+    monkeypatch.delenv("DOPT_COMMIT", raising=False)
+    assert "commit" not in program.version()
+    monkeypatch.setenv("DOPT_COMMIT", "a1b2")
+    assert program.version().endswith(", commit a1b2")
+
+
+def test_texts_name_the_program_that_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "python -m orchestrate work, python -m analysis serve, python orchestrate/launch.py -m"
+    monkeypatch.setattr(sys, "argv", ["/usr/lib/orchestrate/__main__.py"])
+    assert as_started(text) == text
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/dopt", "status"])
+    assert as_started(text) == "dopt work, dopt-analysis serve, dopt-launch -m"
+
+
+def test_python_without_assertions_is_refused_by_name(tmp_path: Path) -> None:
+    words = ["orchestrate/launch.py", "env=pendulum"]
+    code, _, err = run_program(words, tmp_path, PYTHONOPTIMIZE="2")
+    assert code == 2
+    assert re.fullmatch("error: [^\n]*unset PYTHONOPTIMIZE[^\n]*\n", err), err
+    assert not os.listdir(tmp_path)  # noqa: PTH208
