@@ -3,7 +3,8 @@
 Hydra composes each distinct choice of groups once, with the first value of every other sweep; the
 other values of scalar sweeps are then set in the composed configuration. An override that is
 neither a choice nor a scalar is composed by Hydra for each of its values. The result equals that
-of Hydra's basic sweeper wherever that one succeeds.
+of Hydra's basic sweeper wherever that one succeeds, but for the values of some sweeps
+(:mod:`orchestrate.config.sweep_axes`).
 
 The basic sweeper fails if an override sets a key that only some of the choices have, such as
 ``policy.regularization=1e-2`` with every policy. Here the override applies to the choices that have
@@ -43,7 +44,7 @@ def expand(
     loader, config
         Hydra's loader, and the configuration of the launch as Hydra composed it without sweeps.
     grids
-        Overrides that span each grid; a later one replaces an earlier one of the same key.
+        Overrides that span each grid (:func:`orchestrate.config.sweep_axes.read_axes`).
     sections
         Top-level keys that the settings of a combination hold.
     grouped
