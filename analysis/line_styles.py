@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import colorsys
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -72,11 +74,15 @@ _DASHES: tuple[Dashes, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.2,
 
 
 def policy_style(policy: str) -> LineStyle:
-    """Return a policy's style; policies of a user are grey, each with dashes from its name."""
+    """Return a policy's style; policies of a user have a colour and dashes from their name."""
     if policy in _POLICIES:
         return LineStyle(policy_title(policy), *_POLICIES[policy])
-    dash = 2.0 + sum(policy.encode()) % 7
-    return LineStyle(policy_title(policy), GREY, (0, (dash, 1.5)))
+    number = zlib.crc32(policy.encode())
+    channels = colorsys.hls_to_rgb(number % 360 / 360, 0.5, 0.75)
+    light = sum(w * c**2.2 for w, c in zip((0.2126, 0.7152, 0.0722), channels, strict=True))
+    scale = min(1.0, (0.25 / light) ** (1 / 2.2))  # for a contrast of 3 : 1 to white
+    colour = "#" + "".join(f"{round(255 * scale * channel):02x}" for channel in channels)
+    return LineStyle(policy_title(policy), colour, (0, (2.0 + number // 360 % 7, 1.5)))
 
 
 def sequence_style(place: int, same: int, label: str, colour: str | None = None) -> LineStyle:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from analysis.data.divergence import DivergenceRule
@@ -17,6 +18,9 @@ from analysis.serve.policy_labels import legend_entry
 from analysis.serve.query_params import QueryParams
 from analysis.serve.state import ServerState
 from orchestrate.store import ConfigRow, Reader
+
+WINDOW = 25
+RUNNING = f"running median of {WINDOW} steps"
 
 COLUMNS = ("loss", "reachable_loss")
 
@@ -58,7 +62,7 @@ def curves(state: ServerState, params: QueryParams) -> dict[str, Any]:
     return {
         "env": found[0].env,
         "is_prequential": found[0].is_prequential,
-        "statistic": found[0].statistic.label,
+        "statistic": RUNNING if found[0].is_prequential else found[0].statistic.label,
         "band": found[0].statistic.band,
         "t": longest.t,
         "x": longest.x,
@@ -119,12 +123,17 @@ def _light(curve: LossCurve) -> LossCurve:
 
 
 def _curve(curve: LossCurve) -> dict[str, Any]:
+    band = curve.band
+    values = {"centre": band.centre, "low": band.low, "high": band.high}
+    if curve.is_prequential:  # of one step it is noise
+        running = pd.Series(band.centre).rolling(WINDOW, min_periods=1, center=True).median()
+        nothing = np.full(len(running), np.nan)
+        values = {"centre": running.to_numpy(), "low": nothing, "high": nothing}
+        values["points"] = band.centre
     return {
         **legend_entry(curve.policy),
-        "centre": curve.band.centre,
-        "low": curve.band.low,
-        "high": curve.band.high,
-        "n": curve.band.n,
+        **values,
+        "n": band.n,
         "n_diverged": curve.sample.n_diverged,
         "count": curve.sample.describe(),
     }

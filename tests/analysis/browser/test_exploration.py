@@ -42,3 +42,25 @@ def test_its_page_follows_it(browser: Browser, sqlite_url: str, figures: Path) -
             )
             assert page.locator("#loss canvas").count() == 1, "the chart before is gone"
             assert "prequential loss" in page.inner_text("#outcome")
+
+
+def test_its_curve_is_a_running_median_among_points(
+    browser: Browser, sqlite_url: str, figures: Path
+) -> None:
+    with Explorer(MOTOR, policy="random", steps=500) as explorer:
+        explore(explorer, 40)
+        explorer.save(sqlite_url)
+        errors = explorer.errors
+    with (
+        chromium.served(sqlite_url, figures) as address,
+        chromium.strict_page(browser, address) as page,
+    ):
+        [curve] = page.request.get(f"{address}/api/curves?env=plant").json()["curves"]
+        np.testing.assert_allclose(curve["points"], errors)
+        assert curve["centre"][20] == np.median(errors[8:33])
+        assert set(curve["low"]) == {None}
+        page.goto(f"{address}/curves?env=plant")
+        page.wait_for_selector("#chart[data-shown=random] canvas")
+        assert page.inner_text("#lead").startswith("Prequential loss against time")
+        assert "Points: each step. Lines: running median" in page.inner_text("#band")
+        assert not page.is_visible("text=evaluation grid")

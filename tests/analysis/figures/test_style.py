@@ -66,9 +66,16 @@ def test_values_of_a_setting_look_different() -> None:
     assert len({(style.colour, style.line) for style in styles}) == len(styles)
 
 
-def test_a_policy_of_the_user_has_a_style() -> None:
-    assert policy_style("my_policy").label == "my policy"
-    assert policy_style("my_policy") == policy_style("my_policy")
+def test_policies_of_the_user_have_colours_of_their_own() -> None:
+    """The same in every process, and all dark enough for a line."""
+    names = ["my_policy", "curiosity", "staircase", "frontier", *(f"own_{n}" for n in range(40))]
+    styles = [policy_style(name) for name in names]
+    assert styles[0].label == "my policy"
+    assert [style.colour for style in styles[:3]] == ["#df2029", "#2039df", "#6c20df"]
+    assert len({(style.colour, style.line) for style in styles}) == len(names)
+    for colour in (style.colour for style in styles):
+        assert max(to_rgb(colour)) - min(to_rgb(colour)) > 0.3, "no grey"
+        assert contrast_to_white(colour) >= 3
 
 
 def test_dotted_letters_become_mathematics() -> None:

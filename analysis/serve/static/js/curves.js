@@ -2,7 +2,7 @@
 
 import { errorBars } from "./bars.js";
 import { hoverBox } from "./hover.js";
-import { fillLegend, readLegend } from "./legend.js";
+import { fillLegend, nameLines, readLegend } from "./legend.js";
 import { numeral } from "./numbers.js";
 import { axis, describe, ink, logRange, plot, veil } from "./plot.js";
 
@@ -14,6 +14,8 @@ const ASKED = ["env", "width", "column", "x", "diverged", "where"];
 const part = (id) => document.getElementById(id);
 const form = /** @type {HTMLFormElement|null} */ (part("controls"));
 const place = part("chart");
+const LEAD = part("lead").textContent;
+const PREQUENTIAL = "Prequential loss against time: the error of each predicted acceleration before it is learned, not an error over a grid.";
 const hidden = new Set(
   (new URLSearchParams(location.search).get("hide") ?? "").split(",").filter(Boolean),
 );
@@ -98,6 +100,9 @@ function draw() {
   hoverBox(place, chart, values);
   if (range) chart.setScale("x", { min: range.min, max: range.max });
   part("band").textContent = style === "none" ? "" : `Interval: ${answer.band}.`;
+  part("lead").textContent = answer.is_prequential ? PREQUENTIAL : LEAD;
+  if (answer.is_prequential) part("band").textContent = `Points: each step. Lines: ${answer.statistic}.`;
+  for (const name of ["column", "style"]) form.querySelector(`[name=${name}]`).closest("fieldset").hidden = answer.is_prequential;
   part("legend").tHead.rows[0].cells[0].textContent = "policy";
   read(null);
   shown();
@@ -107,7 +112,7 @@ function draw() {
 function data() {
   const columns = [answer.x];
   for (const curve of answer.curves) {
-    const low = curve.low.map((value, at) => (value === null ? null : Math.max(value, curve.centre[at] / 4)));
+    const low = curve.points ?? curve.low.map((value, at) => (value === null ? null : Math.max(value, curve.centre[at] / 4)));
     columns.push(curve.centre, low, curve.high);
   }
   return columns;
@@ -122,7 +127,7 @@ function options(style, unit, column) {
     const first = 1 + 3 * index;
     series.push(
       { label: curve.policy, show, stroke: () => ink(curve.colour), width: 1.25 * curve.line_width, dash, points: { show: false } },
-      { label: "low", show, stroke: "transparent", width: 0, points: { show: false } },
+      { label: "low", show, stroke: "transparent", width: 0, points: faint(curve) },
       { label: "high", show, stroke: "transparent", width: 0, points: { show: false } },
     );
     bands.push({ series: [first + 2, first + 1], fill: () => veil(curve.colour, 0.17) });
@@ -131,7 +136,7 @@ function options(style, unit, column) {
   const name = column === "loss" && answer.is_prequential ? "prequential loss" : what;
   return {
     series,
-    bands: style === "band" ? bands : [],
+    bands: style === "band" && !answer.is_prequential ? bands : [],
     scales: { x: { time: false }, y: { distr: 3, log: 10, range: limits } },
     axes: [
       axis(`time t [${unit}]`, false, { size: 38, space: 70 }),
@@ -145,6 +150,12 @@ function options(style, unit, column) {
       draw: style === "errorbar" ? [errorBars(barred)] : [],
     },
   };
+}
+
+/** The points of a prequential loss, of which a line would be noise. */
+function faint(curve) {
+  const fill = () => veil(curve.colour, 0.3);
+  return curve.points ? { show: true, size: 3, width: 0, stroke: "transparent", fill } : { show: false };
 }
 
 /** Limits of the loss axis: the visible curves, without those far below the others. */
@@ -210,6 +221,7 @@ function toggle(policy, on) {
 /** Describe the chart for screen readers. */
 function shown() {
   const curves = answer.curves.filter((curve) => !hidden.has(curve.policy));
+  nameLines(part("key"), curves);
   place.dataset.shown = curves.map((curve) => curve.policy).join(" ");
   place.dataset.steps = String(answer.x.length);
   describe(place, `Loss against time in the ${answer.env}: ${curves.map((curve) => curve.label).join(", ")}. The table below has the values.`);

@@ -21,6 +21,17 @@ export function swatch(entry) {
   return svg;
 }
 
+/** Write the legend of several lines above their chart. @param {HTMLElement} place */
+export function nameLines(place, lines) {
+  const items = lines.map((line) => {
+    const item = document.createElement("li");
+    item.append(swatch(line), line.label);
+    return item;
+  });
+  place.replaceChildren(...items);
+  place.hidden = items.length < 2;
+}
+
 /**
  * Fill the table with a row for each curve.
  * @param {HTMLTableElement} table

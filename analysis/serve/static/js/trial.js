@@ -1,7 +1,7 @@
 /** Trial page: charts of loss, inputs, bounded states, spectrum and phase plane. */
 
 import { hoverBox } from "./hover.js";
-import { swatch } from "./legend.js";
+import { nameLines } from "./legend.js";
 import { drawPhase } from "./phase.js";
 import { numeral } from "./numbers.js";
 import { axis, ink, logRange, plot, theme } from "./plot.js";
@@ -76,20 +76,14 @@ function drawInputs(found) {
     title: `t = ${numeral(times[index])} s`,
     rows: found.inputs.map((one, i) => ({ line: sample(paint(found, found.inputs, i)), label: one.label, value: numeral(one.values[index]) })),
   }));
-  nameLines("inputs-legend", found.inputs, found);
+  nameLines(part("inputs-legend"), named(found.inputs, found));
   const names = found.inputs.length > 1 ? `Bound of the norm` : `Bound`;
   part("inputs-note").textContent = `${names}: γ = ${numeral(found.gamma, 3)}.`;
 }
 
-/** Write the legend of several lines above their chart. */
-function nameLines(place, lines, found) {
-  const items = lines.map((one, index) => {
-    const item = document.createElement("li");
-    item.append(swatch(sample(paint(found, lines, index))), one.label);
-    return item;
-  });
-  part(place).replaceChildren(...items);
-  part(place).hidden = items.length < 2;
+/** What a legend needs of several lines. */
+function named(lines, found) {
+  return lines.map((one, index) => ({ ...sample(paint(found, lines, index)), label: one.label }));
 }
 
 function paint(found, lines, index) {
@@ -117,7 +111,7 @@ function drawStates(found) {
     title: `t = ${numeral(times[index])} s`,
     rows: lines.map((one, i) => ({ line: sample(paint(found, lines, i)), label: one.label, value: numeral(one.values[index]) })),
   }));
-  nameLines("states-legend", lines, found);
+  nameLines(part("states-legend"), named(lines, found));
 }
 
 function drawSpectrum(found) {
