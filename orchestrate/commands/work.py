@@ -8,8 +8,9 @@ from functools import partial
 
 from orchestrate.cli_parser import length_of_time, positive, tell
 from orchestrate.commands.command import Command
-from orchestrate.commands.output import say, say_json
+from orchestrate.commands.output import say_json
 from orchestrate.errors import ExitCode
+from orchestrate.program import say
 from orchestrate.redaction import without_password
 from orchestrate.store import Reader
 
