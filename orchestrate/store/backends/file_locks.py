@@ -22,7 +22,7 @@ _held: weakref.WeakSet[LaunchLocks] = weakref.WeakSet()
 
 @contextmanager
 def file_lock(path: Path, patience: float) -> Iterator[None]:
-    """Hold the lock of a file, which is created if needed; wait for others as :func:`patiently`."""
+    """Hold the lock of a file, which is created if needed; wait as :func:`patiently` does."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
 
     def locked(seconds: float) -> bool:
@@ -36,26 +36,27 @@ def file_lock(path: Path, patience: float) -> Iterator[None]:
             time.sleep(_PAUSE_SECONDS)
 
     try:
-        if not patiently(locked, patience, str(path), path):
-            raise StoreUnavailableError(
-                f"The file {path} is locked by {holder(path)} for more than {patience:g} s: end "
-                "it, and run the same command again."
-            )
+        patiently(locked, patience, path, path)
         yield
     finally:
         os.close(descriptor)
 
 
-def patiently(locked: Callable[[float], bool], patience: float, name: str, path: Path) -> bool:
-    """Return whether ``locked``, which waits for the given seconds, succeeds in time.
+def patiently(locked: Callable[[float], bool], patience: float, name: Path, path: Path) -> None:
+    """Call ``locked``, which waits for the given seconds and returns whether it has locked a file.
 
-    After two seconds a warning says who holds the lock of ``path``.
+    After two seconds a warning says who holds the lock of ``path``, and after ``patience`` seconds
+    ``StoreUnavailableError`` is raised.
     """
     first = min(ANNOUNCE_SECONDS, patience)
     if locked(first):
-        return True
+        return
     log.warning("waiting for a lock of %s, which %s holds", name, holder(path))
-    return locked(patience - first)
+    if not locked(patience - first):
+        raise StoreUnavailableError(
+            f"The file {name} cannot be used: {holder(path)} has locked it for more than "
+            f"{patience:g} s; end it, and run the same command again."
+        )
 
 
 def holder(path: Path) -> str:

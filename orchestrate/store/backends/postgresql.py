@@ -6,7 +6,7 @@ import threading
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count, repeat
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
@@ -120,28 +120,20 @@ class PostgreSQLBackend(Backend):
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
-        given_up: list[str] = []
+        ended, given_up = threading.Event(), list[str]()
         try:
-            with super().transaction() as connection, self._watched(connection, given_up):
+            with super().transaction() as connection, ExitStack() as stack:
+                driver = cast("psycopg.Connection", connection.connection.driver_connection)
+                words = (driver.info.backend_pid, ended, given_up)
+                watch = threading.Thread(target=self._watch, args=words, daemon=True)
+                watch.start()
+                stack.callback(watch.join, ANNOUNCE_SECONDS)  # it may hold a connection
+                stack.callback(ended.set)
                 yield connection
         except StoreUnavailableError as error:
             if given_up:
                 raise StoreUnavailableError(given_up[0]) from error
             raise
-
-    @contextmanager
-    def _watched(self, connection: Connection, given_up: list[str]) -> Iterator[None]:
-        """Watch for locks of others that the block waits for, in a thread."""
-        driver = cast("psycopg.Connection", connection.connection.driver_connection)
-        ended = threading.Event()
-        words = (driver.info.backend_pid, ended, given_up)
-        thread = threading.Thread(target=self._watch, args=words, name="locks", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join(ANNOUNCE_SECONDS)  # it may hold a connection
 
     def _watch(self, pid: int, ended: threading.Event, given_up: list[str]) -> None:
         """End launches that hold the lock and are dead; say who holds it; give up in the end.

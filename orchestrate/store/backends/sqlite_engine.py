@@ -14,7 +14,7 @@ from sqlalchemy.pool import QueuePool
 
 from orchestrate.store import database_url
 from orchestrate.store.backends.driver_errors import translated_file
-from orchestrate.store.backends.file_locks import holder, patiently
+from orchestrate.store.backends.file_locks import patiently
 from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
 from orchestrate.store.views import VIEWS
 
@@ -58,26 +58,17 @@ def write_engine(connect: Callable[[], sqlite3.Connection], path: Path, patience
 
     def begin(connection: Connection) -> None:
         driver = driver_of(connection)
-        seconds = min(patience, BUSY_TIMEOUT_SECONDS)
 
         def locked(seconds: float) -> bool:
             driver.execute(f"PRAGMA busy_timeout = {round(1000 * seconds)}")
             try:
                 driver.execute("BEGIN IMMEDIATE")
             except sqlite3.OperationalError as error:
-                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY:  # of any kind
                     raise
             return driver.in_transaction
 
-        memory = path.with_name(f"{path.name}-shm")
-        if patiently(locked, seconds, str(path), memory):
-            return
-        if seconds < patience:
-            driver.execute("BEGIN IMMEDIATE")  # raises the error of SQLite, after which one waits
-        raise StoreUnavailableError(
-            f"The results database {path} cannot be used: {holder(memory)} has locked it for more "
-            f"than {patience:g} s; end it, and run the same command again."
-        )
+        patiently(locked, patience, path, path.with_name(f"{path.name}-shm"))
 
     return _engine(connect, begin)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, select, text
+from sqlalchemy import Connection, select
 
 from orchestrate.store.backends.base import LaunchLife
 from orchestrate.store.read.rows import LaunchRow
@@ -14,11 +14,6 @@ from orchestrate.store.serialization import stored_json
 
 Dead = Callable[[Connection, Sequence[LaunchLife]], list[LaunchLife]]
 
-_MIXED = text(
-    "SELECT c.config_key FROM trial r JOIN launch l ON l.launch_id = r.launch_id "
-    "JOIN config c ON c.config_id = r.config_id WHERE r.status IN ('done', 'diverged') "
-    "GROUP BY c.config_key HAVING count(DISTINCT l.fingerprint) > 1 ORDER BY c.config_key"
-)
 _ROWS = select(launch).order_by(launch.c.launch_id)
 
 
@@ -53,8 +48,3 @@ def _row(row: Mapping[str, Any], alive: bool) -> LaunchRow:
         versions=stored_json(row["versions"], dict),
         fingerprint=row["fingerprint"] and stored_json(row["fingerprint"], dict),
     )
-
-
-def mixed_code(connection: Connection) -> list[str]:
-    """Return the keys of configurations with finished trials of code with several fingerprints."""
-    return list(connection.execute(_MIXED).scalars())

@@ -54,6 +54,11 @@ _TRIALS = text(
 _MEASURES = (
     "SELECT DISTINCT measure FROM v_assessment WHERE config_key = :config_key ORDER BY measure"
 )
+_MIXED = (
+    "SELECT c.config_key FROM trial r JOIN launch l ON l.launch_id = r.launch_id "
+    "JOIN config c ON c.config_id = r.config_id WHERE r.status IN ('done', 'diverged') "
+    "GROUP BY c.config_key HAVING count(DISTINCT l.fingerprint) > 1 ORDER BY c.config_key"
+)
 _ARRAYS = ("states", "inputs", "parameters")
 _TRAJECTORY = (
     select(
@@ -142,8 +147,7 @@ class Reader:
 
     def mixed_code(self) -> list[str]:
         """Return the keys of configurations whose finished trials were run by different code."""
-        with self._snapshot() as connection:
-            return liveness.mixed_code(connection)
+        return [row.config_key for row in self.rows(_MIXED)]
 
     def trials(self, config_key: str) -> list[TrialRow]:
         """Return the trials of a configuration by seed; none if it is unknown."""

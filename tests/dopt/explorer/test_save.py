@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -30,7 +31,6 @@ from orchestrate.store import (
     default_url,
     examine,
 )
-from orchestrate.store.backends import sqlite_engine
 from orchestrate.store.write import explorations as writing
 from tests.dopt.explorer.saves import STEPS, content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH
@@ -220,13 +220,14 @@ def test_a_save_that_fails_in_the_middle_leaves_what_was_stored(
 def test_a_locked_database_is_said_and_the_exploration_goes_on(
     sqlite_url: str, monkeypatch: pytest.MonkeyPatch, run: Explorer
 ) -> None:
-    monkeypatch.setattr(sqlite_engine, "BUSY_TIMEOUT_SECONDS", 0.05)
+    opening = partial(Store.open, patience=0.05)
+    monkeypatch.setattr("orchestrate.runner.saving.Store.open", opening)
     run.save(sqlite_url)
     before = content(sqlite_url)
     other = sqlite3.connect(sqlite_url.removeprefix("sqlite:///"), isolation_level=None)
     other.execute("BEGIN IMMEDIATE")
     drive(run, 10)
-    with pytest.raises(StoreUnavailableError, match="another process has locked it"):
+    with pytest.raises(StoreUnavailableError, match=r"has locked it for more than 0.05 s"):
         run.save(sqlite_url)
     assert content(sqlite_url) == before
     drive(run, 10)

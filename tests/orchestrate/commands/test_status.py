@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from datetime import UTC, datetime
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,7 +18,8 @@ from orchestrate.queries.status import Status, gather
 from orchestrate.store import Claim, ConfigRow, Reader, Store, StoreUnavailableError
 from tests.orchestrate.commands.conftest import WAITING, Answer, failure, run_now
 from tests.orchestrate.standins import trial_of
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.fakes import LAUNCH, Spec, result
+from tests.orchestrate.store.places import execute
 
 Run = Callable[..., Answer]
 Take = Callable[..., list[Claim]]
@@ -118,10 +117,10 @@ def test_attempts_that_were_made_good_are_no_failed_trials(
     assert (kind["cause"], kind["trials"], kind["attempts"]) == ("killed", 0, 1)
 
 
-def test_the_rate_is_that_of_the_living(store: Store, take: Take, reader: Reader) -> None:
-    long_ago = replace(RUN, ended=datetime(2026, 1, 1, tzinfo=UTC))
-    for i, claim in enumerate(take(*(Spec(seed) for seed in range(4)))):
-        store.commit(claim, result(), run_now() if i < 3 else long_ago)
+def test_the_rate_is_that_of_the_living(store: Store, take: Take, reader: Reader, url: str) -> None:
+    for claim in take(*(Spec(seed) for seed in range(4))):
+        store.commit(claim, result(), run_now())
+    execute(url, f"UPDATE attempt SET ended = '2026-01-01' WHERE trial_id = {claim.trial_id}")
     status = gather(reader, reader.configs())
     assert 3 / 120 < status.rate <= 3
     store.end_launch(1, "done")

@@ -166,7 +166,7 @@ def test_a_creation_that_hangs_is_said_and_ends_the_wait(
     lock = Path(f"{file_of(sqlite_url)}-locks") / "create"
     with lock.open("w") as hung:
         fcntl.flock(hung, fcntl.LOCK_EX)
-        named = rf"locked by process {os.getpid()} for more than 0.6 s: end it"
+        named = rf"process {os.getpid()} has locked it for more than 0.6 s; end it"
         with pytest.raises(StoreUnavailableError, match=named):
             Store.open(sqlite_url, patience=PATIENCE)
     assert len(warnings(caplog)) == 1
@@ -183,6 +183,6 @@ def test_a_free_file_is_locked_at_once(
         taken.append(seconds)
         return True
 
-    assert file_locks.patiently(locked, patience, "it", tmp_path)
+    file_locks.patiently(locked, patience, tmp_path, tmp_path)
     assert taken == [min(0.2, patience)]
     assert not warnings(caplog)
