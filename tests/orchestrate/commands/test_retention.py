@@ -6,7 +6,6 @@ import os
 import sqlite3
 import subprocess
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 
 from orchestrate.store import Store, back_up
+from orchestrate.store.serialization import utc_text
 from tests.orchestrate.commands.conftest import BAD, DONE, RUNNING, WAITING, Answer
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
@@ -133,11 +133,11 @@ class TestPrune:
         }
 
     def test_by_age(self, ended: int, store: Store, command: Run, url: str) -> None:
-        moment = datetime.now(UTC) - timedelta(days=100)
-        old = replace(RUN, started=moment, ended=moment)
+        moment = utc_text(datetime.now(UTC) - timedelta(days=100))
         launch = store.begin_launch(LAUNCH)
         (claim,) = store.claim(launch, store.register(launch, [Spec(99)]).todo)
-        store.commit(claim, result(99), old)
+        store.commit(claim, result(99), RUN)
+        execute(url, f"UPDATE attempt SET ended = '{moment}' WHERE trial_id = {claim.trial_id}")
         store.end_launch(launch, "done")
         document = command("prune", "--older-than", "90d", "--yes", "--json").document
         assert ended
