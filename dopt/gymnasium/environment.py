@@ -162,13 +162,16 @@ class _Episode:
         self._steps += 1
         turns = (self._state - reached)[self._angles] / (2 * math.pi)
         reached[self._angles] += 2 * math.pi * np.round(turns)
-        self._state = np.full_like(reached, np.nan) if self.over else reached
+        self._state = reached
         return applied
 
     def _advance(self, action: Any) -> tuple[Array, bool]:
-        """Return the state that follows, (d,), and whether the episode is cut short."""
+        """Return the state that follows, (d,), NaN at the end, and if the episode is cut short."""
         observation, _, self.over, truncated, _ = self._environment.step(action.copy())
-        return self._read(observation), bool(truncated) and not self.over
+        reached = self._read(observation)
+        if self.over:
+            return np.full_like(reached, np.nan), False
+        return reached, bool(truncated)
 
     def _begin_anew(self) -> None:
         if not self._system.restarts:
