@@ -16,12 +16,14 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, Page, Playwright, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
 from analysis.serve.app import create_app
 from analysis.serve.server import Server
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS, until
+
+expect.set_options(timeout=1000 * PATIENCE_SECONDS)
 
 PROGRAMS = ("chromium-headless-shell", "chromium")
 """Debian's packages; the first draws the same pages in half of the time."""

@@ -19,7 +19,6 @@ from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
-expect.set_options(timeout=1000 * PATIENCE_SECONDS)
 
 CONTRAST = (Path(__file__).parent / "contrast.js").read_text()
 PATHS = (

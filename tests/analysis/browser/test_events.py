@@ -6,10 +6,11 @@ import asyncio
 import json
 import shutil
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, aclosing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 import pytest
@@ -24,6 +25,14 @@ from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import fake_result, make_grid
 from tests.waiting import PATIENCE_SECONDS
+
+T = TypeVar("T")
+
+
+def run(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Run in a thread: in this one the browser of other tests may have a loop that runs."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(asyncio.run, coroutine).result()
 
 
 @contextmanager
@@ -100,7 +109,7 @@ def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.Mon
         await asyncio.sleep(0.5)
         assert len(readings) <= count + 1, "nobody listens any more"
 
-    asyncio.run(follow_all())
+    run(follow_all())
 
 
 def test_a_silent_stream_says_that_it_is_alive(
@@ -115,7 +124,7 @@ def test_a_silent_stream_says_that_it_is_alive(
         shared.end()
         return said + [text async for text in shared.stream()]
 
-    said = asyncio.run(follow())
+    said = run(follow())
     assert events.COMMENT in said
     assert sum(text.startswith("event: progress") for text in said) == 1
     assert len(said) == 20, "a stream that is opened after the end ends at once"
@@ -129,7 +138,7 @@ def test_a_defect_ends_the_stream(sqlite_grid: str, monkeypatch: pytest.MonkeyPa
             pass
 
     with pytest.raises(KeyError):
-        asyncio.run(follow())
+        run(follow())
 
 
 @pytest.mark.browser
