@@ -75,5 +75,5 @@ def test_a_policy_of_a_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
     cells = [nbformat.v4.new_code_cell(text) for text in (defined, asked)]
     notebook = nbformat.v4.new_notebook(cells=cells)
     place = {"metadata": {"path": str(tmp_path)}}
-    done = NotebookClient(notebook, timeout=200, resources=place).execute()
+    done = NotebookClient(notebook, resources=place).execute()
     assert "'__main__.Alternating'" in done.cells[1].outputs[0]["data"]["text/plain"]

@@ -33,7 +33,7 @@ def started(*words: str, **environment: str) -> subprocess.CompletedProcess[str]
     return subprocess.run(
         [sys.executable, "-m", "tests.orchestrate.framed", *words],
         cwd=ROOT, env={**without_coverage(), **environment},
-        capture_output=True, encoding="latin-1", timeout=60, check=False,
+        capture_output=True, encoding="latin-1", check=False,
     )  # fmt: skip
 
 
@@ -114,7 +114,7 @@ def test_a_closed_stream_is_no_place_for_a_file(closed: str, tmp_path: Path) -> 
     command = f"{sys.executable} -m tests.orchestrate.framed"
     for words, expected in ((f"open {out}", 5), ("child", 5), ("letters", 5)):
         done = subprocess.run(
-            f"{command} {words} {closed}", shell=True, cwd=ROOT, timeout=60, check=False,
+            f"{command} {words} {closed}", shell=True, cwd=ROOT, check=False,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL,
         )  # fmt: skip
         assert done.returncode == expected
@@ -127,7 +127,7 @@ def test_an_output_on_a_full_disk_is_a_sentence_and_lost_errors_end_nothing(
 ) -> None:
     command = f"{sys.executable} -m tests.orchestrate.framed letters {redirected}"
     done = subprocess.run(
-        command, shell=True, cwd=ROOT, timeout=60, check=False, text=True, capture_output=True
+        command, shell=True, cwd=ROOT, check=False, text=True, capture_output=True
     )
     assert done.returncode == code
     assert ("No space left on device" in done.stderr) == (code == 2)
@@ -138,7 +138,7 @@ def test_an_output_on_a_full_disk_is_a_sentence_and_lost_errors_end_nothing(
 def test_a_hang_up_is_a_request_to_end(number: signal.Signals) -> None:
     with waiting() as running:
         running.send_signal(number)
-        out, err = running.communicate(timeout=60)
+        out, err = running.communicate()
     assert running.returncode == 5, out + err
     assert "finishing running trials" in err
 
@@ -149,7 +149,7 @@ def test_a_hang_up_that_nohup_ignores_stays_ignored() -> None:
         with pytest.raises(subprocess.TimeoutExpired):
             running.wait(0.5)
         running.send_signal(signal.SIGTERM)
-        assert running.wait(60) == 5
+        assert running.wait() == 5
 
 
 def waiting(before: Callable[[], Any] | None = None) -> subprocess.Popen[str]:
@@ -189,7 +189,7 @@ def run_program(words: list[str], cwd: Path, **environment: str) -> tuple[int, s
     done = subprocess.run(
         [sys.executable, *first, *words[len(first) :]], cwd=cwd,
         env={**without_coverage(), "PYTHONPATH": str(ROOT), **environment},
-        capture_output=True, text=True, timeout=120, check=False,
+        capture_output=True, text=True, check=False,
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 
@@ -202,7 +202,7 @@ def test_a_deleted_folder_is_named(words: list[str], tmp_path: Path) -> None:
     command = f"rmdir {gone}; exec {sys.executable} {first} {WORDS[words[-1]]}"
     done = subprocess.run(
         command, shell=True, cwd=gone, env={**without_coverage(), "PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, timeout=120, check=False,
+        capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 2
     assert re.fullmatch(f"error: [^\n]*{gone} [^\n]*deleted[^\n]*\n", done.stderr), done.stderr
