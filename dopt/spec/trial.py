@@ -274,9 +274,10 @@ def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:
     section = given.get(key)
     kind = section if isinstance(section, type) else type(section)
     if issubclass(kind, Validated):
+        what = "the class" if kind is section else "a"
         raise SpecificationError(
-            f"configuration key '{key}' is {section!r}, but a name or a section is expected: give "
-            f"objects, such as {kind.__name__}(), to TrialSpec.of_system."
+            f"configuration key '{key}' is {what} {kind.__name__}, but a name or a section is "
+            f"expected: give objects, such as {kind.__name__}(), to TrialSpec.of_system."
         )
     if not isinstance(section, Mapping):
         raise SpecificationError(
