@@ -120,8 +120,9 @@ class SQLiteBackend(Backend):
         place = _place(self._opened[0])
         now = f" and is now {place}" if place not in ("", os.path.realpath(self._given)) else ""
         return (
-            f"The results database {self.safe_url} {what} since it was opened{now}; {saved}: save "
-            f"again to write everything there, or {more}run the same command again to continue."
+            f"The results database {self.safe_url} {what} since it was opened{now}; {saved}: {more}"
+            "run the same command again to continue (an Explorer that saves again writes all of "
+            "it there)."
         )
 
     @contextmanager

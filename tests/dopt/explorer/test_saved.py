@@ -228,7 +228,7 @@ def test_a_database_that_is_gone_is_said_and_written_anew(
         path.touch()
     drive(run, 5)
     said = "replaced by another file" if replaced else "removed or renamed"
-    with pytest.raises(StoreUnavailableError, match=rf"{said} since .*: save again"):
+    with pytest.raises(StoreUnavailableError, match=rf"{said} since .*Explorer that saves again"):
         run.save(sqlite_url)
     if renamed:
         assert content(f"sqlite:///{moved}") == before
