@@ -9,8 +9,9 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from dopt.kernel.compiler import compiled
+from dopt.kernel.stored_code import StoredCode
 from dopt.kernel.structs import Trial
-from dopt.kernel.user_code import _OwnCode
+from dopt.kernel.user_code import content_digest
 from dopt.learning.base import Array, CustomLearner, Updater
 from dopt.policies.base import CustomPolicy, Planner
 from dopt.systems import System
@@ -26,7 +27,8 @@ def kept(function: F) -> F:
     compiled in every process, for seconds.
     """
     dispatcher = compiled(function)
-    dispatcher._cache = _OwnCode(function)  # type: ignore[attr-defined]
+    folder = f"own/{content_digest(function)}"
+    dispatcher._cache = StoredCode(function, folder)  # type: ignore[attr-defined]
     return dispatcher
 
 

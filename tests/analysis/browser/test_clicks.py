@@ -248,7 +248,7 @@ def test_pages_follow_a_launch(browser: Browser, tmp_path: Path) -> None:
         program = [sys.executable, "-m", module, url, "6", str(tmp_path)]
         launch = subprocess.Popen(program, cwd=ROOT)
         expect(page.locator("#state")).to_have_attribute("data-mode", "writing")
-        expect(page.locator(".tile").first).to_contain_text("pending")
+        expect(page.locator(".tile").first).to_contain_text("3 running")
         page.get_by_role("link", name="Curves", exact=True).click()
         count = page.locator("#legend tbody tr").first.locator("td").nth(3)
         expect(count).to_have_text("3")

@@ -24,8 +24,9 @@ from analysis.serve import app
 from analysis.serve import server as serving
 from analysis.serve.app import create_app
 from tests.analysis.browser import chromium
-from tests.analysis.browser.chromium import PATIENCE, ROOT, wait_until
 from tests.orchestrate.faults.laboratory import alive, children, command_line
+from tests.paths import ROOT
+from tests.waiting import PATIENCE_SECONDS, until
 
 ENDLESS = "SELECT instr(hex(zeroblob(30000000)), hex(zeroblob(15000000)) || '1')"
 LARGE = "SELECT hex(zeroblob(15000000))"
@@ -36,7 +37,7 @@ def connected(address: str, sent: bytes) -> socket.socket:
     place = urlsplit(address)
     assert place.hostname
     assert place.port
-    opened = socket.create_connection((place.hostname, place.port), timeout=PATIENCE)
+    opened = socket.create_connection((place.hostname, place.port), timeout=PATIENCE_SECONDS)
     opened.sendall(sent)
     return opened
 
@@ -59,7 +60,7 @@ def request(address: str, path: str, body: bytes | None = None) -> bytes:
 
 def asking(address: str, statement: str = ENDLESS) -> bytes:
     """Return a request of a statement, by default of one that takes hours."""
-    page = httpx.get(f"{address}/sql", timeout=PATIENCE).text
+    page = httpx.get(f"{address}/sql", timeout=PATIENCE_SECONDS).text
     (token,) = re.findall(r'name="token" value="([\w-]+)"', page)
     return request(address, "/api/sql", urlencode({"q": statement, "token": token}).encode())
 
@@ -98,20 +99,20 @@ def test_ctrl_c_ends_the_server_whoever_is_connected(sqlite_grid: str) -> None:
         asked = asking(address)
         for _ in range(4):  # two more than run at once
             stack.enter_context(connected(address, asked))
-        wait_until(lambda: len(queries(server.pid)) == 2, "two statements")
+        until(lambda: len(queries(server.pid)) == 2)
         running = queries(server.pid)
         server.send_signal(signal.SIGINT)
-        assert server.wait(PATIENCE) == 0
-        wait_until(lambda: not any(map(alive, running)), "the end of the statements")
+        assert server.wait(PATIENCE_SECONDS) == 0
+        until(lambda: not any(map(alive, running)))
 
 
 def test_a_statement_ends_with_its_client(sqlite_grid: str, figures: Path) -> None:
     with chromium.served(sqlite_grid, figures) as address:
         client = connected(address, asking(address))
-        wait_until(lambda: queries(os.getpid()), "the statement")
+        until(lambda: queries(os.getpid()))
         (running,) = queries(os.getpid())
         client.close()
-        wait_until(lambda: not alive(running), "the end of the statement")
+        until(lambda: not alive(running))
 
 
 def test_half_open_connections_are_few(
@@ -120,8 +121,8 @@ def test_half_open_connections_are_few(
     monkeypatch.setattr(serving, "MAX_WAITING", 3)
     with chromium.served(sqlite_grid, figures) as address, ExitStack() as stack:
         held = [stack.enter_context(connected(address, HALF)) for _ in range(20)]
-        wait_until(lambda: sum(map(is_closed, held)) >= 17, "the end of the oldest")
-        assert httpx.get(address, timeout=PATIENCE).status_code == 200
+        until(lambda: sum(map(is_closed, held)) >= 17)
+        assert httpx.get(address, timeout=PATIENCE_SECONDS).status_code == 200
         assert not is_closed(held[-1])
 
 
@@ -143,7 +144,7 @@ def test_half_a_request_is_given_up(
                 slow.send(b"7")  # a part at a time
             return all(map(is_closed, (silent, slow, second)))
 
-        wait_until(all_closed, "the end of half a request")
+        until(all_closed)
 
 
 def test_streams_outlive_the_time_of_a_request(
@@ -156,7 +157,7 @@ def test_streams_outlive_the_time_of_a_request(
         connected(address, HALF) as half,
     ):
         assert stream.recv(2**16)
-        wait_until(lambda: is_closed(half), "the end of half a request")
+        until(lambda: is_closed(half))
         assert not is_closed(stream)
 
 
@@ -190,19 +191,19 @@ def test_a_page_that_never_ends_does_not_keep_the_server(
 
     def stuck(_: object) -> None:
         asked.set()
-        assert left.wait(PATIENCE)
+        assert left.wait(PATIENCE_SECONDS)
 
     pages = create_app(sqlite_grid, figures)
     pages.routes.insert(0, Route("/stuck", stuck))
     server = serving.Server(pages, 0, leave=left.set)
     thread = threading.Thread(target=server.run)
     thread.start()
-    wait_until(lambda: server.started, "the start of the server")
+    until(lambda: server.started)
     port = server.servers[0].sockets[0].getsockname()[1]
     address = f"http://127.0.0.1:{port}"
     with connected(address, request(address, "/stuck")):
-        assert asked.wait(PATIENCE)
+        assert asked.wait(PATIENCE_SECONDS)
         server.should_exit = True
-        assert left.wait(PATIENCE)
-        thread.join(PATIENCE)
+        assert left.wait(PATIENCE_SECONDS)
+        thread.join(PATIENCE_SECONDS)
     assert not thread.is_alive()

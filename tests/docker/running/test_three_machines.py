@@ -14,7 +14,7 @@ from tests.pages import PAGES, blocks
 pytestmark = [pytest.mark.image, pytest.mark.timeout(900)]
 
 SECTION = PAGES["docs/many_machines.md"].split("## Three machines")[1].split("\n## ")[0]
-FIRST, OTHERS, LAST = (
+FIRST, OTHERS, LAST, _ = (
     [line.split("  #")[0].strip() for line in block.splitlines()]
     for block in blocks(SECTION, "bash")
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -100,10 +101,9 @@ def test_the_fingerprint_is_that_of_the_sources_and_libraries(
     found = fingerprint.importlib.util.find_spec
 
     def find(name: str) -> object:
-        spec = found(name)
-        if name == "dopt" and spec is not None:
-            spec.submodule_search_locations = [str(tmp_path / "dopt")]
-        return spec
+        if name == "dopt":
+            return SimpleNamespace(submodule_search_locations=[str(tmp_path / "dopt")])
+        return found(name)
 
     monkeypatch.setattr(fingerprint.importlib.util, "find_spec", find)
     assert fingerprint.fingerprint() == before, "the same sources in another folder"

@@ -63,7 +63,7 @@ class TestRegistration:
             def config_json(self) -> str:
                 return '{"env": {"name": "pendulum"}, "policy": {"_target_": "__main__.Held"}}'
 
-        message = r"policy is of the class __main__\.Held, .*: put it into a file"
+        message = r"policy is of the class __main__\.Held of a notebook, .*: put it into a file"
         with pytest.raises(SpecificationError, match=message):
             store.register(launch, [Spec(1), Typed(1)])
         assert reader.query("SELECT * FROM trial") == []
