@@ -316,7 +316,7 @@ def test_a_typed_class_is_refused_where_others_have_to_import_it() -> None:
     [
         (
             Nameless,
-            r"'policy' is <class '.*Nameless'>, .*, such as Nameless\(\), to TrialSpec.of_system",
+            r"'policy' is the class Nameless, .*, such as Nameless\(\), to TrialSpec.of_system",
         ),
         (Nameless(), "a class with a 'name' of its own"),
         (SYSTEMS["arm"](), "a dataclass derived from dopt's Policy"),
@@ -334,5 +334,5 @@ def test_a_class_whose_source_is_unknown_is_refused_in_a_sentence() -> None:
 
 
 def test_names_take_no_objects() -> None:
-    with pytest.raises(SpecificationError, match=r"'policy' is Held.*TrialSpec.of_system"):
+    with pytest.raises(SpecificationError, match=r"'policy' is a Held.*TrialSpec.of_system"):
         TrialSpec.from_names("pendulum", typed()())
