@@ -14,7 +14,7 @@ from tabulate import tabulate
 from benchmarks import calibration, history
 from benchmarks.history import Run
 from benchmarks.machine import describe
-from benchmarks.rows import Row
+from benchmarks.rows import Row, number
 
 QUESTIONS = (
     "step",
@@ -44,7 +44,7 @@ HEADERS = ("question", "what", "measured", "target", "of target", "others", "× 
 HISTORY = Path("results/benchmarks.jsonl")
 LEGEND = (
     "target: number of the target and its bound; of target: 1 or more meets it; others: the same "
-    "in other people's code (benchmarks/anchors.py), and how many times faster this is."
+    "in other people's code, measured as follows, and how many times faster this is."
 )
 
 
@@ -54,6 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     known = history.read(options.against) if options.against else []
     start = time.perf_counter()
     lines: list[list[str]] = []
+    others: set[str] = set()
     failed: list[str] = []
     about, run = describe(), Run.now()
     for question in options.only:
@@ -63,10 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             failed.append(question)
             rows = [Row("failed", None, note=_first_line(error))]
         lines += [[question, row.what, *row.cells()] for row in rows]
+        others |= {f"{number(row.anchor.value)}: {row.anchor.source}" for row in rows if row.anchor}
     table = tabulate(lines, headers=HEADERS, tablefmt="github", disable_numparse=True)
     mode = "quick, for a look only" if options.quick else "means, quickest of several runs"
     seconds = f"{time.perf_counter() - start:.0f} s in all"
-    _say("\n".join([*about, f"{mode}, {seconds}", "", table, "", LEGEND]))
+    _say("\n".join([*about, f"{mode}, {seconds}", "", table, "", LEGEND, *sorted(others)]))
     _keep(options.history, run)
     slower = history.slower(known, run)
     for row in slower:

@@ -10,7 +10,8 @@ from benchmarks.trials import LARGE_GRID, cartpole
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 
-TIMES_FASTER = 40
+TARGET_SECONDS = 0.158
+"""A fortieth of what the authors' code took for 500 steps when the target was set."""
 
 
 def measure(quick: bool) -> list[Row]:
@@ -33,7 +34,7 @@ def measure(quick: bool) -> list[Row]:
     for name, what in (("default", "default grid"), ("large", "8,000 points")):
         steps = specs[name].system.horizon
         anchor = Anchor(1e-6 * steps * microseconds[name], anchors.STEP.source)
-        target = Target(2, anchor.value / TIMES_FASTER) if name == "default" else None
+        target = Target(2, TARGET_SECONDS) if name == "default" else None
         wall, cpu = map(min, zip(*taken[name][1:], strict=True))
         timing = Timing(cpu, "s", min(fixed))
         rows.append(Row(what, wall, "s", target, anchor, f"{cpu:.4f} s of CPU", timing))

@@ -13,6 +13,8 @@ LOSSES, TIMES = (
     POINTS.pivot_table(index="name", columns="env", values=column).dropna()
     for column in ("loss", "us_per_step")
 )
+STEP_TIMES = pd.read_csv(DOCS / "step_times.csv").set_index("configuration")
+"""Times of the steps of some of them, by system and seed."""
 
 
 def over_systems() -> pd.Series:
