@@ -38,7 +38,7 @@ def test_twenty_shares_become_one_database(tmp_path: Path, request: pytest.Fixtu
     for number in range(1, SHARES + 1):
         part = Share(number, SHARES)
         url = f"sqlite:///{tmp_path}/disk/s.{part}.here.db"
-        settings = LaunchSettings("inprocess", url, share=part, collect_in=str(shared))
+        settings = LaunchSettings("inprocess", url, share=part, collect_in=shared)
         run(grid.only(part.holds), settings)
     start = time.monotonic()
     added = sum(sum(one.added.values()) for one in merge_collected(merged, shared))
