@@ -8,6 +8,9 @@ if [ ! -e "$PGDATA/PG_VERSION" ]; then
     echo "host all all all scram-sha-256" >>"$PGDATA/pg_hba.conf"
     pg_ctl start --silent --wait --options="-c listen_addresses=" --log="$PGDATA/setup.log"
     createdb --username="$POSTGRES_USER" "$POSTGRES_DB"
+    for script in /docker-entrypoint-initdb.d/*.sh; do
+        [ ! -r "$script" ] || sh "$script"
+    done
     pg_ctl stop --silent --wait
 fi
 exec postgres -c listen_addresses='*'
