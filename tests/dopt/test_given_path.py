@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pwd
 from pathlib import Path
 
 import pytest
@@ -46,7 +47,7 @@ def test_what_is_around_a_path_is_left_out_with_one_note(
 def test_a_tilde_is_the_home_folder(home: Path) -> None:
     assert given_path("~", "--out") == home
     assert given_path("~/x/r.db", "--out") == home / "x/r.db"
-    assert given_path("~root/r.db", "--out") == Path("/root/r.db")
+    assert given_path("~root/r.db", "--out") == Path(pwd.getpwnam("root").pw_dir, "r.db")
 
 
 @pytest.mark.parametrize("given", REFUSED)
