@@ -18,7 +18,6 @@ from analysis.data.divergence import DivergenceRule
 from analysis.data.trial_selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.figures.loss_curves.data import Axis
-from analysis.floor import command as offline
 from analysis.outputs.names import NAMES, partial_warning
 from analysis.plot_options import PlotOptions, Spread
 from analysis.report import command as report
@@ -92,9 +91,7 @@ def parser() -> Parser:
         commands, "aggregate", _aggregate, "every variant against the reference, over all systems"
     )
     calibrated = _command(commands, "calibration", _calibration, calibration.HELP, diverged=False)
-    floor = _command(commands, "floor", _floor, offline.HELP, diverged=False)
-    offline.add_arguments(floor)
-    for table in (summary, compare, aggregate, calibrated, floor):
+    for table in (summary, compare, aggregate, calibrated):
         table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
     for command in (figures, compare):
         command.add_argument(
@@ -108,7 +105,7 @@ def parser() -> Parser:
             metavar="POLICY",
             help=f"what all others are compared with ({REFERENCE}); with --group-by a value",
         )
-    for command in (figures, summary, compare, aggregate, calibrated, floor):
+    for command in (figures, summary, compare, aggregate, calibrated):
         command.add_argument(
             "--group-by",
             nargs="+",
@@ -244,12 +241,6 @@ def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) 
 
 def _calibration(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
     return _print_table(calibration.KIND, reader, selection, PlotOptions(), options.format)
-
-
-def _floor(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    text_table, table = offline.run(reader, selection, options)
-    tell(sys.stdout, _text(text_table, table, options.format), exact=options.format == "csv")
-    return 0
 
 
 def _print_table(

@@ -23,6 +23,12 @@ _INSTALLED = {
 }
 
 
+SUCCESSORS = {
+    "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
+}
+"""Successors of removed words, by command and word or by ``key=value`` of the configuration."""
+
+
 class UsageError(DoptError):
     """Invalid command-line arguments.
 
@@ -46,6 +52,7 @@ class Parser(argparse.ArgumentParser):
         read = self.parse_known_intermixed_args if mixed else self.parse_known_args
         arguments, unknown = read(list(words))
         for word in unknown:
+            check_removed(f"{self.prog} {word.split('=')[0]}")
             if word.startswith("-"):
                 options = {one for one in _options(self, words) if one.startswith("--")}
                 raise UsageError(f"{unknown_name('option', word.split('=')[0], options)}")
@@ -59,6 +66,7 @@ class Parser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse a value outside the choices, with the nearest one."""
         if action.choices is not None and value not in action.choices:
+            check_removed(f"{self.prog} {value}")
             name = max(action.option_strings, key=len, default=action.metavar or action.dest)
             names = [str(choice) for choice in action.choices]
             raise UsageError(f"{unknown_name(str(name).lower(), value, names)}")
@@ -102,6 +110,17 @@ def _options(parser: argparse.ArgumentParser, words: Sequence[str]) -> Iterator[
         if isinstance(action, argparse._SubParsersAction):
             for name in set(words) & set(action.choices):
                 yield from _options(action.choices[name], words)
+
+
+def check_removed(typed: str) -> None:
+    """Raise ``UsageError`` if a typed text, such as ``python -m analysis floor``, was removed.
+
+    The text ends with the word; it may begin with what leads to the word.
+    """
+    words = f" {typed}".replace(" dopt-", " ")
+    for word, successor in SUCCESSORS.items():
+        if words.endswith(f" {word}"):
+            raise UsageError(f"'{word}' was removed: {successor}.")
 
 
 def positive(option: str, number: type[int] | type[float]) -> Callable[[str], float]:

@@ -241,10 +241,10 @@ def test_every_command_of_the_analysis_works(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    extra = {"animate": ("--frames", "2"), "floor": ()}
+    extra = {"animate": ("--frames", "2")}
     extra |= dict.fromkeys(("summary", "compare", "aggregate", "report", "yardsticks"), ())
     extra["calibration"] = ()
-    if command.words[0] in {"floor", "calibration"}:
+    if command.words[0] == "calibration":
         monkeypatch.setenv("DOPT_DB", narrow_database)
     if command.words[0] == "yardsticks":
         address = f"sqlite:///{tmp_path}/pendulums.db"

@@ -1,1 +1,0 @@
-"""Error budgets of systems: floor, exploration and learner."""

@@ -1,1 +1,0 @@
-"""Floor and error budget of systems, from offline fits of the models of stored trials."""
