@@ -25,13 +25,13 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 # Three workers on two cores: many tests wait for processes, servers and leases.
 # tests/conftest.py says what comes first; xdist would put groups of many tests before slow ones.
-ALL := --numprocesses 3 --dist loadgroup --no-loadscope-reorder -m 'not soak and not machines and not image'
+ALL := --numprocesses 3 --dist loadgroup --no-loadscope-reorder --ignore=tests/studies -m 'not soak and not machines and not image'
 # Tests of pure functions, of the configuration and of the architecture: no trial, no database server,
 # no cluster and no browser. Two files compile, or compose many grids, and are left to `make test`.
 FAST := tests/test_architecture.py tests/test_release.py tests/dopt/declare tests/dopt/math \
 	tests/dopt/spec tests/dopt/stopping tests/dopt/control tests/dopt/systems tests/analysis/stats tests/orchestrate/config \
 	--ignore=tests/dopt/systems/test_chain.py --ignore=tests/orchestrate/config/test_several_grids.py
-.PHONY: help setup run test test-fast test-lowest test-machines soak image coverage lint format docs \
+.PHONY: help setup run test test-fast test-studies test-lowest test-machines soak image coverage lint format docs \
 	grid figures study claims smoke bench bench-check clean
 
 help:  ## show the targets
@@ -60,6 +60,9 @@ test: setup  ## run the test suite
 
 test-fast: setup  ## run the tests of pure functions and of the configuration
 	$(BIN)/python -m pytest --numprocesses 2 --quiet $(FAST)
+
+test-studies: setup  ## check that the tables of the studies follow from stored rows
+	$(BIN)/python -m pytest --numprocesses 2 --quiet tests/studies
 
 test-lowest: .venv-lowest/ready  ## run the fast tests with the lowest versions that are supported
 	.venv-lowest/bin/python -m pytest --numprocesses 2 --quiet $(FAST)

@@ -29,7 +29,6 @@ from analysis.tables import calibration
 from analysis.tables.registry import TABLES, TableKind, comparison
 from analysis.tables.rendering import TextTable, gaps_table
 from analysis.workers_option import add_workers
-from analysis.yardsticks import command as yardsticks
 from orchestrate.cli_parser import Parser, path, tell
 from orchestrate.program import answered
 from orchestrate.store import DEFAULT_URL, Reader, default_url
@@ -52,7 +51,7 @@ def _run(options: argparse.Namespace) -> int:
     if "alone" in options:
         return int(options.alone(options))
     with Reader.open(options.db) as reader:
-        selection = select(reader, _filter(options))
+        selection = select(reader, wanted(options))
         _check_complete(selection, options.allow_partial)
         for note in selection.notes:
             tell(sys.stderr, f"note: {note}\n")  # the output may be a CSV
@@ -117,13 +116,10 @@ def parser() -> Parser:
         "--color-by", metavar="KEY", help="setting that colours figure 1 (the first of --group-by)"
     )
     report.add_arguments(compared)
-    compared.set_defaults(alone=lambda options: report.run(options, _filter(options)))
-    published = _command(commands, "yardsticks", None, yardsticks.HELP, diverged=False)
-    yardsticks.add_arguments(published)
-    published.set_defaults(alone=lambda options: yardsticks.run(options, _filter(options)))
+    compared.set_defaults(alone=lambda options: report.run(options, wanted(options)))
     animate = commands.add_parser("animate", help=film.HELP, description=film.HELP)
     animate.set_defaults(alone=film.run)
-    _add_database(animate)
+    add_database(animate)
     film.add_arguments(animate)
     serve = commands.add_parser("serve", help=browser.HELP, description=browser.HELP)
     serve.set_defaults(alone=browser.run)
@@ -141,7 +137,20 @@ def _command(
 ) -> Parser:
     command = commands.add_parser(name, help=help_text, description=help_text)
     command.set_defaults(run=run)
-    _add_database(command)
+    add_database(command)
+    add_selection(command)
+    if diverged:
+        command.add_argument(
+            "--diverged",
+            choices=list(DivergenceRule),
+            default=DivergenceRule.EXCLUDE,
+            help="what a diverged trial counts as",
+        )
+    return command
+
+
+def add_selection(command: Parser) -> None:
+    """Add the options that select trials."""
     command.add_argument("--env", nargs="+", default=(), help="only these environments")
     command.add_argument("--policy", nargs="+", default=(), help="only these policies")
     command.add_argument(
@@ -151,22 +160,16 @@ def _command(
         metavar="PATH=VALUE",
         help="only configurations with this value, such as model.width=32",
     )
-    if diverged:
-        command.add_argument(
-            "--diverged",
-            choices=list(DivergenceRule),
-            default=DivergenceRule.EXCLUDE,
-            help="what a diverged trial counts as",
-        )
     command.add_argument("--allow-partial", action="store_true", help="go on without the missing")
-    return command
 
 
-def _add_database(command: Parser) -> None:
+def add_database(command: Parser) -> None:
+    """Add the option ``--db``."""
     command.add_argument("--db", default=default_url(), help=f"database (DOPT_DB, {DEFAULT_URL})")
 
 
-def _filter(options: argparse.Namespace) -> Filter:
+def wanted(options: argparse.Namespace) -> Filter:
+    """Return the selection that the options of :func:`add_selection` ask for."""
     where = dict(_condition(text) for text in options.where)
     reference = getattr(options, "reference", REFERENCE)
     group_by = tuple(getattr(options, "group_by", ("policy",)))

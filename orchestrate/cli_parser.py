@@ -25,6 +25,7 @@ _INSTALLED = {
 
 SUCCESSORS = {
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
+    "analysis yardsticks": "python -m studies.yardsticks makes these tables",
 }
 """Successors of removed words, by command and word or by ``key=value`` of the configuration."""
 

@@ -198,6 +198,10 @@ def test_nothing_imports_the_analysis_but_itself() -> None:
     assert all(path.startswith("analysis/") for path in importers("analysis"))
 
 
+def test_nothing_imports_a_study() -> None:
+    assert not importers("studies")
+
+
 @pytest.mark.parametrize("module", ONLY_IN)
 def test_a_library_is_seen_by_one_layer(module: str) -> None:
     assert importers(module)

@@ -22,7 +22,6 @@ from orchestrate import __main__ as orchestrate
 from orchestrate.commands import COMMANDS
 from orchestrate.runner import launch
 from tests.analysis.synthetic import fill, make_grid
-from tests.analysis.yardsticks.small_grid import fill_small_grid
 from tests.pages import GENERATED, PAGES, Command, blocks, commands
 from tests.paths import EXAMPLE, ROOT
 from tests.typed_commands import empty_folder, run_typed
@@ -75,7 +74,7 @@ def test_every_module_at_the_top_of_dopt_has_a_line() -> None:
 
 
 def test_every_command_is_one_that_is_tested() -> None:
-    ours = {"launch.py", "orchestrate", "analysis", "benchmarks"}
+    ours = {"launch.py", "orchestrate", "analysis", "benchmarks", "studies.yardsticks"}
     for command in commands():
         assert command.program in ours | SHELL.get(command.page, set()), command
 
@@ -239,17 +238,12 @@ def test_every_command_of_the_analysis_works(
     typed: Callable[[Command], str],
     narrow_database: str,
     monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
 ) -> None:
     extra = {"animate": ("--frames", "2")}
-    extra |= dict.fromkeys(("summary", "compare", "aggregate", "report", "yardsticks"), ())
+    extra |= dict.fromkeys(("summary", "compare", "aggregate", "report"), ())
     extra["calibration"] = ()
     if command.words[0] == "calibration":
         monkeypatch.setenv("DOPT_DB", narrow_database)
-    if command.words[0] == "yardsticks":
-        address = f"sqlite:///{tmp_path}/pendulums.db"
-        fill_small_grid(address)
-        monkeypatch.setenv("DOPT_DB", address)
     if command.words[0] == "serve":  # which does not end; its own tests start it
         assert cli.parser().read(command.words)
     else:

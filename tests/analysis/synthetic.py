@@ -13,6 +13,7 @@ from dopt.assessment import violations
 from dopt.errors import IncompatibleError
 from dopt.models import MLP
 from dopt.result import Assessment, TrialResult
+from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System
 from dopt.systems.equilibrium import eigenmode
@@ -208,3 +209,8 @@ def fill(
         ]
         assert all(store.commit_many(items))
         store.end_launch(launch, "done")
+
+
+def simulated(spec: TrialSpec, _: TrialResult) -> TrialResult:
+    """Return the result of the trial itself in place of a made-up one."""
+    return run_trial(spec)

@@ -28,7 +28,7 @@ def partial(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_what_a_command_writes_by_default_is_ignored_by_git() -> None:
     """Otherwise later launches would be marked as run with changes."""
     ignored = (ROOT / ".gitignore").read_text().splitlines()
-    for words in (["figures"], ["report"], ["yardsticks"]):
+    for words in (["figures"], ["report"]):
         assert f"/{parser().parse_args(words).out}/" in ignored
 
 
@@ -131,6 +131,7 @@ def test_a_wrong_request_is_one_sentence(
         (["figures", "--workers", "0"], "--workers is 0, but at least 1 is expected"),
         (["figures", "--workers", "two"], "--workers is two, but at least 1 is expected"),
         (["floor", "--env", "arm"], "'analysis floor' was removed: .*dopt.fit_offline"),
+        (["yardsticks"], "'analysis yardsticks' was removed: python -m studies.yardsticks"),
         (["summary", "more"], "unexpected argument 'more'"),
     ],
 )
@@ -143,7 +144,7 @@ def test_wrong_words_are_one_sentence(
     assert captured.out == ""
 
 
-@pytest.mark.parametrize("command", ["calibration", "figures", "summary", "yardsticks"])
+@pytest.mark.parametrize("command", ["calibration", "figures", "summary"])
 def test_help_shows_a_percent_sign_once(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main([command, "--help"])

@@ -12,8 +12,7 @@ import pytest
 from analysis.cli import main
 from dopt.calibration import held_out_fit
 from dopt.run import run_trial
-from tests.analysis.synthetic import fill
-from tests.analysis.yardsticks.small_grid import simulated
+from tests.analysis.synthetic import fill, simulated
 from tests.dopt.trials import trial
 
 LEARNER = {"name": "gauss_newton"}

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from dopt.result import TrialResult
-from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from tests.analysis.synthetic import fill
+from tests.analysis.synthetic import fill, simulated
 from tests.dopt.trials import trial
 
 LEARNED: dict[str, dict[str, Any]] = {
@@ -20,11 +18,6 @@ def pendulums(policy: str, n: int, seed: int, **env: object) -> TrialSpec:
     planned: dict[str, Any] = {"regularization": 1e-8} if policy == "d_optimal" else {}
     fields = {"n_pendulums": n, "horizon": 40, **env}
     return trial("coupled_pendulums", policy, seed, env=fields, policy=planned, **LEARNED)
-
-
-def simulated(spec: TrialSpec, _: TrialResult) -> TrialResult:
-    """Return the result of the trial itself in place of a made-up one."""
-    return run_trial(spec)
 
 
 SPECS = [

@@ -15,16 +15,21 @@ from analysis.data.learned_model import learned_model
 from analysis.data.trial_selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks.distinct_entries import distinct_entries
-from analysis.yardsticks.growth import median
-from analysis.yardsticks.published import ACTIVE_SYSID
-from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_text, ratio_to_random
 from dopt.control.prediction import forecast_by_equations
 from dopt.forecasts import model_forecast
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System, UnbalancedDisk
 from dopt.types import Array
 from orchestrate.store import ConfigRow, Reader
+from studies.yardsticks.common import (
+    ACTIVE_SYSID,
+    REFERENCE,
+    distinct_entries,
+    interval_columns,
+    median,
+    ratio_text,
+    ratio_to_random,
+)
 
 NAME = "active_sysid"
 ANGLE, RATE = 0, 1

@@ -9,11 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.cli import main
-from analysis.yardsticks.star_rows import CENTRE
 from dopt.spec.trial import TrialSpec
-from tests.analysis.synthetic import fill
-from tests.analysis.yardsticks.small_grid import simulated
+from studies.yardsticks.__main__ import main
+from studies.yardsticks.star import CENTRE
+from tests.analysis.synthetic import fill, simulated
 from tests.dopt.trials import trial
 
 BOX = {"name": "grey_box", "unknown": list(CENTRE), "initial": [0.1, 0.1]}
@@ -39,7 +38,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_errors_are_half_the_squared_distances_to_the_star_at_the_last_step(
     small: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["yardsticks", "--db", small, "--out", str(tmp_path)]) == 0
+    assert main(["--db", small, "--out", str(tmp_path)]) == 0
     table = pd.read_csv(tmp_path / "flex_star_trials.csv").set_index(["learner", "policy", "seed"])
     assert len(table) == len(SPECS)
     for spec in SPECS:
@@ -56,7 +55,7 @@ def test_errors_are_half_the_squared_distances_to_the_star_at_the_last_step(
 
 
 def test_medians_counts_and_ratios_are_those_of_the_trials(small: str, tmp_path: Path) -> None:
-    main(["yardsticks", "--db", small, "--out", str(tmp_path)])
+    main(["--db", small, "--out", str(tmp_path)])
     trials = pd.read_csv(tmp_path / "flex_star_trials.csv")
     table = pd.read_csv(tmp_path / "flex_star.csv").set_index(["learner", "policy"])
     by_seed = trials.pivot_table(index="seed", columns=["learner", "policy"], values="error")
@@ -72,5 +71,5 @@ def test_two_kinds_of_one_policy_are_refused(
 ) -> None:
     address = f"sqlite:///{tmp_path}/two.db"
     fill(address, [star("random", 0), star("random", 0, gamma=20.0)], edit=simulated)
-    assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
+    assert main(["--db", address, "--out", str(tmp_path)]) == 2
     assert "choose by --where" in capsys.readouterr().err

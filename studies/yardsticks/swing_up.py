@@ -15,13 +15,17 @@ from analysis.stats.paired_tests import benjamini_hochberg, compare_hitting_time
 from analysis.stats.trial_scores import first_passage, last_passage
 from analysis.tables.comparisons import paired
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks.distinct_entries import distinct_entries
-from analysis.yardsticks.growth import median
-from analysis.yardsticks.published import FLEX_SWING_UP, FLEX_SWING_UP_LONGEST
-from analysis.yardsticks.ratios import REFERENCE, interval_columns
 from dopt.systems import Cartpole, Pendulum
 from dopt.types import Array
 from orchestrate.store import Assessments, ConfigRow, Reader
+from studies.yardsticks.common import (
+    FLEX_SWING_UP,
+    FLEX_SWING_UP_LONGEST,
+    REFERENCE,
+    distinct_entries,
+    interval_columns,
+    median,
+)
 
 NAME = "flex_table1"
 

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from analysis.formatting import within
-from analysis.yardsticks.disk_rows import TARGET, run_of_the_test, tables, tabulate
 from dopt.forecasts import true_forecast
+from studies.yardsticks.disk import TARGET, run_of_the_test, tables, tabulate
 from tests.dopt.trials import trial
 from tests.pages import DOCS, PAGES
 

@@ -13,15 +13,20 @@ from analysis.data.learned_model import learned_model
 from analysis.data.trial_selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks.distinct_entries import distinct_entries
-from analysis.yardsticks.growth import median
-from analysis.yardsticks.published import FLEX_STAR
-from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_text, ratio_to_random
 from dopt.models import GreyBox
 from dopt.parameter_error import parameter_error
 from dopt.systems import MovingStar, System
 from dopt.types import Array
 from orchestrate.store import ConfigRow, Reader
+from studies.yardsticks.common import (
+    FLEX_STAR,
+    REFERENCE,
+    distinct_entries,
+    interval_columns,
+    median,
+    ratio_text,
+    ratio_to_random,
+)
 
 NAME = "flex_star"
 CENTRE = ("center_x", "center_y")

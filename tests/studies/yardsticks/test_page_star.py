@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from analysis.formatting import within
-from analysis.yardsticks.star_rows import tables, tabulate
+from studies.yardsticks.star import tables, tabulate
 from tests.pages import DOCS, PAGES
 
 PAGE = PAGES["docs/yardsticks.md"]

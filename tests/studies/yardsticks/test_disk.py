@@ -9,13 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.cli import main
-from analysis.yardsticks.disk_rows import TEST_SAMPLES, rate_error
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import UnbalancedDisk
-from tests.analysis.synthetic import fill
-from tests.analysis.yardsticks.small_grid import simulated
+from studies.yardsticks.__main__ import main
+from studies.yardsticks.disk import TEST_SAMPLES, rate_error
+from tests.analysis.synthetic import fill, simulated
 from tests.dopt.trials import trial
 
 MEASURED = {"measured_states": [1], "measurement_noise": [0.045], "initial_state": [0.0, 0.0]}
@@ -52,7 +51,7 @@ def named(spec: TrialSpec) -> tuple[bool, str, int]:
 
 
 def test_rows_are_those_of_the_trials(small: str, tmp_path: Path) -> None:
-    assert main(["yardsticks", "--db", small, "--out", str(tmp_path)]) == 0
+    assert main(["--db", small, "--out", str(tmp_path)]) == 0
     rows = pd.read_csv(tmp_path / "active_sysid_trials.csv")
     table = rows.set_index(["enforced", "policy", "seed"]).sort_index()
     assert len(table) == len(SPECS)
@@ -82,7 +81,7 @@ def test_the_true_model_is_left_with_the_noise_and_none_with_the_motion() -> Non
 def test_medians_counts_and_ratios_are_those_of_the_trials(
     small: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    main(["yardsticks", "--db", small, "--out", str(tmp_path)])
+    main(["--db", small, "--out", str(tmp_path)])
     shown = capsys.readouterr().out
     assert "published: idw" in shown
     assert "| rate within 4.5 rad/s" in shown
@@ -102,7 +101,7 @@ def test_a_trial_that_diverged_counts_with_an_infinite_error(tmp_path: Path) -> 
     spec = TrialSpec.from_mapping(whole | {"env": env})
     assert run_trial(spec).diverged
     fill(address, [spec], edit=simulated)
-    assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 0
+    assert main(["--db", address, "--out", str(tmp_path)]) == 0
     row = pd.read_csv(tmp_path / "active_sysid_trials.csv").iloc[0]
     assert row.error == np.inf
     assert np.isnan(row.turned)
@@ -115,7 +114,7 @@ def test_other_bounds_are_another_question(
     address = f"sqlite:///{tmp_path}/other.db"
     narrow = disk("random", 0).to_mapping() | {"limits": LIMITS | {"bounds": {"ω": [-2.0, 2.0]}}}
     fill(address, [TrialSpec.from_mapping(narrow)], edit=simulated)
-    assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
+    assert main(["--db", address, "--out", str(tmp_path)]) == 2
     assert "holds no trials of a published table" in capsys.readouterr().err
 
 
@@ -124,7 +123,7 @@ def test_two_kinds_of_one_policy_are_refused(
 ) -> None:
     address = f"sqlite:///{tmp_path}/two.db"
     fill(address, [disk("random", 0), disk("random", 0, horizon=10)], edit=simulated)
-    assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
+    assert main(["--db", address, "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "rate within 4.5 rad/s with the policy 'random'" in said
     assert "choose by --where" in said

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from analysis.yardsticks.growth import exponent, median, slopes
+from studies.yardsticks.common import exponent, median, slopes
 
 SIZES = (2, 5, 10, 20, 50)
 

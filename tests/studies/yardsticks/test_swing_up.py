@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.cli import main
-from analysis.yardsticks.published import FLEX_SWING_UP
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import TrialSpec
+from studies.yardsticks.__main__ import main
+from studies.yardsticks.common import FLEX_SWING_UP
 from tests.analysis.synthetic import fill, make_spec
 
 SOLVED = {
@@ -62,7 +62,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_samples_are_those_after_which_every_episode_succeeds(small: str, tmp_path: Path) -> None:
-    assert main(["yardsticks", "--db", small, "--out", str(tmp_path)]) == 0
+    assert main(["--db", small, "--out", str(tmp_path)]) == 0
     table = pd.read_csv(tmp_path / "flex_table1_trials.csv").set_index(["policy", "seed"])
     assert len(table) == len(SAMPLES)
     for key, expected in SAMPLES.items():
@@ -71,7 +71,7 @@ def test_samples_are_those_after_which_every_episode_succeeds(small: str, tmp_pa
 
 
 def test_medians_and_improvements_are_those_of_the_trials(small: str, tmp_path: Path) -> None:
-    main(["yardsticks", "--db", small, "--out", str(tmp_path)])
+    main(["--db", small, "--out", str(tmp_path)])
     table = pd.read_csv(tmp_path / "flex_table1.csv").set_index("policy")
     assert tuple(table.samples[["d_optimal", "random"]]) == (10, np.inf)
     assert tuple(table["first"][["d_optimal", "random"]]) == (10, 10)
@@ -86,7 +86,7 @@ def test_a_trial_that_diverged_is_not_solved(tmp_path: Path) -> None:
     address = f"sqlite:///{tmp_path}/diverged.db"
     lost = swing_up("d_optimal", 1)
     fill(address, SPECS, diverged={lost.trial_key: 15}, edit=solved_as_listed)
-    main(["yardsticks", "--db", address, "--out", str(tmp_path)])
+    main(["--db", address, "--out", str(tmp_path)])
     table = pd.read_csv(tmp_path / "flex_table1_trials.csv").set_index(["policy", "seed"])
     assert tuple(table.loc[("d_optimal", 1), ["samples", "first"]]) == (np.inf, 10)
 
@@ -94,7 +94,7 @@ def test_a_trial_that_diverged_is_not_solved(tmp_path: Path) -> None:
 def test_the_tables_show_the_published_rows_and_what_is_censored(
     small: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    main(["yardsticks", "--db", small, "--out", str(tmp_path)])
+    main(["--db", small, "--out", str(tmp_path)])
     lines = capsys.readouterr().out.splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     assert ["policy", "pendulum, mlp"] in rows
@@ -112,10 +112,10 @@ def test_two_learners_of_one_policy_are_refused(
     address = f"sqlite:///{tmp_path}/two.db"
     specs = [swing_up("random", 0), swing_up("random", 0, learner={"name": "gauss_newton"})]
     fill(address, specs, edit=solved_as_listed)
-    assert main(["yardsticks", "--db", address, "--out", str(tmp_path)]) == 2
+    assert main(["--db", address, "--out", str(tmp_path)]) == 2
     assert "choose by --where" in capsys.readouterr().err
     asked = ["--where", "learner.name=gauss_newton", "--out", str(tmp_path)]
-    assert main(["yardsticks", "--db", address, *asked]) == 0
+    assert main(["--db", address, *asked]) == 0
 
 
 def test_a_policy_that_learns_the_task_has_a_row_for_its_own_feedback(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_a_policy_that_learns_the_task_has_a_row_for_its_own_feedback(tmp_path: 
 
     address = f"sqlite:///{tmp_path}/agent.db"
     fill(address, SPECS, edit=edit)
-    main(["yardsticks", "--db", address, "--out", str(tmp_path)])
+    main(["--db", address, "--out", str(tmp_path)])
     trials = pd.read_csv(tmp_path / "flex_table1_trials.csv").set_index(["policy", "seed"])
     for seed in range(3):
         assert trials.samples["d_optimal, its own feedback", seed] == 30

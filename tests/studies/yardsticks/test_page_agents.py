@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from analysis.formatting import steps_text
-from analysis.yardsticks.swing_up_rows import tables, tabulate
+from studies.yardsticks.swing_up import tables, tabulate
 from tests.pages import DOCS, PAGES
 
 PAGE = PAGES["docs/yardsticks.md"]

@@ -1,4 +1,4 @@
-"""``python -m analysis yardsticks``: published tables, run here, beside the published numbers."""
+"""``python -m studies.yardsticks``: published tables, run here, beside the published numbers."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ from pathlib import Path
 
 import pandas as pd
 
+from analysis.cli import add_database, add_selection, wanted
 from analysis.data import provenance
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Entry, Selection
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.outputs import publish
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks import disk_rows, pendulum_rows, star_rows, swing_up_rows
-from orchestrate.cli_parser import path, tell
+from orchestrate.cli_parser import Parser, path, tell
+from orchestrate.program import answered, run
 from orchestrate.store import Reader
+from studies.yardsticks import disk, pendulums, star, swing_up
 
 HELP = "published tables, run here, beside the published numbers"
 
@@ -36,21 +38,31 @@ class Yardstick:
 
 YARDSTICKS = tuple(
     Yardstick(rows.NAME, rows.entries, rows.measure, rows.tabulate, rows.tables)
-    for rows in (swing_up_rows, pendulum_rows, star_rows, disk_rows)
+    for rows in (swing_up, pendulums, star, disk)
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options that only this command has."""
+@answered
+def main(words: Sequence[str] | None = None) -> int:
+    """Print the tables of which there are trials, and write their files; 0."""
+    parser = Parser(prog="python -m studies.yardsticks", description=HELP)
+    add_database(parser)
+    add_selection(parser)
     parser.add_argument(
         "--out", type=path("--out"), default="yardsticks", help="folder (yardsticks/)"
     )
+    options = parser.read(sys.argv[1:] if words is None else words)
+    try:
+        _write_tables(options)
+    except IncompleteError as error:
+        tell(sys.stderr, f"{error}\n")
+        return 3
+    return 0
 
 
-def run(options: argparse.Namespace, wanted: Filter) -> int:
-    """Print the tables of which there are trials, and write their files; 0."""
+def _write_tables(options: argparse.Namespace) -> None:
     with Reader.open(options.db) as reader, reader.moment() as moment:
-        found = [(one, one.entries(moment, wanted)) for one in YARDSTICKS]
+        found = [(one, one.entries(moment, wanted(options))) for one in YARDSTICKS]
         found = [(one, entries) for one, entries in found if entries]
         if not found:
             names = " or ".join(one.name for one in YARDSTICKS)
@@ -62,7 +74,6 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
             _check_finished(one, entries, allowed=options.allow_partial)
         parts = [table for each in found for table in _written(moment, *each, options.out)]
     tell(sys.stdout, "\n".join(part.markdown() for part in parts))
-    return 0
 
 
 def _check_finished(one: Yardstick, entries: Iterable[Entry], *, allowed: bool) -> None:
@@ -85,3 +96,7 @@ def _written(
     facts = provenance.describe(reader, Selection(tuple(entries))) | {"name": one.name}
     publish.write_provenance(facts, folder, one.name)
     return one.tables(table)
+
+
+if __name__ == "__main__":
+    run("studies.yardsticks.__main__")

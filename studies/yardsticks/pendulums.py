@@ -14,14 +14,23 @@ from analysis.data.trial_selection import Entry, policy_rank
 from analysis.formatting import steps_text, within
 from analysis.stats.trial_scores import last_passage
 from analysis.tables.rendering import TextTable
-from analysis.yardsticks.distinct_entries import distinct_entries
-from analysis.yardsticks.growth import exponent, median, slopes
-from analysis.yardsticks.published import FLEX_LONGEST, FLEX_SAMPLES, FLEX_SIZES
-from analysis.yardsticks.ratios import REFERENCE, interval_columns, ratio_text, ratio_to_random
 from dopt.parameter_error import loss_by_parameter_error
 from dopt.spec.prequential import system_of
 from dopt.systems import CoupledPendulums
 from orchestrate.store import ConfigRow, Reader
+from studies.yardsticks.common import (
+    FLEX_LONGEST,
+    FLEX_SAMPLES,
+    FLEX_SIZES,
+    REFERENCE,
+    distinct_entries,
+    exponent,
+    interval_columns,
+    median,
+    ratio_text,
+    ratio_to_random,
+    slopes,
+)
 
 NAME = "flex_table3"
 

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from analysis.formatting import within
-from analysis.yardsticks.growth import exponent
-from analysis.yardsticks.pendulum_rows import (
+from studies.yardsticks.common import exponent
+from studies.yardsticks.pendulums import (
     ratio_table,
     samples_table,
     tabulate,

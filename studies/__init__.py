@@ -1,0 +1,1 @@
+"""Studies beside the packages: each uses what users have, and no package imports one."""
