@@ -6,6 +6,7 @@ import codecs
 import errno
 import functools
 import importlib
+import importlib.util
 import io
 import logging
 import os
@@ -16,11 +17,12 @@ import traceback
 import unicodedata
 import warnings
 from collections.abc import Callable, Iterator
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import IO, NoReturn, ParamSpec
 
 import dopt
-from dopt.errors import DoptError
+from dopt.errors import DISTRIBUTION, DoptError
 from orchestrate.cli_parser import as_started, discard_output, tell
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
 from orchestrate.redaction import without_password
@@ -40,6 +42,26 @@ _ASCII = {
 }
 
 Parameters = ParamSpec("Parameters")
+
+
+def stored_results() -> NoReturn:
+    """Run ``dopt``: commands on stored results."""
+    run("orchestrate.__main__")
+
+
+def analysis() -> None:
+    """Run ``dopt-analysis``: figures, tables and the browser.
+
+    An ``analysis.py`` in a folder of ``PYTHONPATH`` would be taken for the package of that name.
+    """
+    spec = PathFinder.find_spec("analysis", [str(ROOT)])
+    if spec is None or spec.loader is None:
+        raise ModuleNotFoundError(
+            f"analysis is not installed beside orchestrate: install {DISTRIBUTION} again."
+        )
+    sys.modules["analysis"] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    importlib.import_module("analysis.__main__").program()
 
 
 def run(module: str) -> NoReturn:

@@ -149,6 +149,11 @@ def importers(module: str) -> list[str]:
 
 def loaded_by(module: str) -> set[str]:
     """Return the top-level modules that are loaded once ``module`` is, in a fresh process."""
+    return {name.split(".")[0] for name in all_loaded_by(module)}
+
+
+def all_loaded_by(module: str) -> list[str]:
+    """Return all modules that are loaded once ``module`` is, in a fresh process."""
     program = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-c", program],
@@ -158,7 +163,8 @@ def loaded_by(module: str) -> set[str]:
         text=True,
         check=True,
     )
-    return {name.split(".")[0] for name in json.loads(done.stdout)}
+    names: list[str] = json.loads(done.stdout)
+    return names
 
 
 def test_the_science_knows_no_effects() -> None:
@@ -273,6 +279,11 @@ def test_a_trial_in_the_kernel_needs_no_torch() -> None:
 def test_the_read_side_loads_neither_torch_nor_ray_nor_hydra() -> None:
     loaded = loaded_by("analysis.data.curves")
     assert not loaded & {"torch", "ray", "hydra", "numba"}
+
+
+def test_the_store_loads_at_most_five_modules_of_the_science() -> None:
+    names = all_loaded_by("orchestrate.store")
+    assert len([name for name in names if name.split(".")[0] == "dopt"]) <= 5
 
 
 def test_numbers_load_no_plotting_library() -> None:

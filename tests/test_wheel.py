@@ -98,8 +98,7 @@ def crowded(tmp_path: Path) -> Path:
     for name in ("analysis", "orchestrate", "dopt"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('the wrong module')\n")
     (tmp_path / "first").mkdir()  # on PYTHONPATH, before the installed packages
-    for name in ("analysis", "orchestrate"):
-        shutil.copy(tmp_path / f"{name}.py", tmp_path / "first")
+    shutil.copy(tmp_path / "analysis.py", tmp_path / "first")
     return tmp_path
 
 

@@ -8,7 +8,7 @@ from orchestrate.cli_parser import path
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store import back_up
+from orchestrate.store.backup import back_up
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

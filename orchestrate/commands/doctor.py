@@ -11,7 +11,8 @@ from orchestrate.commands.command import Command
 from orchestrate.commands.display import plain, show
 from orchestrate.commands.output import say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store import Finding, examine
+from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor.findings import Finding
 
 
 def add_arguments(_: argparse.ArgumentParser) -> None:

@@ -12,7 +12,8 @@ from orchestrate.commands.command import Command
 from orchestrate.commands.doctor import trial_key
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store import Merged, TrialName, merge, merge_collected
+from orchestrate.store.merging.merge import Merged, TrialName, merge
+from orchestrate.store.shards import merge_collected
 
 MAX_LISTED = 10
 """Trials of a kind that are listed; the JSON has all of them."""

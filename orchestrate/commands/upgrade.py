@@ -8,7 +8,7 @@ import dataclasses
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store import Upgrade, upgrade
+from orchestrate.store.migrations.upgrade import Upgrade, upgrade
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ import dataclasses
 from orchestrate.commands.command import Command
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store import vacuum
+from orchestrate.store.vacuum import vacuum
 
 
 def add_arguments(_: argparse.ArgumentParser) -> None:

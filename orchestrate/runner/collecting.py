@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.store import DatabaseMovedError, StoreError, collect, merge_collected
+from orchestrate.store import DatabaseMovedError, StoreError
+from orchestrate.store.shards import collect, merge_collected
 
 REST = 20.0
 """Least time between two copies, as a multiple of the time that a copy takes."""

@@ -2,16 +2,15 @@
 
 :class:`Store` is the write side, used by launches; :class:`Reader` is the read side, used by the
 analysis. A trial is registered, claimed by one launch, and committed completely or rejected.
+What a command does to a whole database is in modules of their own: ``merging``, ``migrations``,
+``doctor``, ``shards``, ``backup`` and ``vacuum``.
 """
 
 from __future__ import annotations
 
 from orchestrate.records import Failure, RunRecord
 from orchestrate.store.backends.open import LEASE_SECONDS
-from orchestrate.store.backup import back_up
 from orchestrate.store.database_url import DEFAULT_URL, READ_VARIABLE, URL_VARIABLE, default_url
-from orchestrate.store.doctor.examine import examine
-from orchestrate.store.doctor.findings import Finding
 from orchestrate.store.errors import (
     DatabaseMovedError,
     InvalidResultError,
@@ -22,8 +21,6 @@ from orchestrate.store.errors import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.merging.merge import Merged, TrialName, merge
-from orchestrate.store.migrations.upgrade import Upgrade, upgrade
 from orchestrate.store.read.explorations import ExplorationRow, explorations
 from orchestrate.store.read.failures import FailureKind, failure_kinds
 from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
@@ -46,9 +43,7 @@ from orchestrate.store.records import (
     Result,
 )
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
-from orchestrate.store.shards import collect, merge_collected
 from orchestrate.store.store import Store
-from orchestrate.store.vacuum import Vacuumed, vacuum
 from orchestrate.store.write.explorations import Saved
 
 __all__ = [
@@ -67,12 +62,10 @@ __all__ = [
     "ExplorationRow",
     "Failure",
     "FailureKind",
-    "Finding",
     "InvalidResultError",
     "LaunchAliveError",
     "LaunchRecord",
     "LaunchRow",
-    "Merged",
     "NoDatabaseError",
     "OpenConfig",
     "OpenTrial",
@@ -90,19 +83,9 @@ __all__ = [
     "StoreUnavailableError",
     "Table",
     "Trajectory",
-    "TrialName",
     "TrialRow",
-    "Upgrade",
-    "Vacuumed",
-    "back_up",
-    "collect",
     "default_url",
-    "examine",
     "explorations",
     "failure_kinds",
-    "merge",
-    "merge_collected",
     "prunable",
-    "upgrade",
-    "vacuum",
 ]

@@ -14,7 +14,8 @@ from orchestrate.config.grid import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.runner.run_grid import Work, launch_grid
-from orchestrate.store import Reader, examine
+from orchestrate.store import Reader
+from orchestrate.store.doctor.examine import examine
 from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.standins import specification
 

@@ -7,14 +7,18 @@ current program computes, the labels, is written after the scripts.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 
+from sqlalchemy import Connection, bindparam, select, update
+
+from dopt.spec.label import config_label
 from orchestrate.store import database_url, migrations, packed_curves, schema_version
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import make_backend
-from orchestrate.store.schema import SCHEMA_VERSION
-from orchestrate.store.write import labels, launches
+from orchestrate.store.schema import SCHEMA_VERSION, config
+from orchestrate.store.write import launches
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
                 launches.refuse_living(connection, backend)
                 name = backend.back_up(connection, before) if backup else None
                 migrations.migrate(connection, before)
-                labels.write_missing(connection)
+                _write_missing_labels(connection)
             else:
                 migrations.create_views(connection)
             packed_curves.create(connection)
@@ -90,3 +94,14 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
             backend.discard_backup(name)
         raise
     return Upgrade(backend.safe_url, before, SCHEMA_VERSION, name)
+
+
+def _write_missing_labels(connection: Connection) -> None:
+    columns = select(config.c.config_id, config.c.config_json).where(config.c.label == "")
+    rows = [
+        {"id": config_id, "text": config_label(json.loads(text))}
+        for config_id, text in connection.execute(columns)
+    ]
+    if rows:
+        statement = update(config).where(config.c.config_id == bindparam("id"))
+        connection.execute(statement.values(label=bindparam("text")), rows)

@@ -13,7 +13,6 @@ import numpy as np
 from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 
 from dopt.errors import suggestion
-from dopt.spec.added_fields import completed
 from orchestrate.store import database_url, packed_curves, schema_version
 from orchestrate.store.backends import bundle, postgresql, sqlite
 from orchestrate.store.backends.driver_errors import translated
@@ -136,8 +135,13 @@ class Reader:
 
     def configs(self) -> list[ConfigRow]:
         """Return all configurations, sorted by name, with the counts of their trials."""
+        from dopt.spec.added_fields import completed  # loads every class that it may meet
+
         with self._snapshot() as connection:
-            configs = [_config_row(*row) for row in connection.execute(_CONFIGS)]
+            configs = [
+                ConfigRow(*values, completed(stored_json(content, dict)))  # type: ignore[call-arg]
+                for *values, content in connection.execute(_CONFIGS)
+            ]
         return sorted(configs, key=_names)
 
     def launches(self) -> list[LaunchRow]:
@@ -251,10 +255,6 @@ _KINDS = {"sqlite": sqlite, "postgresql": postgresql, database_url.BUNDLE: bundl
 
 def _kind(url: URL) -> ModuleType:
     return _KINDS[url.get_backend_name()]
-
-
-def _config_row(*values: Any) -> ConfigRow:
-    return ConfigRow(*values[:-1], completed(stored_json(values[-1], dict)))  # type: ignore[call-arg]
 
 
 def _names(row: ConfigRow) -> tuple[str | int, ...]:

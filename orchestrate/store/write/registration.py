@@ -9,7 +9,6 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, or_, select, update
 
-from dopt.declare.registry import check_importable
 from orchestrate.store.backends.base import Backend, NewTrial
 from orchestrate.store.records import Registrable, Registration
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, PREQUENTIAL, alike, config, trial
@@ -44,6 +43,8 @@ def _config_row(spec: Registrable) -> dict[str, Any]:
             f"expected {', '.join(CONFIG_COLUMNS)}."
         )
     if PREQUENTIAL.strip("%") not in spec.config_json:  # what was measured is not run again
+        from dopt.declare.registry import check_importable  # loaded with the specifications
+
         for key, section in json.loads(spec.config_json).items():
             check_importable(key, section)
     values = {name: plain(value) for name, value in columns.items()}

@@ -22,14 +22,9 @@ from analysis.tables.comparisons import compare_policies
 from dopt import Explorer, TrialSpec
 from orchestrate.__main__ import main
 from orchestrate.commands.doctor import trial_key
-from orchestrate.store import (
-    Reader,
-    Store,
-    StoreUnavailableError,
-    examine,
-    explorations,
-    merge,
-)
+from orchestrate.store import Reader, Store, StoreUnavailableError, explorations
+from orchestrate.store.doctor.examine import examine
+from orchestrate.store.merging.merge import merge
 from tests.dopt.explorer.saves import content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN
 from tests.orchestrate.store.test_heartbeat import wait_for_renewals

@@ -10,7 +10,8 @@ from sqlalchemy import create_engine
 from sqlalchemy.engine import make_url
 
 from orchestrate.commands.doctor import trial_key
-from orchestrate.store import Reader, Store, merge
+from orchestrate.store import Reader, Store
+from orchestrate.store.merging.merge import merge
 from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import Answer
 from tests.orchestrate.standins import specification

@@ -23,6 +23,7 @@ from orchestrate.executors.local import LocalExecutor
 from orchestrate.program import exit_code
 from orchestrate.records import Failure
 from tests.orchestrate.executors.names import ALL, WITH_PROCESSES, WORKERS
+from tests.orchestrate.loaded_modules import report_modules
 from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
 from tests.waiting import until
 
@@ -213,3 +214,14 @@ def test_a_pool_that_cannot_start_all_its_workers_keeps_none(
     ):
         pass
     assert started[0].poll() == -signal.SIGKILL
+
+
+def test_a_worker_of_the_local_executor_loads_no_heavy_library() -> None:
+    with LocalExecutor(report_modules, workers=1) as executor:
+        executor.submit(tasks([0]))
+        [done] = drain(executor)
+    assert isinstance(done, TaskDone)
+    assert isinstance(done.outcome, Failure)
+    loaded = set(done.outcome.message.split())
+    assert loaded >= {"numba", "numpy"}
+    assert not loaded & {"torch", "pandas", "sqlalchemy", "hydra", "omegaconf", "matplotlib", "ray"}

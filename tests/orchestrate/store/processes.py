@@ -15,9 +15,11 @@ from typing import Any
 
 import sqlalchemy
 
-from orchestrate.store import Claim, Store, merge, migrations, upgrade
+from orchestrate.store import Claim, Store, migrations
 from orchestrate.store.merging import merge as merging
 from orchestrate.store.merging import source as merge_source
+from orchestrate.store.merging.merge import merge
+from orchestrate.store.migrations.upgrade import upgrade
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
 from tests.waiting import PATIENCE_SECONDS
 

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 from sqlalchemy import event
 
-from orchestrate.store import Failure, Reader, Store, examine, merge
+from orchestrate.store import Failure, Reader, Store
+from orchestrate.store.doctor.examine import examine
+from orchestrate.store.merging.merge import merge
 from orchestrate.store.merging.source import Source
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged
 

@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orchestrate.store import Claim, Reader, Store, StoreUnavailableError, examine, upgrade
+from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
+from orchestrate.store.doctor.examine import examine
+from orchestrate.store.migrations.upgrade import upgrade
 from orchestrate.store.schema import STEP_VALUES
 from tests.orchestrate.store.fakes import LAUNCH, RUN, FakeResult, Spec, diverged, result
 from tests.orchestrate.store.places import execute

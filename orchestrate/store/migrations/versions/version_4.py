@@ -1,7 +1,7 @@
 """Schema 4: a short human label of each configuration, also as a column of the views.
 
 Labels are left empty here: the upgrade writes them after the migrations, by the code of the
-program that upgrades (:func:`orchestrate.store.write.labels.write_missing`).
+program that upgrades (:mod:`orchestrate.store.migrations.upgrade`).
 """
 
 from __future__ import annotations

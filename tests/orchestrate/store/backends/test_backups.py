@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
-from orchestrate.store import StoreError, StoreUnavailableError, upgrade
+from orchestrate.store import StoreError, StoreUnavailableError
+from orchestrate.store.migrations.upgrade import upgrade
 from tests.orchestrate.store.migrations.released import restore
 from tests.orchestrate.store.places import backups, execute, file_of, schema_of
 from tests.orchestrate.store.structure import columns, contents, structure

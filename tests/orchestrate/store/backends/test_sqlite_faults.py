@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from sqlalchemy.engine import make_url
 
-from orchestrate.store import Claim, Reader, Store, StoreError, StoreUnavailableError, examine
+from orchestrate.store import Claim, Reader, Store, StoreError, StoreUnavailableError
 from orchestrate.store.backends import sqlite_engine
+from orchestrate.store.doctor.examine import examine
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import hear, kill, run_and_stop, running, without_rights
 

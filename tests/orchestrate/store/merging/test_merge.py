@@ -11,17 +11,9 @@ import numpy as np
 import pytest
 from sqlalchemy import create_engine, text
 
-from orchestrate.store import (
-    Claim,
-    Failure,
-    Merged,
-    NoDatabaseError,
-    Reader,
-    Store,
-    StoreError,
-    merge,
-)
+from orchestrate.store import Claim, Failure, NoDatabaseError, Reader, Store, StoreError
 from orchestrate.store.merging import source
+from orchestrate.store.merging.merge import Merged, merge
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
 from tests.orchestrate.store.processes import hear, kill, merge_and_tell, running

@@ -15,9 +15,9 @@ from orchestrate.store import (
     SchemaVersionError,
     Store,
     StoreUnavailableError,
-    merge,
     schema_version,
 )
+from orchestrate.store.merging.merge import merge
 from orchestrate.store.schema import derived, metadata
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.places import execute

@@ -21,10 +21,10 @@ from orchestrate.store import (
     StoreUnavailableError,
     database_url,
     migrations,
-    upgrade,
 )
 from orchestrate.store.backends.file_locks import LaunchLocks
 from orchestrate.store.backends.open import make_backend
+from orchestrate.store.migrations.upgrade import upgrade
 from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.store.fakes import LAUNCH, Spec
 from tests.orchestrate.store.migrations.released import VERSIONS
