@@ -25,7 +25,7 @@ SEEDS = 2_120
 """With 19 configurations of 500 steps, twenty million rows."""
 
 LISTS = ("/", "/trials", "/trials?env=cartpole&sort=final_loss", "/api/grid")
-CURVES = ("/api/curves?env=pendulum", "/api/curves?env=quadrotor", "/compare?env=pendulum")
+CURVES = ("/api/curves?env=pendulum", "/api/curves?env=quadrotor")
 LIST_SECONDS, CURVE_SECONDS = 1.0, 2.0
 STEPS = "SELECT count(*) FROM step"
 
@@ -35,7 +35,7 @@ def measure(quick: bool) -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         url = os.environ.get("DOPT_BENCH_DB") or database(folder)
         steps = _steps(url) or fill(url, 5 if quick else SEEDS)
-        with _served(url, folder) as address:
+        with _served(url) as address:
             return [
                 _row(address, page, f"{steps:,} steps", Target(9, seconds))
                 for pages, seconds in ((LISTS, LIST_SECONDS), (CURVES, CURVE_SECONDS))
@@ -53,9 +53,9 @@ def _steps(url: str) -> int:
 
 
 @contextmanager
-def _served(url: str, folder: str) -> Iterator[str]:
+def _served(url: str) -> Iterator[str]:
     """Serve a database in a process of its own, and yield the address."""
-    words = ("-m", "analysis", "serve", "--db", url, "--port", "0", "--figures", folder)
+    words = ("-m", "analysis", "serve", "--db", url, "--port", "0")
     with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, cwd=ROOT) as process:
         assert process.stdout is not None
         greeting = process.stdout.readline().decode()

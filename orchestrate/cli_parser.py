@@ -24,6 +24,7 @@ _INSTALLED = {
 
 
 SUCCESSORS = {
+    "analysis --figures": "open README.md in the folder of figures",
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
 }

@@ -288,7 +288,7 @@ def test_the_store_loads_at_most_five_modules_of_the_science() -> None:
 
 def test_numbers_load_no_plotting_library() -> None:
     modules = "analysis.report.variant_table, analysis.report.control, analysis.tables.registry"
-    assert "matplotlib" not in loaded_by(f"{modules}, analysis.serve.policy_labels, analysis.cli")
+    assert "matplotlib" not in loaded_by(f"{modules}, analysis.cli")
 
 
 def test_every_package_is_typed_and_described() -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -17,26 +16,27 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import FileResponse, Response
+from starlette.responses import Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from analysis.serve import compare, control, curves, gallery, grid, launches, sql, trial, trials
-from analysis.serve.addresses import is_loopback
-from analysis.serve.errors import BusyError, ForbiddenError, NotFoundError, RequestError
-from analysis.serve.events import respond
-from analysis.serve.query_params import QueryParams
-from analysis.serve.responses import FOLDER, as_csv, as_json, as_page
-from analysis.serve.security import LONGEST_QUERY, SecurityMiddleware
-from analysis.serve.side_by_side import side_by_side
-from analysis.serve.sites import state_at, states_of
-from analysis.serve.state import ServerState
-from dopt.errors import DoptError
-from orchestrate.store.errors import (
-    NoDatabaseError,
-    SchemaVersionError,
-    StoreUnavailableError,
+from analysis.serve import pages, sql
+from analysis.serve.command import is_loopback
+from analysis.serve.server import LONGEST_QUERY, SecurityMiddleware
+from analysis.serve.state import Database, ServerState
+from analysis.serve.web import (
+    FOLDER,
+    BusyError,
+    ForbiddenError,
+    NotFoundError,
+    QueryParams,
+    RequestError,
+    as_csv,
+    as_json,
+    as_page,
 )
+from dopt.errors import DoptError
+from orchestrate.store.errors import NoDatabaseError, SchemaVersionError, StoreUnavailableError
 
 Numbers = Callable[[ServerState, QueryParams], Mapping[str, Any]]
 Answer = Callable[[ServerState, Request, QueryParams, sql.Stopped], Response]
@@ -45,33 +45,19 @@ FORM_SECONDS = 10.0
 """Time in which a form has to arrive."""
 
 PAGES: tuple[tuple[str, str, Numbers], ...] = (
-    ("/", "grid", grid.grid),
-    ("/curves", "curves", curves.choices),
-    ("/trials", "trials", trials.trials),
-    ("/trials/{trial_key}", "trial", trial.trial),
-    ("/compare", "compare", compare.compare),
-    ("/control", "control", control.control),
-    ("/launches", "launches", launches.launches),
-    ("/figures", "figures", gallery.gallery),
+    ("/", "grid", pages.grid),
+    ("/curves", "curves", pages.choices),
+    ("/trials", "trials", pages.trials),
+    ("/trials/{trial_key}", "trial", pages.trial),
     ("/sql", "sql", sql.form),
 )
 DATA: tuple[tuple[str, Numbers], ...] = (
-    ("/api/grid", grid.grid),
-    ("/api/curves", curves.curves),
-    ("/api/trials", trials.trials),
-    ("/api/trials/{trial_key}", trial.trial),
-    ("/api/trials/{trial_key}/arrays", trial.arrays),
-    ("/api/trials/{trial_key}/samples", trial.samples),
-    ("/api/compare", compare.compare),
-    ("/api/control", control.control),
-    ("/api/launches", launches.launches),
-    ("/api/figures", gallery.gallery),
+    ("/api/grid", pages.grid),
+    ("/api/curves", pages.curves),
+    ("/api/trials", pages.trials),
+    ("/api/trials/{trial_key}", pages.trial),
+    ("/api/trials/{trial_key}/arrays", pages.arrays),
 )
-TABLES: dict[str, Callable[[ServerState, QueryParams], str]] = {
-    "curves": lambda state, params: curves.table(state, params).to_csv(index=False),
-    "compare": lambda state, params: compare.table(state, params).to_csv(index=False),
-    "control": lambda state, params: control.table(state, params).to_csv(index=False),
-}
 STATES = (
     ((NoDatabaseError, SchemaVersionError, StoreUnavailableError), 503),
     ((BusyError,), 429),
@@ -81,59 +67,38 @@ STATES = (
 )
 
 
-def create_app(
-    url: str, figures: Path, host: str = "127.0.0.1", others: Sequence[str] = ()
-) -> Starlette:
-    """Return the application for a database, ``others`` beside it, and a folder of figures.
+def create_app(url: str, host: str = "127.0.0.1") -> Starlette:
+    """Return the application for a database; ``host`` is the address that the server listens at.
 
-    ``host`` is the address that the server listens at. Raises ``StoreError`` for an invalid
-    database URL. A database that does not exist yet gives an error page until it is created.
+    Raises ``StoreError`` for an invalid database URL. A database that does not exist yet gives an
+    error page until it is created.
     """
-    states = states_of([url, *others], figures, not is_loopback(host))
-    routes = [
-        Route("/databases", partial(_both, states)),
-        Route("/api/databases", partial(_both_data, states)),
-        Mount("/static", StaticFiles(directory=FOLDER / "static")),
-        *(Mount(state.base, routes=_routes(state)) for state in states[1:]),
-        *_routes(states[0]),
-    ]
+    state = ServerState(Database(url), not is_loopback(host))
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
         yield
-        for state in states:
-            state.database.close()
+        state.database.close()
 
     app = Starlette(
-        routes=routes,
+        routes=[
+            Mount("/static", StaticFiles(directory=FOLDER / "static")),
+            *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
+            *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
+            *(Route(path, partial(_ask, state, to), methods=["POST"]) for path, to in STATEMENTS),
+            Route("/api/curves.csv", partial(_curves_table, state)),
+            Route("/api/events", partial(_events, state)),
+        ],
         middleware=[Middleware(SecurityMiddleware, host=host)],
         exception_handlers={
-            DoptError: partial(_error_response, states),
-            HTTPException: partial(_error_response, states),
-            Exception: partial(_server_error, states),
+            DoptError: partial(_error_response, state),
+            HTTPException: partial(_error_response, state),
+            Exception: partial(_server_error, state),
         },
         lifespan=lifespan,
     )
-    app.state.events = [state.events for state in states]
+    app.state.end = state.events.end
     return app
-
-
-def end_streams(app: Starlette) -> None:
-    """End event streams and statements, with which open pages keep the server from ending."""
-    for events in app.state.events:
-        events.end()
-
-
-def _routes(state: ServerState) -> list[Route]:
-    """Return the pages of one database, and what is behind them."""
-    return [
-        *(Route(path, partial(_page, state, name, numbers)) for path, name, numbers in PAGES),
-        *(Route(path, partial(_data, state, numbers)) for path, numbers in DATA),
-        *(Route(f"/api/{name}.csv", partial(_table, state, name)) for name in TABLES),
-        *(Route(path, partial(_ask, state, to), methods=["POST"]) for path, to in STATEMENTS),
-        Route("/api/events", partial(_events, state)),
-        Route("/figures/{name}", partial(_file, state)),
-    ]
 
 
 def _query_params(request: Request) -> QueryParams:
@@ -142,8 +107,9 @@ def _query_params(request: Request) -> QueryParams:
 
 def _page(state: ServerState, name: str, numbers: Numbers, request: Request) -> Response:
     content = numbers(state, _query_params(request))
-    status = 400 if content.get("error") else 200
-    return as_page(f"{name}.html", _page_context(state, name, request) | dict(content), status)
+    query = QueryText({key: value for key, value in request.query_params.items() if value})
+    frame = {"page": name, "database": state.database.safe_url, "query": query}
+    return as_page(f"{name}.html", frame | dict(content), 400 if content.get("error") else 200)
 
 
 def _data(state: ServerState, numbers: Numbers, request: Request) -> Response:
@@ -194,26 +160,12 @@ STATEMENTS: tuple[tuple[str, Answer], ...] = (
 )
 
 
-def _both(states: Sequence[ServerState], request: Request) -> Response:
-    content = side_by_side(states, _query_params(request))
-    return as_page("databases.html", _page_context(states[0], "databases", request) | content)
-
-
-def _both_data(states: Sequence[ServerState], request: Request) -> Response:
-    return as_json(side_by_side(states, _query_params(request)))
-
-
 async def _events(state: ServerState, request: Request) -> Response:
-    return respond(state.events, request)
+    return state.events.respond(request)
 
 
-def _table(state: ServerState, name: str, request: Request) -> Response:
-    return as_csv(TABLES[name](state, _query_params(request)), name)
-
-
-def _file(state: ServerState, request: Request) -> Response:
-    path = gallery.find(state, request.path_params["name"])
-    return FileResponse(path, media_type=gallery.TYPES[path.suffix[1:]])
+def _curves_table(state: ServerState, request: Request) -> Response:
+    return as_csv(pages.curves_table(state, _query_params(request)).to_csv(index=False), "curves")
 
 
 class QueryText(dict[str, str]):
@@ -223,53 +175,25 @@ class QueryText(dict[str, str]):
         return ""
 
 
-def _page_context(state: ServerState, name: str, request: Request) -> dict[str, Any]:
-    """Return the content that every page shows beside its own."""
-    query = QueryText({key: value for key, value in request.query_params.items() if value})
-    return {"query": query, **_frame(state, name)}
+def _error_response(state: ServerState, request: Request, error: Exception) -> Response:
+    if not isinstance(error, HTTPException):
+        status = next(code for kinds, code in STATES if isinstance(error, kinds))
+        return _message(state, request, status, str(error))
+    missing = "This page does not exist: choose a page from the menu above."
+    sentence = missing if error.status_code == 404 else f"{error.detail}."
+    return _message(state, request, error.status_code, sentence)
 
 
-def _frame(state: ServerState, name: str) -> dict[str, Any]:
-    """Return what the menus of a page need; ``here`` is its path under each database."""
-    paths = {name: path for path, name, _ in PAGES} | {"trial": "/trials"}
-    return {
-        "page": name,
-        "here": paths.get(name, "/"),
-        "base": state.base,
-        "databases": state.links,
-        "database": state.database.safe_url,
-    }
-
-
-def _error_response(states: Sequence[ServerState], request: Request, error: Exception) -> Response:
-    if isinstance(error, HTTPException):
-        sentence = (
-            "This page does not exist: choose a page from the menu above."
-            if error.status_code == 404
-            else (f"{error.detail}.")
-        )
-        return _message(states, request, error.status_code, sentence)
-    status = next(code for kinds, code in STATES if isinstance(error, kinds))
-    return _message(states, request, status, str(error))
-
-
-def _server_error(states: Sequence[ServerState], request: Request, error: Exception) -> Response:
+def _server_error(state: ServerState, request: Request, error: Exception) -> Response:
     logging.getLogger(__name__).error("%r failed", request.scope["path"], exc_info=error)
     return _message(
-        states,
-        request,
-        500,
-        "This page failed: the server's terminal shows the traceback.",
+        state, request, 500, "This page failed: the server's terminal shows the traceback."
     )
 
 
-def _message(
-    states: Sequence[ServerState], request: Request, status: int, sentence: str
-) -> Response:
-    state = state_at(states, request.scope["path"])
-    path = request.scope["path"].removeprefix(state.base)
+def _message(state: ServerState, request: Request, status: int, sentence: str) -> Response:
+    path = request.scope["path"]
     if path.startswith("/api/"):
         return as_json({"error": sentence}, status)
-    name = path.split("/")[1] or "grid"
-    content = {"sentence": sentence, "status": status, "query": QueryText()}
-    return as_page("message.html", _frame(state, name) | content, status)
+    content = {"page": path.split("/")[1] or "grid", "database": state.database.safe_url}
+    return as_page("message.html", content | {"sentence": sentence, "status": status}, status)

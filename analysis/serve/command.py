@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import ipaddress
 import os
 import socket
 import sys
 from contextlib import ExitStack
 
 from analysis.errors import AnalysisError
-from analysis.serve.addresses import is_loopback
 from dopt.errors import install_command
-from orchestrate.cli_parser import path
 from orchestrate.store import DEFAULT_URL, default_url
 
 HELP = "show the results in a browser, read-only, while a launch writes"
@@ -22,24 +21,15 @@ HOST = "127.0.0.1"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     parser.add_argument(
-        "--db",
-        nargs="+",
-        default=[default_url()],
-        metavar="URL",
-        help=f"databases, side by side where there are several (DOPT_DB, {DEFAULT_URL})",
+        "--db", nargs="+", default=[default_url()], metavar="URL", help=f"(DOPT_DB, {DEFAULT_URL})"
     )
     parser.add_argument("--port", type=int, default=PORT, help=f"port, 0: any free one ({PORT})")
     parser.add_argument("--host", default=HOST, help=f"address to listen at ({HOST})")
-    parser.add_argument(
-        "--figures",
-        type=path("--figures"),
-        default="figures",
-        help="folder of figures (figures/)",
-    )
 
 
 def run(options: argparse.Namespace) -> int:
     """Serve until the user ends it with Ctrl-C."""
+    _check_one_database(options)
     try:
         from analysis.serve.app import create_app
         from analysis.serve.server import Server
@@ -48,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
             f"The browser needs the library {error.name}: "
             f"install it with {install_command('serve')}."
         ) from error
-    app = create_app(options.db[0], options.figures, options.host, options.db[1:])
+    app = create_app(options.db[0], options.host)
     listening = _listen(options.host, options.port)
     sys.stdout.write(_greeting(options, listening.getsockname()[1]))
     sys.stdout.flush()
@@ -59,6 +49,22 @@ def run(options: argparse.Namespace) -> int:
     finally:
         listening.close()
     return 0
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen at is reached from this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def _check_one_database(options: argparse.Namespace) -> None:
+    if len(options.db) > 1:
+        raise AnalysisError(
+            f"A browser shows one database, but {len(options.db)} are given: start one for each, "
+            f"with --port 0, or put them together with orchestrate merge."
+        )
 
 
 def _listen(host: str, port: int) -> socket.socket:

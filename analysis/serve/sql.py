@@ -16,9 +16,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from analysis.serve.errors import BusyError, ForbiddenError
-from analysis.serve.query_params import QueryParams
 from analysis.serve.state import ServerState
+from analysis.serve.web import BusyError, ForbiddenError, QueryParams
 from orchestrate.store import READ_VARIABLE, Table
 from orchestrate.store.errors import QueryError
 
@@ -37,8 +36,6 @@ EXAMPLES = (
      "WHERE env = 'pendulum' AND policy = 'd_optimal' AND width = 16\nORDER BY t"),
     ("The ten worst trials", "SELECT env, policy, width, seed, final_loss, trial_key\n"
      "FROM v_trial WHERE status = 'done' ORDER BY final_loss DESC LIMIT 10"),
-    ("Losses of running trials", "SELECT env, policy, seed, t, loss\n"
-     "FROM live_step JOIN v_trial USING (trial_id) ORDER BY trial_id, t"),
     ("What failed, and why", "SELECT env, policy, seed, cause, type, message\n"
      "FROM v_failures ORDER BY ended DESC"),
     ("Time and memory", "SELECT env, policy, width, avg(wall_seconds) AS wall_s,\n"

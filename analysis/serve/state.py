@@ -1,39 +1,216 @@
-"""State that all pages share: database, folder of figures and caches."""
+"""State that all pages share: the database, cached values, and the stream of its progress."""
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
+import json
 import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Hashable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
 
 from analysis.data.config_matching import Filter
 from analysis.data.trial_selection import Selection, select
-from analysis.serve.cache import Cache
-from analysis.serve.database import Database
-from analysis.serve.events import Events
-from analysis.serve.progress import read_progress
+from dopt.errors import DoptError
 from orchestrate.store import Reader
+from orchestrate.store.database_url import parse, read_login, safe, sqlite_path
+
+PERIOD = 1.0
+"""Least time between two readings of the progress [s]; a reading may take a tenth of it."""
+
+SILENCE = 15.0
+"""Time after which an unchanged stream sends a comment [s], so that nobody takes it for dead."""
+
+COMMENT = ": nothing new\n\n"
+MEDIA_TYPE = "text/event-stream"
+
+_TRIALS = """
+SELECT status, count(*) AS n, sum(attempt) AS attempts, sum(coalesce(n_steps, 0)) AS steps
+FROM trial GROUP BY status ORDER BY status
+"""
+_LAUNCHES = """
+SELECT count(*) AS n, max(launch_id) AS newest, count(*) FILTER (WHERE state = 'running') AS running
+FROM launch
+"""
+
+T = TypeVar("T")
+Identity = tuple[int, int] | None
 
 
-@dataclass(frozen=True)
-class Link:
-    """Name of a database on its pages, and the start of their paths."""
+class Database:
+    """Access to the database at a URL, which may be missing, created later or replaced."""
 
-    name: str
-    base: str
+    def __init__(self, url: str) -> None:
+        parsed = parse(url)
+        self.safe_url = safe(parsed)
+        self._url = url
+        self.is_file = parsed.get_backend_name() != "postgresql"
+        self.user = parsed.username
+        self.read_login = read_login(parsed)
+        self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
+        self._lock = threading.Lock()
+        self._reader: Reader | None = None
+        self._identity: Identity = None
+
+    def reader(self) -> Reader:
+        """Return a reader; raise ``StoreError`` for a missing database or another schema."""
+        with self._lock:
+            identity = self._file()
+            if self._reader is None or identity != self._identity:
+                self.close()
+                self._reader = Reader.open(self._url)
+                self._identity = identity
+            return self._reader
+
+    def close(self) -> None:
+        """Close the connections."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def _file(self) -> Identity:
+        """Return device and inode of the database file; None without one or on PostgreSQL."""
+        if self._path is None:
+            return None
+        try:
+            found = self._path.stat()
+        except OSError:
+            self.close()
+            return None
+        return found.st_dev, found.st_ino
+
+
+class Cache:
+    """Thread-safe cache that drops the least recently used entry beyond ``size`` entries.
+
+    A key contains everything that its value depends on, such as the finished trials of a
+    configuration, so a cached value is never stale. Two threads may compute one value concurrently.
+    """
+
+    def __init__(self, size: int = 1024) -> None:
+        self._size = size
+        self._lock = threading.Lock()
+        self._values: OrderedDict[Hashable, object] = OrderedDict()
+
+    def get_or_compute(self, key: Hashable, compute: Callable[[], T]) -> T:
+        """Return the value of a key; compute it when it is not cached."""
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return cast("T", self._values[key])
+        value = compute()
+        with self._lock:
+            self._values[key] = value
+            while len(self._values) > self._size:
+                self._values.popitem(last=False)
+        return value
+
+
+def read_progress(reader: Reader) -> dict[str, Any]:
+    """Return the counts of trials by status, and a token that changes when a trial changes."""
+    trials = [[row.status, *map(int, row[1:])] for row in reader.rows(_TRIALS)]
+    (launches,) = reader.rows(_LAUNCHES)
+    counts = {status: n for status, n, *_ in trials}
+    content = json.dumps([trials, list(launches)])
+    return {
+        "token": hashlib.sha256(content.encode()).hexdigest()[:16],
+        "counts": counts,
+        "total": sum(counts.values()),
+        "ended": sum(n for status, n in counts.items() if status not in ("pending", "running")),
+        "launches_running": int(launches.running),
+    }
+
+
+@dataclass
+class Events:
+    """Progress of the database, read once a second for all streams together while one is open."""
+
+    database: Database
+    _latest: str = ""
+    _n_open: int = 0
+    ended: bool = False
+    _reading: asyncio.Task[None] | None = None
+    _changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def stream(self) -> AsyncIterator[str]:
+        """Yield the progress, and again after every change, until the server ends."""
+        self._n_open += 1
+        if self._reading is None:
+            self._reading = asyncio.create_task(self._read())
+        try:
+            sent = ""
+            while not self.ended:
+                if self._latest == sent and not await self._change():
+                    yield COMMENT
+                elif self._latest != sent:
+                    sent = self._latest
+                    yield sent
+        finally:
+            self._n_open -= 1
+            if not self._n_open:
+                self._reading.cancel()
+                self._reading, self._latest = None, ""
+
+    def end(self) -> None:
+        """End all streams, now and later."""
+        self.ended = True
+        self._tell()
+
+    def respond(self, request: Request) -> Response:
+        """Return the stream."""
+        if request.method == "HEAD":
+            return Response(media_type=MEDIA_TYPE)
+        return StreamingResponse(self.stream(), media_type=MEDIA_TYPE)
+
+    async def _change(self) -> bool:
+        """Wait for the next change; return whether it came. Raises what the reading raised."""
+        assert self._reading
+        change = asyncio.ensure_future(self._changed.wait())
+        done, _ = await asyncio.wait(
+            [change, self._reading], timeout=SILENCE, return_when=asyncio.FIRST_COMPLETED
+        )
+        change.cancel()
+        if self._reading in done:
+            await self._reading
+        return bool(done)
+
+    async def _read(self) -> None:
+        while True:
+            start = time.monotonic()
+            latest = await asyncio.to_thread(self._event)
+            if latest != self._latest:
+                self._latest = latest
+                self._tell()
+            await asyncio.sleep(max(PERIOD, 10 * (time.monotonic() - start)))
+
+    def _tell(self) -> None:
+        """Wake all streams."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _event(self) -> str:
+        """Return the event ``progress``, or ``unavailable`` for a database that has none."""
+        try:
+            name, content = "progress", read_progress(self.database.reader())
+        except DoptError as error:
+            name, content = "unavailable", {"error": str(error)}
+        return f"event: {name}\ndata: {json.dumps(content)}\n\n"
 
 
 @dataclass(frozen=True)
 class ServerState:
-    """A database with its event stream, the folder of figures, and caches of computed values.
+    """The database with its event stream, and caches of computed values.
 
     Attributes
     ----------
-    link
-        Where the pages of the database are.
-    links
-        Where those of all databases of the server are, this one included.
     exposed
         Whether other machines reach the server.
     token
@@ -41,21 +218,10 @@ class ServerState:
     """
 
     database: Database
-    figures: Path
-    link: Link
-    links: tuple[Link, ...]
     exposed: bool = False
     token: str = field(default_factory=secrets.token_urlsafe)
     cache: Cache = field(default_factory=Cache)
     selections: Cache = field(default_factory=lambda: Cache(6))  # each contains all its trials
-
-    @property
-    def name(self) -> str:
-        return self.link.name
-
-    @property
-    def base(self) -> str:
-        return self.link.base
 
     @cached_property
     def events(self) -> Events:

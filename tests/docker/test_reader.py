@@ -81,8 +81,8 @@ def test_it_reads_tables_that_come_later_and_writes_nothing(
             connection.execute(text(statement))
     engine.dispose()
     monkeypatch.setenv("DOPT_READ_DB", login)
-    with TestClient(create_app(login, Path("figures"), "0.0.0.0"), base_url=BASE) as client:
-        for page in ("/", "/curves", "/trials", "/control", "/launches", "/sql"):
+    with TestClient(create_app(login, "0.0.0.0"), base_url=BASE) as client:
+        for page in ("/", "/curves", "/trials", "/sql"):
             assert client.get(page).status_code == 200, page
         assert post(client, "/api/sql", "SELECT count(*) FROM v_trial").json()["rows"] == [[1]]
 

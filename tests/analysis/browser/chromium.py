@@ -10,9 +10,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
@@ -62,10 +61,9 @@ def opened() -> Iterator[Browser]:
 
 
 @contextmanager
-def served(url: str, figures: Path, port: int = 0, others: Sequence[str] = ()) -> Iterator[str]:
-    """Serve databases from a thread of this process; yield the address."""
-    app = create_app(url, figures, others=others)
-    server = Server(app, port)
+def served(url: str, port: int = 0) -> Iterator[str]:
+    """Serve a database from a thread of this process; yield the address."""
+    server = Server(create_app(url), port)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:

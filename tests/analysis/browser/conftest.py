@@ -5,7 +5,6 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -15,7 +14,6 @@ from starlette.testclient import TestClient
 from analysis.serve.app import create_app
 from orchestrate.store import Reader
 from tests.analysis.browser import grids
-from tests.paths import ROOT
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -71,33 +69,21 @@ def browser() -> Iterator[Browser]:
         yield opened
 
 
-@pytest.fixture(scope="session")
-def figures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder of one figure and one table."""
-    folder = tmp_path_factory.mktemp("figures")
-    icon = ROOT / "analysis" / "serve" / "static" / "icon.svg"
-    (folder / "figure1.svg").write_bytes(icon.read_bytes())
-    (folder / "figure1.txt").write_text("A caption.")
-    (folder / "figure1.json").write_text('{"title": "Loss curves", "statistic": "mean"}')
-    (folder / "summary.csv").write_text("env,policy,loss\narm,random,0.123456\n")
-    return folder
-
-
 @pytest.fixture(scope="package")
-def address(sqlite_grid: str, figures: Path) -> Iterator[str]:
+def address(sqlite_grid: str) -> Iterator[str]:
     """Return the address of a server of the mixed grid."""
     from tests.analysis.browser import chromium
 
-    with chromium.served(sqlite_grid, figures) as found:
+    with chromium.served(sqlite_grid) as found:
         yield found
 
 
 @pytest.fixture(scope="package")
-def variants(variants_grid: str, figures: Path) -> Iterator[str]:
+def variants(variants_grid: str) -> Iterator[str]:
     """Return the address of a server of the grid of variants."""
     from tests.analysis.browser import chromium
 
-    with chromium.served(variants_grid, figures) as found:
+    with chromium.served(variants_grid) as found:
         yield found
 
 
@@ -116,12 +102,12 @@ def reader(grid: str) -> Iterator[Reader]:
 
 
 @pytest.fixture
-def visit(tmp_path: Path) -> Iterator[Callable[..., TestClient]]:
+def visit() -> Iterator[Callable[..., TestClient]]:
     """Return a function that gives a client of the application over a database."""
     with ExitStack() as stack:
 
-        def open_client(url: str, figures: Path = tmp_path / "figures") -> TestClient:
-            client = TestClient(create_app(url, figures), base_url=BASE)
+        def open_client(url: str) -> TestClient:
+            client = TestClient(create_app(url), base_url=BASE)
             return stack.enter_context(client)
 
         yield open_client

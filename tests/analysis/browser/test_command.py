@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from analysis.cli import main
-from analysis.serve.cache import Cache
-from analysis.serve.responses import loss_text, plain
+from analysis.serve.state import Cache
+from analysis.serve.web import loss_text, plain
 
 
 @pytest.fixture
@@ -30,6 +30,8 @@ def taken() -> Iterator[int]:
         (["--host", "no.such.host.invalid"], "cannot listen at no.such.host.invalid"),
         (["--db", "nothing"], "The database URL cannot be read"),
         (["--where", "model.width=3"], "--where"),
+        (["--db", "sqlite:///a.db", "sqlite:///b.db"], "orchestrate merge"),
+        (["--figures", "figures"], "open README.md"),
     ],
 )
 def test_a_wrong_request_is_one_sentence(

@@ -13,7 +13,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from urllib.parse import urlencode, urlsplit
 
 import httpx
@@ -106,8 +105,8 @@ def test_ctrl_c_ends_the_server_whoever_is_connected(sqlite_grid: str) -> None:
         until(lambda: not any(map(alive, running)))
 
 
-def test_a_statement_ends_with_its_client(sqlite_grid: str, figures: Path) -> None:
-    with chromium.served(sqlite_grid, figures) as address:
+def test_a_statement_ends_with_its_client(sqlite_grid: str) -> None:
+    with chromium.served(sqlite_grid) as address:
         client = connected(address, asking(address))
         until(lambda: queries(os.getpid()))
         (running,) = queries(os.getpid())
@@ -115,22 +114,18 @@ def test_a_statement_ends_with_its_client(sqlite_grid: str, figures: Path) -> No
         until(lambda: not alive(running))
 
 
-def test_half_open_connections_are_few(
-    sqlite_grid: str, figures: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_half_open_connections_are_few(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serving, "MAX_WAITING", 3)
-    with chromium.served(sqlite_grid, figures) as address, ExitStack() as stack:
+    with chromium.served(sqlite_grid) as address, ExitStack() as stack:
         held = [stack.enter_context(connected(address, HALF)) for _ in range(20)]
         until(lambda: sum(map(is_closed, held)) >= 17)
         assert httpx.get(address, timeout=PATIENCE_SECONDS).status_code == 200
         assert not is_closed(held[-1])
 
 
-def test_half_a_request_is_given_up(
-    sqlite_grid: str, figures: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_half_a_request_is_given_up(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serving, "REQUEST_SECONDS", 0.5)
-    with chromium.served(sqlite_grid, figures) as address, ExitStack() as stack:
+    with chromium.served(sqlite_grid) as address, ExitStack() as stack:
         silent = stack.enter_context(connected(address, b""))
         slow = stack.enter_context(connected(address, HALF))
         second = stack.enter_context(connected(address, request(address, "/static/icon.svg")))
@@ -148,11 +143,11 @@ def test_half_a_request_is_given_up(
 
 
 def test_streams_outlive_the_time_of_a_request(
-    sqlite_grid: str, figures: Path, monkeypatch: pytest.MonkeyPatch
+    sqlite_grid: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(serving, "REQUEST_SECONDS", 0.2)
     with (
-        chromium.served(sqlite_grid, figures) as address,
+        chromium.served(sqlite_grid) as address,
         connected(address, request(address, "/api/events")) as stream,
         connected(address, HALF) as half,
     ):
@@ -161,11 +156,9 @@ def test_streams_outlive_the_time_of_a_request(
         assert not is_closed(stream)
 
 
-def test_half_a_form_is_given_up(
-    sqlite_grid: str, figures: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_half_a_form_is_given_up(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app, "FORM_SECONDS", 0.2)
-    with chromium.served(sqlite_grid, figures) as address:
+    with chromium.served(sqlite_grid) as address:
         form = request(address, "/api/sql", b"q=SELECT")[:-3]
         with connected(address, form) as half:
             assert half.recv(2**16).startswith(b"HTTP/1.1 400")
@@ -184,7 +177,7 @@ def test_strangers_cannot_fill_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_page_that_never_ends_does_not_keep_the_server(
-    sqlite_grid: str, figures: Path, monkeypatch: pytest.MonkeyPatch
+    sqlite_grid: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(serving, "END_SECONDS", 0.5)
     left, asked = threading.Event(), threading.Event()
@@ -193,7 +186,7 @@ def test_a_page_that_never_ends_does_not_keep_the_server(
         asked.set()
         assert left.wait(PATIENCE_SECONDS)
 
-    pages = create_app(sqlite_grid, figures)
+    pages = create_app(sqlite_grid)
     pages.routes.insert(0, Route("/stuck", stuck))
     server = serving.Server(pages, 0, leave=left.set)
     thread = threading.Thread(target=server.run)

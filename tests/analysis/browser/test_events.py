@@ -16,11 +16,8 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 
-from analysis.serve import events
-from analysis.serve.database import Database
-from analysis.serve.events import Events
-from analysis.serve.progress import read_progress
-from orchestrate.records import Sample
+from analysis.serve import state
+from analysis.serve.state import Database, Events, read_progress
 from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import fake_result, make_grid
@@ -48,11 +45,11 @@ def heard(address: str) -> Iterator[Iterator[tuple[str, Any]]]:
         )
 
 
-def test_a_change_is_an_event(url: str, figures: Path) -> None:
+def test_a_change_is_an_event(url: str) -> None:
     specs = make_grid(("pendulum",), ("random",), range(2), **grids.SHORT)
     with (
         Store.open(url) as store,
-        chromium.served(url, figures) as address,
+        chromium.served(url) as address,
         heard(address) as stream,
     ):
         assert next(stream)[1]["total"] == 0
@@ -65,9 +62,9 @@ def test_a_change_is_an_event(url: str, figures: Path) -> None:
         assert next(stream)[1]["ended"] == 1
 
 
-def test_it_says_that_the_database_is_gone_and_back(tmp_path: Path, figures: Path) -> None:
+def test_it_says_that_the_database_is_gone_and_back(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/results.db"
-    with chromium.served(url, figures) as address, heard(address) as stream:
+    with chromium.served(url) as address, heard(address) as stream:
         name, content = next(stream)
         assert name == "unavailable"
         assert "There is no results database" in content["error"]
@@ -77,9 +74,9 @@ def test_it_says_that_the_database_is_gone_and_back(tmp_path: Path, figures: Pat
         assert (name, content["total"]) == ("progress", 1)
 
 
-def test_an_open_stream_does_not_keep_the_server(sqlite_grid: str, figures: Path) -> None:
+def test_an_open_stream_does_not_keep_the_server(sqlite_grid: str) -> None:
     with ExitStack() as stack:
-        with chromium.served(sqlite_grid, figures) as address:
+        with chromium.served(sqlite_grid) as address:
             stream = stack.enter_context(heard(address))
             assert next(stream)[0] == "progress"
         assert list(stream) == []
@@ -92,8 +89,8 @@ def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.Mon
         readings.append(time.monotonic())
         return read_progress(reader) | {"n": len(readings)}
 
-    monkeypatch.setattr(events, "read_progress", read)
-    monkeypatch.setattr(events, "PERIOD", 0.05)
+    monkeypatch.setattr(state, "read_progress", read)
+    monkeypatch.setattr(state, "PERIOD", 0.05)
 
     async def follow(stream: AsyncIterator[str]) -> int:
         return len([await anext(stream) for _ in range(5)])
@@ -115,7 +112,7 @@ def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.Mon
 def test_a_silent_stream_says_that_it_is_alive(
     sqlite_grid: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(events, "SILENCE", 0.05)
+    monkeypatch.setattr(state, "SILENCE", 0.05)
 
     async def follow() -> list[str]:
         shared = Events(Database(sqlite_grid))
@@ -125,13 +122,13 @@ def test_a_silent_stream_says_that_it_is_alive(
         return said + [text async for text in shared.stream()]
 
     said = run(follow())
-    assert events.COMMENT in said
+    assert state.COMMENT in said
     assert sum(text.startswith("event: progress") for text in said) == 1
     assert len(said) == 20, "a stream that is opened after the end ends at once"
 
 
 def test_a_defect_ends_the_stream(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(events, "read_progress", lambda _: {}["no such entry"])
+    monkeypatch.setattr(state, "read_progress", lambda _: {}["no such entry"])
 
     async def follow() -> None:
         async for _ in Events(Database(sqlite_grid)).stream():
@@ -143,13 +140,11 @@ def test_a_defect_ends_the_stream(sqlite_grid: str, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.browser
 @pytest.mark.xdist_group("browser")
-def test_the_curve_of_a_running_trial_grows(
-    browser: Browser, sqlite_url: str, figures: Path
-) -> None:
+def test_the_page_of_a_trial_gets_charts_when_it_ends(browser: Browser, sqlite_url: str) -> None:
     (spec,) = make_grid(("pendulum",), ("random",), range(1), **grids.SHORT)
     with (
         Store.open(sqlite_url) as store,
-        chromium.served(sqlite_url, figures) as address,
+        chromium.served(sqlite_url) as address,
         chromium.strict_page(browser, address) as page,
     ):
         launch = grids.begin(store)
@@ -158,37 +153,27 @@ def test_the_curve_of_a_running_trial_grows(
         expect(page.locator("#waiting")).to_contain_text("This trial is pending")
         (claim,) = store.claim(launch, [spec.trial_key])
         expect(page.locator("#waiting")).to_contain_text("This trial is running")
-        expect(page.locator("#charts")).to_be_hidden()
-        for count in (2, 3):
-            store.sample([(claim, Sample(spec.trial_key, count, 1.0 / count, 2.0))])
-            store.sample([(claim, Sample(spec.trial_key, 0, 2.0, 3.0))])
-            expect(page.locator("#charts")).to_have_attribute("data-drawn", str(count))
-        expect(page.locator("#loss canvas")).to_have_count(1)
-        samples = httpx.get(f"{address}/api/trials/{spec.trial_key}/samples").json()
-        assert (samples["t"], samples["loss"]) == ([0, 2, 3], [2.0, 1 / 2, 1 / 3])
         assert store.commit(claim, fake_result(spec), grids.RUN)
-        expect(page.locator("#charts")).to_have_attribute("data-drawn", "yes")
-        expect(page.locator("#phase path.path")).to_have_count(1)
-        assert httpx.get(f"{address}/api/trials/{spec.trial_key}/samples").json()["t"] == []
+        expect(page.locator("#charts")).to_have_attribute("data-drawn", "40")
 
 
 @pytest.mark.browser
 @pytest.mark.xdist_group("browser")
-def test_a_page_connects_again(browser: Browser, tmp_path: Path, figures: Path) -> None:
+def test_a_page_connects_again(browser: Browser, tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/results.db"
     grids.one_trial(url)
     refused = "ERR_CONNECTION_REFUSED|ERR_INCOMPLETE_CHUNKED_ENCODING|ERR_EMPTY_RESPONSE"
-    with chromium.served(url, figures) as address:
+    with chromium.served(url) as address:
         pass
     port = int(address.rpartition(":")[2])
     with chromium.strict_page(browser, address, complaint=refused) as page:
-        with chromium.served(url, figures, port):
+        with chromium.served(url, port):
             page.goto("/")
             expect(page.locator("#state-text")).to_have_text("1 of 1 trials ended")
         expect(page.locator("#state-text")).to_have_text("server not reachable")
         page.evaluate("window.same = true")
         grids.all_diverged(url)
-        with chromium.served(url, figures, port):
+        with chromium.served(url, port):
             expect(page.locator("#state-text")).to_have_text("6 of 6 trials ended")
             expect(page.locator("#grid")).to_contain_text("diverged")
             assert page.evaluate("window.same") is True, "the page was loaded again"

@@ -12,7 +12,6 @@ from tests.analysis.browser import chromium
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 
 DESK: ViewportSize = {"width": 1400, "height": 900}
-PHONE: ViewportSize = {"width": 390, "height": 844}
 BOXES = """(tiles) => tiles.map((tile) => {
   const { left, right, top, bottom } = tile.getBoundingClientRect();
   return { left, right, top, bottom, inner: tile.scrollHeight - tile.clientHeight };
@@ -43,16 +42,14 @@ def overlap(one: Box, other: Box) -> bool:
     return not apart
 
 
-@pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_tiles_are_apart_and_inside_the_window(page: Page, size: ViewportSize) -> None:
-    page.set_viewport_size(size)
+def test_tiles_are_apart_and_inside_the_window(page: Page) -> None:
     page.goto("/")
     found = boxes(page, ".tile")
     assert len(found) == 10
     for place, one in enumerate(found):
         assert one["inner"] <= 0, "a text does not fit into its tile"
         assert one["left"] >= 0
-        assert one["right"] <= size["width"]
+        assert one["right"] <= DESK["width"]
         assert not any(overlap(one, other) for other in found[place + 1 :])
     cells = boxes(page, ".heat td:has(.tile)")
     for one in found:
@@ -65,28 +62,16 @@ def test_tiles_are_apart_and_inside_the_window(page: Page, size: ViewportSize) -
 
 def test_tiles_of_one_cell_say_how_they_differ(page: Page) -> None:
     page.goto("/")
-    cell = page.locator("tbody tr").first.locator("td").first
+    cell = page.locator(".heat tbody tr").first.locator("td").first
     labels = cell.locator(".tile small:nth-of-type(2)").all_inner_texts()
     assert len(labels) == len(set(labels)) >= 4
     assert any("γ=3" in label for label in labels)
     assert any("adam_replay" in label for label in labels)
 
 
-def test_a_phone_shows_several_policies_beside_each_other(browser: Browser, address: str) -> None:
-    with chromium.strict_page(browser, address, viewport=PHONE) as page:
-        page.goto("/")
-        row = page.locator("tbody tr").last
-        assert len({box["left"] for box in boxes(page, "tbody tr:last-child .tile")}) == 2
-        expect(row.locator(".on-phone:visible")).to_have_count(5)
-
-
 def test_hover_values_are_inside_the_window(page: Page) -> None:
     page.goto("/curves?env=pendulum")
     check_hover(page, "#chart", "D-optimal")
-    page.goto("/control?env=quadrotor")
-    page.wait_for_selector("section[data-drawn]")
-    for place in (1, 2):
-        check_hover(page, f".pair > .chart:nth-child({place})", "true model")
     page.goto("/trials?env=quadrotor&policy=random&seed=0")
     page.locator("tbody a").click()
     page.wait_for_selector("#charts[data-drawn]")
@@ -125,18 +110,3 @@ def test_two_inputs_have_a_legend(page: Page) -> None:
     page.locator("tbody a").first.click()
     page.wait_for_selector("#charts[data-drawn]")
     expect(page.locator("#inputs-legend")).to_be_hidden()
-
-
-def test_control_results_are_drawn_and_filtered(page: Page) -> None:
-    page.goto("/control")
-    expect(page.locator("section[data-drawn]")).to_have_count(2)
-    expect(page.locator("section[data-drawn] canvas")).to_have_count(4)
-    headings = page.locator("#control-quadrotor table.success th[scope=col]")
-    assert headings.all_inner_texts() == [
-        "policy", "after 0 steps", "after 10 steps", "after 20 steps", "after 40 steps", "trials"
-    ]  # fmt: skip
-    page.get_by_label("Environment").select_option("quadrotor")
-    expect(page.locator("section[data-drawn]")).to_have_count(1)
-    with page.expect_download() as download:
-        page.get_by_role("link", name="CSV").click()
-    assert download.value.path().read_text().startswith("env,policy,t,n,success")

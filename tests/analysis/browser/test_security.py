@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from urllib.parse import quote, urlencode
 
 import pytest
@@ -11,25 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from analysis.serve.security import is_own
+from analysis.serve.server import is_own
 
 Visit = Callable[..., TestClient]
 
 
 @pytest.fixture
-def client(sqlite_grid: str, visit: Visit, tmp_path: Path) -> TestClient:
-    folder = tmp_path / "figures"
-    folder.mkdir()
-    (folder / "figure1.png").write_bytes(b"\x89PNG")
-    (folder / "figure1.txt").write_text("A <b>caption</b>.")
-    (folder / "figure1.json").write_text('{"title": "Loss curves", "schema": "1"}')
-    (folder / "summary.csv").write_text("env,policy,loss\narm,random,0.123456\n")
-    (folder / "notes.html").write_text("<script>alert(1)</script>")
-    (folder / ".hidden.png").write_bytes(b"")
-    (folder / "link.png").symlink_to("/etc/passwd")
-    (folder / "sub.png").mkdir()
-    (tmp_path / "secret.txt").write_text("secret")
-    return visit(sqlite_grid, folder)
+def client(sqlite_grid: str, visit: Visit) -> TestClient:
+    return visit(sqlite_grid)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +48,7 @@ def test_only_names_of_this_server_are_answered(host: str, listening: str, own: 
 
 
 def test_a_foreign_host_sees_nothing(client: TestClient) -> None:
-    for path in ("/", "/api/grid", "/static/style.css", "/figures/figure1.png"):
+    for path in ("/", "/api/grid", "/static/style.css"):
         answer = client.get(path, headers={"host": "evil.example"})
         assert answer.status_code == 421
         assert "dopt" not in answer.text
@@ -70,7 +58,7 @@ def test_a_foreign_site_may_link_but_not_load(client: TestClient) -> None:
     cross = {"sec-fetch-site": "cross-site"}
     assert client.get("/api/grid", headers=cross).status_code == 403
     image = {**cross, "sec-fetch-mode": "no-cors", "sec-fetch-dest": "image"}
-    assert client.get("/figures/figure1.png", headers=image).status_code == 403
+    assert client.get("/static/icon.svg", headers=image).status_code == 403
     frame = {**cross, "sec-fetch-mode": "navigate", "sec-fetch-dest": "iframe"}
     assert client.get("/", headers=frame).status_code == 403
     visit = {**cross, "sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
@@ -79,16 +67,14 @@ def test_a_foreign_site_may_link_but_not_load(client: TestClient) -> None:
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "BREW"])
 def test_it_only_reads(client: TestClient, method: str) -> None:
-    for path in ("/", "/curves", "/api/grid", "/figures/figure1.png", "/static/style.css"):
+    for path in ("/", "/curves", "/api/grid", "/static/style.css"):
         answer = client.request(method, path)
         assert answer.status_code == 405
         assert answer.headers["allow"] == "GET, HEAD"
     assert client.head("/").status_code == 200
 
 
-@pytest.mark.parametrize(
-    "path", ["/", "/nothing", "/api/nothing", "/static/style.css", "/figures/figure1.png"]
-)
+@pytest.mark.parametrize("path", ["/", "/nothing", "/api/nothing", "/static/style.css"])
 def test_every_answer_carries_the_headers(client: TestClient, path: str) -> None:
     headers = client.get(path).headers
     policy = headers["content-security-policy"]
@@ -98,15 +84,6 @@ def test_every_answer_carries_the_headers(client: TestClient, path: str) -> None
     assert "unsafe" not in policy
     assert headers["x-content-type-options"] == "nosniff"
     assert headers["referrer-policy"] == "no-referrer"
-
-
-def test_the_gallery_shows_pictures_tables_and_captions(client: TestClient) -> None:
-    page = client.get("/figures").text
-    assert 'src="/figures/figure1.png"' in page
-    assert "A &lt;b&gt;caption&lt;/b&gt;." in page
-    assert "0.1235" in page
-    assert "passwd" not in page
-    assert client.get("/figures/figure1.png").content == b"\x89PNG"
 
 
 @pytest.mark.parametrize(
@@ -125,7 +102,7 @@ def test_the_gallery_shows_pictures_tables_and_captions(client: TestClient) -> N
     ],
 )
 def test_no_other_file_is_served(client: TestClient, name: str) -> None:
-    for folder in ("figures", "static", "static/js"):
+    for folder in ("static", "static/js"):
         answer = client.get(f"/{folder}/{name}")
         assert answer.status_code == 404
         assert "secret" not in answer.text.replace("secret.txt", "")
@@ -141,16 +118,16 @@ TEXTS = st.text(max_size=30) | st.sampled_from(
 )
 NAMES = st.sampled_from(
     [
-        *("env", "policy", "width", "status", "seed", "config", "launch", "sort", "order", "size"),
-        *("after", "before", "column", "x", "diverged", "where", "measure", "q", "hide"),
+        *("env", "policy", "width", "status", "seed", "config", "launch", "sort", "order", "page"),
+        *("column", "x", "diverged", "where", "q", "hide"),
     ]
 )
-PAGES = ("/", "/curves", "/trials", "/compare", "/control", "/launches", "/figures", "/sql")
-DATA = ("grid", "curves", "trials", "compare", "control", "figures", "sql")
-TABLES = ("curves.csv", "compare.csv", "control.csv", "sql.csv")
+PAGES = ("/", "/curves", "/trials", "/sql")
+DATA = ("grid", "curves", "trials", "sql")
+TABLES = ("curves.csv", "sql.csv")
 PATHS = st.sampled_from([*PAGES, *(f"/api/{name}" for name in (*DATA, *TABLES))]) | st.builds(
     lambda base, tail: base + tail,
-    st.sampled_from(["/trials/", "/api/trials/", "/figures/", "/static/", "/"]),
+    st.sampled_from(["/trials/", "/api/trials/", "/static/", "/"]),
     st.text(max_size=20),
 )
 
@@ -180,6 +157,6 @@ def test_nothing_that_is_asked_breaks_a_page(
 @given(query=st.binary(max_size=40).map(lambda raw: raw.hex()))
 def test_bytes_that_are_no_text_break_nothing(client: TestClient, query: str) -> None:
     encoded = "".join(f"%{query[i : i + 2]}" for i in range(0, len(query), 2))
-    for name in ("q", "env", "after", encoded):
+    for name in ("q", "env", "page", encoded):
         answer = client.get(f"/api/trials?{name}={encoded}")
         assert answer.status_code in (200, 400)

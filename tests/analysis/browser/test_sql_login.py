@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import uuid
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from sqlalchemy import Engine, make_url, text
@@ -13,7 +12,7 @@ from starlette.testclient import TestClient
 
 from analysis.serve import sql
 from analysis.serve.app import create_app
-from analysis.serve.sites import states_of
+from analysis.serve.state import Database, ServerState
 from orchestrate.store import Store
 from tests.analysis.browser import grids
 from tests.analysis.browser.conftest import BASE
@@ -106,7 +105,7 @@ def test_a_login_of_another_database_is_not_one_of_this(
     visit: Visit, sqlite_grid: str, server_grid: str
 ) -> None:
     other = make_url(server_grid).set(database="another").render_as_string(hide_password=False)
-    assert "pg_terminate_backend" in sql._access(states_of([other], Path())[0])[1]
+    assert "pg_terminate_backend" in sql._access(ServerState(Database(other)))[1]
     assert post(visit(sqlite_grid), "/api/sql", RUN).json()["rows"] == [[42]]
 
 
@@ -125,7 +124,7 @@ def test_the_owner_is_named_and_holds_no_lock_after_a_statement(
 
 def test_the_owner_asks_from_this_machine_alone(server_grid: str, sqlite_grid: str) -> None:
     for url, status in ((server_grid, 403), (sqlite_grid, 200)):
-        with TestClient(create_app(url, Path("figures"), "0.0.0.0"), base_url=BASE) as client:
+        with TestClient(create_app(url, "0.0.0.0"), base_url=BASE) as client:
             assert client.get("/sql").status_code == 200
             answer = post(client, "/api/sql", RUN)
             assert answer.status_code == status
@@ -136,7 +135,7 @@ def test_the_owner_asks_from_this_machine_alone(server_grid: str, sqlite_grid: s
 
 @pytest.mark.usefixtures("login")
 def test_other_machines_ask_as_the_user_who_can_only_read(server_grid: str) -> None:
-    with TestClient(create_app(server_grid, Path("figures"), "0.0.0.0"), base_url=BASE) as client:
+    with TestClient(create_app(server_grid, "0.0.0.0"), base_url=BASE) as client:
         assert post(client, "/api/sql", RUN).json()["rows"] == [[42]]
 
 

@@ -15,7 +15,7 @@ from orchestrate.store import Reader, Store
 from tests.analysis.browser import grids
 from tests.analysis.synthetic import make_grid
 
-PAGES = ("/", "/curves", "/trials", "/control", "/launches", "/figures", "/sql")
+PAGES = ("/", "/curves", "/trials", "/sql")
 Visit = Callable[..., TestClient]
 
 
@@ -54,7 +54,7 @@ def check(client: TestClient, path: str) -> str:
 
 
 def test_every_page_of_a_mixed_grid_is_well_made(client: TestClient) -> None:
-    for path in (*PAGES, "/compare", "/sql?q=SELECT env FROM v_trial"):
+    for path in (*PAGES, "/sql?q=SELECT env FROM v_trial"):
         assert "read-only" in check(client, path)
     for row in client.get("/api/trials").json()["rows"]:
         check(client, f"/trials/{row['trial_key']}")
@@ -68,8 +68,7 @@ def test_an_empty_database_says_so(url: str, visit: Visit) -> None:
     assert "has no trials yet" in client.get("/").text
     assert "has no trials yet" in client.get("/curves").text
     assert client.get("/api/grid").json()["progress"]["total"] == 0
-    for path in ("/api/curves", "/api/compare", "/compare"):
-        assert client.get(path).status_code == 400
+    assert client.get("/api/curves").status_code == 400
 
 
 def test_one_trial_has_a_curve_and_no_interval(url: str, visit: Visit) -> None:
@@ -78,11 +77,8 @@ def test_one_trial_has_a_curve_and_no_interval(url: str, visit: Visit) -> None:
     for path in PAGES:
         check(client, path)
     (curve,) = client.get("/api/curves").json()["curves"]
-    assert len(curve["centre"]) == 40
+    assert len(curve["values"]) == 40
     assert curve["low"] == [None] * 40
-    refused = client.get("/compare")
-    assert refused.status_code == 400
-    assert "needs finished trials of D-optimal and of a baseline" in refused.text
 
 
 def test_where_all_diverged_there_is_no_mean(url: str, visit: Visit) -> None:
@@ -91,14 +87,13 @@ def test_where_all_diverged_there_is_no_mean(url: str, visit: Visit) -> None:
     for path in PAGES:
         check(client, path)
     for curve in client.get("/api/curves").json()["curves"]:
-        assert curve["centre"] == [None] * 40
+        assert curve["values"] == [None] * 40
         assert curve["count"] == "0/3, 3 diverged"
     assert "3 diverged" in client.get("/").text
     for row in client.get("/api/trials").json()["rows"]:
         check(client, f"/trials/{row['trial_key']}")
         arrays = client.get(f"/api/trials/{row['trial_key']}/arrays").json()
         assert arrays["loss"][-1] is None
-    assert client.get("/compare").status_code == 400
 
 
 def test_a_trial_with_limits_shows_bounds_and_what_is_beyond(url: str, visit: Visit) -> None:
@@ -178,7 +173,7 @@ def test_what_a_launch_writes_is_seen_at_once(url: str, visit: Visit, way: str) 
             grids.finish(store, launch, specs[2])
             newer = client.get("/api/curves").json()["curves"][0]
             assert newer["count"] == "3"
-            assert newer["centre"] != found["centre"]
+            assert newer["values"] != found["values"]
         else:
             (claim,) = store.claim(launch, [specs[0].trial_key])
             store.fail(claim, grids.FAILURE, grids.RUN)

@@ -109,8 +109,8 @@ def test_a_merge_keeps_another_run_of_the_same_arguments_apart(
 
 
 @pytest.fixture
-def client(url: str, tmp_path: Path) -> Iterator[TestClient]:
-    app = create_app(url, tmp_path / "figures")
+def client(url: str) -> Iterator[TestClient]:
+    app = create_app(url)
     with TestClient(app, base_url="http://127.0.0.1:8000") as opened:
         yield opened
 
@@ -118,7 +118,7 @@ def client(url: str, tmp_path: Path) -> Iterator[TestClient]:
 def test_the_pages_show_it_live(url: str, client: TestClient, run: Explorer) -> None:
     run.save(url, test=(run.states, run.inputs) if run.n_steps > 50 else None)
     key = content(url)["trial_key"]
-    for page in ("/", "/trials", f"/trials/{key}", "/curves", "/control", "/sql"):
+    for page in ("/", "/trials", f"/trials/{key}", "/curves", "/sql"):
         assert client.get(page).status_code == 200, page
     assert "prequential loss" in client.get("/").text
     assert "running, 40 of 300 steps" in client.get(f"/trials/{key}").text

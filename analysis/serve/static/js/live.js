@@ -4,7 +4,6 @@ const AGAIN = 2000;
 const state = document.getElementById("state");
 const words = document.getElementById("state-text");
 let token = document.body.dataset.token;
-let samples = "";
 /** @type {EventSource|null} */
 let stream = null;
 /** @type {Progress|null} */
@@ -17,9 +16,7 @@ let busy = false;
  * @property {Object<string, number>} counts trials by status
  * @property {number} total
  * @property {number} ended
- * @property {number} running
  * @property {number} launches_running
- * @property {string} samples changes with each sample of a trial that runs
  */
 
 /** Show the progress of the grid in the header. @param {Progress} progress */
@@ -66,13 +63,11 @@ async function show(progress) {
   if ("retry" in document.body.dataset) location.reload();
   say(progress);
   const changed = token && token !== progress.token;
-  const sampled = samples !== progress.samples;
-  ({ token, samples } = progress);
+  ({ token } = progress);
   if (changed) {
     await refresh();
     document.dispatchEvent(new CustomEvent("dopt:change"));
   }
-  if (sampled) document.dispatchEvent(new CustomEvent("dopt:samples"));
 }
 
 /** Take an event; of those that come during an update, only the last counts. @param {MessageEvent} event */
@@ -98,7 +93,7 @@ function follow() {
   stream?.close();
   stream = null;
   if (document.hidden) return;
-  stream = new EventSource(`${document.body.dataset.base}/api/events`);
+  stream = new EventSource("/api/events");
   stream.addEventListener("progress", take);
   stream.addEventListener("unavailable", () => lose("database not available"));
   stream.addEventListener("error", () => {

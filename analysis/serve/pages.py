@@ -1,0 +1,496 @@
+"""Contents of the pages: grid, curves, trials and one trial, with the numbers of the figures."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from analysis.data.bounded_states import bounded_states
+from analysis.data.divergence import DivergenceRule
+from analysis.data.latest_configs import latest
+from analysis.data.missing_trials import absent_pairs
+from analysis.data.trial_selection import Selection, environment_rank, policy_rank
+from analysis.errors import AnalysisError
+from analysis.figures.axis_break import axis_parts
+from analysis.figures.loss_curves.data import Axis, LossCurve, measure_curves, tabulate_curves
+from analysis.figures.phase_portraits.data import DrawnPlane
+from analysis.line_styles import policy_style
+from analysis.serve.state import ServerState, read_progress
+from analysis.serve.web import NotFoundError, QueryParams, truncated
+from analysis.stats.intervals import mean, standard_error
+from analysis.stats.spectrum import periodogram
+from dopt.errors import SpecificationError
+from dopt.spec.added_fields import completed
+from dopt.spec.label import flatten, labels
+from dopt.spec.prequential import is_prequential, system_of
+from dopt.systems import System
+from dopt.systems.equilibrium import eigenmode
+from orchestrate.store import ConfigRow, LaunchRow, Reader, explorations, failure_kinds
+from orchestrate.store.errors import QueryError
+
+Array = npt.NDArray[np.float64]
+Content = dict[str, Any]
+
+SHADES = 9
+"""Steps of the heat scale."""
+
+MOST_LAUNCHES, MOST_KINDS = 20, 20
+"""Launches and kinds of failures in the head of the grid: the newest and the commonest."""
+
+WINDOW = 25
+RUNNING = f"running median of {WINDOW} steps"
+LOSSES = ("loss", "reachable_loss")
+
+STATUSES = ("done", "diverged", "failed", "cancelled", "running", "pending")
+COLUMNS = {
+    "env": "environment",
+    "policy": "policy and settings",
+    "width": "width",
+    "seed": "seed",
+    "status": "status",
+    "final_loss": "final loss",
+    "best_loss": "best loss",
+    "diverged_at": "diverged at",
+    "wall_seconds": "wall time",
+    "attempt": "attempts",
+    "node": "node",
+    "error_type": "error",
+}
+"""Columns of the list of trials with their headings; the list can be sorted by each."""
+
+NUMBERS = ("width", "seed", "final_loss", "best_loss", "diverged_at", "wall_seconds", "attempt")
+"""Columns that are aligned to the right."""
+
+PAGE_ROWS = 50
+
+_FINAL = """
+SELECT config_key, final_loss FROM v_trial
+WHERE status = 'done' AND final_loss IS NOT NULL ORDER BY config_key, seed
+"""
+_OUTCOMES = """
+SELECT launch_id, count(*) FILTER (WHERE outcome IN ('done', 'diverged')) AS finished,
+       count(*) FILTER (WHERE outcome = 'failed') AS failed
+FROM attempt GROUP BY launch_id
+"""
+_TRIAL = """
+SELECT v.*, c.config_json FROM v_trial v
+JOIN config c ON c.config_key = v.config_key WHERE v.trial_key = :trial_key
+"""
+_ATTEMPTS = """
+SELECT a.attempt, a.outcome, a.cause, a.launch_id, a.node, a.claimed, a.ended,
+       a.wall_seconds, a.peak_memory_bytes, e.type, e.traceback
+FROM attempt a LEFT JOIN error e ON e.error_id = a.error_id
+WHERE a.trial_id = :trial_id ORDER BY a.attempt
+"""
+_LAUNCHES = """
+SELECT launch_id, state, started, ended, host, pid, argv, git_commit, git_dirty, git_diff_hash,
+       versions
+FROM launch
+WHERE launch_id IN (SELECT launch_id FROM attempt WHERE trial_id = :trial_id) ORDER BY launch_id
+"""
+_ASSESSED = """
+SELECT t, measure, value FROM assessment WHERE trial_id = :trial_id ORDER BY t, measure
+"""
+_STEPS = "SELECT t, loss, reachable_loss FROM step WHERE trial_id = :trial_id ORDER BY t"
+
+
+def legend_entry(policy: str) -> Content:
+    """Return label, colour, dashes (in units of the line width) and line width of a policy."""
+    style = policy_style(policy)
+    return {
+        "policy": policy,
+        "label": style.label,
+        "colour": style.colour,
+        "dash": [] if isinstance(style.line, str) else list(style.line[1]),
+        "line_width": style.width,
+    }
+
+
+def _environments(configs: Iterable[ConfigRow]) -> list[str]:
+    return sorted({config.env for config in configs}, key=environment_rank)
+
+
+def _policies(configs: Iterable[ConfigRow]) -> list[str]:
+    return sorted({config.policy for config in configs}, key=policy_rank)
+
+
+def _widths(configs: Iterable[ConfigRow]) -> list[int]:
+    return sorted({config.width for config in configs if config.width is not None})
+
+
+def grid(state: ServerState, params: QueryParams) -> Content:  # noqa: ARG001  # as every page
+    """Return every configuration with its final loss and trials, launches and failures."""
+    reader = state.database.reader()
+    progress = read_progress(reader)
+    stored = reader.configs()
+    configs = latest(reader, stored)
+    finals = state.selections.get_or_compute(
+        ("final", reader, progress["token"]), lambda: _finals(reader)
+    )
+    policies, absent = _policies(configs), absent_pairs(configs)
+    return {
+        "progress": progress,
+        "policies": [legend_entry(policy) for policy in policies],
+        "environments": [
+            {
+                "env": env,
+                "rows": _rows([one for one in configs if one.env == env], policies, absent, finals),
+            }
+            for env in _environments(configs)
+        ],
+        "older": len(stored) - len(configs),
+        **_launches(reader),
+    }
+
+
+def _finals(reader: Reader) -> dict[str, Array]:
+    losses: dict[str, list[float]] = {}
+    for config_key, loss in reader.rows(_FINAL):
+        losses.setdefault(config_key, []).append(loss)
+    return {config_key: np.array(values) for config_key, values in losses.items()}
+
+
+def _rows(
+    configs: Sequence[ConfigRow],
+    policies: Sequence[str],
+    absent: Sequence[tuple[str, str]],
+    finals: Mapping[str, Array],
+) -> list[Content]:
+    """Return a row for each width of an environment, with a cell for each policy."""
+    widths = _widths(configs)
+    only = widths[0] if len(widths) == 1 else None
+    tiles = [_tile(config, finals.get(config.config_key, np.empty(0))) for config in configs]
+    for kind in (False, True):  # prequential losses have a scale of their own
+        _shade([t for c, t in zip(configs, tiles, strict=True) if is_prequential(c.config) is kind])
+    cells: dict[tuple[int | None, str], list[tuple[ConfigRow, Content]]] = {}
+    for config, tile in zip(configs, tiles, strict=True):
+        cells.setdefault((config.width or only, config.policy), []).append((config, tile))
+    for cell in cells.values():
+        own = [config.config for config, _ in cell]
+        words = labels(own) if len(own) > 1 or is_prequential(own[0]) else [""]
+        for (_, tile), label in zip(cell, words, strict=True):
+            tile["label"] = label
+    return [
+        {
+            "width": width,
+            "cells": [
+                {
+                    "missing": (configs[0].env, policy) in absent,
+                    "configurations": [tile for _, tile in cells.get((width, policy), ())],
+                }
+                for policy in policies
+            ],
+        }
+        for width in sorted({width for width, _ in cells}, key=lambda w: (w is None, w or 0))
+    ]
+
+
+def _tile(config: ConfigRow, losses: Array) -> Content:
+    counts = {status: int(getattr(config, f"n_{status}")) for status in STATUSES}
+    return {
+        "config_key": config.config_key,
+        "policy": config.policy,
+        "n": config.n,
+        "ended": config.n - config.n_pending - config.n_running,
+        "counts": {status: count for status, count in counts.items() if count},
+        "loss": float(mean(losses)),
+        "loss_2se": 2 * float(standard_error(losses)),
+        "n_used": len(losses),
+    }
+
+
+def _shade(tiles: Sequence[Content]) -> None:
+    """Give each configuration of an environment its rank by loss, 0 the lowest, as a shade.
+
+    Ranks, because one loss a thousand times below the others would leave those without contrast.
+    """
+    ranked = sorted((one for one in tiles if np.isfinite(one["loss"])), key=lambda one: one["loss"])
+    for place, one in enumerate(ranked):
+        one["shade"] = round((SHADES - 1) * place / max(len(ranked) - 1, 1))
+
+
+def _launches(reader: Reader) -> Content:
+    """Return the newest launches with the trials that they ended, and the failures by kind."""
+    with reader.moment() as moment:
+        configs = {config.config_key: config for config in moment.configs()}
+        failures = failure_kinds(moment, configs, MOST_KINDS)
+        found = moment.launches()[::-1]
+        outcomes = {int(row[0]): row[1:] for row in moment.rows(_OUTCOMES)}
+    return {
+        "launches": [
+            _launch(one) | dict(zip(("finished", "failed"), outcomes.get(one.launch_id, (0, 0))))  # noqa: B905
+            for one in found[:MOST_LAUNCHES]
+        ],
+        "n_launches": len(found),
+        "failures": [
+            {name: getattr(kind, name) for name in ("cause", "type", "message", "trials")}
+            | {"places": [f"{env}/{policy}" for env, policy in sorted(kind.places)]}
+            | {"traceback": kind.traceback}
+            for kind in failures[:MOST_KINDS]
+        ],
+    }
+
+
+def _launch(launch: LaunchRow) -> Content:
+    lost = launch.state == "running" and not launch.alive
+    end = datetime.now(UTC) if launch.ended is None else datetime.fromisoformat(launch.ended)
+    length = end - datetime.fromisoformat(launch.started)
+    return {
+        "launch_id": launch.launch_id,
+        "kind": launch.kind,
+        "state": "lost" if lost else launch.state,
+        "started": launch.started,
+        "seconds": None if lost else length.total_seconds(),
+        "host": launch.host,
+        "command": shlex.join(launch.argv),
+    }
+
+
+def choices(state: ServerState, params: QueryParams) -> Content:
+    """Return the stored environments, each with its widths."""
+    stored = _by_environment(state.database.reader())
+    return {
+        "env": params.choice("env", stored, next(iter(stored), "")),
+        "environments": {env: _widths(configs) for env, configs in stored.items()},
+        "rules": list(DivergenceRule),
+    }
+
+
+def _by_environment(reader: Reader) -> dict[str, list[ConfigRow]]:
+    """Return the stored configurations by environment, in the paper's order."""
+    configs = latest(reader, reader.configs())
+    return {env: [one for one in configs if one.env == env] for env in _environments(configs)}
+
+
+def curves(state: ServerState, params: QueryParams) -> Content:
+    """Return the curve and interval of every policy in one environment, and the missing trials.
+
+    ``main`` holds the limits of the upper part of the axis where figure 1 has an axis break, else
+    None.
+    """
+    selection, found = _measured(state, params)
+    parts = axis_parts([curve.band for curve in found])
+    widths = _widths(entry.config for entry in selection.entries)
+    return {
+        "env": found[0].env,
+        "is_prequential": found[0].is_prequential,
+        "statistic": RUNNING if found[0].is_prequential else found[0].statistic.label,
+        "band": found[0].statistic.band,
+        "x": max((curve.x for curve in found), key=len),
+        "main": parts.upper if parts.lower else None,
+        "curves": [_curve(curve) for curve in found],
+        "widths": f", width {widths[0]}" if len(widths) == 1 else "",
+        "notes": [one.replace("--where", "the fields Width and Where") for one in selection.notes],
+        "missing": [
+            {"policy": gap.policy, "states": gap.states, "seeds": gap.describe_seeds()}
+            for gap in selection.gaps
+        ],
+    }
+
+
+def curves_table(state: ServerState, params: QueryParams) -> pd.DataFrame:
+    """Return the curves as a table with the columns of figure 1's CSV file."""
+    return tabulate_curves(_measured(state, params)[1])
+
+
+def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple[LossCurve, ...]]:
+    reader = state.database.reader()
+    env = params.text("env") or next(iter(_by_environment(reader)), "")
+    if not env:
+        raise AnalysisError(
+            "The database has no trials yet: curves appear when the first trial has ended."
+        )
+    selection = state.select(reader, params.filter(env))
+    column = params.choice("column", LOSSES, "loss")
+    rule = params.member("diverged", DivergenceRule, DivergenceRule.EXCLUDE)
+    axis = params.member("x", Axis, Axis.STEPS)
+
+    def measured(part: Selection) -> LossCurve:
+        """Return a curve without the values of its trials, which the pages do not show."""
+        curve = measure_curves(reader, part, column, rule, axis)[0]
+        values = curve.sample.values[:, :0].copy()
+        return replace(curve, sample=replace(curve.sample, values=values))
+
+    def cached(part: Selection) -> LossCurve:
+        key = ("curve", reader, part.fingerprint(), column, rule, axis)
+        return state.cache.get_or_compute(key, lambda: measured(part))
+
+    parts = [replace(selection, entries=(entry,), gaps=()) for entry in selection.entries]
+    return selection, tuple(cached(part) for part in parts)
+
+
+def _curve(curve: LossCurve) -> Content:
+    band = curve.band
+    values = {"values": band.centre, "low": band.low, "high": band.high}
+    if curve.is_prequential:  # of one step it is noise
+        running = pd.Series(band.centre).rolling(WINDOW, min_periods=1, center=True).median()
+        values = {"values": running.to_numpy(), "points": band.centre}
+    return legend_entry(curve.policy) | values | {"count": curve.sample.describe()}
+
+
+def trials(state: ServerState, params: QueryParams) -> Content:
+    """Return one page of the list and the number of matches."""
+    reader = state.database.reader()
+    configs = reader.configs()
+    given = {
+        "env": params.choice("env", {config.env for config in configs}),
+        "policy": params.choice("policy", {config.policy for config in configs}),
+        "status": params.choice("status", STATUSES),
+        "config_key": params.text("config"),
+        "width": params.integer("width", low=1),
+        "seed": params.integer("seed", high=2**63 - 1),
+        "launch_id": params.integer("launch"),
+    }
+    wanted = {column: value for column, value in given.items() if value not in ("", None)}
+    where = " AND ".join(["1 = 1", *(f"{column} = :{column}" for column in wanted)])
+    sort = params.choice("sort", COLUMNS, "env")
+    order = params.choice("order", ("asc", "desc"), "asc")
+    page = params.integer("page", low=1) or 1
+    total = int(reader.rows(f"SELECT count(*) AS n FROM v_trial WHERE {where}", **wanted)[0].n)
+    found = reader.rows(
+        f"SELECT trial_key, label, {', '.join(COLUMNS)} FROM v_trial WHERE {where} "
+        f"ORDER BY CASE WHEN {sort} IS NULL THEN 1 ELSE 0 END, {sort} {order}, trial_id "
+        f"LIMIT {PAGE_ROWS} OFFSET {PAGE_ROWS * (page - 1)}",
+        **wanted,
+    )
+    policies = _policies(configs)
+    return {
+        "progress": read_progress(reader),
+        "rows": [dict(zip(found.columns, row, strict=True)) for row in found],
+        "total": total,
+        "sort": sort,
+        "order": order,
+        "at": page,
+        "last": max(1, math.ceil(total / PAGE_ROWS)),
+        "columns": COLUMNS,
+        "numbers": NUMBERS,
+        "legend": {name: legend_entry(name) for name in policies},
+        "options": {
+            "env": _environments(configs),
+            "policy": {name: policy_style(name).label for name in policies},
+            "width": _widths(configs),
+            "status": STATUSES,
+        },
+    }
+
+
+def trial(state: ServerState, params: QueryParams) -> Content:
+    """Return everything that is stored of a trial except its arrays, see ``arrays``."""
+    reader = state.database.reader()
+    row = _row(reader, params)
+    config = completed(json.loads(row.pop("config_json")))
+    system = _system(config)
+    running = next((one for one in explorations(reader) if one.trial_key == row["trial_key"]), None)
+    launches = _table(reader, _LAUNCHES, row["trial_id"])
+    return {
+        "progress": read_progress(reader),
+        "trial": row,
+        "config": flatten(config),
+        "attempts": _table(reader, _ATTEMPTS, row["trial_id"]),
+        "launches": [
+            one | {name: json.loads(one[name]) for name in ("argv", "versions")} for one in launches
+        ],
+        "assessments": _table(reader, _ASSESSED, row["trial_id"]),
+        "has_arrays": row["status"] in ("done", "diverged"),
+        "exploration": running and {"is_running": running.is_running, "state": running.state},
+        "system_is_known": system is not None,
+        "has_bounded_states": bool(system and bounded_states(config, system)),
+        "legend_entry": legend_entry(row["policy"]),
+    }
+
+
+def arrays(state: ServerState, params: QueryParams) -> Content:
+    """Return losses, phase-plane path, inputs and their spectrum for the charts."""
+    reader = state.database.reader()
+    row = _row(reader, params)
+    try:
+        trajectory = reader.trajectory(row["config_key"], row["seed"])
+    except QueryError as error:
+        raise NotFoundError(
+            f"Trial {row['trial_key'][:12]} is {row['status']} and has no curve: wait for it."
+        ) from error
+    config = json.loads(row["config_json"])
+    system = _system(config)
+    steps = _table(reader, _STEPS, row["trial_id"])
+    inputs, states = trajectory.inputs, trajectory.states
+    names = system.input_labels if system else [f"u{i + 1}" for i in range(inputs.shape[1])]
+    bounded = bounded_states(config, system) if system else {}
+    return {
+        **{name: [step[name] for step in steps] for name in ("t", *LOSSES)},
+        "is_prequential": is_prequential(config),
+        "legend_entry": legend_entry(row["policy"]),
+        "dt": row["dt"],
+        "gamma": row["gamma"],
+        "inputs": [
+            {"label": name, "values": values} for name, values in zip(names, inputs.T, strict=True)
+        ],
+        "bounded": [
+            {"label": system.state_labels[i], "values": states[1:, i], "bounds": bounds}
+            for i, bounds in bounded.items()
+            if system
+        ],
+        "spectrum": _spectrum(inputs, row["dt"], system),
+        "phase": _phase(states, system) if system else None,
+    }
+
+
+def _row(reader: Reader, params: QueryParams) -> Content:
+    key = params.text("trial_key")
+    found = reader.rows(_TRIAL, trial_key=key)
+    if not found:
+        raise NotFoundError(
+            f"There is no trial '{truncated(key, 20)}' in {reader.safe_url}: "
+            f"choose one of the trials page."
+        )
+    return dict(zip(found.columns, found[0], strict=True))
+
+
+def _table(reader: Reader, sql: str, trial_id: int) -> list[Content]:
+    found = reader.rows(sql, trial_id=trial_id)
+    return [dict(zip(found.columns, row, strict=True)) for row in found]
+
+
+def _system(config: Content) -> System | None:
+    """Return the system of a configuration, None for a custom system that is not registered."""
+    try:
+        return system_of(config)
+    except (SpecificationError, KeyError):
+        return None
+
+
+def _phase(states: Array, system: System) -> Content:
+    plane = DrawnPlane.of(system)
+    points = plane.project(states)
+    points = points[np.isfinite(points).all(axis=1)]
+    line = plane.line(points) if len(points) else points
+    return {
+        "x": line[:, 0],
+        "y": line[:, 1],
+        "start": plane.wrapped(points[:1])[0] if len(points) else None,
+        "labels": plane.labels,
+        "angles": plane.angles,
+        "box": plane.box,
+    }
+
+
+def _spectrum(inputs: Array, dt: float, system: System | None) -> Content:
+    """Return the one-sided periodogram without its first and last frequency."""
+    inputs = inputs[np.isfinite(inputs).all(axis=1)]
+    mode = eigenmode(system) if system else None
+    frequency, density = np.empty(0), np.empty((1, 0))
+    if len(inputs) > 3:
+        frequency, density = periodogram(inputs[None], dt)
+    return {
+        "frequency": frequency[1:-1],
+        "density": density[0, 1:-1],
+        "eigenfrequency": mode.frequency / (2 * math.pi) if mode else None,
+    }
