@@ -6,6 +6,7 @@ nothing and fails where a page differs from its CSV files.
 
 from __future__ import annotations
 
+import importlib
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -18,9 +19,10 @@ from scipy import stats
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from analysis.formatting import number, plus_minus, share, within
+from analysis.stats.intervals import band
 
 DOCS = Path(__file__).parent
-PAGES = ("findings.md", "method.md", "../README.md")
+PAGES = ("findings.md", "method.md", "yardsticks.md", "../README.md")
 ALL = ("pendulum", "cartpole", "arm", "quadrotor")
 LEARNERS = ("adam_window", "adam_replay", "gauss_newton")
 TITLES = {"d_optimal": "D-optimal", "random_held": "held random", "periodic_square": "square wave"}
@@ -415,6 +417,64 @@ def noisy_angle_expected() -> str:
     return markdown(["inputs", "loss", "left by 1° of noise in the angle alone"], rows)
 
 
+def of_study(module: str, name: str) -> str:
+    """Return all tables of a published experiment, as its study prints them."""
+    study = importlib.import_module(f"studies.yardsticks.{module}")
+    return "\n".join(f"{one.markdown()}\n" for one in study.tables(read(f"yardsticks/{name}")))
+
+
+def flex_table1() -> str:
+    return of_study("swing_up", "flex_table1")
+
+
+def flex_table1_agents() -> str:
+    return of_study("swing_up", "agents/flex_table1")
+
+
+def flex_table3() -> str:
+    return of_study("pendulums", "flex_table3")
+
+
+def flex_star() -> str:
+    return of_study("star", "flex_star")
+
+
+def active_sysid() -> str:
+    return of_study("disk", "active_sysid")
+
+
+def flex_example() -> str:
+    """Return final losses with intervals, and those of pairs by random inputs."""
+    losses = read("yardsticks/flex_example").pivot_table(
+        index="seed", columns="policy", values="final_loss"
+    )
+
+    def interval(values: pd.Series[float]) -> str:
+        found = band(np.log(values.to_numpy())[:, None])
+        return within(*(float(np.exp(one[0])) for one in (found.centre, found.low, found.high)))
+
+    rows = [
+        [name, interval(losses[name]), interval(losses[name] / losses.random)]
+        for name in ("d_optimal", "random_held")
+    ]
+    rows.append(["random", interval(losses.random), "–"])
+    return markdown(["policy", "loss [rad/s²]", "by random inputs"], rows)
+
+
+def mujoco() -> str:
+    """Return ratios to random inputs on both sets, in brackets their 95 % intervals."""
+    report = read("mujoco/report").set_index(["env", "variant"])
+    envs = ("pendulum", "cartpole", "acrobot", "reacher")
+    rows = []
+    for words, measure in (("grid", "loss"), ("reachable set", "reachable_loss")):
+        cells = [number(report.loc[f"mujoco_{env}", "random"][measure]) for env in envs]
+        rows.append([f"random, {words}: loss", *cells])
+        for variant in ("D-optimal", "held random", "look-ahead"):
+            cells = [ratio(report.loc[f"mujoco_{env}", variant], measure) for env in envs]
+            rows.append([f"{variant}, {words}", *cells])
+    return markdown(["inputs", *envs], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     made.__name__: made
     for made in (
@@ -422,7 +482,8 @@ TABLES: dict[str, Callable[[], str]] = {
         control, best, best_control, pareto, time_of_a_step, summary, adam_replay, sensitivity,
         periodic, models,
         unknown_gain, integrators, integrators_gauss_newton, calibration, limits, noisy_angle,
-        noisy_angle_expected,
+        noisy_angle_expected, flex_table1, flex_table1_agents, flex_table3, flex_star,
+        active_sysid, flex_example, mujoco,
     )
 }  # fmt: skip
 
