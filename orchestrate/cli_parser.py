@@ -26,6 +26,8 @@ _INSTALLED = {
 SUCCESSORS = {
     "analysis --figures": "open README.md in the folder of figures",
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
+    "--live": "look at the progress of a launch with python -m orchestrate status --watch",
+    "launch.live": "look at the progress of a launch with python -m orchestrate status --watch",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
 }
 """Successors of removed words, by command and word or by ``key=value`` of the configuration."""

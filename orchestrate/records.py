@@ -38,16 +38,6 @@ class RunRecord:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """Losses of a running trial after step ``t``; ``key`` is that of the trial."""
-
-    key: str
-    t: int
-    loss: float
-    reachable_loss: float
-
-
-@dataclass(frozen=True)
 class Failure:
     """Reason why an attempt failed.
 

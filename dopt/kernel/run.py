@@ -19,19 +19,12 @@ from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from dopt.watching import current_watch
 
 FIRST_STEPS = 300
 """Steps of a trial before it is known what a step costs; those of the paper have no more."""
 
 PIECE_SECONDS = 1.0
 """Interval at which compiled code comes back to the interpreter, which can then heed a signal."""
-
-FIRST_WATCHED_STEPS = 10
-"""As ``FIRST_STEPS``, of a trial that is watched."""
-
-PIECES_PER_LOOK = 4
-"""Pieces of a watched trial between two samples of its losses."""
 
 
 class KernelTrial(KernelState):
@@ -133,15 +126,9 @@ def trial_in_kernel(spec: TrialSpec) -> KernelTrial | SteppedTrial:
 
 def _advance_in_pieces(trial: KernelTrial | SteppedTrial, last: int) -> None:
     """Run a trial up to a step; the numbers do not depend on where it is cut."""
-    watch, record = current_watch(), trial.record
-    steps, seconds = FIRST_STEPS, PIECE_SECONDS
-    if watch is not None:
-        steps, seconds = FIRST_WATCHED_STEPS, min(PIECE_SECONDS, watch.seconds / PIECES_PER_LOOK)
+    steps = FIRST_STEPS
     while trial.done < last and trial.diverged_at is None:
         before, start = trial.done, time.perf_counter()
         trial.advance(min(last, before + steps))
         rate = (trial.done - before) / (time.perf_counter() - start)
-        steps = max(1, int(rate * seconds))
-        if watch is not None and trial.diverged_at is None:
-            newest = slice(trial.done - 1, trial.done)
-            watch.look(trial.done - 1, record.loss[newest], record.reachable_loss[newest])
+        steps = max(1, int(rate * PIECE_SECONDS))

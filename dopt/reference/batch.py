@@ -21,7 +21,6 @@ from dopt.reference.steps import BatchSteps
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from dopt.watching import current_watch
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
@@ -146,14 +145,11 @@ def run_trials(
     """
     wall, cpu = time.perf_counter(), time.process_time()
     batch = Lockstep(specs, device, module)
-    watch = current_watch()
     for t in range(batch.system.horizon + 1):
         if t in specs[0].assessed_steps:
             batch.note_checkpoint(t)
         if t < batch.system.horizon:
             batch.step(t)
-            if watch is not None:
-                watch.look(t, *(batch.columns[name][:, t] for name in ("loss", "reachable_loss")))
     n = len(specs)
     seconds = ((time.perf_counter() - wall) / n, (time.process_time() - cpu) / n)
     return [_result(batch, i, *seconds) for i in range(n)]

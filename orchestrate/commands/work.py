@@ -43,12 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="run a trial that exceeds --memory-gib once more, with so many times as much",
     )
     parser.add_argument(
-        "--live",
-        type=number("--live"),
-        metavar="SECONDS",
-        help="show the loss of trials that run, with a sample every so many seconds",
-    )
-    parser.add_argument(
         "--lease",
         type=number("--lease"),
         default=60.0,
@@ -62,7 +56,7 @@ def run(arguments: argparse.Namespace) -> ExitCode:
     from orchestrate.runner.worker import WorkerSettings, run_worker
 
     Reader.open(arguments.db).close()  # a worker creates no database
-    names = ("processes", "timeout", "memory_gib", "retry_memory", "live")
+    names = ("processes", "timeout", "memory_gib", "retry_memory")
     given = {name: getattr(arguments, name) for name in names}
     settings = WorkerSettings(arguments.db, arguments.until, lease=arguments.lease, **given)
     answer = _to_stderr if arguments.json else say

@@ -10,7 +10,7 @@ from pathlib import Path
 from hydra._internal.utils import get_args_parser
 
 from dopt.errors import SpecificationError
-from orchestrate.cli_parser import Parser, UsageError
+from orchestrate.cli_parser import Parser, UsageError, check_removed
 
 PROGRAM = "python orchestrate/launch.py"
 
@@ -38,7 +38,8 @@ def normalize(arguments: Sequence[str], folder: Path) -> list[str]:
     Raises
     ------
     UsageError
-        If a flag is unknown, flags contradict each other, or the sweeper is replaced.
+        If a flag is unknown, flags contradict each other, a setting was removed, or the
+        sweeper is replaced.
     SpecificationError
         If the option of a group is not a name.
     """
@@ -46,6 +47,8 @@ def normalize(arguments: Sequence[str], folder: Path) -> list[str]:
     flags = parser.read(arguments, mixed=True)
     _check_flags(flags)
     for word in flags.overrides:
+        check_removed(word)
+        check_removed(word.partition("=")[0])
         if word.startswith("hydra/sweeper=") and word != "hydra/sweeper=grid":
             raise UsageError(OTHER_SWEEPER)
         _check_choice(word, folder)

@@ -55,8 +55,6 @@ class LaunchSettings:
         Memory that one worker process may take, or None for no limit.
     retry_memory
         Factor on ``memory_gib`` with which a trial that runs out of memory runs once more, or None.
-    live
-        Seconds between two samples of the losses of a running trial, or None for no samples.
     lease
         Seconds after its last heartbeat for which a launch on PostgreSQL keeps its trials.
     patience
@@ -83,7 +81,6 @@ class LaunchSettings:
     timeout: float | None = 3600.0
     memory_gib: float | None = None
     retry_memory: float | None = None
-    live: float | None = None
     lease: float = 60.0
     patience: float = 30.0
     ray_address: str = "local"
@@ -125,7 +122,6 @@ class LaunchSettings:
             retry_memory=factor(
                 "launch.retry_memory", launch["retry_memory"], "launch.memory_gib", memory_gib
             ),
-            live=limit("launch.live", launch["live"], "seconds"),
             **_lease_and_patience(launch["lease"], launch["patience"]),
             ray_address=text("launch.ray.address", section("launch.ray", launch["ray"])["address"]),
             executor_options={key: value for key, value in executor.items() if key != "name"},

@@ -13,8 +13,7 @@ from typing import Self
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.executors.live import Report
-from orchestrate.records import Failure, RunRecord, Sample
+from orchestrate.records import Failure, RunRecord
 
 Run = Callable[[TrialSpec], TrialResult]
 """Function that runs a trial: pure, and importable by name where it goes to other processes."""
@@ -83,13 +82,10 @@ class Executor(ABC):
         Number of tasks that run at the same time; known once started.
     batch : int or None
         Chunk size in trials of one configuration, for executors that run a chunk as one batch.
-    listener : callable or None
-        Takes the samples of running tasks, within ``wait``; where it is None they are dropped.
     """
 
     slots: int = 1
     batch: int | None = None
-    listener: Report | None = None
 
     def __enter__(self) -> Self:
         self.start()
@@ -130,8 +126,3 @@ class Executor(ABC):
     @abstractmethod
     def stop(self) -> None:
         """Kill the workers at once."""
-
-    def report(self, sample: Sample) -> None:
-        """Hand a sample to the listener."""
-        if self.listener is not None:
-            self.listener(sample)

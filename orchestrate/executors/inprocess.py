@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from orchestrate.executors.base import Event, Executor, Run, Task
 from orchestrate.executors.factory import ExecutorFactory, limits_of
 from orchestrate.executors.limits import NO_LIMITS, Limits
-from orchestrate.executors.live import Live
 from orchestrate.executors.task import run_task
 
 
@@ -19,10 +18,9 @@ class InProcessExecutor(Executor):
     is not set, because it would hold for the whole launch.
     """
 
-    def __init__(self, run: Run, limits: Limits = NO_LIMITS, live: float | None = None) -> None:
+    def __init__(self, run: Run, limits: Limits = NO_LIMITS) -> None:
         self._run = run
         self._limits = limits
-        self._live = None if live is None else Live(live, self.report)
         self._chunks: deque[deque[Task]] = deque()
 
     def start(self) -> None:
@@ -35,7 +33,7 @@ class InProcessExecutor(Executor):
     def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a running trial is not left
         if not self._chunks:
             return []
-        event = run_task(self._run, self._chunks[0].popleft(), self._limits, self._live)
+        event = run_task(self._run, self._chunks[0].popleft(), self._limits)
         if not self._chunks[0]:
             self._chunks.popleft()
         return [event]
@@ -49,7 +47,7 @@ class InProcessExecutor(Executor):
 
 
 FACTORY = ExecutorFactory(
-    make=lambda settings, run, _: InProcessExecutor(run, limits_of(settings), settings.live),
+    make=lambda settings, run, _: InProcessExecutor(run, limits_of(settings)),
     trials_at_once=lambda _: 1,
     in_process=True,
 )

@@ -22,10 +22,8 @@ from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, Wor
 from orchestrate.executors.exit_status import CrashReport, ExitStatus
 from orchestrate.executors.factory import ExecutorFactory, limits_of
 from orchestrate.executors.limits import NO_LIMITS, Limits
-from orchestrate.executors.live import Report
 from orchestrate.executors.worker_environment import ONE_THREAD, module_path
 from orchestrate.program import LIMITS, hiding
-from orchestrate.records import Sample
 
 PREFETCHED_CHUNKS = 2
 """Chunks that a worker holds at once, so that it need not wait between two of them."""
@@ -41,8 +39,7 @@ DYING_SECONDS = 5.0
 class Worker:
     """Worker process as seen by the driver."""
 
-    def __init__(self, run: Run, limits: Limits, live: float | None, report: Report) -> None:
-        self._report = report
+    def __init__(self, run: Run, limits: Limits) -> None:
         ours, theirs = socket.socketpair()
         self._crash_report = CrashReport()
         try:
@@ -55,7 +52,7 @@ class Worker:
         self.connection = Connection(ours.detach())
         self.chunks: deque[deque[Task]] = deque()
         self.ready = False
-        self.send((run, limits, live))
+        self.send((run, limits))
 
     def send(self, message: object) -> None:
         """Send a message; a dead worker is detected by the next receive."""
@@ -85,11 +82,9 @@ class Worker:
                 raise EOFError from None
         return events
 
-    def _take(self, message: TaskDone | Sample | None, events: list[Event]) -> None:
-        """Take an outcome, a sample, or None: first for "ready", then for each finished chunk."""
-        if isinstance(message, Sample):
-            self._report(message)
-        elif message is not None:
+    def _take(self, message: TaskDone | None, events: list[Event]) -> None:
+        """Take an outcome, or None: first for "ready", then for each finished chunk."""
+        if message is not None:
             self.chunks[0].popleft()
             events.append(message)
         elif self.ready:
@@ -107,21 +102,11 @@ class Worker:
 
 
 class LocalExecutor(Executor):
-    """Runs chunks on ``workers`` processes, by default one on each core that is usable.
+    """Runs chunks on ``workers`` processes, by default one on each core that is usable."""
 
-    Every ``live`` seconds a worker reports a sample of the trial that it runs; None reports none.
-    """
-
-    def __init__(
-        self,
-        run: Run,
-        workers: int | None = None,
-        limits: Limits = NO_LIMITS,
-        live: float | None = None,
-    ) -> None:
+    def __init__(self, run: Run, workers: int | None = None, limits: Limits = NO_LIMITS) -> None:
         self._run = run
         self._limits = limits
-        self._live = live
         self.slots = workers or usable_cores()
         self._workers: list[Worker] = []
         self._queue: deque[Sequence[Task]] = deque()
@@ -204,7 +189,7 @@ class LocalExecutor(Executor):
 
     def _worker(self) -> Worker:
         try:
-            return Worker(self._run, self._limits, self._live, self.report)
+            return Worker(self._run, self._limits)
         except OSError as error:
             if error.errno not in LIMITS:
                 raise
@@ -240,8 +225,6 @@ def _standard_error() -> Iterator[int]:
 
 
 FACTORY = ExecutorFactory(
-    make=lambda settings, run, _: LocalExecutor(
-        run, settings.workers, limits_of(settings), settings.live
-    ),
+    make=lambda settings, run, _: LocalExecutor(run, settings.workers, limits_of(settings)),
     trials_at_once=lambda settings: settings.workers or usable_cores(),
 )

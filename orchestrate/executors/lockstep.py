@@ -21,7 +21,6 @@ from orchestrate.config.value_checks import count, text
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import Event, Executor, Task, TaskDone
 from orchestrate.executors.factory import ExecutorFactory
-from orchestrate.executors.live import Live, sampled
 from orchestrate.executors.task import BYTES_PER_KIB, failure_of
 from orchestrate.records import Failure, RunRecord
 
@@ -40,13 +39,10 @@ class LockstepExecutor(Executor):
         Torch device, such as ``"cpu"`` or ``"cuda"``.
     batch : int
         Largest number of trials in a batch.
-    live : float, optional
-        Time between two samples of the losses of a batch [s].
     """
 
-    def __init__(self, device: str, batch: int, live: float | None = None) -> None:
+    def __init__(self, device: str, batch: int) -> None:
         self._device = device
-        self._live = None if live is None else Live(live, self.report)
         self.batch = batch
         self._chunks: deque[list[Task]] = deque()
 
@@ -59,7 +55,7 @@ class LockstepExecutor(Executor):
             self._chunks.append(list(chunk))
 
     def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a running batch is not left
-        return run_batch(self._chunks.popleft(), self._device, self._live) if self._chunks else []
+        return run_batch(self._chunks.popleft(), self._device) if self._chunks else []
 
     @property
     def pending(self) -> int:
@@ -82,7 +78,7 @@ def check_device(device: str) -> None:
         )
 
 
-def run_batch(tasks: Sequence[Task], device: str, live: Live | None = None) -> list[Event]:
+def run_batch(tasks: Sequence[Task], device: str) -> list[Event]:
     """Run tasks of one configuration as a batch; an exception fails all of them."""
     from dopt.assessment import assessed
     from dopt.reference.batch import run_trials
@@ -91,8 +87,7 @@ def run_batch(tasks: Sequence[Task], device: str, live: Live | None = None) -> l
     outcomes: Sequence[TrialResult | Failure]
     try:
         specs = [task.spec for task in tasks]
-        with sampled([task.key for task in tasks], live):
-            results = run_trials(specs, device)
+        results = run_trials(specs, device)
         outcomes = [assessed(spec, result) for spec, result in zip(specs, results, strict=True)]
     except Exception as error:
         outcomes = [failure_of(error)] * len(tasks)
@@ -131,9 +126,7 @@ def _trials_at_once(settings: LaunchSettings) -> int | None:
 
 
 FACTORY = ExecutorFactory(
-    make=lambda settings, *_: LockstepExecutor(
-        _device(settings), _batch_size(settings), settings.live
-    ),
+    make=lambda settings, *_: LockstepExecutor(_device(settings), _batch_size(settings)),
     trials_at_once=_trials_at_once,
     check=_check,
     path="reference",

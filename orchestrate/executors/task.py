@@ -13,15 +13,12 @@ from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from orchestrate.executors.base import Run, Task, TaskDone
 from orchestrate.executors.limits import NO_LIMITS, Limits, TrialTimeoutError, interrupted_after
-from orchestrate.executors.live import Live, sampled
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 
 BYTES_PER_KIB = 1024
 
 
-def run_task(
-    run: Run, task: Task, limits: Limits = NO_LIMITS, live: Live | None = None
-) -> TaskDone:
+def run_task(run: Run, task: Task, limits: Limits = NO_LIMITS) -> TaskDone:
     """Run the task within its time limit; return its result or the exception that it raised.
 
     A time limit needs the main thread of the process.
@@ -29,7 +26,7 @@ def run_task(
     started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
     outcome: TrialResult | Failure
     try:
-        with interrupted_after(limits), sampled([task.key], live):
+        with interrupted_after(limits):
             outcome = _checked(run(task.spec))
     except (Exception, SystemExit, TrialTimeoutError) as error:
         outcome = failure_of(error)

@@ -20,7 +20,6 @@ from multiprocessing.connection import Connection
 from dopt.garbage_collection import collect_rarely
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits, die_with_parent, ended_after, limit_memory
-from orchestrate.executors.live import Live
 from orchestrate.executors.task import run_task
 from orchestrate.executors.worker_environment import pin_threads
 
@@ -39,11 +38,7 @@ def main(descriptor: int, crash_report: int, errors: int) -> None:
     connection = Connection(descriptor)
     run: Run
     limits: Limits
-    seconds: float | None
-    run, limits, seconds = connection.recv()
-    # The time limit of a trial cannot tear a message apart: the system takes one as short as a
-    # sample whole or not at all.
-    live = None if seconds is None else Live(seconds, connection.send)
+    run, limits = connection.recv()
     chunks: queue.SimpleQueue[list[Task]] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(connection, chunks), daemon=True).start()
     with ended_after(limits, crash_report):
@@ -54,7 +49,7 @@ def main(descriptor: int, crash_report: int, errors: int) -> None:
         for task in chunks.get():
             limit_memory(limits, task.memory_factor)
             with ended_after(limits, crash_report):
-                finished = run_task(run, task, limits, live)
+                finished = run_task(run, task, limits)
             connection.send(finished)
         connection.send(None)
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import TypeVar
 
-from orchestrate.records import Failure, RunRecord, Sample
+from orchestrate.records import Failure, RunRecord
 from orchestrate.runner.signals import undisturbed
 from orchestrate.store import (
     Claim,
@@ -129,11 +128,6 @@ class RetryingStore:
             return self._store.fail(claim, failure, run) or self._store.written([claim])[0]
 
         return self._persist(lambda: self._store.fail(claim, failure, run), again)
-
-    def sample(self, samples: Sequence[tuple[Claim, Sample]]) -> None:
-        """Write samples of running trials, or none of them while the database does not answer."""
-        with suppress(StoreUnavailableError):
-            _whole(lambda: self._store.sample(samples))
 
     def release(self, trial_keys: Sequence[str], cause: str) -> None:
         """Put trials of the launch back to pending, and record the cause in their attempts."""

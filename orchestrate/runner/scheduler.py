@@ -13,9 +13,8 @@ from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
-from orchestrate.records import ENVIRONMENT, Failure, RunRecord, Sample
+from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 from orchestrate.runner.batching import Chunks
-from orchestrate.runner.live_samples import LiveSamples
 from orchestrate.runner.progress import Tally
 from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.store import Claim, InvalidResultError
@@ -76,11 +75,6 @@ class Scheduler:
     _crash_counts: Counter[str] = field(default_factory=Counter)
     _node_losses: Counter[str] = field(default_factory=Counter)
     _out_of_memory: set[str] = field(default_factory=set)
-    _live: LiveSamples = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._live = LiveSamples(self.store)
-        self.executor.listener = self._sample
 
     def step(self) -> bool:
         """Submit waiting trials and commit finished ones; return False when none is left.
@@ -91,18 +85,12 @@ class Scheduler:
         if not self.executor.pending:
             return False
         events = self.executor.wait(POLL_SECONDS)
-        self._live.write()
         self._commit([event for event in events if isinstance(event, TaskDone)])
         for event in events:
             if isinstance(event, WorkerLost):
                 self._recover(event)
         self.store.check()
         return True
-
-    def _sample(self, sample: Sample) -> None:
-        """Write a sample of a trial that runs; one may come late."""
-        if sample.key in self._running:
-            self._live.add(self._running[sample.key][0], sample)
 
     @property
     def ending(self) -> bool:

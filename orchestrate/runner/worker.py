@@ -57,7 +57,7 @@ class WorkerSettings:
         Time after which nothing is held any more; None until no trial is left.
     processes
         Trials at once; None for one on each core that this process may use.
-    timeout, memory_gib, retry_memory, live, lease
+    timeout, memory_gib, retry_memory, lease
         As those of a launch (:class:`orchestrate.config.launch_settings.LaunchSettings`).
 
     Raises
@@ -72,7 +72,6 @@ class WorkerSettings:
     timeout: float | None = 3600.0
     memory_gib: float | None = None
     retry_memory: float | None = None
-    live: float | None = None
     lease: float = 60.0
 
     def __post_init__(self) -> None:
@@ -88,7 +87,6 @@ class WorkerSettings:
             timeout=self.timeout,
             memory_gib=self.memory_gib,
             retry_memory=self.retry_memory,
-            live=self.live,
             lease=self.lease,
             patience=min(30.0, self.lease / 2),
         )

@@ -29,7 +29,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Number of the newest script in ``migrations/versions``."""
 
 LOCK_TABLE = "store_lock"
@@ -192,15 +192,6 @@ step = _table(
     _trial_key(primary_key=True),
     Column("t", Integer, primary_key=True, autoincrement=False),
     *(Column(name, _Real) for name in STEP_VALUES),
-    rowid=False,
-)
-
-live_step = _table(
-    "live_step",
-    _trial_key(primary_key=True),
-    Column("t", Integer, primary_key=True, autoincrement=False),
-    Column("loss", _Real),
-    Column("reachable_loss", _Real),
     rowid=False,
 )
 

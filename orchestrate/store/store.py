@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Self
 
-from orchestrate.records import Failure, RunRecord, Sample
+from orchestrate.records import Failure, RunRecord
 from orchestrate.store import database_url, packed_curves, schema_version
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, PATIENCE_SECONDS, make_backend
@@ -23,7 +23,6 @@ from orchestrate.store.write import (
     claims,
     explorations,
     launches,
-    live_steps,
     pruning,
     registration,
     results,
@@ -174,7 +173,6 @@ class Store:
         with self._backend.transaction() as connection:
             for i in order:
                 written[i] = results.write(connection, self._backend, prepared[i])
-            live_steps.clear(connection)
         return written
 
     def holds_more(self, spec: Registrable, result: Result) -> bool:
@@ -203,14 +201,7 @@ class Store:
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
         """Write a failed trial with its error; return False if the claim is lost."""
         with self._backend.transaction() as connection:
-            written = results.write_failure(connection, claim, failure, run)
-            live_steps.clear(connection)
-        return written
-
-    def sample(self, samples: Sequence[tuple[Claim, Sample]]) -> None:
-        """Write samples of running trials; those of lost claims are left out."""
-        with self._backend.transaction() as connection:
-            live_steps.add(connection, samples)
+            return results.write_failure(connection, claim, failure, run)
 
     def written(self, claims: Sequence[Claim]) -> list[bool]:
         """Return for each claim whether its attempt has an outcome."""

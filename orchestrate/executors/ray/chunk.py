@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from orchestrate.executors.base import Prepare, Run, Task, TaskDone
 from orchestrate.executors.limits import Limits, ended_after, limit_memory
-from orchestrate.executors.ray.samples import Channel, live_to
 from orchestrate.executors.task import run_task
 from orchestrate.executors.worker_environment import pin_threads
 
@@ -18,14 +17,11 @@ def run_chunk(
     tasks: list[Task],
     limits: Limits,
     prepare: Prepare | None = None,
-    channel: Channel | None = None,
 ) -> Iterator[TaskDone | None]:
     """Run tasks in order; yield None when the first begins, then each outcome as it ends.
 
-    ``prepare`` is called first, on machines where the launch has not called it. Samples of running
-    tasks go through the channel.
+    ``prepare`` is called first, on machines where the launch has not called it.
     """
-    live = live_to(channel)
     pin_threads()
     if prepare:
         prepare()
@@ -33,5 +29,5 @@ def run_chunk(
     for task in tasks:
         limit_memory(limits, task.memory_factor)
         with ended_after(limits, _STDERR):
-            finished = run_task(run, task, limits, live)
+            finished = run_task(run, task, limits)
         yield finished

@@ -20,7 +20,6 @@ from orchestrate.executors.base import Prepare, Run, Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection, unreachable
 from orchestrate.executors.ray.health import ClusterWatch
-from orchestrate.executors.ray.samples import Channel
 from orchestrate.executors.worker_environment import ONE_THREAD
 from orchestrate.fingerprint import Fingerprint, fingerprint
 
@@ -60,11 +59,11 @@ class Cluster(Connection):
     def slots(self) -> int:
         return self._workers or max(1, self._watch.cores)
 
-    def run(self, run: Run, tasks: list[Task], limits: Limits, channel: Channel | None) -> Any:
+    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
         payload = cloudpickle.dumps(  # type: ignore[no-untyped-call]
             (run, tasks, limits, self._prepare)
         )
-        return self._task.remote(self._expected, payload, channel)
+        return self._task.remote(self._expected, payload)
 
     def check(self) -> None:
         self._watch.check()
@@ -91,14 +90,11 @@ def setting_names() -> list[str]:
     return [line.partition("=")[0] for line in lines if line and not line.startswith("#")]
 
 
-def run_where_alike(
-    expected: Fingerprint, payload: bytes, channel: tuple[float, Any] | None = None
-) -> Iterator[Any]:
+def run_where_alike(expected: Fingerprint, payload: bytes) -> Iterator[Any]:
     """Run a chunk, or yield one clause that names the difference.
 
     ``payload`` holds the pickled arguments of
-    :func:`orchestrate.executors.ray.chunk.run_chunk`, whose outcomes are yielded, but for the
-    channel, which holds an actor.
+    :func:`orchestrate.executors.ray.chunk.run_chunk`, whose outcomes are yielded.
 
     Ray finds a function on a worker by its name, in the code installed there. This one and what it
     calls are pickled by value instead: they run before any module of this project is imported on
@@ -114,4 +110,4 @@ def run_where_alike(
                 return
         _verified.append(True)
     chunk = importlib.import_module("orchestrate.executors.ray.chunk")
-    yield from chunk.run_chunk(*cloudpickle.loads(payload), channel)
+    yield from chunk.run_chunk(*cloudpickle.loads(payload))

@@ -13,7 +13,6 @@ from dopt.errors import DoptError
 from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
-from orchestrate.executors.ray.samples import Channel
 from orchestrate.program import exit_code
 
 TASK_OPTIONS: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "num_returns": "streaming"}
@@ -38,8 +37,8 @@ class Connection(ABC):
         """Number of tasks that run at the same time, now."""
 
     @abstractmethod
-    def run(self, run: Run, tasks: list[Task], limits: Limits, channel: Channel | None) -> Any:
-        """Start a chunk and return the stream of its outcomes; its samples go to the channel."""
+    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
+        """Start a chunk and return the stream of its outcomes."""
 
     @abstractmethod
     def check(self) -> None:

@@ -18,7 +18,6 @@ from orchestrate.executors.limits import NO_LIMITS, Limits
 from orchestrate.executors.ray.cluster import Cluster
 from orchestrate.executors.ray.connection import Connection, first_line
 from orchestrate.executors.ray.local import OwnRay
-from orchestrate.executors.ray.samples import Inbox
 
 _WORKER_LOST = (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError)
 _NODE_LOST = (exceptions.NodeDiedError, exceptions.ObjectLostError)
@@ -50,8 +49,6 @@ class RayExecutor(Executor):
         Limits of a trial and of a worker.
     prepare
         Function that each machine of a cluster calls before its first trial.
-    live
-        Time between two samples of a running trial [s]; None for no samples.
     """
 
     def __init__(
@@ -61,10 +58,7 @@ class RayExecutor(Executor):
         address: str = "local",
         limits: Limits = NO_LIMITS,
         prepare: Prepare | None = None,
-        live: float | None = None,
     ) -> None:
-        self._live = live
-        self._inbox: Inbox | None = None
         self._run = run
         self._limits = limits
         self._ray: Connection
@@ -79,8 +73,6 @@ class RayExecutor(Executor):
     def start(self) -> None:
         self._ray.connect()
         self.slots = self._ray.slots
-        if self._live is not None:
-            self._inbox = Inbox(self._live)
 
     def submit(self, chunk: Sequence[Task]) -> None:
         if chunk:
@@ -91,8 +83,7 @@ class RayExecutor(Executor):
         limit = self._ray.limit
         while self._queue and (limit is None or len(self._chunks) < limit):
             chunk = list(self._queue.popleft())
-            channel = self._inbox.channel if self._inbox else None
-            stream = self._ray.run(self._run, chunk, self._limits, channel)
+            stream = self._ray.run(self._run, chunk, self._limits)
             self._chunks[stream] = Chunk(deque(chunk))
 
     def wait(self, timeout: float) -> list[Event]:
@@ -108,8 +99,6 @@ class RayExecutor(Executor):
                 streams = list(self._chunks)
                 count = len(streams)
                 ready = ray.wait(streams, num_returns=count, timeout=0)[0] if count else []
-            for sample in self._inbox.take() if self._inbox else ():
-                self.report(sample)
         except InfrastructureError:
             self._lost = True
             raise

@@ -12,7 +12,7 @@ def _make(settings: LaunchSettings, run: Run, prepare: Prepare | None) -> Execut
     from orchestrate.executors.ray.executor import RayExecutor  # importing Ray takes a second
 
     limits = limits_of(settings)
-    return RayExecutor(run, settings.workers, settings.ray_address, limits, prepare, settings.live)
+    return RayExecutor(run, settings.workers, settings.ray_address, limits, prepare)
 
 
 def _trials_at_once(settings: LaunchSettings) -> int | None:

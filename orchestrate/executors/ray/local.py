@@ -14,7 +14,6 @@ from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.ray.chunk import run_chunk
 from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection
-from orchestrate.executors.ray.samples import Channel
 from orchestrate.executors.ray.start import start
 from orchestrate.executors.worker_environment import ONE_THREAD, module_path
 
@@ -49,8 +48,8 @@ class OwnRay(Connection):
     def slots(self) -> int:
         return self._workers
 
-    def run(self, run: Run, tasks: list[Task], limits: Limits, channel: Channel | None) -> Any:
-        return self._task.remote(run, tasks, limits, None, channel)
+    def run(self, run: Run, tasks: list[Task], limits: Limits) -> Any:
+        return self._task.remote(run, tasks, limits, None)
 
     def check(self) -> None:
         """Check that Ray's processes run; Ray itself notices after a minute."""

@@ -96,8 +96,6 @@ class SlurmJob:
             given["memory-gib"] = f"{self.settings.memory_gib:g}"
         if self.settings.retry_memory is not None:
             given["retry-memory"] = f"{self.settings.retry_memory:g}"
-        if self.settings.live is not None:
-            given["live"] = f"{self.settings.live:g}"
         words = (word for name, value in given.items() for word in (f"--{name}", str(value)))
         return [sys.executable, "-P", "-m", "orchestrate", "work", *words]
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from sqlalchemy import Double, LargeBinary
 from sqlalchemy.types import Integer
 
-from orchestrate.store.schema import alembic_version, live_step, metadata
+from orchestrate.store.schema import alembic_version, metadata
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-TABLES = tuple(sorted({*metadata.tables} - {alembic_version.name, live_step.name}))
+TABLES = tuple(sorted({*metadata.tables} - {alembic_version.name}))
 """Names of the tables but that of the version, which is written in the provenance, and of samples.
 
 Samples are of trials that run, and a bundle holds results.

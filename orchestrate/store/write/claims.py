@@ -24,7 +24,6 @@ from orchestrate.store.schema import (
     trial,
 )
 from orchestrate.store.serialization import not_before, now
-from orchestrate.store.write import live_steps
 
 
 def claim(
@@ -101,7 +100,6 @@ def free_claims(
     over = open_attempt & attempt.c.trial_id.not_in(still_held)
     end = {"outcome": outcome, "cause": cause, "ended": not_before(attempt.c.claimed, now())}
     connection.execute(update(attempt).where(over).values(end))
-    live_steps.clear(connection)
     return freed.rowcount
 
 

@@ -20,7 +20,6 @@ TRIAL = ("env.horizon=5", "executor=inprocess")
         ["launch.memory_gib=1.5"],
         ["launch.memory_gib=2", "launch.retry_memory=1.5"],
         ["launch.lease=20", "launch.patience=10.5"],
-        ["launch.live=0.5"],
     ],
     ids=" ".join,
 )
@@ -40,8 +39,6 @@ def test_what_is_taken(command_line: CommandLine, words: list[str]) -> None:
         ("launch.timeout=true", "launch.timeout"),
         ("launch.memory_gib=0", "launch.memory_gib is 0, but null or a number of GiB above 0"),
         ("launch.retry_memory=2", "launch.retry_memory is 2, but there is no limit that it could"),
-        ("launch.live=0", "launch.live is 0, but null or a number of seconds above 0"),
-        ("launch.live=true", "launch.live"),
         ("launch.lease=null", "launch.lease"),
         ("launch.lease=10", "launch.patience is 30, but less than launch.lease=10 is expected"),
         ("launch.patience=60", "launch.patience is 60, but less than launch.lease=60 is expected"),

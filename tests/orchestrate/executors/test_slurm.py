@@ -59,7 +59,7 @@ def test_a_dry_run_prints_the_script_and_needs_no_slurm(command_line: CommandLin
         "executor.memory_gib=1.5", "executor.partition=long", "executor.account=lab",
         "+executor.options.qos=low", "+executor.options.exclusive=true",
         "+executor.options.comment='a \"b\"'", "launch.lease=90",
-        "launch.memory_gib=1", "launch.retry_memory=1.5", "launch.live=2",
+        "launch.memory_gib=1", "launch.retry_memory=1.5",
     )  # fmt: skip
     assert code == 0, errors
     lines = [line for line in output.splitlines() if line.startswith("#SBATCH ")]
@@ -70,7 +70,7 @@ def test_a_dry_run_prints_the_script_and_needs_no_slurm(command_line: CommandLin
         "--export=ALL", "--qos=low", "--exclusive", '--comment="a \\"b\\""',
     }  # fmt: skip
     command = "-m orchestrate work --processes 4 --timeout 3600 --lease 90"
-    assert f"{command} --memory-gib 1 --retry-memory 1.5 --live 2)" in output
+    assert f"{command} --memory-gib 1 --retry-memory 1.5)" in output
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,6 @@ WRITERS: dict[str, Callable[[Store, int, list[Claim]], object]] = {
     "register": lambda store, launch, _: store.register(launch, [Spec(50)]),
     "claim": lambda store, launch, _: store.claim(launch, [SPECS[3].trial_key]),
     "fail": lambda store, _, claims: store.fail(claims[0], Failure("E", "m", "t"), RUN),
-    "sample": lambda store, *_: store.sample([]),
     "release": lambda store, launch, _: store.release(launch),
     "retry": lambda store, *_: store.retry("all"),
     "prune": lambda store, *_: store.prune([SPECS[0].trial_key]),

@@ -45,7 +45,7 @@ def test_tables_are_strict_and_steps_have_no_rowid(store: Store, path: Path) -> 
     ).fetchall()
     assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
     connection.close()
-    assert len(tables) == 11
+    assert len(tables) == 10
     assert all(strict for _, strict, _ in tables)
     assert ("step", 1, 1) in tables
 

@@ -122,7 +122,7 @@ def test_upgraded_equals_created(old: str, other_url: str) -> None:
 
 
 def test_every_row_stays_as_it_was(old: str, version: int) -> None:
-    kept = columns(old)
+    kept = _kept(old)
     before = contents(old, kept)
     assert len(before["step"]) == 125
     done = upgrade(old)
@@ -131,6 +131,11 @@ def test_every_row_stays_as_it_was(old: str, version: int) -> None:
     with Reader.open(old) as reader:
         assert reader.schema_version() == str(SCHEMA_VERSION)
         assert sum(config.n_done for config in reader.configs()) == 4
+
+
+def _kept(url: str) -> dict[str, tuple[str, ...]]:
+    """Return the columns of the tables that the upgrade keeps."""
+    return {name: names for name, names in columns(url).items() if name != "live_step"}
 
 
 def test_every_configuration_gets_its_label(old: str) -> None:
@@ -183,7 +188,7 @@ def test_a_failure_in_the_middle_changes_nothing(
 def test_tables_that_are_written_anew_keep_everything(
     old: str, with_script: Callable[[str], None]
 ) -> None:
-    kept = columns(old)
+    kept = _kept(old)
     rows = contents(old, kept)
     upgrade(old)
     before = structure(old)
