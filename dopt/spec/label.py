@@ -7,9 +7,7 @@ configurations that are shown together with each other, such as ``Î³=2`` and ``Î
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from dopt.control import Control
 from dopt.declare.kernel_support import default_path
@@ -71,107 +69,59 @@ def config_label(config: Mapping[str, object]) -> str:
 
     Settings of a user's class are compared where that class is loaded, and left out elsewhere.
     """
-    flat, usual = flatten(config), usual_values(config)
-    known = [path for path in _paths([flat]) if path in usual]
-    unusual = [path for path in known if _is_unusual(path, flat, usual)]
-    return ", ".join([_title(flat), *_words(flat, unusual)])
+    flat = flatten(config)
+    return _label(flat, _named(flat, usual_values(config), set(flat)), titled=True)
 
 
 def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
-    """Return a label for each configuration that says only what differs among those of its env.
+    """Return a different label for each configuration of an environment.
 
-    The policy is named where several are shown. Of the settings that differ, usual values are left
-    out, unless the label would be empty or equal to that of another configuration. Of a user's
-    class whose defaults are unknown, a value is left out where all that have this class share it;
-    its path and digest are named only where nothing else differs. A loss of its own and limits are
-    always named, the bounds only where they differ.
+    It has the policy's title, where several are shown, and the settings that are not the default,
+    but for those that all configurations of the environment share. Limits and a loss of its own are
+    always named. Configurations that are alike in this are told apart by what else differs.
     """
     flats = [flatten(completed(config)) for config in configs]
+    usual = [usual_values(config) for config in configs]
     titled = len({flat.get("policy.name") for flat in flats}) > 1
-    places: dict[object, list[int]] = {}
-    for place, flat in enumerate(flats):
-        places.setdefault(flat.get("env.name"), []).append(place)
-    found: dict[int, str] = {}
-    for group in places.values():
-        usual = [usual_values(configs[place]) for place in group]
-        found |= zip(group, _labels([flats[place] for place in group], usual, titled), strict=True)
-    return [found[place] for place in range(len(configs))]
-
-
-def _labels(flats: Sequence[Flat], usual: Sequence[Flat], titled: bool) -> list[str]:
-    """Return the labels of the configurations of one environment."""
-    paths = [path for path in _paths(flats) if len({repr(flat.get(path)) for flat in flats}) > 1]
-    rows = [
-        _choices(flat, _with_shared(flat, own, flats), own, paths, flats, titled)
-        for flat, own in zip(flats, usual, strict=True)
-    ]
-    counts = [Counter(column) for column in zip(*rows, strict=True)]
-    return [
-        next((text for text, n in zip(row, counts, strict=True) if n[text] == 1), row[-1])
-        for row in rows
-    ]
-
-
-def _choices(
-    flat: Flat,
-    usual: Flat,
-    own: Flat,
-    differing: Sequence[str],
-    flats: Sequence[Flat],
-    titled: bool,
-) -> list[str]:
-    """Return the labels that a configuration may have, of which the first that is unique is taken.
-
-    ``usual`` holds the values that are not named where they differ, and ``own`` the defaults.
-    """
-    paths = [path for path in differing if not _is_origin(path)]
-    common = [path for path in paths if all(path in flat for flat in flats)]
-    title = [_title(flat)] if titled or not paths else []
-    words = _words(flat, [path for path in paths if _is_unusual(path, flat, usual)])
-    brief = title + words or _words(flat, _telling(common)) or [_title(flat)]
-    whole = title + _words(flat, [path for path in paths if path in flat], digits=17)
-    rest = [path for path in _paths([flat]) if path in _ALWAYS and path not in paths]
-    always = _words(flat, [path for path in rest if _is_unusual(path, flat, own)])
-    origins = [path for path in differing if _is_origin(path) and _is_unusual(path, flat, usual)]
-    origin = _words(flat, origins)
-    ends = (brief, always), (whole, always), (brief, always, origin), (whole, always, origin)
-    return [", ".join(itertools.chain(*parts)) for parts in ends]
-
-
-def _is_origin(path: str) -> bool:
-    """Return whether a path names the class or the file of a section."""
-    return path.rpartition(".")[2] in (SOURCE, TARGET)
-
-
-def _with_shared(flat: Flat, usual: Flat, flats: Sequence[Flat]) -> Flat:
-    """Return the usual values; of a setting without one, the value that all of its class share."""
-    found = dict(usual)
-    for path in set(flat) - set(usual):
-        section = path.partition(".")[0]
-        name = flat.get(f"{section}.name")
-        peers = [one for one in flats if name and one.get(f"{section}.name") == name]
-        if peers and all(one.get(path) == flat[path] for one in peers):
-            found[path] = flat[path]
+    found = [""] * len(flats)
+    for env in {flat.get("env.name") for flat in flats}:
+        places = [place for place, flat in enumerate(flats) if flat.get("env.name") == env]
+        differing = _differing([flats[place] for place in places])
+        named = {place: _named(flats[place], usual[place], differing) for place in places}
+        for place in places:
+            found[place] = _label(flats[place], named[place], titled or not differing)
+        for text in {found[place] for place in places}:
+            alike = [place for place in places if found[place] == text]
+            others = _differing([flats[place] for place in alike])
+            plain = {path for path in others if path.rpartition(".")[2] not in (SOURCE, TARGET)}
+            for place in alike if others else ():
+                paths = named[place] | (plain or others)
+                found[place] = _label(flats[place], paths, titled or not plain, digits=17)
     return found
 
 
-def _telling(paths: Sequence[str]) -> list[str]:
-    """Return the paths without the settings of sections whose names are among them."""
-    named = {path.partition(".")[0] for path in paths if path.endswith(".name")}
-    return [path for path in paths if path.endswith(".name") or path.partition(".")[0] not in named]
+def _differing(flats: Sequence[Flat]) -> set[str]:
+    """Return the paths at which configurations differ, or where some have nothing."""
+    return {path for path in _paths(flats) if len({repr(flat.get(path)) for flat in flats}) > 1}
 
 
-def _is_unusual(path: str, flat: Flat, usual: Flat) -> bool:
-    """Return whether a configuration has a setting other than the default, versions apart."""
-    hidden = path.endswith("_version")
-    return not hidden and path in flat and (path not in usual or flat[path] != usual[path])
+def _named(flat: Flat, usual: Flat, differing: set[str]) -> set[str]:
+    """Return the differing paths with another value than the default; versions have none."""
+    wanted = (differing | set(_ALWAYS)) & set(flat) & set(usual)
+    return {path for path in wanted if flat[path] != usual[path] and not path.endswith("_version")}
+
+
+def _label(flat: Flat, paths: Collection[str], titled: bool, digits: int = 6) -> str:
+    words = _words(flat, [path for path in _paths([flat]) if path in paths], digits)
+    return ", ".join([_title(flat), *words] if titled or not words else words)
 
 
 def limits_label(config: Mapping[str, object]) -> str:
     """Return the words for limits, such as ``limits, y=[-2, 2]``; empty without any."""
-    flat, usual = flatten(config), usual_values(config)
-    paths = [path for path in _paths([flat]) if path.startswith("limits.")]
-    return ", ".join(_words(flat, [path for path in paths if _is_unusual(path, flat, usual)]))
+    flat = flatten(config)
+    named = _named(flat, usual_values(config), set(flat))
+    paths = [path for path in _paths([flat]) if path in named and path.startswith("limits.")]
+    return ", ".join(_words(flat, paths))
 
 
 def value_label(path: str, value: object) -> str:

@@ -66,15 +66,15 @@ def test_a_stored_label_says_what_is_not_the_default(one: Config, label: str) ->
     [
         ([PLAIN], ["D-optimal"]),
         ([BOUND], ["D-optimal"]),
-        ([PLAIN, BOUND], ["γ=2", "γ=3"]),
-        ([PLAIN, REPLAY], ["adam_window", "adam_replay ×60"]),
+        ([PLAIN, BOUND], ["D-optimal", "γ=3"]),
+        ([PLAIN, REPLAY], ["D-optimal", "adam_replay ×60"]),
         ([PLAIN, RANDOM], ["D-optimal", "random"]),
         ([PLAIN, RANDOM, BOUND], ["D-optimal", "random", "D-optimal, γ=3"]),
         ([RANDOM, TASK], ["random", "task control"]),
         ([PLAIN, ENFORCED], ["D-optimal", "limits, φ=[-2, 2]"]),
         ([ENFORCED], ["D-optimal, limits"]),
         ([COUNTED], ["D-optimal, limits, enforced=False"]),
-        ([ENFORCED, COUNTED], ["enforced=True, limits", "enforced=False, limits"]),
+        ([ENFORCED, COUNTED], ["limits", "limits, enforced=False"]),
         ([], []),
     ],
 )
