@@ -11,8 +11,7 @@ from orchestrate.commands.command import Command
 from orchestrate.commands.display import plain, show
 from orchestrate.commands.output import say_json
 from orchestrate.errors import ExitCode
-from orchestrate.store.doctor.examine import examine
-from orchestrate.store.doctor.findings import Finding
+from orchestrate.store.doctor import Finding, examine
 
 
 def add_arguments(_: argparse.ArgumentParser) -> None:

@@ -15,7 +15,7 @@ from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import Reader
-from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor import examine
 from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.standins import specification
 

@@ -15,7 +15,7 @@ from sqlalchemy import Row
 
 from orchestrate.store import database_url
 from orchestrate.store.backends import sqlite
-from orchestrate.store.doctor.keys import TrialKey
+from orchestrate.store.doctor import TrialKey
 from orchestrate.store.errors import StoreError
 from orchestrate.store.merging.source import Page, Source
 from orchestrate.store.merging.target import Target, add_launches

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from orchestrate.store.doctor.keys import TrialKey
+from orchestrate.store.doctor import TrialKey
 from orchestrate.store.errors import StoreError
 from orchestrate.store.read.reader import Reader
 from orchestrate.store.records import Array

@@ -95,13 +95,13 @@ def test_a_label_names_the_field_only_where_it_differs() -> None:
     plain, fresh = config_label(old), config_label(new)
     assert "information" not in plain
     assert fresh == f"{plain}, information=fresh"
-    assert labels([old, new]) == [plain, "information=fresh"]
+    assert labels([old, new]) == ["D-optimal", "information=fresh"]
     assert labels([completed(old), new]) == labels([old, new])
 
 
 def test_the_text_that_is_stored_is_the_one_whose_hash_is_the_key(tmp_path: Path) -> None:
     from orchestrate.commands.doctor import trial_key
-    from orchestrate.store.doctor.examine import examine
+    from orchestrate.store.doctor import examine
     from tests.analysis.synthetic import fill
 
     for spec in (PLAIN, FRESH):

@@ -24,7 +24,7 @@ from dopt.systems import System
 from dopt.types import Array
 from orchestrate.commands.doctor import trial_key
 from orchestrate.store import Reader, Store, StoreError, StoreUnavailableError, default_url
-from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor import examine
 from orchestrate.store.write import explorations as writing
 from tests.dopt.explorer.saves import STEPS, content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH

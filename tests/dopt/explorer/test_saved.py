@@ -23,7 +23,7 @@ from dopt import Explorer, TrialSpec
 from orchestrate.__main__ import main
 from orchestrate.commands.doctor import trial_key
 from orchestrate.store import Reader, Store, StoreUnavailableError, explorations
-from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor import examine
 from orchestrate.store.merging.merge import merge
 from tests.dopt.explorer.saves import content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN

@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import event
 
 from orchestrate.store import Failure, Reader, Store
-from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor import examine
 from orchestrate.store.merging.merge import merge
 from orchestrate.store.merging.source import Source
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
-from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor import examine
 from orchestrate.store.migrations.upgrade import upgrade
 from orchestrate.store.schema import STEP_VALUES
 from tests.orchestrate.store.fakes import LAUNCH, RUN, FakeResult, Spec, diverged, result

@@ -15,7 +15,7 @@ from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreError, StoreUnavailableError
 from orchestrate.store.backends import sqlite_engine
-from orchestrate.store.doctor.examine import examine
+from orchestrate.store.doctor import examine
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import hear, kill, run_and_stop, running, without_rights
 

@@ -13,8 +13,7 @@ from sqlalchemy import create_engine
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreError
-from orchestrate.store.doctor.examine import examine
-from orchestrate.store.doctor.findings import Finding
+from orchestrate.store.doctor import Finding, examine
 from orchestrate.store.schema import STEP_VALUES
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
 from tests.orchestrate.store.structure import columns, contents
