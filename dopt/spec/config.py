@@ -181,7 +181,7 @@ class TrialConfig:
 
     @property
     def memory(self) -> int:
-        """Bytes that one trial holds at once, beside the interpreter."""
+        """Estimated bytes of the matrices and arrays of one trial, beside the interpreter."""
         return sum(self._memory_by_setting.values())
 
     @property
@@ -191,7 +191,7 @@ class TrialConfig:
 
     @functools.cached_property
     def _memory_by_setting(self) -> dict[str, int]:
-        return memory_by_setting(*self._parts, self.path, self.task)
+        return memory_by_setting(*self._parts, self.path)
 
     @functools.cached_property
     def canonical_json(self) -> str:
