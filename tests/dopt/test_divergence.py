@@ -11,7 +11,7 @@ from dopt.reference.batch import run_trials
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from tests.dopt.trials import PAIRS, trial
+from tests.dopt.trials import PAIRS, covering, trial
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us", "states", "inputs")
 POLICIES = ["random", "uniform", "d_optimal", "oracle"]
@@ -78,7 +78,7 @@ def test_any_learning_rate_gives_a_result(policy: str, rate: float) -> None:
                 assert np.isfinite(result.loss).all()
 
 
-@pytest.mark.parametrize(("env", "policy"), PAIRS)
+@pytest.mark.parametrize(("env", "policy"), covering(PAIRS))
 def test_a_step_too_long_for_the_system_ends_a_trial(env: str, policy: str) -> None:
     fields: dict[str, Any] = {"dt": 40.0, "state_limit": 50.0}
     if policy == "periodic":

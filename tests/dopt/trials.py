@@ -68,5 +68,19 @@ KNOWN_EFFECT = [env for env, system in SYSTEMS.items() if not system.reads_input
 ALL_PAIRS = [
     (env, policy) for env in KNOWN_EFFECT for policy in POLICIES if compatible(env, policy)
 ]
+
+
+def covering(pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return few of the pairs, in which each of their systems and policies occurs."""
+    systems, policies = ({pair[i] for pair in pairs} for i in (0, 1))
+    chosen: list[tuple[str, str]] = []
+    while systems or policies:
+        best = max(pairs, key=lambda pair: (pair[0] in systems) + (pair[1] in policies))
+        chosen.append(best)
+        systems.discard(best[0])
+        policies.discard(best[1])
+    return chosen
+
+
 PAIRS = [pair for pair in ALL_PAIRS if trial(*pair).config.path == "kernel"]
 """Pairs of a system and a policy that the kernel runs; the others run on the reference alone."""

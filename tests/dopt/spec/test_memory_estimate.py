@@ -13,7 +13,7 @@ from dopt.kernel.state_from_spec import empty_record, initial_state
 from dopt.randomness import draw
 from dopt.spec.config import LARGEST_HORIZON
 from dopt.spec.trial import TrialSpec
-from tests.dopt.trials import PAIRS, trial
+from tests.dopt.trials import PAIRS, covering, trial
 
 
 def size(item: Any) -> int:
@@ -31,7 +31,7 @@ def held(spec: TrialSpec) -> int:
     return size(arrays) + size(record) + size(initial_state(spec, draws.weights, record))
 
 
-@pytest.mark.parametrize(("env", "policy"), PAIRS)
+@pytest.mark.parametrize(("env", "policy"), covering(PAIRS))
 def test_a_usual_trial_needs_little(env: str, policy: str) -> None:
     assert trial(env, policy, env={"horizon": 500}).config.memory < 2**26
 
