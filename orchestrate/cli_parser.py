@@ -28,6 +28,9 @@ SUCCESSORS = {
     "analysis floor": "fit the model of a trial to samples with dopt.fit_offline in Python",
     "--live": "look at the progress of a launch with python -m orchestrate status --watch",
     "launch.live": "look at the progress of a launch with python -m orchestrate status --watch",
+    "launch.reference": "compare with python -m analysis compare --reference POLICY",
+    "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
+    "launch.until='ci<5%'",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
 }
 """Successors of removed words, by command and word or by ``key=value`` of the configuration."""

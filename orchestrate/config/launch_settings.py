@@ -11,8 +11,17 @@ from typing import Any, Literal, cast
 from dopt.errors import unknown_name
 from dopt.given_path import given_path, stripped
 from orchestrate.config.share import Share, share
-from orchestrate.config.stopping_rule import Until, until
-from orchestrate.config.value_checks import amount, count, factor, flag, limit, section, text, wrong
+from orchestrate.config.value_checks import (
+    amount,
+    count,
+    factor,
+    flag,
+    limit,
+    precision,
+    section,
+    text,
+    wrong,
+)
 from orchestrate.errors import LaunchError
 
 SHARD_SUFFIX = ".db"
@@ -42,9 +51,8 @@ class LaunchSettings:
     retry
         Finished trials of the grid that are run again.
     until
-        Rule by which a configuration gets no more of its seeds, or None to run all.
-    reference
-        Policy that the others are compared with where ``until`` decides comparisons.
+        Precision of the geometric mean of the final loss, as a share of it, at which a
+        configuration gets no more of its seeds; None to run all.
     workers
         Processes, or None for one on each core.
     chunk_seconds
@@ -74,8 +82,7 @@ class LaunchSettings:
     collect_in: Path | None = None
     collect_seconds: float = 60.0
     retry: Retry | None = None
-    until: Until | None = None
-    reference: str = "d_optimal"
+    until: float | None = None
     workers: int | None = None
     chunk_seconds: float = 1.0
     timeout: float | None = 3600.0
@@ -113,8 +120,7 @@ class LaunchSettings:
             collect_in=place.folder,
             collect_seconds=place.seconds,
             retry=cast("Retry | None", retry),
-            until=until(launch["until"]),
-            reference=text("launch.reference", launch["reference"]),
+            until=precision("launch.until", launch["until"]),
             workers=count("launch.workers", launch["workers"]),
             chunk_seconds=amount("launch.chunk_seconds", launch["chunk_seconds"], "seconds"),
             timeout=limit("launch.timeout", launch["timeout"], "seconds"),

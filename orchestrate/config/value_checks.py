@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +10,8 @@ from orchestrate.errors import LaunchError
 
 LARGEST = 1_000_000_000
 """Bound of seconds and GiB: system timers and limits overflow above it."""
+
+_PRECISION = re.compile(r"ci\s*<\s*(\d+(?:\.\d+)?)\s*%")
 
 
 def section(key: str, value: object) -> Mapping[str, Any]:
@@ -68,3 +71,18 @@ def factor(key: str, value: object, limit_key: str, limited: object) -> float | 
 def wrong(key: str, value: object, expected: str) -> LaunchError:
     """Return the error for a setting with an invalid value."""
     return LaunchError(f"{key} is {value!r}, but {expected} is expected: change {key}.")
+
+
+def precision(key: str, value: object) -> float | None:
+    """Return the share of a mean to within which it shall be known: 0.05 for ``ci<5%``, or None."""
+    match = _PRECISION.fullmatch(value.strip()) if isinstance(value, str) else None
+    if match and 0 < float(match[1]) < 100:
+        return float(match[1]) / 100
+    if value is None:
+        return None
+    raise wrong(
+        key,
+        value,
+        "null or ci<P% with P above 0 and below 100 (the geometric mean of the final loss is known "
+        "to within P percent), such as 'ci<5%',",
+    )

@@ -22,7 +22,6 @@ from orchestrate.runner.memory_check import check_memory
 from orchestrate.runner.provenance import launch_record
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.runner.run_single import launch_trial
-from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.store import URL_VARIABLE
 
 WORK = Work(run_trial, warm_up)
@@ -69,7 +68,6 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
         check_memory(grid, settings)
         grid.check_libraries()
     _check_kind(settings, single=request.single)
-    SeedPlan(grid, settings)  # refuses a rule that does not apply to the grid
     return grid, settings
 
 

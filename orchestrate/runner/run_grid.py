@@ -166,7 +166,7 @@ def _run(
     output: Output,
 ) -> ExitCode:
     free_trials(store, grid, settings)
-    plan, tally = SeedPlan(grid, settings), Tally(0)
+    plan, tally = SeedPlan(grid, settings.until), Tally(0)
     stages = _open_stages(store, plan, tally, settings, output.say)
     first = next(stages, None)
     if first is not None:

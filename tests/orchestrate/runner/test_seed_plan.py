@@ -1,4 +1,4 @@
-"""A launch with ``launch.until`` runs seeds in batches, and decides the same however it was run."""
+"""A launch with ``launch.until`` runs seeds in batches, and ends the same however it was run."""
 
 from __future__ import annotations
 
@@ -10,27 +10,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
+from benchmarks.adaptive_seeds import SHAPES, coverage, resampled_coverages
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.config.stopping_rule import Until, UntilDecided, UntilPrecise
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
 from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.seed_plan import (
+    FEWEST_SEEDS,
+    FEWEST_VALUES,
+    MOST_LOOKS,
+    half_width,
+    is_narrow,
+    looks,
+)
 from orchestrate.store import Reader
 from tests.orchestrate.conftest import RECORD
-from tests.orchestrate.standins import diverged, grid_of, quick, trial_of
+from tests.orchestrate.standins import diverged, grid_of, quick
 
-SEEDS = 60
-FACTORS = {"d_optimal": 1.0, "uniform": 3.0, "periodic": 0.4, "random": 1.0}
-"""Geometric mean of the final loss with each policy; its logarithm has the spread below."""
-
-SPREADS = {"d_optimal": 0.5, "uniform": 0.5, "periodic": 0.5, "random": 0.5, "random_held": 0.02}
+SEEDS, STUDIES = 60, 1_000
+SPREADS = {"d_optimal": 0.02, "uniform": 0.1, "periodic": 0.13, "random": 0.5}
+"""Spread of the logarithm of the final loss with each policy; its mean is 0."""
 
 
-def grid(policies: Sequence[str] = tuple(FACTORS), seeds: int = SEEDS) -> Grid:
+def grid(policies: Sequence[str] = tuple(SPREADS), seeds: int = SEEDS) -> Grid:
     return grid_of(policies, seeds)
 
 
@@ -38,8 +45,7 @@ def lossy(spec: TrialSpec) -> TrialResult:
     """Return a loss of its policy, drawn by the key of the trial."""
     result = quick(spec)
     noise = np.random.default_rng(int(spec.trial_key[:12], 16)).standard_normal()
-    policy = spec.policy.name
-    loss = FACTORS.get(policy, 1.0) * np.exp(SPREADS[policy] * noise)
+    loss = np.exp(SPREADS[spec.policy.name] * noise)
     return dataclasses.replace(result, loss=np.full_like(result.loss, loss))
 
 
@@ -76,7 +82,7 @@ class Adaptive:
     def __call__(
         self,
         run: Run = lossy,
-        until: Until | None = UntilDecided(),  # noqa: B008  # frozen
+        until: float | None = 0.05,
         of: Grid | None = None,
         **settings: object,
     ) -> ExitCode:
@@ -92,7 +98,7 @@ class Adaptive:
 
     def result(self, policy: str) -> tuple[int, str]:
         """Return the seeds of a policy in the report, and its result."""
-        label = {"d_optimal": "D-optimal", "random_held": "held random"}.get(policy, policy)
+        label = {"d_optimal": "D-optimal"}.get(policy, policy)
         line = rf"^pendulum +{label}, .*?  (\d+) +(.*)$"
         match = re.search(line, self.report, flags=re.MULTILINE)
         assert match, self.report
@@ -118,22 +124,25 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Adaptive:
     return found
 
 
-def test_a_clear_difference_needs_few_seeds_and_none_needs_all(whole: Adaptive) -> None:
-    for policy, ratio in (("uniform", 3.0), ("periodic", 0.4)):
-        seeds, result = whole.result(policy)
-        assert seeds <= 30
-        assert result.endswith(", decided")
-        assert float(result.split()[1].strip(",")) == pytest.approx(ratio, rel=0.4)
-    assert whole.result("random")[0] == SEEDS
-    assert whole.result("random")[1].endswith("not decided")
-    assert whole.result("d_optimal") == (SEEDS, "reference")
-    assert whole.report.endswith("2 of 3 comparisons decided")
+def test_a_small_spread_needs_few_seeds_and_a_large_one_all(whole: Adaptive) -> None:
+    seeds = {policy: whole.result(policy)[0] for policy in SPREADS}
+    assert seeds["d_optimal"] == 20
+    assert 20 < seeds["uniform"] < SEEDS
+    assert seeds["random"] == SEEDS
+    match = re.fullmatch(r"mean (\S+) ± (\S+) %, known", whole.result("d_optimal")[1])
+    assert match
+    assert float(match[1]) == pytest.approx(1.0, abs=0.03)
+    assert float(match[2]) < 5
+    assert whole.result("random")[1].endswith("%")
+    assert re.search(
+        rf"{sum(seeds.values())} of 240 trials .*, [23] of 4 means known$", whole.report
+    )
 
 
 def test_the_database_holds_the_seeds_of_the_report_and_nothing_is_left_pending(
     whole: Adaptive,
 ) -> None:
-    for policy in FACTORS:
+    for policy in SPREADS:
         seeds = [seed for name, seed, _ in whole.outcomes() if name == policy]
         assert seeds == list(range(whole.result(policy)[0]))
     assert {status for _, _, status in whole.outcomes()} == {"done"}
@@ -162,10 +171,8 @@ def test_the_same_command_again_runs_nothing_and_reports_the_same(whole: Adaptiv
     assert whole.outcomes() == before
 
 
-def test_trials_that_are_there_already_change_no_decision(
-    adaptive: Adaptive, whole: Adaptive
-) -> None:
-    """Nor does the order in which they were run: here all seeds of all policies."""
+def test_trials_that_are_there_already_change_no_mean(adaptive: Adaptive, whole: Adaptive) -> None:
+    """All seeds of all policies were run, in another order."""
     backwards = grid()
     backwards.trials.reverse()
     assert adaptive(of=backwards, until=None) == ExitCode.DONE
@@ -180,14 +187,12 @@ def test_worker_processes_end_at_the_same_report(adaptive: Adaptive, whole: Adap
 
 
 @pytest.mark.parametrize("fail", [True, False])
-def test_failed_and_diverged_trials_are_no_pairs_and_block_nothing(
+def test_failed_and_diverged_trials_are_no_values_and_block_nothing(
     adaptive: Adaptive, fail: bool
 ) -> None:
     code = adaptive(partial(unlucky, fail=fail))
     assert code == (ExitCode.SOME_FAILED if fail else ExitCode.DONE)
-    seeds, result = adaptive.result("uniform")
-    assert seeds <= 40
-    assert result.endswith(", decided")
+    seeds, _ = adaptive.result("uniform")
     statuses = [status for name, _, status in adaptive.outcomes() if name == "uniform"]
     assert statuses.count("failed" if fail else "diverged") == seeds // 5
     assert adaptive.result("random")[0] == SEEDS
@@ -200,7 +205,7 @@ def test_a_policy_of_which_all_trials_fail_ends_with_all_seeds(adaptive: Adaptiv
         return lossy(spec)
 
     assert adaptive(broken, of=grid(["d_optimal", "uniform"], 25)) == ExitCode.SOME_FAILED
-    assert adaptive.result("uniform") == (25, "no ratio, not decided")
+    assert adaptive.result("uniform") == (25, "mean unknown")
 
 
 def test_fail_fast_starts_no_further_batch(adaptive: Adaptive) -> None:
@@ -216,25 +221,50 @@ def test_failed_trials_that_run_again_count(adaptive: Adaptive, whole: Adaptive)
     assert adaptive.report == whole.report
 
 
-def test_a_mean_that_is_known_needs_no_more_seeds(adaptive: Adaptive) -> None:
-    of = grid(["random", "random_held"], seeds=40)
-    assert adaptive(until=UntilPrecise(0.05), of=of) == ExitCode.DONE
-    seeds, result = adaptive.result("random_held")
-    assert seeds == 20
-    match = re.fullmatch(r"mean (\S+) ± (\S+) %, known", result)
-    assert match
-    assert float(match[1]) == pytest.approx(1.0, abs=0.03)
-    assert float(match[2]) < 5
-    seeds, result = adaptive.result("random")
-    assert seeds == 40
-    assert result.endswith("%")
-    assert adaptive.report.endswith("60 of 80 trials (75 %), 1 of 2 means known")
+@pytest.mark.parametrize("maximum", [1, 9, 10, 11, 25, 100, 199, 200, 201, 1000, 12_345])
+def test_looks_are_spaced_evenly_up_to_the_maximum(maximum: int) -> None:
+    found = looks(maximum)
+    assert found[-1] == maximum
+    assert len(found) <= MOST_LOOKS
+    steps = np.diff([0, *found])
+    assert np.all(steps > 0)
+    assert len(set(steps[:-1])) <= 1, "only the last one may be shorter"
+    assert steps[-1] <= steps[0]
+    assert all(step % FEWEST_SEEDS == 0 for step in steps[:-1])
 
 
-def test_only_shared_seeds_are_run(adaptive: Adaptive) -> None:
-    """The reference has twenty seeds more, which no comparison needs."""
-    own = [trial_of("random", seed) for seed in range(20)]
-    other = [trial_of("d_optimal", seed) for seed in range(40)]
-    assert adaptive(of=Grid([*own, *other], n_jobs=60, left_out={})) == ExitCode.DONE
-    assert adaptive.result("random")[0] == 20
-    assert adaptive.result("d_optimal") == (20, "reference")
+@pytest.mark.parametrize("shape", ["normal", "skewed", "heavy tails"])
+@pytest.mark.parametrize("spread", [0.1, 0.15])
+def test_at_least_95_percent_of_simulated_studies_are_covered(shape: str, spread: float) -> None:
+    found = coverage(SHAPES[shape], STUDIES, spread)
+    assert found.value >= 0.95 - 3 * np.sqrt(0.05 * 0.95 / STUDIES)
+    assert found.seeds < 65, "it stops before all seeds are used"
+
+
+def test_the_interval_covers_with_losses_as_launches_have_them() -> None:
+    found = [share.value for share in resampled_coverages(100).values()]
+    assert len(found) == 38
+    assert np.mean(found) >= 0.95
+    assert min(found) >= 0.95 - 4 * np.sqrt(0.05 * 0.95 / 100)
+
+
+def test_the_half_width_is_students() -> None:
+    losses = np.exp(np.random.default_rng(0).standard_normal(30))
+    logs = np.log(losses)
+    low, high = stats.t.interval(0.98, 29, np.mean(logs), stats.sem(logs))
+    assert half_width(losses) == pytest.approx((high - low) / 2)
+
+
+def test_a_narrow_interval_needs_values_that_have_a_logarithm() -> None:
+    same = np.full(FEWEST_VALUES, 2.0)
+    assert is_narrow(same, 0.01)
+    for losses in (same[1:], np.append(same, np.inf), np.append(same, 0.0), np.array([])):
+        assert not is_narrow(losses, 0.01)
+
+
+def test_a_wider_interval_stops_no_later() -> None:
+    losses = np.exp(0.2 * np.random.default_rng(1).standard_normal(100))
+    narrow = [is_narrow(losses, relative) for relative in (0.01, 0.05, 0.1, 0.5)]
+    assert narrow == sorted(narrow)
+    assert narrow[0] is False
+    assert narrow[-1] is True
