@@ -85,7 +85,7 @@ def test_every_query_has_the_same_answer_in_duckdb_on_a_bundle(small: str, tmp_p
 
 
 def test_the_page_counts_its_queries() -> None:
-    numbers = {"Eleven": 11, "Twelve": 12, "Thirteen": 13}
+    numbers = {"Nine": 9, "Ten": 10, "Eleven": 11}
     (said,) = re.findall(r"^## (\w+) useful queries$", PAGES[DATABASE], flags=re.MULTILINE)
     assert numbers[said] == len(QUERIES)
 
