@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-
 from benchmarks.launches import RECORD
-from benchmarks.processes import ROOT
 from orchestrate.store import Store
-
-sys.path.append(str(ROOT / "orchestrate"))  # where Hydra finds the sweeper
 
 
 def main() -> None:
     """Register the trials of the command line in its database."""
+    from orchestrate.config.command_line import read_command_line
     from orchestrate.config.grid import build_grid
-    from orchestrate.config.request import read_command_line
 
     request = read_command_line()
     assert request is not None

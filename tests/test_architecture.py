@@ -17,14 +17,14 @@ import pytest
 from dopt.kernel.cache import COMPILED_SOURCES
 from tests.paths import ROOT, without_coverage
 
-PACKAGES = ("dopt", "orchestrate", "analysis", "hydra_plugins")
+PACKAGES = ("dopt", "orchestrate", "analysis")
 EFFECTS = {"hydra", "omegaconf", "ray", "sqlalchemy", "psycopg", "matplotlib"}
 SAVES = {"orchestrate.runner.saving"}
 """Imports from other packages by the saves of an exploration."""
 
 ONLY_IN = {
-    "hydra": ("orchestrate/config/", "hydra_plugins/"),
-    "omegaconf": ("orchestrate/config/", "hydra_plugins/"),
+    "hydra": ("orchestrate/config/",),
+    "omegaconf": ("orchestrate/config/",),
     "ray": ("orchestrate/executors/ray/",),
     "sqlalchemy": ("orchestrate/store/",),
     "psycopg": ("orchestrate/store/",),

@@ -65,7 +65,7 @@ def test_every_function_of_the_map_from_the_paper_exists() -> None:
 
 
 def test_every_module_at_the_top_of_dopt_has_a_line() -> None:
-    tree = PAGES[STRUCTURE].split("hydra_plugins/")[0]
+    tree = PAGES[STRUCTURE].split("\norchestrate/")[0]
     modules = {path.name for path in (ROOT / "dopt").glob("*.py")} - {"__init__.py"}
     assert set(re.findall(r"^  (\w+\.py) ", tree, flags=re.MULTILINE)) == modules
 

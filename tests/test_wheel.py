@@ -15,7 +15,7 @@ import pytest
 
 from tests.paths import ROOT
 
-SOURCES = ("dopt", "hydra_plugins", "orchestrate", "analysis", "conf")
+SOURCES = ("dopt", "orchestrate", "analysis", "conf")
 FILES = ("pyproject.toml", "README.md", "LICENSE")
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
@@ -71,7 +71,7 @@ def test_every_source_and_every_setting_is_in_it(wheel: Path) -> None:
     settings = {f"orchestrate/{path.relative_to(ROOT)}" for path in (ROOT / "conf").rglob("*.yaml")}
     sources = {
         str(path.relative_to(ROOT))
-        for package in ("dopt", "hydra_plugins", "orchestrate", "analysis")
+        for package in ("dopt", "orchestrate", "analysis")
         for path in (ROOT / package).rglob("*")
         if path.suffix in (".py", ".sh", ".env")
     }
@@ -81,9 +81,7 @@ def test_every_source_and_every_setting_is_in_it(wheel: Path) -> None:
     assert not {name.split("/")[0] for name in names} & {"tests", "benchmarks", "conf", "docker"}
 
 
-def test_an_installed_launch_finds_its_settings_and_its_sweeper(
-    programs: Path, tmp_path: Path
-) -> None:
+def test_an_installed_launch_finds_its_settings(programs: Path, tmp_path: Path) -> None:
     grid = ("-m", "experiment=paper", "launch.dry_run=true")
     for launch in ((programs / "dopt-launch",), (programs / "python", "-m", "orchestrate.launch")):
         done = run(*launch, *grid, folder=tmp_path)

@@ -8,12 +8,10 @@ import sys
 from dopt.kernel import warm_up
 from dopt.run import run_trial
 from orchestrate.cli_parser import UsageError
-from orchestrate.config.argv import normalize
-from orchestrate.config.error_messages import format_error
+from orchestrate.config.command_line import Request, read_command_line
 from orchestrate.config.grid import Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.config.request import CONFIGURATION, Request, read_command_line
-from orchestrate.config.unknown_keys import check_launch
+from orchestrate.config.messages import check_launch, format_error
 from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.registry import executor_factory, make_job
 from orchestrate.program import ROOT, answered, say
@@ -38,7 +36,6 @@ def main() -> int:
     if not os.environ.get(URL_VARIABLE):
         os.environ.pop(URL_VARIABLE, None)  # oc.env of the configuration takes "" as a URL
     try:
-        sys.argv[1:] = normalize(sys.argv[1:], CONFIGURATION)
         request = read_command_line()
         if request is None:
             return ExitCode.DONE
@@ -54,7 +51,7 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
     """Return the checked grid and settings of a launch, or raise ``DoptError``."""
     grid = build_grid(request.combinations, single=request.single)
     settings = LaunchSettings.from_mapping(request.launch)
-    check_launch(request.launch, CONFIGURATION)
+    check_launch(request.launch)
     from dopt.kernel import cache  # refuses a path of the cache that cannot be meant
 
     path = executor_factory(settings).path

@@ -19,11 +19,9 @@ from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord, Reader
 from tests.hydra_files import parse_once
 from tests.orchestrate.standins import quick, specification
-from tests.paths import ROOT
 
 RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
 
-sys.path.append(str(ROOT / "orchestrate"))  # where a launch finds the plugin of Hydra
 parse_once()
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hydra
 import pytest
 from hydra import initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -22,8 +23,8 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 
 from dopt.errors import SpecificationError
-from orchestrate.config import fast_compose
-from orchestrate.config.expand import expand
+from orchestrate.config import expand as expansion
+from orchestrate.config.grid import Combination
 
 SAMPLE = Path(__file__).parent / "sample"
 SECTIONS = (
@@ -65,6 +66,11 @@ def sample() -> Iterator[Sample]:
         yield Sample(loader, loader.load_configuration("config", [], RunMode.MULTIRUN))
 
 
+def expand(sample: Sample, *grids: Sequence[str], sections: Sequence[str]) -> list[Combination]:
+    master = sample.master.hydra
+    return expansion.expand(master, *grids, sections=sections, check=lambda _: None)
+
+
 @st.composite
 def command_lines(draw: st.DrawFn) -> list[str]:
     """Draw overrides of up to three keys, in any order, with at most 30 jobs or so."""
@@ -89,7 +95,7 @@ def plain(config: Any, key: Any) -> object:
 
 def by_us(sample: Sample, arguments: Sequence[str]) -> Counter[str]:
     jobs: Counter[str] = Counter()
-    for combination in expand(sample.loader, sample.master, arguments, sections=SECTIONS):
+    for combination in expand(sample, arguments, sections=SECTIONS):
         inner = combination.seeds or [combination.settings["seed"]]
         jobs.update(frozen({**combination.settings, "seed": seed}) for seed in inner)
     return jobs
@@ -136,43 +142,39 @@ def test_options_are_exchanged_where_nothing_else_depends_on_them(
     assert by_us(sample, arguments) == by_hydra(sample, arguments)
 
 
-def calls(monkeypatch: pytest.MonkeyPatch, method: str) -> list[Sequence[object]]:
-    """Return a list to which each call of a method of the composer adds what it composes."""
-    composed: list[Sequence[object]] = []
-    compose = getattr(fast_compose.Composer, method)
+@pytest.fixture
+def composed(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """Return a list to which each composition by Hydra adds its overrides."""
+    words: list[list[str]] = []
+    compose = hydra.compose
 
-    def counted(self: Any, files: Any, choices: Sequence[object]) -> Any:
-        composed.append(choices)
-        return compose(self, files, choices)
+    def counted(name: str, overrides: list[str]) -> DictConfig:
+        words.append(overrides)
+        return compose(name, overrides)
 
-    monkeypatch.setattr(fast_compose.Composer, method, counted)
-    return composed
+    monkeypatch.setattr(hydra, "compose", counted)
+    return words
 
 
-def test_each_choice_of_groups_is_composed_once(
-    sample: Sample, monkeypatch: pytest.MonkeyPatch
+def test_a_grid_of_plain_options_is_composed_once(
+    sample: Sample, composed: list[list[str]]
 ) -> None:
-    composed = calls(monkeypatch, "_quick")
-    monkeypatch.setattr(fast_compose.Composer, "like_hydra", None)
     jobs = by_us(sample, ["env=glob(*)", "model=mlp,linear", "scale=range(50)", "seed=range(9)"])
-    assert len(composed) == 4
+    assert len(composed) == 1
     assert sum(jobs.values()) == 4 * 50 * 9
 
 
 def test_an_option_is_exchanged_although_another_is_not_alone_in_its_section(
-    sample: Sample, monkeypatch: pytest.MonkeyPatch
+    sample: Sample, composed: list[list[str]]
 ) -> None:
-    composed = calls(monkeypatch, "_compose")
     arguments = ["policy=cramped", "env=first,second", "model=mlp,linear"]
     assert by_us(sample, arguments) == by_hydra(sample, arguments)
     assert len(composed) == 3  # one to find this out, and one for each env
 
 
 def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> None:
-    apart = expand(sample.loader, sample.master, ["seed=range(4)"], sections=SECTIONS)
-    together = expand(
-        sample.loader, sample.master, ["seed=range(4)", "model=linear"], sections=("policy", "seed")
-    )
+    apart = expand(sample, ["seed=range(4)"], sections=SECTIONS)
+    together = expand(sample, ["seed=range(4)", "model=linear"], sections=("policy", "seed"))
     assert [one.seeds for one in apart] == [None] * 4
     assert [one.seeds for one in together] == [(0, 1, 2, 3)]
 
@@ -190,7 +192,7 @@ def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> No
 )
 def test_sweeps_without_values_are_errors(sample: Sample, override: str, words: str) -> None:
     with pytest.raises((SpecificationError, HydraException), match=words):
-        expand(sample.loader, sample.master, [override])
+        expand(sample, [override], sections=SECTIONS)
 
 
 MIXED: list[tuple[list[str], list[list[str]]]] = [
@@ -222,7 +224,7 @@ def test_a_key_that_some_choices_lack_holds_for_the_others(
         by_hydra(sample, arguments)
     expected: Counter[str] = sum((by_hydra(sample, part) for part in parts), Counter())
     assert by_us(sample, arguments) == expected
-    combinations = expand(sample.loader, sample.master, arguments, sections=SECTIONS)
+    combinations = expand(sample, arguments, sections=SECTIONS)
     assert {one.unused for one in combinations} >= {()}
     assert len({one.unused for one in combinations}) == 2
 
@@ -249,15 +251,15 @@ def test_a_key_that_every_choice_lacks_is_answered_with_the_names_of_all(
     with pytest.raises(HydraException):
         by_hydra(sample, ["model=linear,mlp", override])
     with pytest.raises(SpecificationError, match=sentence):
-        expand(sample.loader, sample.master, ["model=linear,mlp", override])
+        expand(sample, ["model=linear,mlp", override], sections=SECTIONS)
 
 
 def test_a_key_has_to_be_known_to_one_of_several_grids(sample: Sample) -> None:
     grids = [["model=linear", "model.order=3"], ["model=mlp", "model.order=3"]]
-    together = expand(sample.loader, sample.master, *grids, sections=SECTIONS)
+    together = expand(sample, *grids, sections=SECTIONS)
     assert [(one.used, one.unused) for one in together] == [
         (("model.order",), ()),
         ((), ("model.order",)),
     ]
     with pytest.raises(SpecificationError, match="did you mean 'order'"):
-        expand(sample.loader, sample.master, *grids, ["model=linear", "model.oder=3"])
+        expand(sample, *grids, ["model=linear", "model.oder=3"], sections=SECTIONS)

@@ -14,7 +14,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Glob
 
 from dopt.errors import SpecificationError
-from orchestrate.config.sweep_axes import read_axes
+from orchestrate.config.sweeps import read_axes
 
 NAMES = ("plain", "random", "far/exact", "far/random", "far/trace", "near/plain")
 

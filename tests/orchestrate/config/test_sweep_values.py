@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 
 from orchestrate.config.expand import expand
-from orchestrate.config.sweep_axes import parsed_overrides, read_axes
+from orchestrate.config.sweeps import parsed_overrides, read_axes
 from tests.orchestrate.config.test_expand import SAMPLE, SECTIONS
 
 
@@ -29,8 +29,8 @@ def loader() -> Iterator[ConfigLoader]:
 
 
 @pytest.fixture(scope="module")
-def master(loader: ConfigLoader) -> DictConfig:
-    return loader.load_configuration("config", [], RunMode.MULTIRUN)
+def hydra_settings(loader: ConfigLoader) -> DictConfig:
+    return loader.load_configuration("config", [], RunMode.RUN).hydra
 
 
 def swept(loader: ConfigLoader, word: str) -> list[object]:
@@ -160,11 +160,11 @@ def test_what_has_no_such_values_is_refused(loader: ConfigLoader, word: str, wor
     ],
 )
 def test_repeated_overrides_hold_as_in_a_single_trial(
-    loader: ConfigLoader, master: DictConfig, words: list[str]
+    loader: ConfigLoader, hydra_settings: DictConfig, words: list[str]
 ) -> None:
     single = loader.load_configuration("config", words, RunMode.RUN)
     expected = {key: single[key] for key in SECTIONS if key in single}
-    (one,) = expand(loader, master, words, sections=SECTIONS)
+    (one,) = expand(hydra_settings, words, sections=SECTIONS, check=lambda _: None)
     plain: dict[Any, Any] = {
         key: OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
         for key, part in expected.items()
@@ -172,9 +172,9 @@ def test_repeated_overrides_hold_as_in_a_single_trial(
     assert one.settings == plain
 
 
-def test_repeated_mappings_are_swept_together(loader: ConfigLoader, master: DictConfig) -> None:
+def test_repeated_mappings_are_swept_together(hydra_settings: DictConfig) -> None:
     words = ["++new={a:1},{a:2}", "++new={b:3},{b:4}"]
-    found = expand(loader, master, words, sections=SECTIONS)
+    found = expand(hydra_settings, words, sections=SECTIONS, check=lambda _: None)
     assert [one.settings["new"] for one in found] == [
         {"a": a, "b": b} for a in (1, 2) for b in (3, 4)
     ]

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from fractions import Fraction
+from functools import partial
 from typing import Any, Literal
 
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.grammar import grammar_functions
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import (
     ChoiceSweep,
@@ -30,7 +31,6 @@ from hydra.core.override_parser.types import (
 from hydra.errors import ConfigCompositionException
 
 from dopt.errors import SpecificationError, suggestion, unknown_name
-from orchestrate.config.globs import every_option, matches
 
 NOT_SWEPT = ("launch", "store", "executor", "experiment", "hydra")
 """Groups and sections of the whole launch, which cannot be swept."""
@@ -111,7 +111,9 @@ def parsed_overrides(
         If one does not follow it, shuffles a list, or has a sweep within a list or a mapping.
     """
     parser = OverridesParser.create(config_loader=loader)
-    parser.functions.functions |= {"sort": _sorted, "shuffle": _unshuffled}
+    named = parser.functions.functions
+    named["sort"] = partial(_sorted, named["sort"])
+    named["shuffle"] = partial(_unshuffled, named["shuffle"])
     parsed = parser.parse_overrides(list(arguments))
     for one in parsed:
         if not isinstance(one._value, Sweep) and _holds_sweep(one._value):
@@ -122,17 +124,23 @@ def parsed_overrides(
     return parsed
 
 
-def _sorted(*args: Any, sweep: Any = None, reverse: bool = False, **named: Any) -> Any:
-    """Sort as Hydra does, but the values of a range, which Hydra makes another range."""
+def _sorted(
+    sort: Callable[..., Any],
+    *args: Any,
+    sweep: Any = None,
+    reverse: bool = False,
+    **named: Any,
+) -> Any:
+    """Sort as Hydra's ``sort``, except for a range, which Hydra turns into another range."""
     ranges = [one for one in (*args, sweep) if isinstance(one, RangeSweep)]
     if ranges:
         return ChoiceSweep(list=[*sorted(_range_values(ranges[0]), reverse=reverse)])
-    return grammar_functions.sort(*args, sweep=sweep, reverse=reverse, **named)
+    return sort(*args, sweep=sweep, reverse=reverse, **named)
 
 
-def _unshuffled(*args: Any, **named: Any) -> Any:
-    """Leave a sweep in its order, of which no result depends, and refuse to shuffle a value."""
-    shuffled = grammar_functions.shuffle(*args, **named)
+def _unshuffled(shuffle: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    """Keep the order of a sweep, on which no result depends; refuse to shuffle a list."""
+    shuffled = shuffle(*args, **named)
     if not isinstance(shuffled, Sweep):
         raise ValueError("a shuffled list is another value each time: write it in its order")
     shuffled.shuffle = False
@@ -185,7 +193,7 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         texts, values = (override.get_value_element_as_str(),), (value,)
     elif isinstance(value, Glob):
         _check_key(override)
-        texts = values = matches(loader, override.key_or_group, value)
+        texts = values = _matches(loader, override.key_or_group, value)
         if not texts:
             raise _no_match(loader, override, value)
     else:
@@ -193,19 +201,13 @@ def _axis(loader: ConfigLoader, override: Override) -> Axis:
         found = _swept_values(override)
         texts = tuple(map(_text, found))
         values = tuple(map(_unquoted, found))
-    options = _options(loader, override.key_or_group)
+    options = loader.get_group_options(override.key_or_group, results_filter=None)
     if options and not any(isinstance(value, dict) for value in values):
         if None in values:
             raise unknown_name(override.key_or_group, "null", options)
         return Axis(key, texts, values, "choice")
     scalar = override.type == OverrideType.CHANGE and override.package is None
     return Axis(key, texts, values, "scalar" if scalar and all(map(_plain, values)) else "edit")
-
-
-def _options(loader: ConfigLoader, group: str) -> list[str]:
-    """Return the options of a group; the loader itself copies all of its sources to find them."""
-    source = loader.repository if isinstance(loader, ConfigLoaderImpl) else loader
-    return source.get_group_options(group, results_filter=None)
 
 
 def _check_key(override: Override) -> None:
@@ -231,7 +233,7 @@ def _swept_values(override: Override) -> list[Any]:
 
 def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception:
     key = override.key_or_group
-    if options := every_option(loader, key):
+    if options := _every_option(loader, key):
         pattern = ",".join(glob.include)
         hint = suggestion(pattern, sorted(options))
         return SpecificationError(f"no name of {key} matches the pattern '{pattern}': {hint}")
@@ -240,6 +242,41 @@ def _no_match(loader: ConfigLoader, override: Override, glob: Glob) -> Exception
         f"'{override.input_line}' is a glob, but '{key}' is not a group: groups are "
         f"{', '.join(names)}."
     )
+
+
+def _matches(loader: ConfigLoader, group: str, glob: Glob) -> tuple[str, ...]:
+    """Return the options that a glob matches, folder by folder in the order of its patterns.
+
+    As in Hydra, a pattern without a folder matches options of the group itself, not those in its
+    folders; ``beyond/*`` matches those in the folder ``beyond``.
+    """
+    folders = dict.fromkeys(_folder(pattern) for pattern in glob.include)
+    names = [name for folder in folders for name in _options(loader, group, folder)]
+    return tuple(
+        name for name in names if _any(name, glob.include) and not _any(name, glob.exclude)
+    )
+
+
+def _every_option(loader: ConfigLoader, group: str) -> list[str]:
+    """Return the options of a group and of its folders."""
+    folders = loader.get_group_options(group, results_filter=ObjectType.GROUP)
+    return [name for folder in ("", *folders) for name in _options(loader, group, folder)]
+
+
+def _options(loader: ConfigLoader, group: str, folder: str) -> list[str]:
+    path = f"{group}/{folder}" if folder else group
+    found = loader.get_group_options(path, results_filter=ObjectType.CONFIG)
+    return [f"{folder}/{option}" if folder else option for option in found]
+
+
+def _any(name: str, patterns: list[str]) -> bool:
+    return any(
+        _folder(name) == _folder(pattern) and fnmatchcase(name, pattern) for pattern in patterns
+    )
+
+
+def _folder(name: str) -> str:
+    return name.rpartition("/")[0]
 
 
 def _text(value: Any) -> str:

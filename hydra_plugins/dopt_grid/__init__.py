@@ -1,1 +1,0 @@
-"""Hydra plugin with a sweeper that composes each choice of groups once."""

@@ -1,0 +1,279 @@
+"""Command line of a launch: checked, composed by Hydra, and returned in plain types.
+
+Hydra composes the configuration of the launch, with the overrides that have one value. A grid is
+expanded from it (:mod:`orchestrate.config.expand`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from dopt.errors import SpecificationError
+from orchestrate.cli_parser import Parser, UsageError, as_started
+from orchestrate.config.expand import expand, reject_unknown
+from orchestrate.config.grid import TRIAL_SECTIONS, Combination
+from orchestrate.config.options import CONFIGURATION, option_names, register
+from orchestrate.config.sweeps import parsed_overrides
+from orchestrate.removed_words import check_removed
+
+PROGRAM = "python orchestrate/launch.py"
+LAUNCH_SECTIONS = ("launch", "store", "executor")
+
+_SWITCHES = (
+    ("--help", "-h"),
+    ("--hydra-help",),
+    ("--version",),
+    ("--resolve",),
+    ("--run", "-r"),
+    ("--multirun", "-m"),
+    ("--shell-completion", "-sc"),
+)
+_OPTIONS = (
+    ("--package", "-p"),
+    ("--config-path", "-cp"),
+    ("--config-name", "-cn"),
+    ("--config-dir", "-cd"),
+    ("--experimental-rerun",),
+)
+_INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+
+_PATHS = ("store.url", "store.folder", "executor.logs")
+_UNQUOTED = re.compile(r"[^'\"]*[~\s][^'\"]*")
+"""Path with a character that Hydra takes in quotes alone."""
+
+_CHOICE = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>null|\[.*\]|)\s*")
+_OF_TRIALS = re.compile(rf"[+~]*(?:{'|'.join(TRIAL_SECTIONS)})\.")
+"""Override of a key that may exist only in some options of a grid."""
+
+_OF_HYDRA = re.compile(r"[+~]*hydra[./]")
+_OWN_GRIDS = re.compile(r"[+~]*(hydra/sweeper|hydra\.mode)=")
+
+
+@dataclass(frozen=True)
+class Request:
+    """Combinations and launch settings of a command line, in plain types."""
+
+    combinations: Sequence[Combination]
+    launch: dict[str, Any]
+    overrides: tuple[str, ...]
+    single: bool
+
+
+def read_command_line() -> Request | None:
+    """Return the request of ``sys.argv``, or None if Hydra has printed its answer (``--help``).
+
+    ``sys.argv`` then has the flags before the overrides, and the quotes that Hydra requires.
+
+    Raises
+    ------
+    UsageError
+        If a flag is unknown, or flags contradict each other.
+    RemovedWordError
+        If a setting was removed.
+    Exception
+        Errors of Hydra and of the grid.
+    """
+    flags = _checked(_parser().read(sys.argv[1:], mixed=True))
+    options = [word for word in sys.argv[1:] if word not in flags.overrides]
+    words = [_quoted(word) for word in flags.overrides]
+    sys.argv[1:] = [*options, *words]
+    grid = flags.multirun and not (flags.help or flags.hydra_help)
+    if grid:
+        options = [word for word in options if word not in ("-m", "--multirun")]
+    given = tuple(word for word in words if not _OF_HYDRA.match(word))
+    found: list[Request | Exception] = []
+
+    @hydra.main(config_path=str(CONFIGURATION), config_name="config", version_base="1.3")
+    def capture(config: DictConfig) -> None:
+        try:
+            found.append(_grid(config, given) if grid else _single(config, given))
+        except Exception as error:  # Hydra would add a line of its own
+            found.append(error)
+
+    register()
+    answer = io.StringIO()
+    with _arguments([*options, *(_of_launch(words) if grid else words)]), _errors_let_through():
+        try:
+            with contextlib.redirect_stdout(answer):
+                capture()
+        finally:
+            if text := answer.getvalue():
+                sys.stdout.write(as_started(text))
+    request = found[0] if found else None
+    if isinstance(request, Exception):
+        raise request
+    return request
+
+
+def _parser() -> Parser:
+    """Return a parser for the flags of Hydra."""
+    parser = Parser(prog=PROGRAM, add_help=False)
+    parser.add_argument("overrides", nargs="*")
+    for names in _SWITCHES:
+        parser.add_argument(*names, action="store_true")
+    for names in _OPTIONS:
+        parser.add_argument(*names)
+    parser.add_argument("--cfg", "-c", choices=("job", "hydra", "all"))
+    parser.add_argument("--info", "-i", nargs="?", const="all", choices=_INFO)
+    return parser
+
+
+def _checked(flags: argparse.Namespace) -> argparse.Namespace:
+    if flags.multirun and flags.cfg:
+        raise UsageError(
+            "-m and --cfg cannot be combined, a configuration is that of one trial: look at a grid "
+            "with launch.dry_run=true, or leave out -m."
+        )
+    given = {
+        "--run": flags.run,
+        "--multirun": flags.multirun,
+        "--cfg": flags.cfg,
+        "--shell-completion": flags.shell_completion,
+        "--info": flags.info,
+    }
+    several = [name for name, value in given.items() if value]
+    if len(several) > 1:
+        raise UsageError(f"{' and '.join(several)} cannot be combined: leave one out.")
+    if flags.resolve and not (flags.cfg or flags.help):
+        raise UsageError("--resolve goes with --cfg or --help: add one of them.")
+    for word in flags.overrides:
+        check_removed(word)
+        own = _OWN_GRIDS.match(word)
+        if own and word != "hydra/sweeper=grid":
+            raise UsageError(
+                f"{own[1]} is set, but this program expands its grids itself: leave {own[1]} out."
+            )
+        _check_choice(word)
+    return flags
+
+
+def _check_choice(word: str) -> None:
+    """Refuse null, a list or an empty value as the option of a group, which Hydra cannot handle."""
+    match = _CHOICE.fullmatch(word)
+    if not match or match["group"] == "experiment":
+        return
+    group, value = match["group"], match["value"]
+    if options := ", ".join(option_names(group)):
+        what = f"the list {value}" if value.startswith("[") else value or "empty"
+        raise SpecificationError(
+            f"{group} is {what}, but one of {options} is expected: give one, or several to a grid "
+            f"as in -m {group}=a,b."
+        )
+
+
+def _quoted(word: str) -> str:
+    """Return ``launch.until=ci<5%`` or a path with the quotes that Hydra requires around them."""
+    key, _, value = word.partition("=")
+    rule = key.lstrip("+") == "launch.until" and value.startswith("ci")
+    if rule or (key.lstrip("+") in _PATHS and _UNQUOTED.fullmatch(value)):
+        return f"{key}='{value}'"
+    return word
+
+
+def _of_launch(words: Sequence[str]) -> list[str]:
+    """Return the overrides of a grid that Hydra composes first.
+
+    Sweeps are left out, and so are keys that only some swept options have, such as
+    ``policy.budget_us=20`` with ``policy=beyond/exact,random``.
+    """
+    parsed = parsed_overrides(words)
+    return [
+        word
+        for word, one in zip(words, parsed, strict=True)
+        if not one.is_sweep_override() and not _OF_TRIALS.match(word)
+    ]
+
+
+@contextlib.contextmanager
+def _arguments(words: Sequence[str]) -> Iterator[None]:
+    before = list(sys.argv)
+    sys.argv[1:] = words
+    try:
+        yield
+    finally:
+        sys.argv[:] = before
+
+
+@contextlib.contextmanager
+def _errors_let_through() -> Iterator[None]:
+    """Make Hydra raise its errors instead of printing them; workers do not inherit the setting."""
+    before = os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = before
+
+
+def _grid(config: DictConfig, overrides: tuple[str, ...]) -> Request:
+    settings = HydraConfig.get()
+    params = dict(settings.sweeper.params)
+    grids = [{**params, **grid} for grid in settings.sweeper.grids] or [params]
+    words = [[*(_override(*item) for item in one.items()), *overrides] for one in grids]
+    combinations = expand(settings, *words)  # type: ignore[arg-type]  # a DictConfig of this type
+    for one in parsed_overrides(overrides):  # a setting of the launch may refer to one of a trial
+        if _OF_TRIALS.match(str(one.input_line)) and not one.is_sweep_override():
+            with contextlib.suppress(OmegaConfBaseException):
+                OmegaConf.update(config, one.key_or_group, one.value())
+    return Request(combinations, _plain(config, LAUNCH_SECTIONS), overrides, single=False)
+
+
+def _single(config: DictConfig, overrides: tuple[str, ...]) -> Request:
+    _require_multirun(overrides, HydraConfig.get())
+    parsed_overrides(overrides)
+    reject_unknown(config)
+    combination = Combination(_plain(config, TRIAL_SECTIONS))
+    return Request([combination], _plain(config, LAUNCH_SECTIONS), overrides, single=True)
+
+
+def _require_multirun(overrides: Sequence[str], settings: Any) -> None:
+    """Refuse an experiment whose sweeps would be ignored without ``-m``."""
+    named = {word.lstrip("+").partition("=")[0] for word in overrides}
+    usual = OmegaConf.load(CONFIGURATION / "config.yaml").hydra.sweeper.params
+    sweeps = dict(settings.sweeper.params)
+    for grid in settings.sweeper.grids:
+        sweeps |= grid
+    left = [
+        f"{key}={value}"
+        for key, value in sweeps.items()
+        if key not in named and usual.get(key) != value
+    ]
+    if left:
+        raise UsageError(
+            f"experiment={settings.runtime.choices.get('experiment')} is a grid "
+            f"({' '.join(left)}): add -m, or give each of these keys one value for a single trial."
+        )
+
+
+def _override(key: str, value: Any) -> str:
+    """Return the override as typed: text such as ``range(0,5)`` unchanged, the rest as JSON."""
+    if isinstance(value, str):
+        return f"{key}={value}"
+    plain = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+    return f"{key}={json.dumps(plain)}"
+
+
+def _plain(config: DictConfig, sections: Sequence[str]) -> dict[str, Any]:
+    """Return the sections, resolved and in plain types."""
+    parts: Mapping[str, Any] = {key: config[key] for key in sections}
+    return {
+        key: OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
+        for key, part in parts.items()
+    }
