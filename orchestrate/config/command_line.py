@@ -23,12 +23,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dopt.errors import SpecificationError
-from orchestrate.cli_parser import Parser, UsageError, as_started
+from orchestrate.cli_parser import Parser, UsageError, as_started, check_removed
 from orchestrate.config.expand import expand, reject_unknown
 from orchestrate.config.grid import TRIAL_SECTIONS, Combination
 from orchestrate.config.options import CONFIGURATION, option_names, register
 from orchestrate.config.sweeps import parsed_overrides
-from orchestrate.removed_words import check_removed
 
 PROGRAM = "python orchestrate/launch.py"
 LAUNCH_SECTIONS = ("launch", "store", "executor")
@@ -81,9 +80,7 @@ def read_command_line() -> Request | None:
     Raises
     ------
     UsageError
-        If a flag is unknown, or flags contradict each other.
-    RemovedWordError
-        If a setting was removed.
+        If a flag is unknown, flags contradict each other, or a setting was removed.
     Exception
         Errors of Hydra and of the grid.
     """
@@ -152,6 +149,7 @@ def _checked(flags: argparse.Namespace) -> argparse.Namespace:
         raise UsageError("--resolve goes with --cfg or --help: add one of them.")
     for word in flags.overrides:
         check_removed(word)
+        check_removed(word.partition("=")[0])
         own = _OWN_GRIDS.match(word)
         if own and word != "hydra/sweeper=grid":
             raise UsageError(

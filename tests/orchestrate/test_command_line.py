@@ -18,8 +18,8 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.runner import run_grid
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import Reader
-from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.standins import quick, raising, unusable
+from tests.paths import ROOT
 
 Command = Callable[..., tuple[int, str, str]]
 

@@ -19,8 +19,8 @@ from orchestrate.commands import COMMANDS
 from orchestrate.store import Reader, StoreError
 from orchestrate.store.backends.sqlite_engine import existing_path
 from orchestrate.store.database_url import parse
-from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.test_command_line import SHORT, Command
+from tests.paths import ROOT
 
 TRIAL = ("env=pendulum", "policy=random", *SHORT)
 

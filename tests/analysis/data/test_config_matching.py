@@ -10,7 +10,7 @@ from analysis.data.config_matching import USUAL, Candidate, Filter, choose, diff
 from analysis.errors import AnalysisError
 from orchestrate.store import ConfigRow
 from tests.analysis.synthetic import make_spec
-from tests.orchestrate.conftest import ROOT
+from tests.paths import ROOT
 
 
 def config(system: str, name: str, **sections: Mapping[str, object]) -> ConfigRow:

@@ -25,7 +25,7 @@ from orchestrate.executors.local import LocalExecutor
 from orchestrate.executors.task import run_task
 from orchestrate.records import Failure
 from tests.dopt.trials import trial
-from tests.orchestrate.conftest import ROOT, Launches
+from tests.orchestrate.conftest import Launches
 from tests.orchestrate.executors.names import ALL, WITH_PROCESSES
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.faults.laboratory import alive
@@ -39,6 +39,7 @@ from tests.orchestrate.unruly import (
     hanging,
     wants_a_gigabyte,
 )
+from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS, until
 
 SEEDS = 6

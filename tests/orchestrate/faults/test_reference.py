@@ -15,9 +15,9 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.runner import launch
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import NoDatabaseError, Reader, StoreError
-from tests.orchestrate.conftest import ROOT
 from tests.orchestrate.faults.gate import Gate, Gated
 from tests.orchestrate.faults.outcome import Rows, flaws, results
+from tests.paths import ROOT
 from tests.waiting import until
 
 pytestmark = pytest.mark.xdist_group("reference launches")  # one undisturbed database
