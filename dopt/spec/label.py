@@ -89,7 +89,8 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
         differing = _differing([flats[place] for place in places])
         named = {place: _named(flats[place], usual[place], differing) for place in places}
         for place in places:
-            found[place] = _label(flats[place], named[place], titled or not differing)
+            bare = named[place] <= set(_ALWAYS)
+            found[place] = _label(flats[place], named[place], titled or bare)
         for text in {found[place] for place in places}:
             alike = [place for place in places if found[place] == text]
             others = _differing([flats[place] for place in alike])

@@ -52,7 +52,7 @@ def measured(url: str) -> Panels:
 def test_rows_are_bounded_states_of_configurations_that_differ_in_enforced(railed: str) -> None:
     rows = rows_of(measured(railed))
     assert [(row[0].env, row[0].label, row[0].state) for row in rows] == [
-        ("cartpole", "adam_window, limits", "y [m]"),
+        ("cartpole", "D-optimal, limits", "y [m]"),
         ("cartpole", "gauss_newton, limits", "y [m]"),
         ("arm", "D-optimal, limits", "φ₁ [rad]"),
         ("arm", "D-optimal, limits", "φ₂ [rad]"),
@@ -106,7 +106,7 @@ def test_the_figure_has_a_panel_for_each_and_dashed_bounds(railed: str) -> None:
     assert len(axes) == 4 * 2
     assert [len(one.lines) for one in axes] == [22, 22, 5, 5, 0, 3, 0, 4]
     assert axes[0].get_ylim() == axes[1].get_ylim()
-    assert axes[0].get_title().startswith("cartpole: adam_window, limits\ncounted only: ")
+    assert axes[0].get_title().startswith("cartpole: D-optimal, limits\ncounted only: ")
     words = caption(panels)
     assert "cartpole, adam_window, limits: 0-19" in words
     assert words.count("arm, D-optimal, limits: 0-1") == 1

@@ -74,7 +74,7 @@ def test_a_stored_label_says_what_is_not_the_default(one: Config, label: str) ->
         ([PLAIN, ENFORCED], ["D-optimal", "limits, φ=[-2, 2]"]),
         ([ENFORCED], ["D-optimal, limits"]),
         ([COUNTED], ["D-optimal, limits, enforced=False"]),
-        ([ENFORCED, COUNTED], ["limits", "limits, enforced=False"]),
+        ([ENFORCED, COUNTED], ["D-optimal, limits", "D-optimal, limits, enforced=False"]),
         ([], []),
     ],
 )
