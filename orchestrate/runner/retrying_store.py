@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 from orchestrate.records import Failure, RunRecord
 from orchestrate.runner.signals import undisturbed
-from orchestrate.store import (
-    Claim,
-    OpenConfig,
-    OpenTrial,
-    Registrable,
-    Registration,
-    Result,
-    Store,
-    StoreUnavailableError,
-)
+from orchestrate.store import Claim, Result, Store, StoreUnavailableError
 
 FIRST_PAUSE_SECONDS = 0.1
 MAX_PAUSE_SECONDS = 3.0
 """Pauses between two tries; each is twice the one before, up to the maximum."""
+
+IDEMPOTENT = {
+    "recover": False,
+    "retry": False,
+    "final_losses": False,
+    "register": True,
+    "open_configs": True,
+    "others": True,
+    "open_trials": True,
+    "suspects": True,
+    "release": True,
+    "end_launch": True,
+}
+"""Operations of :class:`Store` that may be executed twice, and whether they take the launch."""
 
 T = TypeVar("T")
 Say = Callable[[str], None]
@@ -30,8 +36,9 @@ Say = Callable[[str], None]
 class RetryingStore:
     """Operations of one launch, each retried for ``seconds`` after its first failure.
 
-    A failed operation may have been executed, with only its answer lost. Each one is therefore
-    repeated in a form that is harmless if it was.
+    A failed operation may have been executed, with only its answer lost. The operations of
+    :data:`IDEMPOTENT` are repeated as they are, without the number of the launch as argument;
+    ``claim``, ``commit`` and ``fail`` are repeated in a form that is harmless after that.
 
     Raises
     ------
@@ -42,6 +49,8 @@ class RetryingStore:
     ----------
     alike : bool
         Whether only trials are claimed that code with the fingerprint of this launch registered.
+    safe_url : str
+        The URL without a password.
     """
 
     alike = False
@@ -51,11 +60,14 @@ class RetryingStore:
         self._launch = launch
         self._seconds = seconds
         self._say = say
+        self.safe_url = store.safe_url
 
-    @property
-    def safe_url(self) -> str:
-        """The URL without a password."""
-        return self._store.safe_url
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name not in IDEMPOTENT:
+            raise AttributeError(name)
+        launch = (self._launch,) if IDEMPOTENT[name] else ()
+        operation = partial(getattr(self._store, name), *launch)
+        return lambda *words: self._persist(lambda: operation(*words))
 
     def hurry(self) -> None:
         """Wait no longer for a database that does not answer; a signal handler may call it."""
@@ -64,39 +76,6 @@ class RetryingStore:
     def check(self) -> None:
         """Raise ``DatabaseMovedError`` if the file was removed, renamed or replaced."""
         self._store.check()
-
-    def recover(self) -> None:
-        """Put the trials of dead launches back to pending."""
-        self._persist(self._store.recover)
-
-    def retry(self, status: str, trial_keys: Sequence[str]) -> None:
-        """Put the trials with the status back to pending."""
-        self._persist(lambda: self._store.retry(status, trial_keys))
-
-    def register(self, specs: Sequence[Registrable]) -> Registration:
-        """Register a grid and return the state of its trials."""
-        return self._persist(lambda: self._store.register(self._launch, specs))
-
-    def final_losses(self, trial_keys: Sequence[str]) -> dict[str, float]:
-        """Return the final loss of those of the trials that are done and did not diverge."""
-        return self._persist(lambda: self._store.final_losses(trial_keys))
-
-    def open_configs(self) -> list[OpenConfig]:
-        """Return the configurations that have trials without an outcome for this code."""
-        return self._persist(lambda: self._store.open_configs(self._launch))
-
-    def others(self) -> list[tuple[dict[str, str] | None, int]]:
-        """Return the fingerprints of other code that registered open trials, and their counts."""
-        return self._persist(lambda: self._store.others(self._launch))
-
-    def open_trials(self, config_id: int, size: int, losses: int) -> list[OpenTrial]:
-        """Return some pending trials of a configuration that lost fewer launches."""
-        words = (self._launch, config_id, size, losses)
-        return self._persist(lambda: self._store.open_trials(*words))
-
-    def suspects(self, losses: int) -> list[OpenTrial]:
-        """Return the pending trials whose launch was lost that often."""
-        return self._persist(lambda: self._store.suspects(self._launch, losses))
 
     def claim(self, trial_keys: Sequence[str]) -> list[Claim]:
         """Claim the pending ones of the trials, none of which the launch holds."""
@@ -128,22 +107,6 @@ class RetryingStore:
             return self._store.fail(claim, failure, run) or self._store.written([claim])[0]
 
         return self._persist(lambda: self._store.fail(claim, failure, run), again)
-
-    def release(self, trial_keys: Sequence[str], cause: str) -> None:
-        """Put trials of the launch back to pending, and record the cause in their attempts."""
-        self._persist(lambda: self._store.release(self._launch, trial_keys, cause))
-
-    def release_all(self) -> None:
-        """Put all trials of the launch back to pending; call it while none of them runs.
-
-        A server may commit a claim after its connection broke, and so after the claim was repeated
-        without success.
-        """
-        self._persist(lambda: self._store.release(self._launch))
-
-    def end(self, state: str, exit_code: int) -> None:
-        """End the launch in the given state and release its last claims."""
-        self._persist(lambda: self._store.end_launch(self._launch, state, exit_code))
 
     def _persist(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
         try:

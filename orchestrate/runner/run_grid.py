@@ -131,7 +131,7 @@ def recorded_launch(
             with Heartbeat(store, launch, settings.lease):
                 patient = RetryingStore(store, launch, settings.patience, warn)
                 code = _interruptible(patient, body, say)
-                patient.end(_STATES.get(code, "failed"), code)
+                patient.end_launch(_STATES.get(code, "failed"), code)
         except BaseException as error:
             # Try once more to release the claims; the error itself is reported by the caller.
             with suppress(StoreUnavailableError):
@@ -261,7 +261,7 @@ def _poll_other_launches(scheduler: Scheduler, grid: Grid) -> float:
     """
     start = time.monotonic()
     scheduler.store.recover()
-    scheduler.store.release_all()
+    scheduler.store.release()  # a server may commit a claim after its connection broke
     state = scheduler.store.register(grid.trials)
     _count(scheduler.tally, state)
     scheduler.owned_by_others = state.running_elsewhere

@@ -180,7 +180,7 @@ def _work(
         )
         with Progress(tally, output.progress) as progress:
             _pull(scheduler, chunks, leave, progress)
-    store.release_all()
+    store.release()  # a server may commit a claim after its connection broke
     chunks.look()
     output.say(worked(tally, scheduler, chunks.left, time.monotonic() - start))
     if not chunks.left:

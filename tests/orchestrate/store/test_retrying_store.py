@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from orchestrate.runner.retrying_store import RetryingStore
+from orchestrate.runner.retrying_store import IDEMPOTENT, RetryingStore
 from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
 from orchestrate.store import StoreUnavailableError as UnavailableError
 from tests.orchestrate.losses import lose
@@ -41,6 +42,12 @@ def said() -> list[str]:
 @pytest.fixture
 def patient(store: Store, launch: int, said: list[str]) -> RetryingStore:
     return RetryingStore(store, launch, PATIENCE_SECONDS, said.append)
+
+
+@pytest.mark.parametrize("name", IDEMPOTENT)
+def test_an_idempotent_operation_takes_the_launch_where_the_table_says_so(name: str) -> None:
+    first = [*inspect.signature(getattr(Store, name)).parameters][1:2]
+    assert (first == ["launch"]) == IDEMPOTENT[name]
 
 
 @losses
