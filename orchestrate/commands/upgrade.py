@@ -32,8 +32,7 @@ def _sentence(done: Upgrade) -> str:
         return f"{found}; {packed}." if done.packed else f"{found}: there is nothing to do."
     if done.before is None:
         return f"{done.safe_url} was empty and has schema {done.after} now."
-    kind = "file" if "sqlite" in done.safe_url.partition(":")[0] else "schema"
-    copy = f"a backup is in the {kind} {done.backup}" if done.backup else "no backup was made"
+    copy = f"a backup is in the file {done.backup}" if done.backup else "no backup was made"
     return f"{done.safe_url} went from schema {done.before} to {done.after}; {copy}."
 
 

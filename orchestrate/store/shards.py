@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from orchestrate.store import database_url
+from orchestrate.store.backends.backups import copy_checked
 from orchestrate.store.backends.driver_errors import translated, translated_file
-from orchestrate.store.backends.sqlite_backup import copy_checked
 from orchestrate.store.doctor import TrialKey
 from orchestrate.store.errors import NoDatabaseError
 from orchestrate.store.merging.merge import Merged, merge

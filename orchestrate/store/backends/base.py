@@ -74,11 +74,7 @@ class Backend(ABC):
 
     @abstractmethod
     def back_up(self, connection: Connection, version: int) -> str:
-        """Copy the database of the given version and return the name of the copy."""
-
-    @abstractmethod
-    def discard_backup(self, name: str) -> None:
-        """Delete the copy of a transaction that was rolled back."""
+        """Copy the database of the given version to a new file and return its path."""
 
     @abstractmethod
     def exclusive(self, connection: Connection) -> None:

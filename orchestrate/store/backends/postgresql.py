@@ -7,7 +7,9 @@ import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from itertools import count, repeat
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
@@ -30,8 +32,8 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from dopt.errors import install_command
 from orchestrate.store import database_url
+from orchestrate.store.backends.backups import back_up_to, dump
 from orchestrate.store.backends.base import ANNOUNCE_SECONDS, Backend, LaunchLife, NewTrial, log
-from orchestrate.store.backends.postgresql_backup import copy_schema
 from orchestrate.store.errors import StoreError, StoreUnavailableError
 from orchestrate.store.records import Array
 from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
@@ -104,6 +106,7 @@ _OWN = "FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace(cur
 _TABLES = text(
     f"SELECT oid::regclass::text {_OWN} AND relname NOT IN ('alembic_version', '{LOCK_TABLE}')"
 )
+_SCHEMA = text("SELECT current_schema(), quote_ident(current_schema())")
 _SIZE = text(f"SELECT coalesce(sum(pg_total_relation_size(oid)), 0) {_OWN}")
 _HAS_LAUNCHES = text("SELECT to_regclass('launch') IS NOT NULL")
 
@@ -113,6 +116,7 @@ class PostgreSQLBackend(Backend):
 
     def __init__(self, url: URL, lease_seconds: float, patience: float) -> None:
         self._session = uuid.uuid4().hex
+        self._url = url
         engine = _write_engine(url, lease_seconds, patience, self._session)
         super().__init__(engine, database_url.safe(url))
         self._lease_seconds = lease_seconds
@@ -177,10 +181,10 @@ class PostgreSQLBackend(Backend):
             yield connection
 
     def back_up(self, connection: Connection, version: int) -> str:
-        return copy_schema(connection, version, self.safe_url)
-
-    def discard_backup(self, name: str) -> None:
-        """Do nothing: the copy was made in the transaction that was rolled back."""
+        here, schema = connection.execute(_SCHEMA).one()
+        base = f"{self._url.database}-{here}.v{version}-backup"
+        write = partial(dump, self._url, schema, otherwise=", or give --no-backup")
+        return back_up_to(str(Path.cwd() / base), ".dump", write)
 
     def exclusive(self, connection: Connection) -> None:
         if not connection.execute(_HAS_LOCK).scalar_one():

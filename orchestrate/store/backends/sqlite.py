@@ -8,7 +8,7 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ from sqlalchemy import URL, Connection, Select, func, insert, select, text
 from sqlalchemy.exc import SQLAlchemyError
 
 from orchestrate.store import database_url
+from orchestrate.store.backends.backups import back_up_to, copy_checked, rescue
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
 from orchestrate.store.backends.driver_errors import translated, translated_file
 from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
 from orchestrate.store.backends.network_file_systems import refuse_unsafe
-from orchestrate.store.backends.sqlite_backup import copy_file, rescue
 from orchestrate.store.backends.sqlite_engine import (
     driver_of,
     existing_path,
@@ -156,10 +156,8 @@ class SQLiteBackend(Backend):
             )
 
     def back_up(self, connection: Connection, version: int) -> str:  # noqa: ARG002
-        return str(copy_file(self._path, version))
-
-    def discard_backup(self, name: str) -> None:
-        Path(name).unlink(missing_ok=True)
+        write = partial(copy_checked, self._path)
+        return back_up_to(f"{self._path}.v{version}-backup", "", write)
 
     @contextmanager
     def _creation_lock(self) -> Iterator[None]:

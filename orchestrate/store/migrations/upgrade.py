@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from sqlalchemy import Connection, bindparam, select, update
 
@@ -30,8 +31,8 @@ class Upgrade:
     before, after
         Version of the schema; ``before`` is None if the database was empty.
     backup
-        Name of the backup, a file beside a SQLite database or a schema beside the PostgreSQL
-        one; None without a backup.
+        Path of the backup, a file beside a SQLite database or an archive of ``pg_dump`` in the
+        current folder; None without a backup.
     packed
         Trials whose curve was packed.
     """
@@ -58,6 +59,8 @@ def upgrade(url: str, backup: bool = True) -> Upgrade:
         If the database is not a results database, or one of a newer program.
     LaunchAliveError
         If a launch is running in it.
+    StoreError
+        If ``pg_dump`` is missing or older than the server.
     StoreUnavailableError
         If the database fails; it is then unchanged.
     """
@@ -91,7 +94,7 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
             packed_curves.create(connection)
     except BaseException:
         if name is not None:
-            backend.discard_backup(name)
+            Path(name).unlink(missing_ok=True)
         raise
     return Upgrade(backend.safe_url, before, SCHEMA_VERSION, name)
 

@@ -108,7 +108,7 @@ def test_the_figure_has_a_panel_for_each_and_dashed_bounds(railed: str) -> None:
     assert axes[0].get_ylim() == axes[1].get_ylim()
     assert axes[0].get_title().startswith("cartpole: D-optimal, limits\ncounted only: ")
     words = caption(panels)
-    assert "cartpole, adam_window, limits: 0-19" in words
+    assert "cartpole, D-optimal, limits: 0-19" in words
     assert words.count("arm, D-optimal, limits: 0-1") == 1
     table = tabulate_panels(panels)
     assert len(table) == 6 * 61

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sqlite3
-import subprocess
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -18,7 +17,7 @@ from orchestrate.store.serialization import utc_text
 from tests.orchestrate.commands.conftest import BAD, DONE, RUNNING, WAITING, Answer
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
-from tests.orchestrate.store.places import execute, schema_of
+from tests.orchestrate.store.places import execute, restored
 
 Run = Callable[..., Answer]
 
@@ -54,14 +53,14 @@ class TestBackup:
         assert answer.code == 0
         assert answer.out == f"{copy}: {copy.stat().st_size:,} bytes\n"
         store.end_launch(grid, "done")
-        assert everything(_restored(copy, url)) == before
+        assert everything(restored(copy, url)) == before
         assert [path.name for path in copy.parent.iterdir()] == ["copy"]
 
     def test_a_full_disk_names_the_copy_and_not_the_database(
         self, grid: int, command: Run, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         if url.startswith("sqlite"):
-            monkeypatch.setattr("orchestrate.store.backends.sqlite_backup.sqlite3.connect", short)
+            monkeypatch.setattr("orchestrate.store.backends.backups.sqlite3.connect", short)
         else:
             said = "pg_dump: error: could not write to file: No space left on device"
             program = tmp_path / "bin" / "pg_dump"
@@ -94,16 +93,6 @@ class TestBackup:
         monkeypatch.setenv("PATH", str(tmp_path))
         with pytest.raises(Exception, match="pg_dump, which is not installed"):
             back_up(postgresql_url, tmp_path / "copy")
-
-
-def _restored(copy: Path, url: str) -> str:
-    """Return the URL of the copy, in the place of the database where it is on a server."""
-    if url.startswith("sqlite"):
-        return f"sqlite:///{copy}"
-    execute(url, f"DROP SCHEMA {schema_of(url)} CASCADE")
-    address = url.replace("+psycopg", "")
-    subprocess.run(["pg_restore", "--dbname", address, copy], check=True, env={**os.environ})
-    return url
 
 
 class TestPrune:

@@ -81,7 +81,9 @@ def version(request: pytest.FixtureRequest) -> int:
 
 
 @pytest.fixture
-def old(version: int, url: str) -> str:
+def old(version: int, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """URL of a database of a released schema; the current folder takes backups of a server."""
+    monkeypatch.chdir(tmp_path)
     restore(version, url)
     return url
 

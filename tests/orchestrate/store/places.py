@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 from sqlalchemy import create_engine, text
 from sqlalchemy.engine import make_url
 
 
-def backups(url: str) -> list[object]:
-    if url.startswith("sqlite"):
-        return list(file_of(url).parent.glob("*backup*"))
-    names = execute(url, "SELECT nspname FROM pg_namespace")
-    return [name for (name,) in names if str(name).startswith(f"{schema_of(url)}_")]
+def backups(url: str) -> list[Path]:
+    folder = file_of(url).parent if url.startswith("sqlite") else Path.cwd()
+    return sorted(folder.glob("*backup*"))
 
 
 def file_of(url: str) -> Path:
@@ -30,3 +29,13 @@ def execute(url: str, sql: str) -> list[tuple[object, ...]]:
         rows = [tuple(row) for row in done] if done.returns_rows else []
     engine.dispose()
     return rows
+
+
+def restored(copy: Path, url: str) -> str:
+    """Return the URL of the copy, in the place of the database where it is on a server."""
+    if url.startswith("sqlite"):
+        return f"sqlite:///{copy}"
+    execute(url, f"DROP SCHEMA {schema_of(url)} CASCADE")
+    address = url.replace("+psycopg", "")
+    subprocess.run(["pg_restore", "--dbname", address, copy], check=True)
+    return url

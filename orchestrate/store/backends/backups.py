@@ -1,4 +1,4 @@
-"""Backup of a SQLite database as a file beside it."""
+"""Copies of databases as files: of SQLite as a database, of PostgreSQL as an archive of pg_dump."""
 
 from __future__ import annotations
 
@@ -6,34 +6,41 @@ import contextlib
 import errno
 import os
 import sqlite3
+import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain, count
 from pathlib import Path
 
-from orchestrate.store.errors import StoreUnavailableError
+from sqlalchemy import URL
+
+from orchestrate.store import database_url
+from orchestrate.store.errors import StoreError, StoreUnavailableError
+
+PROGRAM = "pg_dump"
+
+_NOT_WRITTEN = tuple(f"{PROGRAM}: error: could not {verb} " for verb in ("open", "write", "close"))
 
 
-def copy_file(path: Path, version: int) -> Path:
-    """Copy a SQLite database with its log to a file beside it and return the path.
+def back_up_to(base: str, suffix: str, write: Callable[[Path], None]) -> str:
+    """Let ``write`` make a file, give it a name that is free, and return that.
 
-    The copy is checked and synchronised to disk before it gets its name; an existing file is never
-    replaced.
+    The file gets its name when it is complete; an existing file is never replaced.
     """
-    target = _free_name(f"{path}.v{version}-backup", "")
+    target = _free_name(base, suffix)
     partial = target.with_name(f"{target.name}.partial")
     try:
-        copy_checked(path, partial)
+        write(partial)
         partial.rename(target)
     except OSError as error:
         raise StoreUnavailableError(
-            f"The backup {target} cannot be made ({error.strerror}): make room or its folder "
-            "writable, or make a copy yourself and give --no-backup."
+            f"The backup {target} cannot be made ({error.strerror or error}): make room or its "
+            "folder writable, or make a copy yourself and give --no-backup."
         ) from error
     finally:
         partial.unlink(missing_ok=True)
-    return target
+    return str(target)
 
 
 def rescue(opened: sqlite3.Connection, path: Path, before: Path | None) -> Path:
@@ -110,3 +117,46 @@ def _copy_from(source: sqlite3.Connection, partial: Path, path: Path) -> None:
     descriptor = os.open(partial, os.O_RDONLY)
     os.fsync(descriptor)
     os.close(descriptor)
+
+
+def dump(url: URL, schema: str, partial: Path, otherwise: str = "") -> None:
+    """Write tables and views of a PostgreSQL schema to an archive for ``pg_restore``.
+
+    The password is in the environment of ``pg_dump``, where other users cannot read it.
+    ``otherwise`` ends the advice where the program is missing or older than the server.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    StoreError
+        If ``pg_dump`` is missing or older than the server.
+    StoreUnavailableError
+        If the database cannot be read.
+    """
+    address = url.set(drivername="postgresql")._replace(password=None)
+    words = [PROGRAM, "--format=custom", f"--schema={schema}", f"--file={partial}"]
+    words += ["--dbname", address.render_as_string(hide_password=False)]
+    secret = {} if url.password is None else {"PGPASSWORD": str(url.password)}
+    try:
+        environment = {**os.environ, **secret, "LC_ALL": "C"}
+        done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    except FileNotFoundError as error:
+        raise StoreError(
+            f"A backup of PostgreSQL needs the program {PROGRAM}, which is not installed: install "
+            "the client programs of PostgreSQL, such as the Debian package "
+            f"postgresql-client{otherwise}."
+        ) from error
+    reason, *details = done.stderr.strip().splitlines() or ["it gave no reason"]
+    if "server version mismatch" in reason:
+        versions = "; ".join(details).removeprefix(f"{PROGRAM}: detail: ")
+        raise StoreError(
+            f"{PROGRAM} is older than the server of {database_url.safe(url)} ({versions}): install "
+            f"the client programs of the server's version{otherwise}."
+        )
+    if reason.startswith(_NOT_WRITTEN):
+        raise OSError(reason.rstrip("."))
+    if done.returncode:
+        raise StoreUnavailableError(
+            f"{PROGRAM} has not backed up {database_url.safe(url)}: {reason.rstrip('.')}."
+        )
