@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrate.store.bundles import cached
-from orchestrate.store.bundles.tables import TABLES, file_name
+from orchestrate.store.bundle import TABLES, file_name
 from tests.analysis.synthetic import fill, make_grid
 from tests.pages import PAGES, blocks
 from tests.test_docs import SHARING, SHORT
@@ -24,7 +23,6 @@ def test_its_commands_and_programs_run_in_their_order(
             warnings.simplefilter("ignore")
             pytest.importorskip(library, reason="needs the extra all")
     empty_folder(tmp_path, monkeypatch)
-    monkeypatch.setattr(cached, "copies_folder", lambda: tmp_path)
     fill("sqlite:///results/results.db", make_grid(("pendulum",), seeds=range(3), **SHORT))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of libraries, about what they use of others

@@ -42,9 +42,12 @@ def _merge(url: str, other: str) -> Merged:
     if "://" in other:
         return merge(url, other, trial_key)
     place = given_path(other, "OTHER", UsageError)
+    if not place.is_dir():
+        return merge(url, f"sqlite:///{place.absolute()}", trial_key)
     if not any(place.glob("*.db")):  # a bundle has other files
-        kind = "bundle" if place.is_dir() else "sqlite"
-        return merge(url, f"{kind}:///{place.absolute()}", trial_key)
+        from orchestrate.store.bundle import merge_bundle
+
+        return merge_bundle(url, place, trial_key)
     total = Merged()
     for merged in merge_collected(url, place, trial_key=trial_key):
         total.include(merged)

@@ -20,9 +20,8 @@ def back_up(url: str, target: Path) -> int:
 
     That of SQLite is a database file, checked and complete in itself; that of PostgreSQL is an
     archive for ``pg_restore`` with the tables and views of the schema. The file gets its name when
-    it is complete. Raises ``StoreError`` if the file exists or the database is a bundle,
-    ``OutputError`` if the file cannot be written, and ``StoreUnavailableError`` if the database
-    cannot be read.
+    it is complete. Raises ``StoreError`` if the file exists, ``OutputError`` if it cannot be
+    written, and ``StoreUnavailableError`` if the database cannot be read.
     """
     if target.exists():
         raise StoreError(f"The file {target} exists, a new one is expected: give another name.")
@@ -32,10 +31,6 @@ def back_up(url: str, target: Path) -> int:
 
 
 def _copy(parsed: URL, url: str, partial: Path) -> None:
-    if parsed.get_backend_name() == database_url.BUNDLE:
-        raise StoreError(
-            f"{database_url.safe(parsed)} is a bundle, a database is expected: copy its folder."
-        )
     if parsed.get_backend_name() == "postgresql":
         with Reader.open(url) as reader:
             ((schema,),) = reader.rows("SELECT quote_ident(current_schema())")

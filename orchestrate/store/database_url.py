@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 from pathlib import Path
 
 from sqlalchemy.engine import URL, make_url
@@ -20,19 +21,10 @@ URL_VARIABLE = "DOPT_DB"
 READ_VARIABLE = "DOPT_READ_DB"
 """Environment variable with the URL of a user who can only read, as whom the page SQL asks."""
 
-BUNDLE = "bundle"
-"""Kind of URL that names the folder of a bundle, which is only read."""
-
 _IN_MEMORY = ":memory:"
-_EXAMPLES = (
-    "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name, "
-    "or bundle:///FOLDER to read a bundle"
-)
+_EXAMPLES = "sqlite:///results/results.db or postgresql+psycopg://user@host:5432/name"
 _SQLITE_FILE = re.compile(r"[\w./-]+\.(db|sqlite3?)")
 """Path of a file in place of a URL; a text that may hold a password does not match."""
-
-_NAMES = {"sqlite": "SQLite", BUNDLE: "a bundle"}
-_DEFAULT_NAMES = {"sqlite": "results.db", BUNDLE: "results"}
 
 _SECRETS = ("password", "sslpassword", "passfile")
 
@@ -45,17 +37,20 @@ def default_url() -> str:
 def parse(url: str) -> URL:
     """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
 
-    The path of a folder is taken for a bundle in it, and the path of a file is read as
-    :func:`dopt.given_path.given_path` does. The message says whether the URL came from
-    ``DOPT_DB`` or ``DOPT_READ_DB``. It repeats no text other than the path of a SQLite file,
-    because a mistyped URL may hold a password.
+    The path of a file is read as :func:`dopt.given_path.given_path` does. The message says whether
+    the URL came from ``DOPT_DB`` or ``DOPT_READ_DB``. It repeats no text other than a path, because
+    a mistyped URL may hold a password.
     """
     variables = (URL_VARIABLE, READ_VARIABLE)
     names = [name for name in variables if os.environ.get(name, "").strip() == url.strip() != ""]
     where = f" in the environment variable {names[0]}" if names else ""
     url = stripped(url, f"The database URL{where}", StoreError)
-    if "://" not in url and Path(url).is_dir():
-        return URL.create(BUNDLE, database=url)
+    folder = url.removeprefix("bundle:///")
+    if folder != url or ("://" not in url and Path(url).is_dir()):
+        raise StoreError(
+            f"{folder} is a folder, a database is expected{where}: import a bundle with 'python "
+            f"-m orchestrate merge {shlex.quote(folder)} --db URL', and give that URL."
+        )
     try:
         parsed = make_url(url)
     except (ArgumentError, ValueError):  # the latter for a port that is no number
@@ -64,15 +59,14 @@ def parse(url: str) -> URL:
     backend = parsed.get_backend_name()
     if backend == "postgresql":
         return parsed.set(drivername="postgresql+psycopg")
-    if backend not in ("sqlite", BUNDLE):
+    if backend != "sqlite":
         raise StoreError(
             f"A database of kind '{parsed.drivername}'{where} is not supported: give {_EXAMPLES}."
         )
     if parsed.host is not None:
         raise StoreError(
-            f"The database URL {backend}://{parsed.host}/...{where} names a host, but "
-            f"{_NAMES[backend]} has none: write three slashes, {backend}:///{parsed.host}/"
-            f"{parsed.database or _DEFAULT_NAMES[backend]}."
+            f"The database URL sqlite://{parsed.host}/...{where} names a host, but SQLite has "
+            f"none: write three slashes, sqlite:///{parsed.host}/{parsed.database or 'results.db'}."
         )
     if parsed.database and parsed.database != _IN_MEMORY:
         file = given_path(parsed.database, f"The path in the database URL{where}", StoreError)
@@ -90,16 +84,6 @@ def read_login(url: URL) -> URL | None:
 
 def _place(url: URL) -> tuple[object, ...]:
     return url.get_backend_name(), url.host, url.port or 5432, url.database
-
-
-def bundle_path(url: URL) -> Path:
-    """Return the absolute path of the folder of a bundle; raise ``StoreError`` without one."""
-    if not url.database:
-        raise StoreError(
-            "The URL of a bundle names no folder: write bundle:///FOLDER, or bundle:////FOLDER for "
-            "an absolute path."
-        )
-    return Path(url.database).resolve()
 
 
 def safe(url: URL) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from orchestrate.export.bundle.descriptions import COLUMNS, TABLE_TITLES
 from orchestrate.store import ConfigRow
-from orchestrate.store.bundles.tables import file_name
+from orchestrate.store.bundle import file_name
 
 _CITATION = """\
 ```bibtex
@@ -24,17 +24,17 @@ _CITATION = """\
 _LOADING = """\
 Check the files with `sha256sum --check SHA256SUMS`. FOLDER is the folder of this card.
 
-With dopt, which takes a bundle wherever it takes the URL of a database, and only reads it:
+With dopt, which imports a bundle into a database:
 
 ```bash
-python -m orchestrate status --db bundle:///FOLDER
-python -m analysis figures --db bundle:///FOLDER --out figures
+python -m orchestrate merge FOLDER --db sqlite:///results/bundle.db
+python -m analysis figures --db sqlite:///results/bundle.db --out figures
 ```
 
 ```python
 import analysis
 
-results = analysis.load("bundle:///FOLDER")
+results = analysis.load("sqlite:///results/bundle.db")
 results.curves("loss")
 ```
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet
 
-from orchestrate.store.bundles.tables import ARRAY_AXES
+from orchestrate.store.bundle import ARRAY_AXES
 
 _GROUP_BYTES = 2**25
 """Bytes in memory of the rows that are compressed together."""

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
-from orchestrate.store.bundles.tables import ARRAY_AXES, arrow_schema, primary_key
+from orchestrate.store.bundle import ARRAY_AXES, arrow_schema, primary_key
 from orchestrate.store.serialization import unpack
 
 ROWS = 50_000

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orchestrate.store.bundles.tables import TABLES, file_name
+from orchestrate.store.bundle import TABLES, file_name
 from orchestrate.store.views import VIEWS
 
 VIEWS_FILE = "views.sql"

@@ -19,8 +19,14 @@ from orchestrate.export.wanted import ExportError, FolderExport
 from orchestrate.files import whole_folder
 from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
-from orchestrate.store.bundles import checksums
-from orchestrate.store.bundles.tables import KIND, PROVENANCE, TABLES, arrow_schema, file_name
+from orchestrate.store.bundle import (
+    KIND,
+    PROVENANCE,
+    TABLES,
+    arrow_schema,
+    file_name,
+    write_checksums,
+)
 
 CARD = "README.md"
 
@@ -45,7 +51,7 @@ def write_bundle(
         (folder / PROVENANCE).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
         (folder / VIEWS_FILE).write_text(views_sql(), encoding="utf-8")
         (folder / CARD).write_text(card(configs, rows, facts, wanted.license), encoding="utf-8")
-        checksums.write(folder)
+        write_checksums(folder)
         return facts | {
             "n_trials": rows["trial"],
             "bytes": sum(path.stat().st_size for path in folder.iterdir()),

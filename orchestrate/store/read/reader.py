@@ -14,7 +14,7 @@ from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 
 from dopt.errors import suggestion
 from orchestrate.store import database_url, packed_curves, schema_version
-from orchestrate.store.backends import bundle, postgresql, sqlite
+from orchestrate.store.backends import postgresql, sqlite
 from orchestrate.store.backends.driver_errors import translated
 from orchestrate.store.errors import QueryError
 from orchestrate.store.read import liveness
@@ -250,7 +250,7 @@ class Reader:
                 yield connection
 
 
-_KINDS = {"sqlite": sqlite, "postgresql": postgresql, database_url.BUNDLE: bundle}
+_KINDS = {"sqlite": sqlite, "postgresql": postgresql}
 
 
 def _kind(url: URL) -> ModuleType:

@@ -14,8 +14,7 @@ import pytest
 
 from orchestrate.__main__ import main
 from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
-from orchestrate.store.bundles import cached
-from orchestrate.store.bundles.tables import TABLES
+from orchestrate.store.bundle import TABLES
 from tests.orchestrate.store.conftest import (  # noqa: F401  the same ones
     launch,
     open_store,
@@ -107,20 +106,10 @@ def grid(store: Store) -> int:  # noqa: F811
 
 
 @pytest.fixture
-def copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep the SQLite copies of bundles in a folder of the test."""
-    folder = tmp_path / "copies"
-    folder.mkdir()
-    monkeypatch.setattr(cached, "copies_folder", lambda: folder)
-    return folder
-
-
-@pytest.fixture
 def bundle(
     grid: int,
     store: Store,  # noqa: F811
     command: Callable[..., Answer],
-    copies: Path,  # noqa: ARG001
     tmp_path: Path,
 ) -> Path:
     """Return a bundle of the grid with every status, of assessments and of odd numbers."""

@@ -1,1 +1,0 @@
-"""Bundles: folders with the tables of a results database as Parquet files, which are only read."""
