@@ -23,7 +23,7 @@ GOLD, SEA, TEAL = "#a87b00", "#3a96c8", "#00594c"
 WINE, INDIGO, OLIVE, MAROON, ORCHID = "#882255", "#332288", "#999933", "#661100", "#aa4499"
 """Muted colours of Paul Tol."""
 
-BROWN, PINK, ROSE, SLATE = "#8b4513", "#e7298a", "#e0524d", "#66648b"
+BROWN, PINK = "#8b4513", "#e7298a"
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,6 @@ _POLICIES: dict[str, tuple[str, Dashes, float]] = {
     "gaussian_process": (ORCHID, (0, (5, 1, 2, 1)), 1.2),
     "gradient": (INDIGO, (0, (7, 1)), 1.2),
     "linear": (MAROON, (0, (2, 1, 5, 1)), 1.2),
-    "max_agent": (ROSE, (0, (3, 1, 1, 1, 1, 1)), 1.2),
-    "sac": (SLATE, (0, (8, 1, 1, 1)), 1.2),
     "space_filling": (WINE, (0, (7, 1, 2, 1)), 1.2),
 }
 

@@ -32,6 +32,9 @@ SUCCESSORS = {
     "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
     "launch.until='ci<5%'",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
+    "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
+    "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",
+    "experiment=flex_table1_agents": "studies/agents/README.md has it",
 }
 """Successors of removed words, by command and word or by ``key=value`` of the configuration."""
 
@@ -119,15 +122,22 @@ def _options(parser: argparse.ArgumentParser, words: Sequence[str]) -> Iterator[
                 yield from _options(action.choices[name], words)
 
 
-def check_removed(typed: str) -> None:
-    """Raise ``UsageError`` if a typed text, such as ``python -m analysis floor``, was removed.
+def removed_word(typed: str) -> str | None:
+    """Return what takes the place of a removed word; None if the text ends with no removed word.
 
-    The text ends with the word; it may begin with what leads to the word.
+    ``typed`` may begin with what leads to the word, such as ``python -m analysis floor``.
     """
     words = f" {typed}".replace(" dopt-", " ")
     for word, successor in SUCCESSORS.items():
         if words.endswith(f" {word}"):
-            raise UsageError(f"'{word}' was removed: {successor}.")
+            return f"'{word}' was removed: {successor}."
+    return None
+
+
+def check_removed(typed: str) -> None:
+    """Raise ``UsageError`` if a typed text ends with a removed word."""
+    if sentence := removed_word(typed):
+        raise UsageError(sentence)
 
 
 def positive(option: str, number: type[int] | type[float]) -> Callable[[str], float]:

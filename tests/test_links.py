@@ -23,7 +23,7 @@ def test_every_link_leads_to_a_file_and_a_heading(page: str) -> None:
 
 
 def test_every_file_that_a_page_names_exists() -> None:
-    folders = "analysis|benchmarks|conf|docker|docs|dopt|orchestrate|tests"
+    folders = "analysis|benchmarks|conf|docker|docs|dopt|orchestrate|studies|tests"
     for page, text in PAGES.items():
         for path in re.findall(rf"`((?:{folders})/[\w./-]+)`", text):
             if page not in GENERATED and path not in MADE:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dopt.policies.a_optimal import AOptimal
-from dopt.policies.active_exploration import ActiveExploration
 from dopt.policies.base import InformationPolicy, Policy
 from dopt.policies.chirp import Chirp
 from dopt.policies.d_optimal import DOptimal
@@ -22,7 +21,6 @@ from dopt.policies.periodic import Periodic, PeriodicSquare
 from dopt.policies.prbs import PRBS
 from dopt.policies.random import RandomGaussian, RandomHeld, RandomSphere
 from dopt.policies.search import Search
-from dopt.policies.soft_actor_critic import SoftActorCritic
 from dopt.policies.space_filling import SpaceFilling
 from dopt.policies.task import TaskOptimal
 from dopt.policies.trace import Trace
@@ -57,8 +55,6 @@ POLICIES: dict[str, type[Policy]] = {
         GradientDOptimal,
         GreedyLinear,
         SpaceFilling,
-        ActiveExploration,
-        SoftActorCritic,
     )
 }
 
@@ -67,7 +63,6 @@ __all__ = [
     "POLICIES",
     "PRBS",
     "AOptimal",
-    "ActiveExploration",
     "Chirp",
     "DOptimal",
     "Disagreement",
@@ -88,7 +83,6 @@ __all__ = [
     "RandomHeld",
     "RandomSphere",
     "Search",
-    "SoftActorCritic",
     "SpaceFilling",
     "TaskOptimal",
     "Trace",

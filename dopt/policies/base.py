@@ -7,7 +7,6 @@ kernel does not know brings its plan along, a :class:`Planner`.
 
 from __future__ import annotations
 
-import importlib.util
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -19,7 +18,7 @@ from dopt.control.feedback import Feedback
 from dopt.control.task import Control, Goal
 from dopt.declare.kernel_support import PLAN_IN_NUMPY, KernelPart
 from dopt.declare.validated_fields import parameter
-from dopt.errors import IncompatibleError, SpecificationError, install_command
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 
@@ -51,26 +50,15 @@ def check_ensemble(networks: int) -> None:
 class Policy(KernelPart):
     """A rule that chooses the input u_t, ‖u_t‖ ≤ γ.
 
-    ``reads_inputs`` says whether it goes with models that depend on the inputs. ``library`` is a
-    module that it cannot do without, and ``extra`` the extra of this package that installs it.
+    ``reads_inputs`` says whether it goes with models that depend on the inputs.
     """
 
     section: ClassVar[str] = "policy"
     name: ClassVar[str]
     reads_inputs: ClassVar[bool] = False
-    library: ClassVar[str] = ""
-    extra: ClassVar[str] = ""
 
     def check(self, system: System) -> None:
         """Raise IncompatibleError if the policy makes no sense for a system."""
-
-    def check_library(self) -> None:
-        """Raise SpecificationError if the library of the policy is not installed."""
-        if self.library and importlib.util.find_spec(self.library) is None:
-            raise SpecificationError(
-                f"policy '{self.name}' needs the library {self.library}, but it is not installed: "
-                f"{install_command(self.extra)}, or choose another policy."
-            )
 
     def memory_size(self, system: System, n_parameters: int) -> int:  # noqa: ARG002  # of policies that keep nothing
         """Return how many numbers the policy keeps from step to step; they start at zero."""

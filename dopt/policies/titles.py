@@ -28,8 +28,6 @@ TITLES: dict[str, str] = {
     "e_optimal": "E-optimal",
     "task": "task-optimal",
     "space_filling": "space filling",
-    "max_agent": "MAX, imagining agent",
-    "sac": "soft actor-critic",
 }
 """The policies of the paper come first; a user's own policy follows by its name."""
 

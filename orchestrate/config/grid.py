@@ -81,11 +81,6 @@ class Grid:
             trials.append(TrialSpec(configs[key], trial.seed))
         return dataclasses.replace(self, trials=trials)
 
-    def check_libraries(self) -> None:
-        """Raise SpecificationError if a policy needs a library that is not installed here."""
-        for policy in {type(trial.policy): trial.policy for trial in self.trials}.values():
-            policy.check_library()
-
 
 def build_grid(combinations: Iterable[Combination], *, single: bool = False) -> Grid:
     """Return the grid of typed trials; incompatible choices are left out.

@@ -19,6 +19,7 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from dopt.declare.registry import TARGET, imported
 from dopt.errors import DoptError, SpecificationError, unknown_name
+from orchestrate.cli_parser import removed_word
 from orchestrate.config.options import CONFIGURATION, option_names
 
 KNOWN = (
@@ -82,6 +83,8 @@ def _unknown_option(given: str, options: Iterable[str]) -> str:
     """
     match = _OPTION.fullmatch(given)
     group, option = match.groups() if match else ("", given)
+    if sentence := removed_word(f"{group}={option}"):
+        return sentence
     return str(unknown_name(group or "configuration", option, {*options, *option_names(group)}))
 
 

@@ -63,7 +63,6 @@ def _checked(request: Request) -> tuple[Grid, LaunchSettings]:
         if any(trial.config.path == "kernel" for trial in grid.trials):
             cache.check_environment()
         check_memory(grid, settings)
-        grid.check_libraries()
     _check_kind(settings, single=request.single)
     return grid, settings
 

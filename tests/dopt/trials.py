@@ -29,10 +29,6 @@ SMALL_GRIDS = {
 SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"count": 8}}
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}
 SMALL_SEARCHES |= {"episodic": SMALL_SEARCHES["icem"] | {"replan_every": 5}}
-SMALL_SEARCHES |= {"sac": {"hold": 3, "warm_up": 9, "units": 8, "batch": 4}}
-SMALL_SEARCHES["max_agent"] = {"ensemble": 3, "units": 8, "warm_up": 10, "replan_every": 10}
-SMALL_SEARCHES["max_agent"] |= {"fit_updates": 20, "hold": 4, "lookahead": 6, "actors": 6}
-SMALL_SEARCHES["max_agent"] |= {"episodes": 2, "batch": 8}
 SMALL_GRIDS |= {"mass_spring": (2, 2, 2, 2)}
 SIZES = {"chain": {"n_links": 3}, "coupled_pendulums": {"n_pendulums": 3}}
 """Systems of any size: as small as an end, a middle and a start can be."""

@@ -24,7 +24,7 @@ BOUNDED = [
 ]
 
 
-OTHER_NORMS = {"chirp", "max_agent", "multisine", "periodic", "random", "sac"}
+OTHER_NORMS = {"chirp", "multisine", "periodic", "random"}
 """Policies whose inputs have other norms than γ, with a model that is affine in the inputs."""
 
 

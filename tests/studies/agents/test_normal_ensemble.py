@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dopt.agents.normal_ensemble import NormalEnsemble, jensen_renyi_divergence
+from studies.agents.policies import NormalEnsemble, jensen_renyi_divergence
 
 SIZES = st.tuples(st.integers(2, 6), st.integers(1, 4), st.integers(1, 3))
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from dopt.agents.observation import LIMIT, Observation
 from dopt.systems import Cartpole, Quadrotor
+from studies.agents.policies import LIMIT, Observation
 
 
 def test_an_angle_is_shown_by_cosine_and_sine_and_others_by_half_widths() -> None:

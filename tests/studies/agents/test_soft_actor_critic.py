@@ -5,12 +5,9 @@ from __future__ import annotations
 import random
 
 import numpy as np
-import pytest
 import torch
 
-from dopt.agents.soft_actor_critic import Agent, Settings
-
-pytestmark = pytest.mark.xdist_group("agents")  # one process loads the library
+from studies.agents.policies import Agent, Settings
 
 SETTINGS = Settings(
     units=32, learning_rate=3e-3, batch_size=64, gamma=0.0, ent_coef=1e-3, buffer_size=500
