@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 import pandas as pd
 
-from analysis.animation import command as film
 from analysis.data.config_matching import REFERENCE, Filter, read_condition
 from analysis.data.divergence import DivergenceRule
 from analysis.data.trial_selection import Selection, select
@@ -29,7 +29,7 @@ from analysis.tables import calibration
 from analysis.tables.registry import TABLES, TableKind, comparison
 from analysis.tables.rendering import TextTable, gaps_table
 from analysis.workers_option import add_workers
-from orchestrate.cli_parser import Parser, path, tell
+from orchestrate.cli_parser import Parser, path, positive, tell
 from orchestrate.program import answered
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
@@ -117,10 +117,17 @@ def parser() -> Parser:
     )
     report.add_arguments(compared)
     compared.set_defaults(alone=lambda options: report.run(options, wanted(options)))
-    animate = commands.add_parser("animate", help=film.HELP, description=film.HELP)
-    animate.set_defaults(alone=film.run)
+    film = "a film of one stored trial: system, phase trace, learned and true force, loss"
+    animate = commands.add_parser("animate", help=film, description=film)
+    animate.set_defaults(alone=_animate)
     add_database(animate)
-    film.add_arguments(animate)
+    animate.add_argument("env", metavar="ENV", help="environment of the trial")
+    animate.add_argument("policy", metavar="POLICY", help="policy of the trial")
+    animate.add_argument("--seed", type=int, help="seed (that of the median final loss)")
+    animate.add_argument("--out", type=path("--out"), help=".gif or .mp4 (figures/ENV_POLICY.gif)")
+    for option, default, what in (("--frames", 150, "pictures in all"), ("--fps", 15, "a second")):
+        number = positive(option, int)
+        animate.add_argument(option, type=number, default=default, help=f"{what} ({default})")
     serve = commands.add_parser("serve", help=browser.HELP, description=browser.HELP)
     serve.set_defaults(alone=browser.run)
     browser.add_arguments(serve)
@@ -224,6 +231,27 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
         say(f"{options.out / outcome.name}: {outcome.state}")
         empty += bool(options.only) and outcome.state.startswith("not drawn")
     return 1 if empty else 0
+
+
+def _animate(options: argparse.Namespace) -> int:
+    from analysis import film  # Matplotlib: other commands do without it
+    from analysis.figures.phase_portraits.data import median_seed
+
+    name = f"{options.env}_{options.policy}.gif".replace("/", "_")
+    target = options.out or Path("figures") / name
+    with Reader.open(options.db) as reader:
+        entry = select(reader, Filter((options.env,), (options.policy,))).entries[0]
+        losses = entry.final_losses()
+        if options.seed is None and not losses:
+            raise AnalysisError(
+                f"{options.env} × {options.policy} has no finished trial that did not diverge: "
+                f"run one, or give --seed."
+            )
+        seed = median_seed(losses) if options.seed is None else options.seed
+        story = film.tell(reader, entry, seed, options.frames)
+    film.shoot(story, target, options.fps)
+    say(f"{target}: seed {seed}, {len(story.steps)} pictures")
+    return 0
 
 
 def _summary(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:

@@ -37,7 +37,7 @@ ONLY_IN = {
     "matplotlib": (
         "analysis/figures/",
         "analysis/outputs/",
-        "analysis/animation/",
+        "analysis/film.py",
         "analysis/report/",
     ),
     "starlette": ("analysis/serve/",),

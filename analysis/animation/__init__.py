@@ -1,1 +1,0 @@
-"""Animation of a stored trial."""
