@@ -197,5 +197,5 @@ def _force(axes: Axes, story: Story, row: int) -> Move:
     axes.legend(loc="upper left", fontsize=6, ncols=2, handlelength=1.6)
     return lambda frame, step: (
         line.set_data(times, story.learned[frame, :, row]),
-        now.set_xdata([times[step]] * 2),
+        now.set(xdata=[times[step]] * 2),
     )

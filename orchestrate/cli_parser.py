@@ -34,7 +34,7 @@ SUCCESSORS = {
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
     "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
     "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",
-    "experiment=flex_table1_agents": "studies/agents/README.md has it",
+    "experiment=flex_table1_agents": "studies/agents/README.md has it as experiment=agents",
 }
 """Successors of removed words, by command and word or by ``key=value`` of the configuration."""
 

@@ -44,7 +44,7 @@ def test_every_trial_of_the_experiment_is_possible(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     words = ["--config-dir", str(ROOT / "studies/agents/conf"), "-m", "seed=0"]
-    words += ["experiment=flex_table1_agents", "launch.dry_run=true"]
+    words += ["experiment=agents", "launch.dry_run=true"]
     words.append(f"store.url=sqlite:///{tmp_path}/results.db")
     monkeypatch.setattr("sys.argv", ["launch.py", *words])
     assert launch.main() == 0
