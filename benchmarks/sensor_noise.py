@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from benchmarks.rows import Row
 from dopt.calibration import jacobian
-from dopt.control.prediction import predict
+from dopt.control.planning import predict
 from dopt.evaluation import evaluation_set
 from dopt.offline_fit import fit_offline
 from dopt.randomness import initial_weights

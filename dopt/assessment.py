@@ -10,11 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.episode import run_episode, run_feedback
-from dopt.control.feedback import Feedback
-from dopt.control.free_run import free_run_error
-from dopt.control.prediction import Forecast
-from dopt.control.task import Control
+from dopt.control.planning import Forecast, free_run_error, run_episode, run_feedback
+from dopt.control.task import Control, Feedback
 from dopt.coverage import Plane
 from dopt.forecasts import model_forecast, true_forecast
 from dopt.limits import VIOLATIONS, WORST

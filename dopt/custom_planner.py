@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dopt.control.feedback import Feedback
+from dopt.control.task import Feedback
 from dopt.declare.returned_part import check_returned
 from dopt.errors import SpecificationError
 from dopt.policies import POLICIES

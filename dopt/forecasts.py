@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dopt.control.prediction import Array, Forecast, forecast_by, forecast_by_equations
+from dopt.control.planning import Array, Forecast, forecast_by, forecast_by_equations
 from dopt.models import MLP, Linear, Model
 from dopt.systems.base import System
 

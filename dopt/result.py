@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.feedback import Feedback
+from dopt.control.task import Feedback
 
 Array = npt.NDArray[np.float64]
 

@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.systems.base import System
+from dopt.types import Array
+
+# State feedback: an input for each state.
+
+
+class Feedback(Protocol):
+    """A law of control that is evaluated every ``hold`` steps; its input is held in between."""
+
+    @property
+    def hold(self) -> int: ...
+
+    def __call__(self, state: Array) -> Array:
+        """Return the input, (m,), ‖u‖ ≤ γ, at a state, (d,)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,9 +60,9 @@ class Control(Validated):
     lookahead : int
         Number of planned inputs; the planner sees ``hold * lookahead`` steps.
     samples, iterations, elites : int
-        Of the cross-entropy method (:mod:`dopt.control.planner`).
+        Of the cross-entropy method (:mod:`dopt.control.planning`).
     free_run_steps : int
-        Steps n over which the model's prediction runs free (:mod:`dopt.control.free_run`).
+        Steps n over which the model's prediction runs free (:mod:`dopt.control.planning`).
     """
 
     section: ClassVar[str] = "task"

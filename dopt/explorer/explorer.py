@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Mapping
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from threading import TIMEOUT_MAX
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.arguments import finite, instance, numbers, safe_input, seconds, whole, within
-from dopt.explorer.interrupts import uninterrupted
+from dopt.explorer.arguments import (
+    finite,
+    instance,
+    measured,
+    numbers,
+    safe_input,
+    seconds,
+    whole,
+    within,
+)
 from dopt.explorer.journal import FORMAT, Event, Journal, foreign
-from dopt.explorer.measured import measured
-from dopt.explorer.planner import PunctualPlanner, may_remember_plans
 from dopt.explorer.saving import SavedExplored
-from dopt.explorer.state import difference
-from dopt.explorer.unlearned_states import UnlearnedStates
+from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
 from dopt.learning import Learner
 from dopt.models import Model
 from dopt.policies import Policy
@@ -30,6 +39,65 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import Plant
 from dopt.types import Array
+
+# Calls that Ctrl-C does not break off.
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back until the end: what is written is also done, and both once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # which signals do not interrupt
+        return
+    pressed: list[FrameType | None] = []
+    before = signal.signal(signal.SIGINT, lambda _, frame: pressed.append(frame))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if pressed and callable(before):
+            before(signal.SIGINT, pressed[0])
+
+
+# Count of states in a row from which nothing was learned, with one warning when they are many.
+
+
+MANY = 20
+"""States in a row from which nothing was learned that are said."""
+
+_log = logging.getLogger("dopt.explorer")
+
+
+class UnlearnedStates:
+    """States since the last one that was learned from, by the events of an exploration.
+
+    Parameters
+    ----------
+    dt : float
+        Time from one state to the next that is expected [s].
+    """
+
+    def __init__(self, dt: float) -> None:
+        self._dt = dt
+        self._in_a_row = 0
+
+    def note(self, event: Event, counts: Mapping[str, int]) -> None:
+        """Count the state of an event; warn at the ``MANY``-th, with the counts of all states."""
+        if "learn" in event:
+            self._in_a_row = 0
+            return
+        if not event.keys().isdisjoint(("plan", "missed")) or event.get("lost") == "resets":
+            return
+        self._in_a_row += 1
+        if self._in_a_row == MANY:
+            _log.warning(
+                "nothing was learned from the last %d states (%s), but states are expected every "
+                "%g s: tell() each state that followed an input, give times in seconds, call "
+                "reset() if their clock began anew, and give a limit that no state is beyond, and "
+                "a policy and a learner that are faster than that",
+                *(MANY, counts, self._dt),
+            )
+
 
 STEPS = 20_000
 """Steps of an exploration unless it is told otherwise."""

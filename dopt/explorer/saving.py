@@ -6,22 +6,287 @@ import functools
 import threading
 import time
 import weakref
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from dopt.assessment import violations
+from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.explored import Explored, predict
-from dopt.explorer.recorded_run import free_run_error
+from dopt.explorer.arguments import reals, whole
+from dopt.explorer.state import ExplorerState
+from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
 from dopt.spec.prequential import PrequentialTrial
 from dopt.spec.trial import TrialSpec
+from dopt.systems.base import System
+from dopt.systems.sensors import start_variances
 from dopt.types import Array
 
 if TYPE_CHECKING:
     from orchestrate.runner.saving import ExplorationSaver
+
+
+# States of a recorded run of which some states are measured with noise, by a Kalman filter.
+
+
+DIFFERENCE = 1e-5
+"""Change of a state, relative to its size and 1, over which derivatives are taken."""
+
+
+def filtered_states(
+    system: System,
+    predict: Callable[[Array, Array], Array],
+    outputs: Array,
+    inputs: Array,
+    noise_variance: float,
+) -> Array:
+    """Return estimates of the states, (T + 1, d), each from what was measured until then.
+
+    Parameters
+    ----------
+    predict : callable
+        Accelerations, (N, r), of states (N, d) under inputs (N, m).
+    outputs, inputs : (T + 1, n), (T, m)
+        Measured states, and the inputs between them. The other states are taken for 0 at first, up
+        to the half-width of the box, or 1.
+    noise_variance : float
+        ρ, the variance of the accelerations that the model leaves out.
+    """
+    forecast, measured = forecast_by(system, predict), list(system.measured_states)
+    states, P = np.zeros((len(outputs), system.n_states)), np.diag(start_variances(system))
+    states[0, measured] = outputs[0]
+    Q, R = np.zeros_like(P), np.diag(np.square(system.measurement_noise))
+    Q[system.learned_rows, system.learned_rows] = system.dt**2 * noise_variance
+    for t, u in enumerate(inputs):
+        x, A = _step(forecast, states[t], u)
+        P = A @ P @ A.T + Q
+        S = P[np.ix_(measured, measured)] + R
+        gain = np.linalg.solve(S, P[measured]).T
+        states[t + 1] = x + gain @ (outputs[t + 1] - x[measured])
+        P = P - gain @ P[measured]
+        P = 0.5 * (P + P.T)
+    return states
+
+
+def _step(forecast: Forecast, x: Array, u: Array) -> tuple[Array, Array]:
+    """Return the state that follows, (d,), and its derivative A by the state, (d, d)."""
+    d = len(x)
+    steps = np.diag(DIFFERENCE * np.maximum(1.0, np.abs(x)))
+    at = np.concatenate([x[None], x + steps, x - steps])
+    following = forecast(at, np.broadcast_to(u, (len(at), 1, len(u))))[0]
+    ahead, behind = following[1 : d + 1], following[d + 1 :]
+    return following[0], ((ahead - behind) / (2.0 * np.diag(steps))[:, None]).T
+
+
+# Error of predictions of a recorded run, of which all states are known or some are measured.
+
+
+def free_run_error(
+    spec: TrialSpec,
+    predict: Callable[[Array, Array], Array],
+    states: npt.ArrayLike,
+    inputs: npt.ArrayLike,
+    steps: int = 50,
+) -> float:
+    """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations.
+
+    Where the run has the measured states alone, predictions start from the estimates of a filter,
+    the first of them after so many steps as a prediction has, and their error is that of the
+    measured states.
+    """
+    system = spec.system
+    y, u = (np.atleast_1d(reals(*run)) for run in (("states", states), ("inputs", inputs)))
+    steps = whole("steps", steps)
+    rows = _rows_of(system, y)
+    first = 0 if isinstance(rows, slice) else max(steps, 1)  # in which the filter settles
+    n = (len(u) - first) // max(steps, 1)
+    _check_shapes(system, y, u, steps, n)
+    _check_finite(y, u)
+    for column, row in enumerate(np.arange(system.n_states)[rows]):
+        if row in system.angle_indices:
+            y[:, column] = np.unwrap(y[:, column])
+    x = y if isinstance(rows, slice) else filtered_states(system, predict, y, u, _variance(spec))
+    last = first + n * steps
+    cut = u[first:last].reshape(n, steps, system.n_inputs)
+    starts, ends = y[first:last:steps], y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
+    if (starts == ends).all():
+        raise SpecificationError(
+            "a run was given in which nothing changes, but the error of its predictions is "
+            "relative to the changes: give a run that moves."
+        )
+    predicted = forecast_by(system, predict)(x[first:last:steps], cut)
+    return relative_error(predicted[..., rows], ends, starts)
+
+
+def _rows_of(system: System, run: Array) -> slice | list[int]:
+    """Return the states that a run has: all of them, or those that are measured."""
+    given, measured = run.shape[-1] if run.ndim == 2 else 0, list(system.measured_states)
+    return measured if given == len(measured) < system.n_states else slice(None)
+
+
+def _check_shapes(system: System, run: Array, inputs: Array, steps: int, n: int) -> None:
+    d, m, measured = system.n_states, system.n_inputs, system.n_measured
+    fits = run.ndim == 2 and len(run) == len(inputs) + 1 and run.shape[1] in (d, measured or d)
+    if not fits or inputs.shape != (len(inputs), m) or steps < 1 or n < 1:
+        alone = f", or (T + 1, {measured}) and twice as many," if 0 < measured < d else ""
+        raise SpecificationError(
+            f"a run with states of shape {run.shape} and inputs of shape {inputs.shape} was given "
+            f"for predictions of {steps} steps, but shapes (T + 1, {d}) and (T, {m}) with at least "
+            f"so many steps T{alone} are expected: correct it."
+        )
+
+
+def _check_finite(run: Array, inputs: Array) -> None:
+    for what, rows in (("states", run), ("inputs", inputs)):
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        if len(bad):
+            raise SpecificationError(
+                f"a run was given in which the {what} of row {bad[0]} are {rows[bad[0]].tolist()}, "
+                f"but finite numbers are expected: give a part of the run without such rows."
+            )
+
+
+def _variance(spec: TrialSpec) -> float:
+    """Return ρ of the filter over the state: that of the learner, or of joint_ekf by default."""
+    learner = spec.learner if isinstance(spec.learner, JointKalman) else JointKalman()
+    return learner.noise_variance
+
+
+# States, inputs, errors and predictions of an exploration so far.
+
+
+KINDS = (
+    "learned",
+    "repeated",
+    "out_of_order",
+    "gaps",
+    "unusable",
+    "jumps",
+    "resets",
+    "missed",
+)
+"""Kinds of events in :attr:`Explored.counts`."""
+
+
+class Explored:
+    """States, inputs, errors and predictions of an exploration.
+
+    Attributes
+    ----------
+    spec : TrialSpec
+        Plant, policy, model, learner and seed.
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        self.spec, self._state = spec, ExplorerState(spec)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Number of events of each kind since the first step of the journal."""
+        return {kind: self._state.counts[kind] for kind in KINDS}
+
+    @property
+    def n_steps(self) -> int:
+        """Steps t that were learned from."""
+        return self._state.done
+
+    @property
+    def parameters(self) -> Array:
+        """Parameters of the model, (q,)."""
+        return self._state.steps.parameters
+
+    @property
+    def states(self) -> Array:
+        """States x_0 ... x_t from which steps were taken, and the last one, (t + 1, d).
+
+        Where states are measured with noise they are estimates.
+
+        Where the exploration went on from another state, as after a gap, that one is here.
+        """
+        return self._state.steps.states[: self.n_steps + 1].copy()
+
+    @property
+    def inputs(self) -> Array:
+        """Inputs that were applied, (t, m)."""
+        return self._state.steps.inputs[: self.n_steps].copy()
+
+    @property
+    def errors(self) -> Array:
+        """Errors ‖y - a_θ(x, u)‖ of the accelerations, each before it was learned, (t,).
+
+        Where states are measured with noise, they are those of the predicted measurements, in
+        standard deviations of their noise.
+        """
+        return self._state.steps.errors[: self.n_steps].copy()
+
+    def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike | None = None) -> Array:
+        """Return the learned accelerations, (N, r), at states, (N, d), and inputs, (N, m).
+
+        Inputs count in a model that reads them, such as 'affine'; without any they are 0.
+        """
+        return predict(self.spec, self.parameters, states, inputs)
+
+    def free_run_error(
+        self, states: npt.ArrayLike, inputs: npt.ArrayLike, steps: int = 50
+    ) -> float:
+        """Return the error of predictions of a recorded run from its start, without measurements.
+
+        Parameters
+        ----------
+        states, inputs : (T + 1, d), (T, m)
+            States that were measured dt apart, and the inputs between them; best of another run
+            than the one that was learned from. Of a plant some of whose states are measured it may
+            be these alone, (T + 1, n).
+        steps : int
+            Steps of a prediction; the run is cut into as many of them as it holds. Where states are
+            measured the first piece has no prediction: the states are estimated in it.
+
+        Returns
+        -------
+        float
+            Relative root mean square error, without a unit: 0 for perfect predictions, 1 for those
+            that nothing changes (:func:`dopt.control.planning.relative_error`). That of measured
+            states alone has their noise in it.
+
+        Raises
+        ------
+        SpecificationError
+            If the shapes do not fit, or the run has fewer steps.
+        """
+        return free_run_error(self.spec, self.predict, states, inputs, steps)
+
+
+def predict(
+    spec: TrialSpec,
+    parameters: Array,
+    states: npt.ArrayLike,
+    inputs: npt.ArrayLike | None = None,
+) -> Array:
+    """Return the accelerations, (N, r), that a model of given parameters has learned."""
+    system = spec.system
+    at = _rows("states", states, system.n_states)
+    u = None if inputs is None else _rows("inputs", inputs, system.n_inputs)
+    if u is not None and len(u) != len(at):
+        raise SpecificationError(
+            f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
+            f"give the input of each state."
+        )
+    predicted: Array = spec.model.predict(system, parameters, at, u)
+    return predicted
+
+
+def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:
+    rows = np.atleast_2d(reals(what, given))
+    if rows.ndim != 2 or rows.shape[1] != size:
+        raise SpecificationError(
+            f"{what} of shape {np.shape(given)} were given, but (N, {size}) is expected: correct "
+            f"them."
+        )
+    return rows
+
 
 Run = tuple[npt.ArrayLike, npt.ArrayLike]
 """States, (T + 1, d), and inputs, (T, m)."""

@@ -1,4 +1,4 @@
-"""Forecasts for planners that roll thousands of paths: twin of :mod:`dopt.control.prediction`."""
+"""Forecasts for planners that roll thousands of paths: twin of :mod:`dopt.control.planning`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numba import float64
 
-from dopt.control.prediction import Forecast
+from dopt.control.planning import Forecast
 from dopt.kernel.from_spec import plant_of
 from dopt.kernel.held_plant import HeldPlantType, hold_plant
 from dopt.kernel.model_from_spec import network_of

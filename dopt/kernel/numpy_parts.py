@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dopt.control.feedback import Feedback
+from dopt.control.task import Feedback
 from dopt.custom_planner import custom_planner
 from dopt.errors import SpecificationError
 from dopt.kernel import model_queries

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from dopt.control.feedback import Feedback
+from dopt.control.task import Feedback
 from dopt.errors import SpecificationError
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.control.feedback import Feedback
+from dopt.control.task import Feedback
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
 from dopt.kernel.loop import act_next, evaluate_next

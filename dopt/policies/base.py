@@ -14,8 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.feedback import Feedback
-from dopt.control.task import Control, Goal
+from dopt.control.task import Control, Feedback, Goal
 from dopt.declare.kernel_support import PLAN_IN_NUMPY, KernelPart
 from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError, SpecificationError

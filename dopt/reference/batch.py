@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dopt.control.feedback import Feedback
+from dopt.control.task import Feedback
 from dopt.evaluation import evaluation_set
 from dopt.reference.black_box import episodes_for, initial_states, stepped
 from dopt.reference.dynamics import true_accelerations, true_next_states

@@ -31,8 +31,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 
-from dopt.control.episode import costs
-from dopt.control.planner import within_ball
+from dopt.control.planning import costs, within_ball
 from dopt.control.task import Goal
 from dopt.declare.validated_fields import parameter
 from dopt.policies.base import (
@@ -107,7 +106,7 @@ class SoftActorCritic(TaskPolicy):
 
 @dataclass(frozen=True, eq=False)
 class ActorFeedback:
-    """The mean of an actor as state feedback (:class:`dopt.control.feedback.Feedback`)."""
+    """The mean of an actor as state feedback (:class:`dopt.control.task.Feedback`)."""
 
     actor: Actor
     observation: Observation

@@ -15,7 +15,7 @@ from analysis.data.learned_model import learned_model
 from analysis.data.trial_selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
-from dopt.control.prediction import forecast_by_equations
+from dopt.control.planning import forecast_by_equations
 from dopt.forecasts import model_forecast
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System, UnbalancedDisk

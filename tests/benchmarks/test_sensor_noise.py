@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import sensor_noise
 from benchmarks.sensor_noise import expected_error, sensitivities
-from dopt.control.prediction import predict
+from dopt.control.planning import predict
 from dopt.randomness import initial_weights
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt.control.prediction import forecast_by
+from dopt.control.planning import forecast_by
 from dopt.errors import IncompatibleError
 from dopt.evaluation import evaluation_set
 from dopt.forecasts import model_forecast

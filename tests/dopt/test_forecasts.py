@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dopt.control.prediction import forecast_by, forecast_by_equations
+from dopt.control.planning import forecast_by, forecast_by_equations
 from dopt.evaluation import simulate
 from dopt.forecasts import model_forecast, true_forecast
 from dopt.models import MLP, Linear

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from dopt.control.episode import run_feedback
+from dopt.control.planning import run_feedback
 from dopt.control.task import GOALS, Goal
 from dopt.errors import IncompatibleError
 from dopt.forecasts import true_forecast

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from dopt.control import Control
-from dopt.control.episode import costs, run_episode, succeeds
-from dopt.control.prediction import Forecast
+from dopt.control.planning import Forecast, costs, run_episode, succeeds
 from dopt.control.task import GOALS
 from dopt.forecasts import true_forecast
 from dopt.systems import SYSTEMS, Pendulum, Quadrotor

@@ -5,8 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dopt.control.free_run import STARTS, free_run_error, held_out
-from dopt.control.prediction import forecast_by, forecast_by_equations
+from dopt.control.planning import (
+    STARTS,
+    forecast_by,
+    forecast_by_equations,
+    free_run_error,
+    held_out,
+)
 from dopt.evaluation import reachable_states
 from dopt.systems import SYSTEMS, Pendulum
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from dopt.control.planner import CrossEntropy, within_ball
+from dopt.control.planning import CrossEntropy, within_ball
 
 A = np.array([[1.0, 0.1], [0.0, 1.0]])
 B = np.array([[0.0], [0.1]])

@@ -12,7 +12,7 @@ import pytest
 
 from dopt import Explorer, Plant
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.explorer.recorded_run import free_run_error
+from dopt.explorer.saving import free_run_error
 from dopt.types import Array
 from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
 

@@ -12,7 +12,7 @@ import pytest
 
 from dopt import Explorer
 from dopt.errors import SpecificationError
-from dopt.explorer.interrupts import uninterrupted
+from dopt.explorer.explorer import uninterrupted
 from dopt.policies.base import CustomPolicy, Planner
 from dopt.systems import System
 from dopt.trial_view import TrialView

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dopt import Explorer, Plant
-from dopt.control.prediction import forecast_by_equations
+from dopt.control.planning import forecast_by_equations
 from dopt.errors import SpecificationError
 from dopt.evaluation import simulate
 from dopt.forecasts import model_forecast, true_forecast

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dopt.control import Control
-from dopt.control.episode import costs
+from dopt.control.planning import costs
 from dopt.control.task import GOALS
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
