@@ -27,14 +27,14 @@ from orchestrate.store.backends.sqlite_engine import driver_of, filling_engine
 from orchestrate.store.doctor import TrialKey
 from orchestrate.store.errors import SchemaVersionError, StoreError, StoreUnavailableError
 from orchestrate.store.merging.merge import Merged, merge
-from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, metadata
+from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, curve, metadata
 from orchestrate.store.serialization import DTYPE
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-TABLES = tuple(sorted({*metadata.tables} - {alembic_version.name}))
-"""Names of the tables but that of the version, which the provenance holds."""
+TABLES = tuple(sorted({*metadata.tables} - {alembic_version.name, curve.name}))
+"""Names of the tables but those of the version, which the provenance holds, and packed curves."""
 
 ARRAY_AXES = {"states": 2, "inputs": 2, "parameters": 1}
 """Number of axes of the arrays of a trajectory: states (T + 1, d), inputs (T, m), parameters."""

@@ -149,8 +149,6 @@ def _dangling_references(moment: Reader) -> list[Finding]:
 
 def _damaged_curves(moment: Reader) -> list[Finding]:
     """Unpack every array of the packed curves."""
-    if not moment.has_packed_curves():
-        return []
     damaged = [
         f"trial_id {trial_id}"
         for rows in moment.batches(

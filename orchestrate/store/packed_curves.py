@@ -1,10 +1,9 @@
 """Packed curves: each column of the steps of a finished trial once more, as one array.
 
-A column of numbers is read from arrays many times faster than from a row for each step. A database
-that an older program has created lacks the table until its upgrade, and one that such a program has
-written to lacks some rows: those curves are read from their steps. A row counts for the attempt
-that it was written for, so that none is taken for the curve of a later run. Each array ends with a
-checksum, as neither database notices a change within one.
+A column of numbers is read from arrays many times faster than from a row for each step. Where a row
+is missing, the curve is read from its steps. A row counts for the attempt that it was written for,
+so that none is taken for the curve of a later run. Each array ends with a checksum, as neither
+database notices a change within one.
 """
 
 from __future__ import annotations
@@ -13,11 +12,11 @@ import zlib
 from collections.abc import Iterable
 
 import numpy as np
-from sqlalchemy import Connection, Select, and_, bindparam, delete, insert, inspect, select
+from sqlalchemy import Connection, Select, and_, bindparam, delete, insert, select
 
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Array
-from orchestrate.store.schema import FINISHED, STEP_VALUES, curve, derived, step, trial
+from orchestrate.store.schema import FINISHED, STEP_VALUES, curve, step, trial
 from orchestrate.store.serialization import DTYPE
 
 PAGE = 200
@@ -29,22 +28,6 @@ _INSERT = insert(curve)
 _STEPS = select(*(step.c[name] for name in STEP_VALUES)).order_by(step.c.t)
 CURRENT = and_(curve.c.trial_id == trial.c.trial_id, curve.c.attempt == trial.c.attempt)
 """Condition that a row is the curve of a trial as it is now."""
-
-
-def exist(connection: Connection) -> bool:
-    """Return whether the database has the table."""
-    return inspect(connection).has_table(curve.name)
-
-
-def in_use(connection: Connection, backend: Backend) -> bool:
-    """Return whether the database has the table by now: an upgrade may run beside a launch."""
-    backend.has_curves = backend.has_curves or exist(connection)
-    return backend.has_curves
-
-
-def create(connection: Connection) -> None:
-    """Create the table where there is none."""
-    derived.create_all(connection)
 
 
 def write(connection: Connection, curves: Iterable[tuple[int, int, Array]]) -> None:

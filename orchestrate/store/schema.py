@@ -195,6 +195,14 @@ step = _table(
     rowid=False,
 )
 
+# Columns of ``step`` once more (:mod:`orchestrate.store.packed_curves`).
+curve = _table(
+    "curve",
+    _trial_key(primary_key=True, autoincrement=False),
+    Column("attempt", Integer, nullable=False),
+    *(Column(name, LargeBinary, nullable=False) for name in STEP_VALUES),
+)
+
 trajectory = _table(
     "trajectory",
     _trial_key(primary_key=True, autoincrement=False),
@@ -242,16 +250,3 @@ def alike(launch_id: int) -> Select[tuple[int]]:
     mine = select(func.coalesce(launch.c.fingerprint, "")).where(launch.c.launch_id == launch_id)
     same = func.coalesce(launch.c.fingerprint, "") == mine.scalar_subquery()
     return select(launch.c.launch_id).where(same)
-
-
-derived = MetaData()
-"""Tables that repeat others in a form that is faster to read; a database may lack them."""
-
-curve = Table(
-    "curve",
-    derived,
-    Column("trial_id", _Long, ForeignKey(trial.c.trial_id), primary_key=True, autoincrement=False),
-    Column("attempt", Integer, nullable=False),
-    *(Column(name, LargeBinary, nullable=False) for name in STEP_VALUES),
-    sqlite_strict=True,
-)

@@ -9,18 +9,17 @@ from contextlib import contextmanager
 
 from sqlalchemy import Connection, inspect, text
 
-from orchestrate.store import migrations, packed_curves
+from orchestrate.store import migrations
 from orchestrate.store.errors import SchemaVersionError
 from orchestrate.store.schema import (
     LOCK_TABLE,
     SCHEMA_VERSION,
     alembic_version,
-    derived,
     metadata,
 )
 
-# Table of the version before the program used Alembic.
-_FIRST_TABLE = "schema_version"
+OLDEST = 5
+"""Oldest schema that is upgraded."""
 
 CHECK_SECONDS = 10.0
 """Time that the check of a database may take, which a stranger may have made."""
@@ -54,7 +53,6 @@ def is_empty(connection: Connection) -> bool:
 def create(connection: Connection) -> None:
     """Create the newest tables and views in an empty database."""
     metadata.create_all(connection, checkfirst=False)
-    packed_curves.create(connection)
     migrations.create_views(connection)
     migrations.stamp(connection, SCHEMA_VERSION)
 
@@ -91,7 +89,6 @@ def _check_tables(connection: Connection, safe_url: str) -> None:
     found = {(table, column): kind for table, column, kind in rows}
     generated = {table for (table, _), kind in found.items() if kind is None}
     tables = [one for one in metadata.sorted_tables if one is not alembic_version]
-    tables += derived.sorted_tables if packed_curves.exist(connection) else []
     for table in tables:
         kinds = {one.name: one.type.compile(connection.dialect) for one in table.columns}
         whole = all(found.get((table.name, name)) == kind for name, kind in kinds.items())
@@ -124,17 +121,21 @@ def check_not_newer(version: int, safe_url: str) -> None:
 
 
 def version_of(connection: Connection, safe_url: str) -> int:
-    """Return the version of a released schema; raise ``SchemaVersionError`` for other tables."""
+    """Return the version of the schema; raise ``SchemaVersionError`` for others and old ones."""
     tables = inspect(connection).get_table_names()
-    found = None
+    found = "1" if "schema_version" in tables else None  # before the program used Alembic
     if alembic_version.name in tables:
         found = connection.execute(text("SELECT max(version_num) FROM alembic_version")).scalar()
-    elif _FIRST_TABLE in tables:
-        found = connection.execute(text("SELECT max(version) FROM schema_version")).scalar()
     if "trial" not in tables or not str(found).isdecimal():
         raise SchemaVersionError(
             f"{safe_url} is not a results database of this program (it has no table "
             f"'{alembic_version.name}' with the number of a schema): give the URL of another one, "
             "or of a new one."
         )
-    return int(str(found))
+    version = int(str(found))
+    if version < OLDEST:
+        raise SchemaVersionError(
+            f"The results database {safe_url} has schema {version}, but only schemas from {OLDEST} "
+            "on are upgraded: export it with the release of this program that wrote it."
+        )
+    return version

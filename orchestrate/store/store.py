@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Self
 
 from orchestrate.records import Failure, RunRecord
-from orchestrate.store import database_url, packed_curves, schema_version
+from orchestrate.store import database_url, schema_version
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, PATIENCE_SECONDS, make_backend
 from orchestrate.store.read import open_trials
@@ -53,7 +53,6 @@ class Store:
         try:
             with backend.creation() as connection:
                 schema_version.create_or_check(connection, backend.safe_url)
-                backend.has_curves = packed_curves.exist(connection)
         except BaseException:
             backend.close()
             raise

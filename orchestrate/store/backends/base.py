@@ -48,7 +48,6 @@ class Backend(ABC):
         self.engine = engine
         self.safe_url = safe_url
         self._has_answered = False
-        self.has_curves = False
         """Whether the database has the table of packed curves."""
 
     @contextmanager

@@ -118,8 +118,7 @@ class Target:
                     {"trial_id": trial_id, "t": t, "measure": measure, "value": value}
                     for t, measure, value in one.curve.assessments
                 ]
-        if packed_curves.in_use(self._connection, self._backend):
-            packed_curves.write(self._connection, curves)
+        packed_curves.write(self._connection, curves)
         for table, rows in (
             (attempt, attempts),
             (trajectory_table, trajectories),

@@ -1,4 +1,4 @@
-"""Alembic migrations from any released schema to the newest one.
+"""Alembic migrations from schemas 5 and 6 to the newest one.
 
 A new database is created from :mod:`orchestrate.store.schema` and stamped; only an older one runs
 the scripts in ``versions/``. Each script has the number of the schema that it creates.
@@ -26,16 +26,14 @@ def stamp(connection: Connection, version: int) -> None:
     connection.execute(alembic_version.insert().values(version_num=str(version)))
 
 
-def migrate(connection: Connection, version: int) -> None:
-    """Migrate a database from ``version`` to the newest one, in the transaction of the caller.
+def migrate(connection: Connection) -> None:
+    """Migrate a database to the newest schema, in the transaction of the caller.
 
     The views are dropped and created again: not every database can change a table below a view.
     """
     from alembic import command  # a sixth of the start of every program, and used by none but this
 
     drop_views(connection)
-    if not inspect(connection).has_table(alembic_version.name):
-        stamp(connection, version)
     command.upgrade(_configuration(connection), "head")
     create_views(connection)
 

@@ -18,7 +18,7 @@ from orchestrate.store import database_url, migrations, packed_curves, schema_ve
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import make_backend
-from orchestrate.store.schema import SCHEMA_VERSION, config
+from orchestrate.store.schema import SCHEMA_VERSION, config, curve
 from orchestrate.store.write import launches
 
 
@@ -56,7 +56,7 @@ def upgrade(url: str, backup: bool = True) -> Upgrade:
     NoDatabaseError
         If there is no file.
     SchemaVersionError
-        If the database is not a results database, or one of a newer program.
+        If the database is not a results database, or its schema is newer or too old.
     LaunchAliveError
         If a launch is running in it.
     StoreError
@@ -87,11 +87,11 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
             if before < SCHEMA_VERSION:
                 launches.refuse_living(connection, backend)
                 name = backend.back_up(connection, before) if backup else None
-                migrations.migrate(connection, before)
-                _write_missing_labels(connection)
+                migrations.migrate(connection)
+                curve.create(connection, checkfirst=True)
+                _write_labels(connection)
             else:
                 migrations.create_views(connection)
-            packed_curves.create(connection)
     except BaseException:
         if name is not None:
             Path(name).unlink(missing_ok=True)
@@ -99,11 +99,13 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
     return Upgrade(backend.safe_url, before, SCHEMA_VERSION, name)
 
 
-def _write_missing_labels(connection: Connection) -> None:
-    columns = select(config.c.config_id, config.c.config_json).where(config.c.label == "")
+def _write_labels(connection: Connection) -> None:
+    """Write the labels as this program makes them."""
+    columns = select(config.c.config_id, config.c.config_json, config.c.label)
     rows = [
-        {"id": config_id, "text": config_label(json.loads(text))}
-        for config_id, text in connection.execute(columns)
+        {"id": config_id, "text": text}
+        for config_id, document, label in connection.execute(columns)
+        if (text := config_label(json.loads(document))) != label
     ]
     if rows:
         statement = update(config).where(config.c.config_id == bindparam("id"))

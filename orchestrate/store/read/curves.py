@@ -16,11 +16,11 @@ from orchestrate.store.records import Array
 from orchestrate.store.schema import FINISHED, N_ROWS, curve, step, trial
 
 _TRIALS = (
-    f"SELECT r.seed, r.status, {N_ROWS} AS n, {{packed}} AS packed FROM trial r "
-    "JOIN config c ON c.config_id = r.config_id {join} "
+    f"SELECT r.seed, r.status, {N_ROWS} AS n, p.{{column}} AS packed FROM trial r "
+    "JOIN config c ON c.config_id = r.config_id "
+    "LEFT JOIN curve p ON p.trial_id = r.trial_id AND p.attempt = r.attempt "
     "WHERE c.config_id = :config_id AND r.status IN ('done', 'diverged') ORDER BY r.seed"
 )
-_JOIN = "LEFT JOIN curve p ON p.trial_id = r.trial_id AND p.attempt = r.attempt"
 
 
 def read_curves(
@@ -30,11 +30,10 @@ def read_curves(
 
     Raises ``StoreUnavailableError`` if a step is missing; ``place`` names the configuration.
     """
-    has_packed = packed_curves.exist(connection)
-    how = {"packed": f"p.{column}", "join": _JOIN} if has_packed else {"packed": "NULL", "join": ""}
-    trials = connection.execute(text(_TRIALS.format(**how)), {"config_id": config_id}).all()
+    statement = text(_TRIALS.format(column=column))
+    trials = connection.execute(statement, {"config_id": config_id}).all()
     rest = [row.n for row in trials if row.packed is None]
-    stepwise = _stepwise(connection, config_id, horizon, column, has_packed) if rest else _NONE
+    stepwise = _stepwise(connection, config_id, horizon, column) if rest else _NONE
     parts = _parts(trials, stepwise, rest)
     lengths = np.array([row.n for row in trials], dtype=np.int64)
     found = sum(map(len, parts))
@@ -68,20 +67,16 @@ def _parts(trials: Sequence[Row[Any]], stepwise: Array, rest: Sequence[int]) -> 
     ]
 
 
-def _stepwise(
-    connection: Connection, config_id: int, horizon: int, column: str, has_packed: bool
-) -> Array:
+def _stepwise(connection: Connection, config_id: int, horizon: int, column: str) -> Array:
     """Return a column of the steps of the trials without a packed curve, NULL as NaN."""
+    packed = exists().where(packed_curves.CURRENT).correlate(trial).select_from(curve)
     finished = (trial.c.config_id == config_id) & trial.c.status.in_(FINISHED)
     statement = (
         select(step.c[column])
         .join(trial, trial.c.trial_id == step.c.trial_id)
-        .where(finished, step.c.t.between(0, horizon - 1))
+        .where(finished, ~packed, step.c.t.between(0, horizon - 1))
         .order_by(trial.c.seed, step.c.t)
     )
-    if has_packed:
-        packed = exists().where(packed_curves.CURRENT).correlate(trial).select_from(curve)
-        statement = statement.where(~packed)
     return _numbers(connection.execute(statement))
 
 

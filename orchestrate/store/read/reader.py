@@ -13,7 +13,7 @@ import numpy as np
 from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 
 from dopt.errors import suggestion
-from orchestrate.store import database_url, packed_curves, schema_version
+from orchestrate.store import database_url, schema_version
 from orchestrate.store.backends import postgresql, sqlite
 from orchestrate.store.backends.driver_errors import translated
 from orchestrate.store.errors import QueryError
@@ -122,11 +122,6 @@ class Reader:
         """Return the version of the database's schema."""
         with self._snapshot() as connection:
             return str(schema_version.check(connection, self.safe_url))
-
-    def has_packed_curves(self) -> bool:
-        """Return whether the database has the table of packed curves."""
-        with self._snapshot() as connection:
-            return packed_curves.exist(connection)
 
     def size(self) -> int:
         """Return the bytes of the database."""

@@ -7,7 +7,6 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Select, delete, insert, select, update
 
-from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Claim
 from orchestrate.store.schema import (
@@ -125,7 +124,6 @@ def retry(
     keys = list(connection.execute(reset).scalars())
     # By the keys: a launch may write another outcome of the same status meanwhile.
     chosen = select(trial.c.trial_id).where(trial.c.trial_key.in_(backend.members(keys)))
-    packed = (curve,) if packed_curves.in_use(connection, backend) else ()
-    for table in (step, trajectory, assessment, *packed):
+    for table in (step, trajectory, assessment, curve):
         connection.execute(delete(table).where(table.c.trial_id.in_(chosen)))
     return len(keys)

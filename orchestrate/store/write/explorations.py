@@ -133,8 +133,7 @@ def _write_steps(
         steps, n_stored = np.concatenate([steps, missing]), 0
         connection.execute(delete(step).where(step.c.trial_id == trial_id))
     backend.insert_steps(connection, trial_id, steps[n_stored:], n_stored)
-    if packed_curves.in_use(connection, backend):
-        packed_curves.write(connection, [(trial_id, rows.claim.attempt, steps)])
+    packed_curves.write(connection, [(trial_id, rows.claim.attempt, steps)])
 
 
 def _replace_arrays(connection: Connection, rows: PreparedRows) -> None:

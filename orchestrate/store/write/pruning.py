@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection, delete, or_, select, union
 
-from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.schema import (
     ENDED,
@@ -36,8 +35,7 @@ def prune(connection: Connection, backend: Backend, trial_keys: Sequence[str]) -
         .with_for_update()
     )
     found = list(connection.execute(chosen).scalars())
-    packed = (curve,) if packed_curves.in_use(connection, backend) else ()
-    for table in (step, trajectory, assessment, *packed, attempt, trial):
+    for table in (step, trajectory, assessment, curve, attempt, trial):
         connection.execute(delete(table).where(table.c.trial_id.in_(found)))
     return len(found)
 

@@ -171,8 +171,7 @@ def write(connection: Connection, backend: Backend, rows: PreparedRows) -> bool:
         return False
     check_horizon(rows.claim.trial_key, len(rows.steps), horizon)
     backend.insert_steps(connection, rows.claim.trial_id, rows.steps)
-    if packed_curves.in_use(connection, backend):
-        packed_curves.write(connection, [(rows.claim.trial_id, rows.claim.attempt, rows.steps)])
+    packed_curves.write(connection, [(rows.claim.trial_id, rows.claim.attempt, rows.steps)])
     connection.execute(_INSERT_TRAJECTORY, rows.trajectory)
     if rows.assessments:
         connection.execute(_INSERT_ASSESSMENT, rows.assessments)

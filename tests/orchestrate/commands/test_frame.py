@@ -114,7 +114,7 @@ class TestOnEveryDatabase:
         self, words: list[str], url: str, store: Store, capsys: Capture
     ) -> None:
         with store._backend.transaction() as connection:
-            connection.exec_driver_sql("UPDATE alembic_version SET version_num = '1'")
+            connection.exec_driver_sql("UPDATE alembic_version SET version_num = '5'")
         code, sentence = refusal([*words, "--db", url], capsys)
         assert code == ExitCode.BAD_REQUEST
         assert "python -m orchestrate upgrade --db" in sentence

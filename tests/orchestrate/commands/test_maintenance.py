@@ -43,22 +43,22 @@ class TestUpgrade:
         return sqlite_url
 
     def test_of_an_older_database(self, command: Run, url: str) -> None:
-        restore(1, url)
+        restore(5, url)
         refused = command("status")
         assert refused.code == 2
         assert f"run 'python -m orchestrate upgrade --db {url}'" in refused.err
         answer = command("upgrade")
         assert answer.code == 0
-        backup = f"a backup is in the file {_path(url)}.v1-b"
-        assert f"went from schema 1 to {SCHEMA_VERSION}; {backup}" in answer.out
+        backup = f"a backup is in the file {_path(url)}.v5-b"
+        assert f"went from schema 5 to {SCHEMA_VERSION}; {backup}" in answer.out
         assert command("status").code == 0
         assert "there is nothing to do" in command("upgrade").out
 
     def test_without_a_backup(self, command: Run, url: str) -> None:
-        restore(1, url)
+        restore(5, url)
         document = command("upgrade", "--no-backup", "--json").document
         assert document == {
-            "safe_url": url, "before": 1, "after": SCHEMA_VERSION, "backup": None, "packed": 5,
+            "safe_url": url, "before": 5, "after": SCHEMA_VERSION, "backup": None, "packed": 5,
             "changed": True,
         }  # fmt: skip
         assert not list(_path(url).parent.glob("*backup*"))
@@ -107,7 +107,7 @@ class TestMerge:
 
 class TestDoctor:
     def test_finds_nothing_in_what_a_launch_wrote(self, command: Run, url: str) -> None:
-        restore(1, url)
+        restore(5, url)
         command("upgrade", "--no-backup")
         answer = command("doctor")
         assert answer.code == 0
@@ -115,7 +115,7 @@ class TestDoctor:
         assert "error" not in answer.out
 
     def test_names_what_is_wrong(self, command: Run, url: str) -> None:
-        restore(1, url)
+        restore(5, url)
         command("upgrade", "--no-backup")
         engine = create_engine(url)
         with engine.begin() as connection:
@@ -130,7 +130,7 @@ class TestDoctor:
         assert all(one["advice"] for one in document)
 
     def test_what_it_advises_helps(self, command: Run, url: str, tmp_path: Path) -> None:
-        restore(1, url)
+        restore(5, url)
         command("upgrade", "--no-backup")
         engine = create_engine(url)
         with engine.begin() as connection:

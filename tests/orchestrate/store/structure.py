@@ -97,6 +97,6 @@ def columns(url: str) -> dict[str, tuple[str, ...]]:
     engine.dispose()
     found: dict[str, tuple[str, ...]] = {}
     for table, column in pairs:
-        if table not in ("schema_version", "alembic_version"):
+        if table != "alembic_version":
             found[table] = (*found.get(table, ()), column)
     return found

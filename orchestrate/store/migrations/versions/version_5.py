@@ -1,25 +1,10 @@
-"""Schema 5: table of the samples of curves of trials that run."""
+"""Schema 5, the oldest that is upgraded: the start of the migrations, with nothing to do."""
 
 from __future__ import annotations
 
-import sqlalchemy
-from alembic import op
-from sqlalchemy.types import TypeEngine
-
 revision = "5"
-down_revision = "4"
+down_revision = None
 
 
 def upgrade() -> None:
-    real: TypeEngine[float] = sqlalchemy.Double().with_variant(sqlalchemy.REAL(), "sqlite")
-    whole: TypeEngine[int] = sqlalchemy.BigInteger().with_variant(sqlalchemy.Integer(), "sqlite")
-    op.create_table(
-        "live_step",
-        sqlalchemy.Column("trial_id", whole, sqlalchemy.ForeignKey("trial.trial_id")),
-        sqlalchemy.Column("t", sqlalchemy.Integer, autoincrement=False),
-        sqlalchemy.Column("loss", real),
-        sqlalchemy.Column("reachable_loss", real),
-        sqlalchemy.PrimaryKeyConstraint("trial_id", "t"),
-        sqlite_strict=True,
-        sqlite_with_rowid=False,
-    )
+    """Do nothing."""

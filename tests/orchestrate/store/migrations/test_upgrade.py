@@ -19,13 +19,12 @@ from orchestrate.store import (
     SchemaVersionError,
     Store,
     StoreUnavailableError,
-    database_url,
     migrations,
 )
 from orchestrate.store.backends.file_locks import LaunchLocks
-from orchestrate.store.backends.open import make_backend
 from orchestrate.store.migrations.upgrade import upgrade
 from orchestrate.store.schema import SCHEMA_VERSION
+from orchestrate.store.schema_version import OLDEST
 from tests.orchestrate.store.fakes import LAUNCH, Spec
 from tests.orchestrate.store.migrations.released import VERSIONS
 from tests.orchestrate.store.places import backups, execute, file_of
@@ -46,21 +45,6 @@ def upgrade():
     op.add_column("trial", sqlalchemy.Column("more", sqlalchemy.Integer))
     op.execute("DELETE FROM step")
     op.execute("SELECT nonsense FROM nowhere")
-'''
-REBUILDING = '''
-"""A change for which SQLite writes tables anew."""
-
-import sqlalchemy
-from orchestrate.store.migrations.rebuilding import rebuilt
-
-revision = "99"
-down_revision = "{head}"
-
-
-def upgrade():
-    for table in ("step", "trial", "attempt", "launch"):
-        with rebuilt(table) as batch:
-            batch.add_column(sqlalchemy.Column("more", sqlalchemy.Integer))
 '''
 
 
@@ -88,8 +72,8 @@ def with_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[st
 
 def test_there_is_a_script_for_each_version_and_one_database() -> None:
     scripts = {path.stem for path in (migrations.LOCATION / "versions").glob("version_*.py")}
-    assert scripts == {f"version_{n}" for n in range(1, SCHEMA_VERSION + 1)}
-    assert list(range(1, SCHEMA_VERSION)) == VERSIONS
+    assert scripts == {f"version_{n}" for n in range(OLDEST, SCHEMA_VERSION + 1)}
+    assert list(range(OLDEST, SCHEMA_VERSION)) == VERSIONS
 
 
 def test_a_script_uses_no_code_that_may_change() -> None:
@@ -100,8 +84,7 @@ def test_a_script_uses_no_code_that_may_change() -> None:
             if isinstance(node, ast.Import | ast.ImportFrom)
             for alias in node.names
         }
-        own = {name for name in imported if name.split(".")[0] in ("dopt", "orchestrate")}
-        assert own <= {"orchestrate.store.migrations.rebuilding"}, path.name
+        assert not {name for name in imported if name.split(".")[0] in ("dopt", "orchestrate")}
 
 
 @pytest.mark.parametrize("side", [Store, Reader])
@@ -185,46 +168,6 @@ def test_a_failure_in_the_middle_changes_nothing(
     assert backups(old) == []
 
 
-def test_tables_that_are_written_anew_keep_everything(
-    old: str, with_script: Callable[[str], None]
-) -> None:
-    kept = _kept(old)
-    rows = contents(old, kept)
-    upgrade(old)
-    before = structure(old)
-    with_script(REBUILDING)
-    _migrate(old)
-    assert contents(old, kept) == rows
-    after = structure(old)
-    if not old.startswith("sqlite"):
-        after["columns"] = [row for row in after["columns"] if "'more'" not in row]
-        assert after == before
-        return
-    same = [(name, kind, n - (name in MORE), *rest) for name, kind, n, *rest in after["tables"]]
-    assert same == before["tables"]
-    assert _checks(after) == _checks(before)
-    for pragma in ("foreign_key_list", "index_list"):
-        for name in MORE:
-            key = f"{pragma} {name}"
-            assert after[key] == before[key]
-    wanted = [one for one in before["statements"] if one[0] in ("index", "view")]
-    assert [one for one in after["statements"] if one[0] in ("index", "view")] == wanted
-
-
-MORE = ("step", "trial", "attempt", "launch")
-
-
-def _checks(found: dict[str, list[tuple[str, ...]]]) -> list[str]:
-    return [one[3].partition("CHECK")[2].partition("))")[0] for one in found["statements"]]
-
-
-def _migrate(url: str) -> None:
-    backend = make_backend(database_url.parse(url))
-    with backend.rebuilding() as connection:
-        migrations.migrate(connection, SCHEMA_VERSION)
-    backend.close()
-
-
 def test_a_living_launch_is_left_alone(old: str) -> None:
     before = structure(old)
     with ExitStack() as stack:
@@ -275,6 +218,18 @@ def test_the_newest_is_left_alone_and_a_newer_refused(store: Store, url: str) ->
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '99'")
     with pytest.raises(SchemaVersionError, match="a newer program"):
         upgrade(url)
+
+
+@pytest.mark.parametrize("open_", [Store.open, Reader.open, upgrade])
+def test_one_that_is_too_old_is_refused_with_what_to_do(
+    store: Store, url: str, open_: Callable[[str], object]
+) -> None:
+    with store._backend.transaction() as connection:
+        connection.exec_driver_sql(f"UPDATE alembic_version SET version_num = '{OLDEST - 1}'")
+    before = structure(url)
+    with pytest.raises(SchemaVersionError, match="export it with the release of this program"):
+        open_(url)
+    assert structure(url) == before
 
 
 def test_an_empty_database_is_created(url: str) -> None:
