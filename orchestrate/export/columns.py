@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import pyarrow as pa
 
+from orchestrate.store.schema import OUTCOME_COLUMNS, trial
+
 _TEXT, _WHOLE, _REAL = pa.string(), pa.int64(), pa.float64()
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 _NAMES = (("env", _TEXT), ("policy", _TEXT), ("model", _TEXT), ("learner", _TEXT))
 _SIZES = (("width", _WHOLE), ("depth", _WHOLE))
+_KINDS = {int: _WHOLE, float: _REAL, str: _TEXT}
+_OUTCOME = tuple((name, _KINDS[trial.c[name].type.python_type]) for name in OUTCOME_COLUMNS)
 
 CURVES = pa.schema(
     [
@@ -29,10 +33,9 @@ TRIALS = pa.schema(
         *_NAMES,
         *_SIZES,
         *(("horizon", _WHOLE), ("dt", _REAL), ("gamma", _REAL)),
-        *(("seed", _WHOLE), ("status", _TEXT), ("attempt", _WHOLE), ("n_steps", _WHOLE)),
-        *(("final_loss", _REAL), ("best_loss", _REAL), ("diverged_at", _WHOLE)),
-        *(("wall_seconds", _REAL), ("cpu_seconds", _REAL), ("peak_memory_bytes", _WHOLE)),
-        *(("node", _TEXT), ("launch_id", _WHOLE), ("error_type", _TEXT), ("error_message", _TEXT)),
+        *(("seed", _WHOLE), ("status", _TEXT), ("attempt", _WHOLE)),
+        *_OUTCOME,
+        *(("launch_id", _WHOLE), ("error_type", _TEXT), ("error_message", _TEXT)),
     ]
 )
 """One row for each trial, with or without a result."""

@@ -43,9 +43,6 @@ PROVENANCE = "provenance.json"
 KIND = "dopt results bundle"
 """Entry ``kind`` of the provenance of a bundle."""
 
-READABLE = ("6", str(SCHEMA_VERSION))
-"""Schemas whose bundles have the columns of this one."""
-
 CHECKSUMS = "SHA256SUMS"
 
 _LINE = re.compile(r"([0-9a-f]{64}) [ *]([\w.-]+)")
@@ -104,7 +101,7 @@ def merge_bundle(url: str, folder: Path, trial_key: TrialKey | None = None) -> M
 
 
 def _check(folder: Path) -> None:
-    """Compare every file with its SHA-256, and the schema with that of this program."""
+    """Compare every file with its SHA-256."""
     listed = folder / CHECKSUMS
     if not listed.is_file():
         raise StoreError(
@@ -123,13 +120,6 @@ def _check(folder: Path) -> None:
     if not isinstance(facts, dict) or facts.get("kind") != KIND:
         raise StoreError(
             f"{folder} is no bundle, its {PROVENANCE} describes something else: give {_WRITTEN}."
-        )
-    version = str(facts.get("schema_version"))
-    if version not in READABLE:
-        raise SchemaVersionError(
-            f"The bundle {folder} has schema {version}, this program reads "
-            f"{' and '.join(READABLE)}: import it with {facts.get('program')}, which has written "
-            "it, and upgrade that database."
         )
 
 
@@ -182,9 +172,9 @@ def _batches(file: Path, expected: pa.Schema) -> Iterator[pa.RecordBatch]:
     try:
         with pa.parquet.ParquetFile(file) as parquet:
             if not parquet.schema_arrow.equals(expected):
-                raise StoreUnavailableError(
-                    f"The columns of {file} are not those of the schema of this program: "
-                    "export the bundle again with 'python -m orchestrate export bundle'."
+                raise SchemaVersionError(
+                    f"The columns of {file} are not those of schema {SCHEMA_VERSION}: import the "
+                    "bundle with the release that has written it, and upgrade that database."
                 )
             yield from parquet.iter_batches(_ROWS)
     except pa.ArrowException as error:

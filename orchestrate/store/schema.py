@@ -7,7 +7,9 @@ stores NaN as NULL, PostgreSQL as NaN.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from sqlalchemy import (
     REAL,
@@ -55,18 +57,6 @@ CONFIG_COLUMNS = (
     "gamma",
     "label",
 )
-OUTCOME_COLUMNS = (
-    "n_steps",
-    "final_loss",
-    "best_loss",
-    "diverged_at",
-    "wall_seconds",
-    "cpu_seconds",
-    "peak_memory_bytes",
-    "node",
-)
-"""Columns of a trial that its outcome fills, beside status and references."""
-
 RETRIED = {
     "failed": ("failed",),
     "diverged": ("diverged",),
@@ -84,13 +74,61 @@ N_ROWS = (
 )
 """SQL of the number of steps that are stored of a finished trial r of a configuration c."""
 
-STEP_VALUES = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
+_LOSS = "unit of the accelerations"
 
-metadata = MetaData()
+STEP_VALUES = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 # STRICT tables know five type names; INTEGER is 64 bits wide in SQLite already.
 _Real: TypeEngine[float] = Double().with_variant(REAL(), "sqlite")
 _Long: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
+
+
+class OutcomeColumn(NamedTuple):
+    """Type in SQL, unit and meaning of a column.
+
+    A launch takes its value from the result of the trial or, ``of_run``, from the record of its
+    run, where the attribute has the name of the column.
+    """
+
+    kind: Any
+    unit: str
+    meaning: str
+    of_run: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Columns of a trial that its outcome fills; None before.
+
+    The table of trials and the views, what a launch writes, the rows of a reader, exports and
+    bundles are made from these fields: a column is added here, with a migration.
+    """
+
+    n_steps: Annotated[
+        int | None, OutcomeColumn(Integer, "steps", "steps before the end or the divergence")
+    ]
+    final_loss: Annotated[float | None, OutcomeColumn(_Real, _LOSS, "loss of the last step")]
+    best_loss: Annotated[float | None, OutcomeColumn(_Real, _LOSS, "smallest loss of a step")]
+    diverged_at: Annotated[
+        int | None, OutcomeColumn(Integer, "step", "first step whose loss is not finite")
+    ]
+    wall_seconds: Annotated[float | None, OutcomeColumn(_Real, "s", "elapsed time", of_run=True)]
+    cpu_seconds: Annotated[float | None, OutcomeColumn(_Real, "s", "processor time", of_run=True)]
+    peak_memory_bytes: Annotated[
+        int | None, OutcomeColumn(_Long, "byte", "largest memory of the process", of_run=True)
+    ]
+    node: Annotated[str | None, OutcomeColumn(Text, "", "host that ran the trial", of_run=True)]
+
+
+OUTCOME: Mapping[str, OutcomeColumn] = {
+    name: hint.__metadata__[0]
+    for name, hint in get_type_hints(Outcome, include_extras=True).items()
+}
+OUTCOME_COLUMNS = tuple(OUTCOME)
+RUN_COLUMNS = tuple(name for name, column in OUTCOME.items() if column.of_run)
+"""Columns of an outcome that an attempt has too."""
+
+metadata = MetaData()
 
 
 def _one_of(column: str, values: tuple[str, ...]) -> CheckConstraint:
@@ -170,14 +208,7 @@ trial = _table(
     Column("status", Text, nullable=False),
     Column("owner", _Long, ForeignKey("launch.launch_id")),  # launch with the claim while running
     Column("attempt", Integer, nullable=False),
-    Column("n_steps", Integer),
-    Column("final_loss", _Real),
-    Column("best_loss", _Real),
-    Column("diverged_at", Integer),
-    Column("wall_seconds", _Real),
-    Column("cpu_seconds", _Real),
-    Column("peak_memory_bytes", _Long),
-    _text("node", nullable=True),
+    *(Column(name, column.kind) for name, column in OUTCOME.items()),
     Column("launch_id", _Long, ForeignKey("launch.launch_id")),  # launch of the outcome
     Column("error_id", _Long, ForeignKey("error.error_id")),
     Column("registered_by", _Long),  # launch_id of the code that may run it while it is pending
@@ -236,9 +267,7 @@ attempt = _table(
     _text("claimed"),
     _text("started", nullable=True),
     _text("ended", nullable=True),
-    Column("wall_seconds", _Real),
-    Column("cpu_seconds", _Real),
-    Column("peak_memory_bytes", _Long),
+    *(Column(name, OUTCOME[name].kind) for name in RUN_COLUMNS if name != "node"),
     Column("error_id", _Long, ForeignKey("error.error_id")),
     Index("attempt_by_end", "ended"),
     rowid=False,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from orchestrate.store.schema import OUTCOME_COLUMNS
+
 _CONFIG = "c.config_key, c.label, c.env, c.policy, c.model, c.learner, c.width, c.depth"
+
+_OUTCOME = ", ".join(f"r.{name}" for name in OUTCOME_COLUMNS)
 
 _TRIAL = f"""
 SELECT {_CONFIG}, c.horizon, c.dt, c.gamma,
-       r.seed, r.trial_id, r.trial_key, r.status, r.attempt, r.n_steps, r.final_loss, r.best_loss,
-       r.diverged_at, r.wall_seconds, r.cpu_seconds, r.peak_memory_bytes, r.node, r.launch_id,
+       r.seed, r.trial_id, r.trial_key, r.status, r.attempt, {_OUTCOME}, r.launch_id,
        e.type AS error_type, e.message AS error_message
 FROM trial r
 JOIN config c ON c.config_id = r.config_id

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from orchestrate.store.schema import OUTCOME, RUN_COLUMNS
+
 TABLE_TITLES: Mapping[str, str] = {
     "config": "one row for each configuration: all that defines a trial but its seed",
     "trial": "one row for each trial: a configuration with a seed",
@@ -19,11 +21,7 @@ TABLE_TITLES: Mapping[str, str] = {
 _TRIAL_ID = ("", "trial, a row of `trial`")
 _LAUNCH_ID = ("", "launch, a row of `launch`")
 _ERROR_ID = ("", "error, a row of `error`")
-_COST = {
-    "wall_seconds": ("s", "elapsed time"),
-    "cpu_seconds": ("s", "processor time"),
-    "peak_memory_bytes": ("byte", "largest memory of the process"),
-}
+_OUTCOME = {name: (one.unit, one.meaning) for name, one in OUTCOME.items()}
 
 COLUMNS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "config": {
@@ -49,12 +47,7 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "status": ("", "pending, running, done, diverged, failed or cancelled"),
         "owner": ("", "launch that runs the trial"),
         "attempt": ("", "number of runs"),
-        "n_steps": ("steps", "steps before the end or the divergence"),
-        "final_loss": ("unit of the accelerations", "loss of the last step"),
-        "best_loss": ("unit of the accelerations", "smallest loss of a step"),
-        "diverged_at": ("step", "first step whose loss is not finite"),
-        **_COST,
-        "node": ("", "host that ran the trial"),
+        **_OUTCOME,
         "launch_id": _LAUNCH_ID,
         "error_id": _ERROR_ID,
         "registered_by": ("", "number of the launch that registered it"),
@@ -119,7 +112,7 @@ COLUMNS: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "claimed": ("UTC", "time at which the launch claimed the trial"),
         "started": ("UTC", "time of the start"),
         "ended": ("UTC", "time of the end"),
-        **_COST,
+        **{name: _OUTCOME[name] for name in RUN_COLUMNS if name != "node"},
         "error_id": _ERROR_ID,
     },
     "error": {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from functools import partial
 from itertools import chain
 from types import ModuleType
@@ -46,9 +47,9 @@ _CONFIGS = text(
     "FROM v_progress p JOIN config c ON c.config_key = p.config_key"
 )
 _TRIALS = text(
-    "SELECT seed, trial_key, status, attempt, n_steps, diverged_at, final_loss, best_loss, "
-    "wall_seconds, cpu_seconds, peak_memory_bytes, node, launch_id, error_type, error_message "
-    "FROM v_trial WHERE config_key = :config_key ORDER BY seed"
+    f"SELECT {', '.join(one.name for one in fields(TrialRow))} "
+    "FROM (SELECT launch_id AS launch, v_trial.* FROM v_trial WHERE config_key = :config_key) AS v "
+    "ORDER BY seed"
 )
 _MEASURES = (
     "SELECT DISTINCT measure FROM v_assessment WHERE config_key = :config_key ORDER BY measure"

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from orchestrate.store.records import Array
+from orchestrate.store.schema import Outcome
 
 
 @dataclass(frozen=True)
@@ -99,21 +100,13 @@ class Assessments:
 
 
 @dataclass(frozen=True)
-class TrialRow:
+class TrialRow(Outcome):
     """Summary of one trial; None for values that it does not have yet."""
 
     seed: int
     trial_key: str
     status: str
     attempt: int
-    n_steps: int | None
-    diverged_at: int | None
-    final_loss: float | None
-    best_loss: float | None
-    wall_seconds: float | None
-    cpu_seconds: float | None
-    peak_memory_bytes: int | None
-    node: str | None
     launch: int | None
     error_type: str | None
     error_message: str | None

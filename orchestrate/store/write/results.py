@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,8 @@ from orchestrate.store.backends.base import Backend
 from orchestrate.store.records import Array, Claim, Result
 from orchestrate.store.schema import (
     FINISHED,
+    OUTCOME_COLUMNS,
+    RUN_COLUMNS,
     STEP_VALUES,
     assessment,
     attempt,
@@ -43,7 +45,7 @@ from orchestrate.store.serialization import (
 )
 from orchestrate.store.write.result_validation import check_horizon, check_result
 
-_RUN_COLUMNS = ("node", "wall_seconds", "cpu_seconds", "peak_memory_bytes")
+_RESULT_COLUMNS = tuple(name for name in OUTCOME_COLUMNS if name not in RUN_COLUMNS)
 
 # As text: SQLAlchemy omits table names in RETURNING on SQLite, and a bare config_id would be the
 # one of the inner table.
@@ -64,12 +66,8 @@ _FENCED = (
         status=bindparam("status"),
         owner=None,
         launch_id=bindparam("fence_owner"),
-        n_steps=bindparam("n_steps"),
-        final_loss=bindparam("final_loss"),
-        best_loss=bindparam("best_loss"),
-        diverged_at=bindparam("diverged_at"),
         error_id=None,
-        **{name: bindparam(name) for name in _RUN_COLUMNS},
+        **{name: bindparam(name) for name in OUTCOME_COLUMNS},
     )
     .returning(_HORIZON)
 )
@@ -83,7 +81,7 @@ _END_ATTEMPT = (
         outcome=bindparam("status"),
         cause=bindparam("cause"),
         error_id=bindparam("error_id"),
-        **{name: bindparam(name) for name in (*_RUN_COLUMNS, "pid")},
+        **{name: bindparam(name) for name in (*RUN_COLUMNS, "pid")},
         **{name: not_before(attempt.c.claimed, bindparam(name)) for name in ("started", "ended")},
     )
 )
@@ -120,10 +118,7 @@ def prepare(claim: Claim, result: Result, run: RunRecord) -> PreparedRows:
     steps[~np.isfinite(steps)] = np.nan
     summary = {
         "status": "done" if result.diverged_at is None else "diverged",
-        "n_steps": plain(result.n_steps),
-        "final_loss": finite(result.final_loss),
-        "best_loss": finite(result.best_loss),
-        "diverged_at": plain(result.diverged_at),
+        **_values(result, _RESULT_COLUMNS),
         "error_id": None,
         "cause": None,
         **_run_row(run),
@@ -154,14 +149,17 @@ def _assessment_rows(claim: Claim, result: Result) -> list[dict[str, Any]]:
 
 def _run_row(run: RunRecord) -> dict[str, Any]:
     return {
-        "node": run.node,
+        **_values(run, RUN_COLUMNS),
         "pid": int(run.pid),
-        "wall_seconds": finite(run.wall_seconds),
-        "cpu_seconds": finite(run.cpu_seconds),
-        "peak_memory_bytes": int(run.peak_memory_bytes),
         "started": utc_text(run.started),
         "ended": utc_text(max(run.started, run.ended)),
     }
+
+
+def _values(source: Result | RunRecord, names: Sequence[str]) -> dict[str, Any]:
+    """Return attributes as the database stores them: None for a number that is not finite."""
+    found = {name: plain(getattr(source, name)) for name in names}
+    return {name: finite(one) if isinstance(one, float) else one for name, one in found.items()}
 
 
 def write(connection: Connection, backend: Backend, rows: PreparedRows) -> bool:
@@ -183,10 +181,7 @@ def write_failure(connection: Connection, claim: Claim, failure: Failure, run: R
     """Write a failed trial; return False, and write nothing, if the claim is lost."""
     values = {
         "status": "failed",
-        "n_steps": None,
-        "final_loss": None,
-        "best_loss": None,
-        "diverged_at": None,
+        **dict.fromkeys(_RESULT_COLUMNS),
         "cause": failure.cause,
         **_run_row(run),
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -121,7 +122,7 @@ def entry(policy: str, gamma: float, width: int, *, diverged: bool) -> Entry:
         *(f"{policy}{gamma}{width}", "pendulum", policy, "mlp", "adam_window", width, 2, 40, 0.02),
         *(gamma, "", 1, 0, 0, 0, 0, 0, config),
     )
-    values = dict.fromkeys(TrialRow.__annotations__)
+    values = dict.fromkeys(one.name for one in dataclasses.fields(TrialRow))
     status, loss = ("diverged", None) if diverged else ("done", 1.0)
     trial = TrialRow(**values | {"seed": 0, "status": status, "final_loss": loss})  # type: ignore[arg-type]
     return Entry(row, (trial,), f"{policy}, {gamma}, {width}", (policy, gamma, width))
