@@ -31,6 +31,8 @@ SUCCESSORS = {
     "launch.reference": "compare with python -m analysis compare --reference POLICY",
     "launch.until=decided": "run a fixed range of seeds and python -m analysis compare, or give "
     "launch.until='ci<5%'",
+    "export mlflow": "export a bundle, and run studies/trackers/mlflow_runs.py",
+    "export wandb": "export a bundle, and run studies/trackers/wandb_runs.py",
     "analysis yardsticks": "python -m studies.yardsticks makes these tables",
     "policy=beyond/sac": "studies/agents/README.md shows it as a policy of a study",
     "policy=beyond/max_agent": "studies/agents/README.md shows it as a policy of a study",

@@ -32,8 +32,6 @@ ONLY_IN = {
     "numba": ("dopt/kernel/",),
     "gymnasium": ("dopt/gymnasium/",),
     "mujoco": ("dopt/systems/mujoco/",),
-    "mlflow": ("orchestrate/export/trackers/",),
-    "wandb": ("orchestrate/export/trackers/",),
     "matplotlib": (
         "analysis/figures/",
         "analysis/outputs/",

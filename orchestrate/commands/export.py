@@ -12,7 +12,7 @@ from orchestrate.commands.command import Command
 from orchestrate.commands.filtering import add_filters, chosen
 from orchestrate.commands.output import say, say_json
 from orchestrate.errors import ExitCode
-from orchestrate.export.wanted import FOLDERS, FORMATS, KINDS, Export, FolderExport
+from orchestrate.export.exporting import FORMATS, KINDS, BundleExport, Export, export
 from orchestrate.store import Reader
 
 _NO_LICENSE = "unknown"
@@ -22,11 +22,10 @@ _LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]*")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "kind",
-        choices=(*KINDS, *FOLDERS),
+        choices=(*KINDS, "bundle"),
         help="a file: curves (a row for each step), trials (a row for each trial), trajectories "
         "(states and inputs; with npz also the final parameters) or assessments; a folder: bundle "
-        "(all tables as Parquet, which commands and figures read as they do a database), mlflow "
-        "(a tracking store of MLflow) or wandb (offline runs of Weights & Biases)",
+        "(all tables as Parquet, which merge imports into a database)",
     )
     parser.add_argument(
         "path", nargs="?", type=path("PATH"), metavar="PATH", help="file or folder to write"
@@ -47,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> ExitCode:
     """Write the file and its manifest, or the folder."""
     out = _target(arguments)
-    document = _to_folder(arguments, out) if arguments.kind in FOLDERS else _to_file(arguments, out)
+    to = _to_bundle if arguments.kind == "bundle" else _to_file
+    document = to(arguments, out)
     if arguments.json:
         say_json(document)
     else:
@@ -67,8 +67,6 @@ def _target(arguments: argparse.Namespace) -> Path:
 
 
 def _to_file(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
-    from orchestrate.export.exporting import export  # its libraries would slow every command
-
     if arguments.license is not None:
         raise UsageError("--license is for the card of a bundle, not for a file: leave it out.")
     wanted = Export(
@@ -81,27 +79,22 @@ def _to_file(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
         return export(moment, chosen(moment, arguments), wanted)
 
 
-def _to_folder(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
-    from orchestrate.export.folders import export_folder
+def _to_bundle(arguments: argparse.Namespace, out: Path) -> dict[str, Any]:
+    from orchestrate.export.bundle import write_bundle  # Arrow would slow every command
 
     if arguments.format is not None:
-        raise UsageError(f"--format is for files, but {arguments.kind} is a folder: leave it out.")
-    wanted = FolderExport(
-        kind=arguments.kind,
+        raise UsageError("--format is for files, but a bundle is a folder: leave it out.")
+    wanted = BundleExport(
         out=out,
         filters={"env": arguments.env, "policy": arguments.policy},
         license=_license(arguments),
     )
     with Reader.open(arguments.db) as reader, reader.moment() as moment:
-        return export_folder(moment, chosen(moment, arguments), wanted)
+        return write_bundle(moment, chosen(moment, arguments), wanted)
 
 
 def _license(arguments: argparse.Namespace) -> str:
     given = arguments.license
-    if given is not None and arguments.kind != "bundle":
-        raise UsageError(
-            f"--license is for the card of a bundle, not for {arguments.kind}: leave it out."
-        )
     if given is not None and not _LICENSE.fullmatch(given):
         raise UsageError(
             f"--license is {given!r}, an identifier in lower case is expected: give one such as "
@@ -111,7 +104,7 @@ def _license(arguments: argparse.Namespace) -> str:
 
 
 def _line(kind: str, out: Path, document: dict[str, Any]) -> str:
-    if kind in FOLDERS:
+    if kind == "bundle":
         return f"{out}: {document['n_trials']:,} trials, {document['bytes']:,} bytes"
     size = f"{document['rows']:,} rows" if "rows" in document else "matrices"
     manifest = out.with_name(f"{out.name}.manifest.json")
@@ -128,6 +121,4 @@ def _format_of(path: Path) -> str:
     return ending
 
 
-COMMAND = Command(
-    "export", "write results to a file, a bundle, MLflow or Weights & Biases", add_arguments, run
-)
+COMMAND = Command("export", "write results to a file or a bundle", add_arguments, run)

@@ -1,1 +1,1 @@
-"""Results as files for other programs: CSV, parquet and npz, each with its provenance beside it."""
+"""Results as files: tables, matrices, and bundles of all tables."""

@@ -4,32 +4,53 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from orchestrate.export import matrices, streams, tables
-from orchestrate.export.manifest import provenance
-from orchestrate.export.wanted import Export, ExportError
+from dopt import __version__
+from dopt.errors import DoptError
 from orchestrate.files import whole
+from orchestrate.queries.status import counts
+from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
+from orchestrate.store.serialization import now
 
-_STREAMS: dict[str, Callable[[Reader, Sequence[ConfigRow]], streams.Stream]] = {
-    "curves": streams.curves,
-    "trials": streams.trials,
-    "trajectories": streams.trajectories,
-    "assessments": streams.assessments,
-}
-_MATRICES: dict[
-    str, Callable[[Reader, Sequence[ConfigRow]], Generator[matrices.Named, None, None]]
-] = {
-    "curves": matrices.curves,
-    "trials": matrices.trials,
-    "trajectories": matrices.trajectories,
-    "assessments": matrices.assessments,
-}
-_WRITERS = {"csv": tables.write_csv, "parquet": tables.write_parquet}
+KINDS = ("curves", "trials", "trajectories", "assessments")
+"""Exports that are one file."""
+
+FORMATS = ("csv", "parquet", "npz")
+
+_WRITERS = "SELECT DISTINCT config_key, launch_id FROM v_trial WHERE launch_id IS NOT NULL"
+
+
+class ExportError(DoptError):
+    """Empty selection, or file that cannot be written."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Request of an export: one of ``KINDS`` in one of ``FORMATS``, with filters."""
+
+    kind: str
+    format: str
+    out: Path
+    filters: Mapping[str, Sequence[str]]
+
+    @property
+    def manifest(self) -> Path:
+        return self.out.with_name(f"{self.out.name}.manifest.json")
+
+
+@dataclass(frozen=True)
+class BundleExport:
+    """Request of a bundle, with filters; ``license`` is the licence of the data for its card."""
+
+    out: Path
+    filters: Mapping[str, Sequence[str]]
+    license: str
 
 
 def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict[str, Any]:
@@ -56,14 +77,16 @@ def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict
 def _write(
     reader: Reader, configs: Sequence[ConfigRow], wanted: Export, out: Path
 ) -> dict[str, Any]:
+    from orchestrate.export import tables  # Arrow: other commands do without it
+
     # After an error the cursors must close before the database does.
     if wanted.format == "npz":
-        with closing(_MATRICES[wanted.kind](reader, configs)) as arrays:
-            return {"arrays": matrices.write(out, arrays)}
-    stream = _STREAMS[wanted.kind](reader, configs)
+        with closing(tables.MATRICES[wanted.kind](reader, configs)) as arrays:
+            return {"arrays": tables.write_npz(out, arrays)}
+    stream = tables.STREAMS[wanted.kind](reader, configs)
     columns = {field.name: str(field.type) for field in stream.schema}
     with closing(stream.batches):
-        return {"rows": _WRITERS[wanted.format](out, stream), "columns": columns}
+        return {"rows": tables.WRITERS[wanted.format](out, stream), "columns": columns}
 
 
 def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> None:
@@ -86,3 +109,28 @@ def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export)
 def _hash(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def provenance(
+    reader: Reader, configs: Sequence[ConfigRow], filters: Mapping[str, Sequence[str]]
+) -> dict[str, Any]:
+    """Return database, selection, configurations and launches, without passwords."""
+    keys = {config.config_key for config in configs}
+    writers = {row.launch_id for row in reader.rows(_WRITERS) if row.config_key in keys}
+    launches = [asdict(one) for one in reader.launches() if one.launch_id in writers]
+    return {
+        "written": now(),
+        "program": f"dopt {__version__}",
+        "database": reader.safe_url,
+        "schema_version": reader.schema_version(),
+        "filters": {name: list(values) for name, values in filters.items()},
+        "trials": dict(counts(configs)),
+        "missing_values": "empty in csv, null in parquet, NaN in npz: a loss that is not finite",
+        "configs": {config.config_key: dict(config.config) for config in configs},
+        "launches": [_public(launch) for launch in launches],
+    }
+
+
+def _public(launch: Mapping[str, Any]) -> dict[str, Any]:
+    words = {name: [*map(without_password, launch[name])] for name in ("argv", "overrides")}
+    return {**launch, **words}

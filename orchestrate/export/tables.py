@@ -1,15 +1,226 @@
-"""Batches into a CSV or a parquet file."""
+"""Results as tables and as named matrices: rows of the database, and their files.
+
+One Arrow batch at a time is in memory, or the arrays of one configuration.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet
 
-from orchestrate.export.streams import ROWS, Stream
+from orchestrate.store import ConfigRow, Reader, Trajectory
+from orchestrate.store.schema import OUTCOME_COLUMNS, trial
+from orchestrate.store.serialization import stacked, unpack
+
+_TEXT, _WHOLE, _REAL = pa.string(), pa.int64(), pa.float64()
+STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
+_NAMES = (("env", _TEXT), ("policy", _TEXT), ("model", _TEXT), ("learner", _TEXT))
+_SIZES = (("width", _WHOLE), ("depth", _WHOLE))
+_KINDS = {int: _WHOLE, float: _REAL, str: _TEXT}
+_OUTCOME = tuple((name, _KINDS[trial.c[name].type.python_type]) for name in OUTCOME_COLUMNS)
+
+CURVES = pa.schema(
+    [
+        ("config", _TEXT),
+        *_NAMES,
+        *_SIZES,
+        ("seed", _WHOLE),
+        ("status", _TEXT),
+        ("t", _WHOLE),
+        *((name, _REAL) for name in STEP_COLUMNS),
+    ]
+)
+"""One row for each step; ``config`` is the beginning of the configuration's key."""
+
+TRIALS = pa.schema(
+    [
+        ("trial_key", _TEXT),
+        ("config_key", _TEXT),
+        *_NAMES,
+        *_SIZES,
+        *(("horizon", _WHOLE), ("dt", _REAL), ("gamma", _REAL)),
+        *(("seed", _WHOLE), ("status", _TEXT), ("attempt", _WHOLE)),
+        *_OUTCOME,
+        *(("launch_id", _WHOLE), ("error_type", _TEXT), ("error_message", _TEXT)),
+    ]
+)
+"""One row for each trial, with or without a result."""
+
+
+ASSESSMENTS = pa.schema(
+    [
+        ("config", _TEXT),
+        *_NAMES,
+        *_SIZES,
+        *(("seed", _WHOLE), ("status", _TEXT), ("t", _WHOLE), ("measure", _TEXT), ("value", _REAL)),
+    ]
+)
+"""One row for each measure of a trial after t explored steps."""
+
+ROWS = 50_000
+"""Rows of the database in one batch."""
+
+KEY_DIGITS = 12
+
+_CURVES = f"""
+SELECT r.seed, r.status, s.t, {", ".join(f"s.{name}" for name in STEP_COLUMNS)}
+FROM config c
+JOIN trial r ON r.config_id = c.config_id
+JOIN step s ON s.trial_id = r.trial_id
+WHERE c.config_key = :config_key AND r.status IN ('done', 'diverged')
+ORDER BY r.seed, s.t
+"""
+_TRIALS = f"""
+SELECT {", ".join(TRIALS.names)} FROM v_trial WHERE config_key = :config_key ORDER BY seed
+"""
+_TRAJECTORIES = """
+SELECT r.seed, r.status, j.dtype, j.states_shape, j.states, j.inputs_shape, j.inputs,
+       j.parameters_shape, j.parameters
+FROM config c
+JOIN trial r ON r.config_id = c.config_id
+JOIN trajectory j ON j.trial_id = r.trial_id
+WHERE c.config_key = :config_key AND r.status IN ('done', 'diverged')
+ORDER BY r.seed
+"""
+_ASSESSMENTS = """
+SELECT seed, status, t, measure, value FROM v_assessment
+WHERE config_key = :config_key AND status IN ('done', 'diverged') ORDER BY seed, t, measure
+"""
+
+Named = tuple[str, npt.NDArray[Any], tuple[str, ...]]
+"""Name, array and the names of its axes."""
+
+_AT_A_TIME = 100  # trajectories
+
+
+def trajectory_columns(n_states: int, n_inputs: int) -> pa.Schema:
+    """Return the columns of trajectories: one row for each t from 0 to T, without an input at T."""
+    kept = [field for field in CURVES if field.name not in STEP_COLUMNS]
+    states = [pa.field(f"state_{i}", _REAL) for i in range(n_states)]
+    inputs = [pa.field(f"input_{i}", _REAL) for i in range(n_inputs)]
+    return pa.schema([*kept, *states, *inputs])
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Columns and the batches of their rows."""
+
+    schema: pa.Schema
+    batches: Generator[pa.RecordBatch, None, None]
+
+
+def curves(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
+    """Return every step of the finished trials, sorted by configuration, seed and t."""
+    return Stream(CURVES, _curves(reader, configs))
+
+
+def trials(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
+    """Return every trial, sorted by configuration and seed."""
+    return Stream(TRIALS, _trials(reader, configs))
+
+
+def trajectories(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
+    """Return states and inputs of the finished trials, sorted by configuration, seed and t."""
+    firsts = [next(of_config(reader, config, 1), None) for config in configs]
+    n_states = max((one[2].states.shape[1] for one in firsts if one), default=0)
+    n_inputs = max((one[2].inputs.shape[1] for one in firsts if one), default=0)
+    schema = trajectory_columns(n_states, n_inputs)
+    return Stream(schema, _trajectories(reader, configs, schema))
+
+
+def assessments(reader: Reader, configs: Sequence[ConfigRow]) -> Stream:
+    """Return what finished trials were worth, sorted by configuration, seed, t and measure."""
+    return Stream(ASSESSMENTS, _assessments(reader, configs))
+
+
+def steps(reader: Reader, config: ConfigRow) -> Generator[list[Sequence[Any]], None, None]:
+    """Yield (seed, status, t, *STEP_COLUMNS) of the finished trials, in batches, by seed and t."""
+    yield from reader.batches(ROWS, _CURVES, config_key=config.config_key)
+
+
+def of_config(
+    reader: Reader, config: ConfigRow, size: int
+) -> Iterator[tuple[int, str, Trajectory]]:
+    """Yield (seed, status, trajectory) of a configuration; ``size`` of them are read at a time."""
+    for rows in reader.batches(size, _TRAJECTORIES, config_key=config.config_key):
+        for seed, status, dtype, *packed in rows:
+            arrays = [unpack(dtype, *packed[i : i + 2]) for i in (0, 2, 4)]
+            yield seed, status, Trajectory(*arrays)
+
+
+def _curves(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
+    for config in configs:
+        for rows in steps(reader, config):
+            names = ("seed", "status", "t", *STEP_COLUMNS)
+            values = dict(zip(names, zip(*rows, strict=True), strict=True))
+            yield _batch(CURVES, {**_constants(config), **values}, len(rows))
+
+
+def _assessments(
+    reader: Reader, configs: Sequence[ConfigRow]
+) -> Generator[pa.RecordBatch, None, None]:
+    for config in configs:
+        for rows in reader.batches(ROWS, _ASSESSMENTS, config_key=config.config_key):
+            names = ("seed", "status", "t", "measure", "value")
+            values = dict(zip(names, zip(*rows, strict=True), strict=True))
+            yield _batch(ASSESSMENTS, {**_constants(config), **values}, len(rows))
+
+
+def _trials(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[pa.RecordBatch, None, None]:
+    for config in configs:
+        for rows in reader.batches(ROWS, _TRIALS, config_key=config.config_key):
+            values = dict(zip(TRIALS.names, zip(*rows, strict=True), strict=True))
+            yield _batch(TRIALS, values, len(rows))
+
+
+def _trajectories(
+    reader: Reader, configs: Sequence[ConfigRow], schema: pa.Schema
+) -> Generator[pa.RecordBatch, None, None]:
+    for config in configs:
+        size = max(1, ROWS // (config.horizon + 1))
+        for seed, status, one in of_config(reader, config, size):
+            n = len(one.states)
+            values = {"seed": seed, "status": status, "t": np.arange(n)}
+            values |= _named("state", one.states, n) | _named("input", one.inputs, n)
+            yield _batch(schema, {**_constants(config), **values}, n)
+
+
+def _named(name: str, array: npt.NDArray[np.float64], n: int) -> dict[str, Any]:
+    """Return the columns of an array under their names, with NaN up to n rows."""
+    padded = np.full((n, array.shape[1]), np.nan)
+    padded[: len(array)] = array
+    return {f"{name}_{i}": column for i, column in enumerate(padded.T)}
+
+
+def _constants(config: ConfigRow) -> dict[str, Any]:
+    names = ("env", "policy", "model", "learner", "width", "depth")
+    return {
+        "config": config.config_key[:KEY_DIGITS],
+        **{name: getattr(config, name) for name in names},
+    }
+
+
+def _batch(schema: pa.Schema, values: Mapping[str, Any], n: int) -> pa.RecordBatch:
+    """Return n rows; a single value fills its column, and what is not finite is missing."""
+    arrays = [_array(values.get(field.name), field.type, n) for field in schema]
+    return pa.RecordBatch.from_arrays(arrays, schema=schema)
+
+
+def _array(value: Any, kind: pa.DataType, n: int) -> pa.Array:
+    if isinstance(value, tuple | np.ndarray):
+        return pa.array(value, kind, from_pandas=True)
+    return pa.nulls(n, kind) if value is None else pa.repeat(pa.scalar(value, kind), n)
 
 
 def write_csv(path: Path, stream: Stream) -> int:
@@ -42,3 +253,119 @@ def _gathered(batches: Iterable[pa.RecordBatch], size: int) -> Iterator[pa.Table
             waiting = []
     if waiting:
         yield pa.Table.from_batches(waiting)
+
+
+def names(configs: Sequence[ConfigRow]) -> list[str]:
+    """Return env/policy/width of each configuration, and the key where that is not unique."""
+    short = [f"{c.env}/{c.policy}/{'-' if c.width is None else c.width}" for c in configs]
+    count = Counter(short)
+    return [
+        f"{name}/{config.config_key[:KEY_DIGITS]}" if count[name] > 1 else name
+        for name, config in zip(short, configs, strict=True)
+    ]
+
+
+def _curves_in_arrays(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
+    """Yield the curves of the finished trials, (seed, t), NaN from a divergence or an end on."""
+    for name, config in zip(names(configs), configs, strict=True):
+        seeds, diverged, steps = _stacked_steps(reader, config)
+        for column, values in zip(STEP_COLUMNS, steps, strict=True):
+            yield f"{name}/{column}", values, ("seed", "t")
+        yield f"{name}/seed", seeds, ("seed",)
+        yield f"{name}/diverged", diverged, ("seed",)
+
+
+def _stacked_steps(
+    reader: Reader, config: ConfigRow
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
+    """Return seeds (n,), flags of divergence (n,) and the columns of the steps (5, n, T)."""
+    found: dict[int, bool] = {}
+    lengths: Counter[int] = Counter()
+    blocks = [np.empty((0, len(STEP_COLUMNS)))]
+    with closing(steps(reader, config)) as batches:
+        for rows in batches:
+            seeds, statuses, _t, *values = zip(*rows, strict=True)
+            found.update(zip(seeds, (status == "diverged" for status in statuses), strict=True))
+            lengths.update(seeds)
+            blocks.append(np.array(values, dtype=np.float64).T)
+    ends = np.cumsum([lengths[seed] for seed in found])[:-1]
+    split = np.split(np.concatenate(blocks), ends)
+    values_of = stacked(split) if found else np.empty((0, config.horizon, len(STEP_COLUMNS)))
+    return (
+        np.array([*found], np.int64),
+        np.array([*found.values()], np.bool_),
+        values_of.T.swapaxes(1, 2),
+    )
+
+
+def _trajectories_in_arrays(
+    reader: Reader, configs: Sequence[ConfigRow]
+) -> Generator[Named, None, None]:
+    """Yield states, inputs and final parameters of the finished trials."""
+    for name, config in zip(names(configs), configs, strict=True):
+        found = list(of_config(reader, config, _AT_A_TIME))
+        if found:
+            yield f"{name}/states", stacked([one.states for *_, one in found]), _axes("state")
+            yield f"{name}/inputs", stacked([one.inputs for *_, one in found]), _axes("input")
+            parameters = np.stack([one.parameters for *_, one in found])
+            yield f"{name}/parameters", parameters, ("seed", "parameter")
+        yield f"{name}/seed", np.array([seed for seed, *_ in found], dtype=np.int64), ("seed",)
+        diverged = [status == "diverged" for _, status, _ in found]
+        yield f"{name}/diverged", np.array(diverged, dtype=np.bool_), ("seed",)
+
+
+def _assessments_in_arrays(
+    reader: Reader, configs: Sequence[ConfigRow]
+) -> Generator[Named, None, None]:
+    """Yield each measure of the finished trials, (seed, t), with its seeds and numbers of steps."""
+    for name, config in zip(names(configs), configs, strict=True):
+        for measure in reader.measures(config.config_key):
+            found = reader.assessments(config.config_key, measure)
+            yield f"{name}/{measure}", found.values, ("seed", "t")
+            yield f"{name}/{measure}/seed", found.seeds, ("seed",)
+            yield f"{name}/{measure}/t", found.t, ("t",)
+
+
+def _trials_in_arrays(reader: Reader, configs: Sequence[ConfigRow]) -> Generator[Named, None, None]:
+    """Yield the columns of the table of trials; a missing number is NaN, a missing text empty."""
+    table = trials(reader, configs)
+    batches = list(table.batches)
+    for i, field in enumerate(TRIALS):
+        values = [value for batch in batches for value in batch.column(i).to_pylist()]
+        if str(field.type) == "string":
+            array = np.array([value or "" for value in values], dtype=np.str_)
+        elif None in values or str(field.type) == "double":
+            array = np.array(values, dtype=np.float64)
+        else:
+            array = np.array(values, dtype=np.int64)
+        yield field.name, array, ("trial",)
+
+
+def write_npz(path: Path, arrays: Iterator[Named]) -> dict[str, dict[str, Any]]:
+    """Write the arrays one by one; return the axes and the shape of each."""
+    written: dict[str, dict[str, Any]] = {}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array, axes in arrays:
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+            written[name] = {"axes": axes, "shape": array.shape, "dtype": str(array.dtype)}
+    return written
+
+
+def _axes(last: str) -> tuple[str, str, str]:
+    return ("seed", "t", last)
+
+
+STREAMS: dict[str, Callable[[Reader, Sequence[ConfigRow]], Stream]] = {
+    "curves": curves,
+    "trials": trials,
+    "trajectories": trajectories,
+    "assessments": assessments,
+}
+MATRICES: dict[str, Callable[[Reader, Sequence[ConfigRow]], Generator[Named, None, None]]] = {
+    "curves": _curves_in_arrays,
+    "trials": _trials_in_arrays,
+    "trajectories": _trajectories_in_arrays,
+    "assessments": _assessments_in_arrays,
+}
+WRITERS = {"csv": write_csv, "parquet": write_parquet}

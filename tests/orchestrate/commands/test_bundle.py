@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from orchestrate.__main__ import main
-from orchestrate.export.bundle import writing
-from orchestrate.export.bundle.descriptions import COLUMNS, TABLE_TITLES
+from orchestrate.export import bundle as writing
+from orchestrate.export.bundle import COLUMNS, TABLE_TITLES
 from orchestrate.redaction import without_password
 from orchestrate.store import Claim, Reader, Store
 from orchestrate.store.bundle import TABLES, arrow_schema, fill, primary_key

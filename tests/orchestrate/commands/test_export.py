@@ -15,7 +15,7 @@ import pandas as pd
 import pyarrow.parquet
 import pytest
 
-from orchestrate.export import streams, tables
+from orchestrate.export import tables
 from orchestrate.store import Claim, Store
 from tests.orchestrate.commands.conftest import BAD, DONE, SECRET, Answer, run_now
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, assessed, diverged, result
@@ -247,7 +247,6 @@ def test_batches_join_without_a_seam(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(streams, "ROWS", 3)
     monkeypatch.setattr(tables, "ROWS", 3)
     for claim in take(*(Spec(seed) for seed in range(5))):
         store.commit(claim, result(claim.trial_id), run_now())

@@ -1,1 +1,0 @@
-"""Results as runs of experiment trackers, written by the trackers' own libraries."""

@@ -1,0 +1,92 @@
+"""Runs of trackers from a bundle: read back by the libraries that others use."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dopt.spec.trial import TrialSpec
+from orchestrate import __main__ as orchestrate
+from tests.analysis.synthetic import fake_results, fill, make_grid
+from tests.studies.trackers.wandb_file import OfflineRun, read_run
+
+TASK = {"task": {"name": "control", "checkpoints": [10]}}
+SPECS = make_grid(("pendulum", "cartpole"), ("random",), range(2), env={"horizon": 20}, **TASK)
+SPECS += make_grid(("arm",), ("random",), range(1), env={"horizon": 20})
+LOST = {SPECS[-1].trial_key: 12}
+RESULTS = dict(zip([spec.trial_key for spec in SPECS], fake_results(SPECS, LOST), strict=True))
+
+
+@pytest.fixture(autouse=True)
+def _warnings_of_libraries() -> Iterator[None]:
+    """Let the libraries warn of what they use of others."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    fill(f"sqlite:///{tmp_path}/r.db", SPECS, diverged=LOST)
+    words = ["export", "bundle", str(tmp_path / "bundle"), "--db", f"sqlite:///{tmp_path}/r.db"]
+    assert orchestrate.main(words) == 0
+    return tmp_path / "bundle"
+
+
+def losses(spec: TrialSpec) -> list[float]:
+    found = RESULTS[spec.trial_key]
+    return [float(value) for value in found.loss[: found.n_steps]]
+
+
+def test_mlflow_reads_every_run(bundle: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mlflow")
+    from mlflow import MlflowClient
+
+    from studies.trackers.mlflow_runs import write_runs
+
+    write_runs(bundle, tmp_path / "mlflow.db")
+    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlflow.db")
+    names = [one.experiment_id for one in client.search_experiments()]
+    found = {run.data.tags["trial_key"]: run for run in client.search_runs(names)}
+    assert set(found) == set(RESULTS)
+    for spec in SPECS:
+        run, result = found[spec.trial_key], RESULTS[spec.trial_key]
+        assert (run.data.params["env.name"], run.data.params["seed"]) == (
+            spec.system.name,
+            str(spec.seed),
+        )
+        assert run.data.tags["status"] == ("diverged" if spec.trial_key in LOST else "done")
+        history = client.get_metric_history(run.info.run_id, "loss")
+        assert [one.value for one in history] == losses(spec)
+        assert [one.step for one in history] == list(range(result.n_steps))
+        if spec.trial_key not in LOST:
+            assert run.data.metrics["final_loss"] == result.final_loss
+        costs = [row for row in result.assessments if row.measure == "control_cost"]
+        history = client.get_metric_history(run.info.run_id, "control_cost")
+        assert [(one.step, one.value) for one in history] == [(c.t, c.value) for c in costs]
+
+
+def test_wandb_reads_every_run(bundle: Path, tmp_path: Path) -> None:
+    pytest.importorskip("wandb")
+    from studies.trackers.wandb_runs import write_runs
+
+    write_runs(bundle, tmp_path / "out")
+    found: dict[str, OfflineRun] = {}
+    for path in (tmp_path / "out").glob("wandb/offline-run-*/run-*.wandb"):
+        run = read_run(path)
+        found[run.config["key"]] = run
+    assert set(found) == set(RESULTS)
+    for spec in SPECS:
+        run, result = found[spec.trial_key], RESULTS[spec.trial_key]
+        assert (run.project, run.is_finished, run.config["seed"]) == ("dopt", True, spec.seed)
+        assert json.dumps(run.config["env"]["name"]) == json.dumps(spec.system.name)
+        assert [row["_step"] for row in run.history] == list(range(result.n_steps))
+        np.testing.assert_array_equal([row["loss"] for row in run.history], losses(spec))
+        for row in result.assessments:
+            if np.isfinite(row.value):
+                assert run.summary[f"{row.measure}/{row.t}"] == row.value
