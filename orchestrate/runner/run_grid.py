@@ -1,4 +1,4 @@
-"""Launch of a grid: registration, execution of unfinished trials, summary and exit code."""
+"""Execution of a grid: registration, stages, copies of a share, and what a launch says of it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import itertools
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -16,24 +17,24 @@ from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Prepare, Run
+from orchestrate.executors.factory import Job
 from orchestrate.executors.registry import executor_factory, make_executor, make_job
 from orchestrate.program import exit_code
-from orchestrate.runner.batching import Chunks
-from orchestrate.runner.collecting import collected
-from orchestrate.runner.heartbeat import Heartbeat
-from orchestrate.runner.leaving import free_trials, leave
-from orchestrate.runner.progress import Progress, Tally
-from orchestrate.runner.retrying_store import RetryingStore
+from orchestrate.runner.chunks import Chunks
+from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
+from orchestrate.runner.retrying_store import Heartbeat, RetryingStore
 from orchestrate.runner.scheduler import Scheduler
 from orchestrate.runner.seed_plan import SeedPlan
-from orchestrate.runner.signals import Interrupt
-from orchestrate.runner.summary import closing, opening
 from orchestrate.store import (
+    URL_VARIABLE,
+    DatabaseMovedError,
     LaunchRecord,
     Registration,
     Store,
+    StoreError,
     StoreUnavailableError,
 )
+from orchestrate.store.shards import collect, merge_collected
 
 POLL_OTHER_LAUNCHES_SECONDS = 1.0
 """Interval of status queries for trials that another launch runs."""
@@ -278,3 +279,156 @@ def _count(tally: Tally, state: Registration) -> None:
     """Copy the counts of trials that other launches finished from the database to the tally."""
     tally.before = state.done + state.diverged + state.failed + state.cancelled - tally.over
     tally.failed_before = state.failed + state.cancelled - tally.failed
+
+
+WORKER = "python -m orchestrate work"
+
+
+def leave(
+    store: RetryingStore,
+    grid: Grid,
+    settings: LaunchSettings,
+    job: Job | None,
+    say: Callable[[str], None],
+) -> ExitCode:
+    """Register the grid for workers, and submit the job in which they run."""
+    free_trials(store, grid, settings)
+    state = store.register(grid.trials)
+    if job is None:
+        say(f"{registered(grid, state)}; start workers with {WORKER} --db {store.safe_url}")
+        return ExitCode.DONE
+    say(f"{registered(grid, state)} · {store.safe_url}")
+    if state.todo:
+        say(job.submit(len(state.todo), {URL_VARIABLE: settings.store_url}))
+    return ExitCode.DONE
+
+
+def free_trials(store: RetryingStore, grid: Grid, settings: LaunchSettings) -> None:
+    """Put the trials of dead launches, and those to be run again, back to pending."""
+    store.recover()
+    if settings.retry:
+        store.retry(settings.retry, [trial.trial_key for trial in grid.trials])
+
+
+REST = 20.0
+"""Least time between two copies, as a multiple of the time that a copy takes."""
+
+
+@contextmanager
+def collected(settings: LaunchSettings, warn: Callable[[str], None]) -> Iterator[None]:
+    """Copy the database of the block every ``collect_seconds`` or less often, and once after it.
+
+    What earlier launches of the share have collected, perhaps on machines that are gone, is merged
+    before the block. Without a folder nothing is copied.
+
+    Raises
+    ------
+    StoreError
+        If what was collected cannot be merged, or the last copy fails; the local database is kept.
+    """
+    if settings.collect_in is None:
+        yield
+        return
+    folder, ended = settings.collect_in, threading.Event()
+    earlier = f"*.{settings.share}.*.db"
+    if any(folder.glob(earlier)):
+        for _ in merge_collected(settings.store_url, folder, earlier):
+            pass
+
+    def copy_regularly() -> None:
+        pause = settings.collect_seconds
+        while not ended.wait(pause):
+            start = time.monotonic()
+            try:
+                collect(settings.store_url, folder)
+            except StoreError as error:
+                warn(f"the results are not copied yet: {error}")
+            pause = max(settings.collect_seconds, REST * (time.monotonic() - start))
+
+    thread = threading.Thread(target=copy_regularly, name="collect", daemon=True)
+    thread.start()
+    try:
+        yield
+    except DatabaseMovedError:  # another database may have its name
+        _stop(thread, ended)
+        raise
+    except BaseException:
+        _stop(thread, ended)
+        with suppress(StoreError):  # the first error is the one to report
+            collect(settings.store_url, folder)
+        raise
+    _stop(thread, ended)
+    collect(settings.store_url, folder)
+
+
+def _stop(thread: threading.Thread, ended: threading.Event) -> None:
+    ended.set()
+    thread.join()
+
+
+MAX_LISTED_CAUSES = 3
+"""Causes of failure that the summary lists."""
+
+
+def registered(grid: Grid, state: Registration) -> str:
+    """Return the counts of a grid that was registered for workers."""
+    lines = [*left_out(grid), f"{state.done + state.diverged:,} of {state.total:,} already done"]
+    if state.failed:
+        lines[-1] += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
+    if state.running_elsewhere:
+        lines[-1] += f", {state.running_elsewhere:,} running"
+    lines[-1] += f", {len(state.todo):,} registered"
+    return "\n".join(lines)
+
+
+def left_out(grid: Grid) -> list[str]:
+    """Return a line for each reason to leave out trials, and one for repeated jobs."""
+    lines = [f"left out {count:,} trials: {reason}" for reason, count in grid.left_out.items()]
+    if grid.repeats:
+        lines.append(f"{grid.repeats:,} of {grid.n_jobs:,} jobs name a trial of the grid again")
+    return lines
+
+
+def opening(
+    grid: Grid, state: Registration, settings: LaunchSettings, url: str, heading: str = ""
+) -> str:
+    """Return the counts of trials to run, done, failed and left out, after the stage's heading."""
+    lines = left_out(grid)
+    counted = f"{state.done + state.diverged:,} of {state.total:,} already done"
+    if state.failed:
+        counted += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
+    if state.running_elsewhere:
+        counted += f", {state.running_elsewhere:,} running in another launch"
+    todo = f"{len(state.todo):,} to run with executor={settings.executor}"
+    lines.append(f"{heading}{counted}, {todo if state.todo else 'nothing to run'} · {url}")
+    return "\n".join(lines)
+
+
+def closing(tally: Tally, failures: Counter[str], stop_requested: bool, seconds: float) -> str:
+    """Return the counts of outcomes, the commonest failures, and the number of trials left."""
+    lines = [
+        f"{tally.total - tally.left - tally.all_failed:,} of {tally.total:,} done, "
+        f"{tally.all_failed:,} failed, {tally.diverged:,} diverged now, in {duration(seconds)}"
+    ]
+    for cause, count in failures.most_common(MAX_LISTED_CAUSES):
+        lines.append(f"{count:,} failed: {cause}")
+    if tally.left:
+        why = "interrupted" if stop_requested else "stopped at the first failure"
+        lines.append(f"{why}, {tally.left:,} left: run the same command again to continue")
+    return "\n".join(lines)
+
+
+def worked(tally: Tally, scheduler: Scheduler, left: int, seconds: float) -> str:
+    """Return the counts of outcomes of a worker, and the number of trials left to others."""
+    lines = [
+        f"{tally.done + tally.diverged:,} trials done, {tally.diverged:,} of them diverged, "
+        f"{tally.failed:,} failed, in {duration(seconds)}; {left:,} left"
+    ]
+    if scheduler.refused:
+        lines.append(
+            f"{scheduler.refused:,} results refused: the lease had run out, and others had claimed "
+            f"their trials; give a longer --lease"
+        )
+    for cause, count in scheduler.failures.most_common(MAX_LISTED_CAUSES):
+        lines.append(f"{count:,} failed: {cause}")
+    return "\n".join(lines)

@@ -14,7 +14,7 @@ from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
-from orchestrate.runner.batching import Chunks
+from orchestrate.runner.chunks import Chunks
 from orchestrate.runner.progress import Tally
 from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.store import Claim, InvalidResultError

@@ -20,7 +20,7 @@ import numpy as np
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from orchestrate.config.grid import Grid
-from orchestrate.runner.text_table import aligned
+from orchestrate.runner.progress import aligned
 
 FinalLosses = Callable[[Sequence[str]], Mapping[str, float]]
 """Function that returns the final loss of each trial that is done and did not diverge."""

@@ -1,31 +1,47 @@
-"""Worker: a launch that runs trials which other launches have registered, for a limited time."""
+"""Worker: a launch that runs trials which other launches have registered, for a limited time.
+
+It takes a few trials at a time from the database, the longest first, and none that may end after
+its time.
+"""
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
 from dopt.cores import usable_cores
+from dopt.errors import DoptError
 from dopt.kernel import warm_up
 from dopt.run import run_trial
+from dopt.spec.added_fields import completed
+from dopt.spec.prequential import stored_trial
+from dopt.spec.trial import TrialSpec
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.value_checks import factor
 from orchestrate.errors import ExitCode
+from orchestrate.executors.base import Task
 from orchestrate.executors.registry import make_executor
-from orchestrate.runner.progress import Progress, Tally
-from orchestrate.runner.provenance import launch_record
+from orchestrate.fingerprint import differences, fingerprint
+from orchestrate.runner.chunks import (
+    BYTES_PER_GIB,
+    MAX_CHUNK_TRIALS,
+    Chunks,
+    memory_of_this_machine,
+)
+from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally
 from orchestrate.runner.retrying_store import RetryingStore
-from orchestrate.runner.run_grid import Output, Work, prepare_workers, recorded_launch
-from orchestrate.runner.scheduler import Scheduler
-from orchestrate.runner.signals import SIGNALS, Interrupt, Repetition
-from orchestrate.runner.stored_chunks import StoredChunks
-from orchestrate.runner.summary import worked
+from orchestrate.runner.run_grid import Output, Work, prepare_workers, recorded_launch, worked
+from orchestrate.runner.saving import launch_record
+from orchestrate.runner.scheduler import SUSPECT_LOSSES, Scheduler
+from orchestrate.store import OpenConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 WORK = Work(run_trial, warm_up)
@@ -211,3 +227,237 @@ def _pull(scheduler: Scheduler, chunks: StoredChunks, leave: Leave, progress: Pr
         if leave.stop_requested or not chunks.left_here or (chunks.waiting and not len(chunks)):
             return
         pause = max(POLL_SECONDS, 5 * (time.monotonic() - start))
+
+
+REFRESH_SECONDS = 5.0
+"""Least time between two looks at all configurations; a look may take a twentieth of it."""
+
+MARGIN = 1.5
+"""Factor of the longest measured trial of a configuration that bounds the next one."""
+
+UNKNOWN_SHARE = 0.5
+"""Share of the worker's whole time that a trial of a configuration without a measured one gets."""
+
+
+@dataclass
+class Kind:
+    """Configuration with pending trials, as this worker knows it.
+
+    Attributes
+    ----------
+    mean, longest
+        Measured wall time of its trials [s]; None while there is none.
+    """
+
+    config_id: int
+    first: TrialSpec
+    pending: int
+    mean: float | None
+    longest: float | None
+
+
+class StoredChunks(Chunks):
+    """Queue whose trials are pending in the database, where other workers take them too.
+
+    Parameters
+    ----------
+    store : RetryingStore
+    seconds : float
+        Work in a chunk [s].
+    slots : int
+        Processes of this worker.
+    length : float or None
+        Time of the worker [s]; None for no limit. No chunk is returned that may end after it.
+    warn
+        Takes a sentence for each configuration that cannot run here.
+
+    Attributes
+    ----------
+    left : int
+        Trials of the database without an outcome, as of the last look.
+    left_here : int
+        Those of them that this worker can run, or could if another worker gave them back.
+    """
+
+    def __init__(
+        self,
+        store: RetryingStore,
+        seconds: float,
+        slots: int,
+        length: float | None,
+        warn: Callable[[str], None],
+    ) -> None:
+        super().__init__([], seconds, slots)
+        self.left = self.left_here = 0
+        self._store = store
+        self._length = length
+        self._end = None if length is None else time.monotonic() + length
+        self._warn = warn
+        self._kinds: dict[str, Kind] = {}
+        self._refused: set[str] = set()
+        self._left: set[str] = set()
+        self._submitted: deque[float] = deque(maxlen=2 * slots)
+        self._next_look = 0.0
+
+    def look(self) -> None:
+        """Read the configurations that have open trials, after freeing those of dead launches."""
+        start = time.monotonic()
+        self._store.recover()
+        open_configs = self._store.open_configs()
+        kinds = (self._kind(config) for config in open_configs)
+        self._kinds = {kind.first.config_key: kind for kind in kinds if kind is not None}
+        counts = {config.config_key: config.pending + config.running for config in open_configs}
+        self.left = sum(counts.values()) + self._count_others()
+        self.left_here = sum(counts[key] for key in self._kinds)
+        now = time.monotonic()
+        self._next_look = now + max(REFRESH_SECONDS, 20 * (now - start))
+
+    def _count_others(self) -> int:
+        """Return the open trials of other code, and say once what differs."""
+        others = self._store.others()
+        for theirs, count in others:
+            if str(theirs) not in self._left:
+                self._left.add(str(theirs))
+                known = differences(theirs, fingerprint()) if theirs else "an older program"
+                self._warn(
+                    f"{count:,} trials are left, which other code has registered ({known}): run a "
+                    "worker with that code, or give their launch command again with this code."
+                )
+        return sum(count for _, count in others)
+
+    def look_for_suspects(self) -> None:
+        """Queue the trials whose launches were lost too often; call it while no trial runs."""
+        self._exclusive.clear()
+        by_id = {kind.config_id: kind for kind in self._kinds.values()}
+        for trial in self._store.suspects(SUSPECT_LOSSES):
+            if trial.config_id in by_id and self._room(by_id[trial.config_id]):
+                self.lone_losses[trial.trial_key] = trial.lone_losses
+                self.add_exclusive([by_id[trial.config_id].first.with_seed(trial.seed)])
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the kernel runs some of the trials."""
+        return any(kind.first.config.path == "kernel" for kind in self._kinds.values())
+
+    @property
+    def waiting(self) -> int:
+        """Pending trials that this worker could run if it had the time."""
+        return sum(kind.pending for kind in self._kinds.values())
+
+    def __len__(self) -> int:
+        if self.pending and self._exclusive_runs:
+            return 0
+        if time.monotonic() > self._next_look:
+            self.look()
+        return super().__len__() or int(any(True for _ in self._candidates()))
+
+    def observe(self, config_key: str, seconds: float) -> None:
+        super().observe(config_key, seconds)
+        self.left -= 1
+        self.left_here -= 1
+        if kind := self._kinds.get(config_key):
+            kind.mean = self._costs[config_key]
+            kind.longest = max(seconds, kind.longest or 0.0)
+
+    def next(self) -> list[Task]:
+        """Return trials to claim: some of them may be gone by then; none if nothing fits."""
+        if chunk := self._fitting(self._alone):
+            return chunk
+        for kind in list(self._candidates()):
+            if chunk := self._take(kind):
+                self._exclusive_runs = False
+                return self._given(kind, chunk)
+        return self._fitting(self._exclusive)
+
+    def _fitting(self, queue: deque[TrialSpec]) -> list[Task]:
+        """Return the first trial of a queue that ends in time; the others are left to the store."""
+        while queue:
+            chunk = super().next()
+            kind = self._kinds.get(chunk[0].spec.config_key)
+            if kind is not None and self._room(kind):
+                return self._given(kind, chunk)
+        return []
+
+    def _given(self, kind: Kind, chunk: list[Task]) -> list[Task]:
+        self._submitted.append(len(chunk) * self._bound(kind))
+        return chunk
+
+    def _take(self, kind: Kind) -> list[Task]:
+        """Return pending trials of a configuration, and queue those that killed a process."""
+        size = self._size(kind)
+        found = self._store.open_trials(kind.config_id, size, SUSPECT_LOSSES)
+        kind.pending = max(0, kind.pending - len(found)) if len(found) == size else 0
+        specs = [(trial, kind.first.with_seed(trial.seed)) for trial in found]
+        self.add((spec for trial, spec in specs if trial.crashes), alone=True)
+        chunk = [Task(spec.trial_key, spec) for trial, spec in specs if not trial.crashes]
+        return chunk or (super().next() if self._alone else [])
+
+    def _candidates(self) -> Iterator[Kind]:
+        """Yield the configurations of which a trial fits, the longest first, unknown ones before.
+
+        A long trial that starts last would keep one process busy while the others have nothing.
+        """
+        waiting = (kind for kind in self._kinds.values() if kind.pending)
+        ordered = sorted(waiting, key=lambda kind: -(kind.mean or float("inf")))
+        return (kind for kind in ordered if self._room(kind))
+
+    def _size(self, kind: Kind) -> int:
+        if kind.mean is None:
+            return 1
+        most = min(MAX_CHUNK_TRIALS, max(1, kind.pending // (2 * self.slots)), self._room(kind))
+        return max(1, min(most, int(self._seconds / max(kind.mean, 1e-9))))
+
+    def _room(self, kind: Kind) -> int:
+        """Return how many trials of a configuration, one after the other, end in time."""
+        if self._end is None:
+            return MAX_CHUNK_TRIALS
+        # A process holds at most one chunk before the new one.
+        before = max(self._submitted, default=0.0) if self.pending >= self.slots else 0.0
+        seconds = self._end - time.monotonic() - before
+        return max(0, min(MAX_CHUNK_TRIALS, int(seconds / max(self._bound(kind), 1e-9))))
+
+    def _bound(self, kind: Kind) -> float:
+        """Return the time [s] that a trial of a configuration is assumed to take at most."""
+        if kind.longest is not None:
+            return MARGIN * kind.longest
+        return UNKNOWN_SHARE * (self._length or 0.0)
+
+    def _kind(self, config: OpenConfig) -> Kind | None:
+        """Return a configuration as this process builds it, or None if it cannot."""
+        known = self._kinds.get(config.config_key)
+        if config.config_key in self._refused:
+            return None
+        try:
+            first = known.first if known else trial_of(config, self.slots)
+        except DoptError as error:
+            self._refused.add(config.config_key)
+            self._warn(f"{config.pending:,} trials are left to other workers: {error}")
+            return None
+        mean = self._costs.get(config.config_key, config.mean_seconds)
+        longest = max(config.max_seconds or 0.0, (known and known.longest) or 0.0) or None
+        return Kind(config.config_id, first, config.pending, mean, longest)
+
+
+def trial_of(config: OpenConfig, at_once: int) -> TrialSpec:
+    """Return the trial with seed 0 of a stored configuration.
+
+    Raises
+    ------
+    DoptError
+        If the code of this machine builds another trial from it or lacks a part of it, or if its
+        memory does not hold ``at_once`` of them.
+    """
+    spec = stored_trial(completed(json.loads(config.config_json)))
+    if spec.config_key != config.config_key:
+        raise DoptError(
+            f"Configuration {config.config_key[:12]} was registered by another version of the "
+            f"code, in which it has other numbers: run the worker with that version."
+        )
+    available = memory_of_this_machine()
+    if at_once * spec.config.memory > available:
+        raise DoptError(
+            f"{at_once} trials of env={spec.system.name} policy={spec.policy.name} need "
+            f"{at_once * spec.config.memory / BYTES_PER_GIB:.3g} GiB of memory, but this machine "
+            f"has {available / BYTES_PER_GIB:.3g} GiB: give a lower --processes."
+        )
+    return spec

@@ -16,7 +16,7 @@ import pytest
 import dopt
 from analysis.data.provenance import versions
 from dopt.errors import SpecificationError
-from orchestrate.runner.provenance import launch_record
+from orchestrate.runner.saving import launch_record
 from tests.paths import ROOT
 
 HEAVY = {"torch", "ray", "numba", "hydra", "sqlalchemy", "matplotlib", "pandas", "scipy"}

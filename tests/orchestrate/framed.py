@@ -8,7 +8,7 @@ import time
 import warnings
 
 from orchestrate.program import run
-from orchestrate.runner.signals import Interrupt
+from orchestrate.runner.progress import Interrupt
 
 LETTERS = "0 · ± 2 °C, m/s², 10⁻¹², θ̇ ≤ γ, Ω, é, 東"
 

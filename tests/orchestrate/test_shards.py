@@ -12,7 +12,7 @@ from orchestrate.__main__ import main
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.share import Share, share
 from orchestrate.errors import LaunchError
-from orchestrate.runner.collecting import collected
+from orchestrate.runner.run_grid import collected
 from orchestrate.store import NoDatabaseError, Reader, Store, StoreError
 from orchestrate.store.shards import collect, merge_collected
 from tests.orchestrate.faults.outcome import flaws, results

@@ -146,7 +146,7 @@ def test_a_worker_ends_when_the_rest_cannot_run_here(
     command_line: Run, pull: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     command_line(*GRID, LEAVE)
-    monkeypatch.setattr("orchestrate.runner.stored_chunks.memory_of_this_machine", lambda: 10)
+    monkeypatch.setattr("orchestrate.runner.worker.memory_of_this_machine", lambda: 10)
     code, out, err = pull("work")
     assert code == 3
     assert "6 left" in out
@@ -220,8 +220,8 @@ def code(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
 
     def change(digest: str) -> None:
         changed = {**fingerprint(), "code of dopt": digest}
-        monkeypatch.setattr("orchestrate.runner.provenance.fingerprint", lambda: changed)
-        monkeypatch.setattr("orchestrate.runner.stored_chunks.fingerprint", lambda: changed)
+        monkeypatch.setattr("orchestrate.runner.saving.fingerprint", lambda: changed)
+        monkeypatch.setattr("orchestrate.runner.worker.fingerprint", lambda: changed)
 
     return change
 

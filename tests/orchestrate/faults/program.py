@@ -23,7 +23,7 @@ import psycopg
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors import exit_status
-from orchestrate.runner import launch, stored_chunks, worker
+from orchestrate.runner import launch, worker
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store, StoreUnavailableError
@@ -132,7 +132,7 @@ class Clock:
 def _pull(order: Order, work: Work) -> int:
     if order.tick:
         clock = Clock(Gate(Path(order.gate)), order.tick)
-        worker.time = stored_chunks.time = clock  # type: ignore[assignment]
+        worker.time = worker.time = clock  # type: ignore[assignment]
     settings = WorkerSettings(order.url, **{"processes": 2, **dict(order.worker or {})})
     try:
         return run_worker(settings, Output(launch.say, launch.say, sys.stderr), work)

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from orchestrate.runner import signals
-from orchestrate.runner.signals import FINISHING, Interrupt, undisturbed
+from orchestrate.runner import progress
+from orchestrate.runner.progress import FINISHING, Interrupt, undisturbed
 from tests.orchestrate.faults.laboratory import Laboratory, Launched, alive
 
 
@@ -81,7 +81,7 @@ def test_two_interrupts_at_any_moment_leave_no_lock(
 def test_a_signal_that_is_passed_on_counts_once_and_a_second_ctrl_c_counts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(signals, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: 100.0))
     with Interrupt((signal.SIGTERM, signal.SIGUSR1, signal.SIGINT)) as stop:
         for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGTERM):
             os.kill(os.getpid(), number)

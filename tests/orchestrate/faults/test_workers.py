@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 
 from orchestrate.runner import worker as worker_module
+from orchestrate.runner.progress import Interrupt
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, POLL_SECONDS
-from orchestrate.runner.signals import Interrupt
 from orchestrate.runner.worker import WARNINGS, Leave
 from tests.orchestrate.faults.laboratory import Laboratory
 from tests.orchestrate.faults.preemptions import OPEN, preempt

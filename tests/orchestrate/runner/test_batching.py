@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dopt.spec.trial import TrialSpec
-from orchestrate.runner.batching import MAX_CHUNK_TRIALS, Chunks
+from orchestrate.runner.chunks import MAX_CHUNK_TRIALS, Chunks
 from tests.orchestrate.standins import specification
 
 TRIALS = [specification(seed) for seed in range(1000)]

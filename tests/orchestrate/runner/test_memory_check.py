@@ -9,7 +9,7 @@ import pytest
 from orchestrate.config.grid import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import LaunchError
-from orchestrate.runner.memory_check import BYTES_PER_GIB, check_memory, memory_of_this_machine
+from orchestrate.runner.chunks import BYTES_PER_GIB, check_memory, memory_of_this_machine
 
 
 def grid(seeds: int, width: int, form: str = "primal") -> Grid:

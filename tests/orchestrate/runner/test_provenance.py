@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from orchestrate import fingerprint
-from orchestrate.runner.provenance import launch_record
+from orchestrate.runner.saving import launch_record
 from tests.paths import ROOT
 
 

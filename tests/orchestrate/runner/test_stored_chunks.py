@@ -13,7 +13,7 @@ from dopt.errors import DoptError
 from dopt.spec.trial import TrialSpec
 from orchestrate.records import RunRecord
 from orchestrate.runner.retrying_store import RetryingStore
-from orchestrate.runner.stored_chunks import StoredChunks, trial_of
+from orchestrate.runner.worker import StoredChunks, trial_of
 from orchestrate.store import LaunchRecord, OpenConfig, Store
 from tests.orchestrate.faults.trials import outcome
 from tests.orchestrate.standins import trial_of as short_trial
@@ -123,7 +123,7 @@ def test_a_trial_that_killed_a_process_goes_alone(store: Store, build: Build) ->
 def test_what_this_machine_cannot_build_is_left_to_others(
     build: Build, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrate.runner.stored_chunks.memory_of_this_machine", lambda: 10)
+    monkeypatch.setattr("orchestrate.runner.worker.memory_of_this_machine", lambda: 10)
     chunks, said = build(trials_of("random", 4), {})
     assert len(chunks) == 0
     assert (chunks.left, chunks.left_here, chunks.waiting) == (4, 0, 0)

@@ -15,7 +15,7 @@ from orchestrate.executors.base import Task
 from orchestrate.executors.limits import Limits
 from orchestrate.executors.task import run_task
 from orchestrate.records import Failure
-from orchestrate.runner.heartbeat import Heartbeat
+from orchestrate.runner.retrying_store import Heartbeat
 from orchestrate.store import Store
 from orchestrate.store.backends.open import LEASE_SECONDS
 from tests.dopt.trials import trial
@@ -31,7 +31,7 @@ LEASE = 4.0
 @pytest.fixture
 def many_beats(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let ten heartbeats come in a second, and a lease last as long as ever."""
-    monkeypatch.setattr("orchestrate.runner.heartbeat.HEARTBEATS_PER_LEASE", 600)
+    monkeypatch.setattr("orchestrate.runner.retrying_store.HEARTBEATS_PER_LEASE", 600)
 
 
 def wait_for_renewals(url: str, count: int = 3) -> None:
