@@ -12,8 +12,7 @@ if __name__ == "__main__":
 
 from dopt.errors import unknown_name
 from orchestrate.commands import COMMANDS
-from orchestrate.commands.command import PROGRAM
-from orchestrate.commands.output import say
+from orchestrate.commands.command import PROGRAM, say
 from orchestrate.errors import ExitCode
 
 

@@ -1,38 +1,25 @@
-"""Commands on a results database, one file for each command.
+"""Commands on a results database.
 
-A new command is a file with a ``COMMAND`` and a line in ``COMMANDS``.
+A new command is a :class:`~orchestrate.commands.command.Command` and a line in ``COMMANDS``.
 """
 
 from __future__ import annotations
 
-from orchestrate.commands import (
-    backup,
-    doctor,
-    export,
-    merge,
-    prune,
-    query,
-    retry,
-    show,
-    status,
-    upgrade,
-    vacuum,
-    work,
-)
+from orchestrate.commands import export, maintenance, results, status
 from orchestrate.commands.command import Command
 
 COMMANDS: tuple[Command, ...] = (
-    work.COMMAND,
-    status.COMMAND,
-    show.COMMAND,
-    retry.COMMAND,
-    query.COMMAND,
-    export.COMMAND,
-    merge.COMMAND,
-    doctor.COMMAND,
-    upgrade.COMMAND,
-    backup.COMMAND,
-    prune.COMMAND,
-    vacuum.COMMAND,
+    status.WORK_COMMAND,
+    status.STATUS_COMMAND,
+    results.SHOW_COMMAND,
+    maintenance.RETRY_COMMAND,
+    results.QUERY_COMMAND,
+    export.EXPORT_COMMAND,
+    maintenance.MERGE_COMMAND,
+    maintenance.DOCTOR_COMMAND,
+    maintenance.UPGRADE_COMMAND,
+    maintenance.BACKUP_COMMAND,
+    maintenance.PRUNE_COMMAND,
+    maintenance.VACUUM_COMMAND,
 )
 """In the order in which the help shows them."""

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrate.cli_parser import UsageError, path
-from orchestrate.commands.command import Command
-from orchestrate.commands.filtering import add_filters, chosen
-from orchestrate.commands.output import say, say_json
+from orchestrate.commands.command import Command, add_filters, chosen, say, say_json
 from orchestrate.errors import ExitCode
 from orchestrate.export.exporting import FORMATS, KINDS, BundleExport, Export, export
 from orchestrate.store import Reader
@@ -19,7 +17,7 @@ _NO_LICENSE = "unknown"
 _LICENSE = re.compile(r"[a-z0-9][a-z0-9.+-]*")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "kind",
         choices=(*KINDS, "bundle"),
@@ -43,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_filters(parser)
 
 
-def run(arguments: argparse.Namespace) -> ExitCode:
+def _run_export(arguments: argparse.Namespace) -> ExitCode:
     """Write the file and its manifest, or the folder."""
     out = _target(arguments)
     to = _to_bundle if arguments.kind == "bundle" else _to_file
@@ -121,4 +119,6 @@ def _format_of(path: Path) -> str:
     return ending
 
 
-COMMAND = Command("export", "write results to a file or a bundle", add_arguments, run)
+EXPORT_COMMAND = Command(
+    "export", "write results to a file or a bundle", _add_export_arguments, _run_export
+)

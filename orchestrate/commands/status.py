@@ -1,25 +1,44 @@
-"""Command ``status``: progress of the grid, failures and running launches."""
+"""Commands on a grid that runs: ``status``, once or repeatedly, and ``work``."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime
+from functools import partial
+from typing import Any
 
-from orchestrate.cli_parser import positive
-from orchestrate.commands.command import Command
-from orchestrate.commands.display import show
-from orchestrate.commands.filtering import add_filters, chosen
-from orchestrate.commands.output import say, say_json
-from orchestrate.commands.status_view import document, parts
-from orchestrate.commands.watching import watch
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.text import Text
+
+from orchestrate.cli_parser import as_started, length_of_time, positive, tell
+from orchestrate.commands.command import (
+    Command,
+    add_filters,
+    chosen,
+    console,
+    plain,
+    say,
+    say_json,
+    show,
+)
+from orchestrate.commands.results import grid_table
 from orchestrate.errors import ExitCode
-from orchestrate.queries.status import Status, gather
-from orchestrate.store import Reader
+from orchestrate.program import say as say_still
+from orchestrate.queries.status import STATES, Status, gather, seconds_since
+from orchestrate.redaction import without_password
+from orchestrate.runner.progress import duration
+from orchestrate.store import ExplorationRow, FailureKind, LaunchRow, Reader, StoreUnavailableError
 
 MAX_ROWS = 60
 """Rows of the table without --all."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
     add_filters(parser)
     parser.add_argument(
         "--all", action="store_true", help=f"a row for each configuration, also above {MAX_ROWS}"
@@ -35,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(arguments: argparse.Namespace) -> ExitCode:
+def _run_status(arguments: argparse.Namespace) -> ExitCode:
     """Print the status once, or until the grid is complete."""
     with Reader.open(arguments.db) as reader:
         if arguments.watch is None:
@@ -62,4 +81,240 @@ def _look(reader: Reader, arguments: argparse.Namespace) -> Status:
         return gather(moment, chosen(moment, arguments))
 
 
-COMMAND = Command("status", "show progress, failures and running launches", add_arguments, run)
+STATUS_COMMAND = Command(
+    "status", "show progress, failures and running launches", _add_status_arguments, _run_status
+)
+
+
+WORK = as_started("python -m orchestrate work")
+_NAMES = ("env", "policy", "model", "learner", "width", "depth", "horizon", "dt", "gamma")
+_CONFIG = ("config_key", *_NAMES, "n", *(f"n_{state}" for state in STATES))
+_LAUNCH = ("launch_id", "alive", "host", "pid", "started", "argv")
+_FAILURE = ("cause", "type", "message", "trials", "attempts", "last_line", "place")
+_MAX_KINDS = 10
+_MAX_EXPLORATIONS = 20  # the newest
+_MAX_PLACES = 4
+_MAX_LINE = 200  # characters of a line of a traceback
+
+
+def summary(status: Status) -> str:
+    """Return the counts, the rate and the estimated remaining time on one line."""
+    counts, total = status.counts, status.total
+    words = [f"{total - status.left:,} of {total:,} trials have an outcome"]
+    words += [f"{counts[name]:,} {name}" for name in counts if counts[name]]
+    if status.rate:
+        words.append(f"{status.rate:.1f}/s")
+    if status.seconds_left is not None:
+        words.append(f"{duration(status.seconds_left)} left")
+    return " · ".join(words)
+
+
+def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
+    """Yield the grid in at most ``max_rows`` rows, the failures and the launches."""
+    yield grid_table(status.configs, max_rows)
+    yield Text(f"\n{summary(status)}", style="bold")
+    if status.mixed:
+        yield Text(
+            f"{_plural(len(status.mixed), 'configuration')} with results of different code "
+            f"(the first is {status.mixed[0][:12]}): python -m orchestrate doctor",
+            style="yellow",
+        )
+    if status.rounded:
+        yield Text(
+            f"{_plural(status.rounded, 'trial')} of ranges of an earlier version, with values such "
+            f"as 0.30000000000000004: the same range now gives 0.3, and runs other trials"
+        )
+    if status.explorations:
+        yield Text("\nExplorations", style="bold")
+        yield from map(_exploration, status.explorations[-_MAX_EXPLORATIONS:])
+    if status.failures:
+        yield Text("\nFailures", style="bold red")
+        yield from map(_failure, status.failures[:_MAX_KINDS])
+        if len(status.failures) > _MAX_KINDS:
+            yield Text(f"  and {len(status.failures) - _MAX_KINDS:,} other kinds")
+    detached = status.detached if status.left else ()
+    if status.launches or detached:
+        yield Text("\nLaunches", style="bold")
+        yield from map(_detached, detached)
+        yield from map(_launch, status.launches)
+    if status.left and not status.launches:
+        again = f"start workers with {WORK}" if detached else "run the same launch command again"
+        yield Text(f"\nNo {'worker' if detached else 'launch'} is running: {again} to continue.")
+
+
+def _exploration(one: ExplorationRow) -> Text:
+    return plain(f"  {one.trial_key[:12]}  {one.env}, {one.label}, seed {one.seed}: {one.state}")
+
+
+def _failure(kind: FailureKind) -> Text:
+    places = sorted(f"{env}/{policy}" for env, policy in kind.places)
+    more = [f"and {len(places) - _MAX_PLACES} other places"] if len(places) > _MAX_PLACES else []
+    text = Text(f"  {_plural(kind.trials, 'trial')} ({_plural(kind.attempts, 'attempt')}), ")
+    text.append(kind.cause, style="red")
+    text.append(f": {', '.join([*places[:_MAX_PLACES], *more])}")
+    last = kind.last_line or f"{kind.type or ''}: {kind.message or ''}".strip(": ")
+    lines = [kind.message] if kind.message and kind.message not in last else []
+    for line in [*lines, last, *([f"at {kind.place}"] if kind.place else [])]:
+        text.append("\n      ").append(plain(_first_line(line)))
+    return text
+
+
+def _detached(launch: LaunchRow) -> Text:
+    since = f"{launch.started[:19]}Z"
+    return Text(f"  {launch.launch_id} on {launch.host}, {since}: registered a grid for workers")
+
+
+def _launch(launch: LaunchRow) -> Text:
+    age = duration(max(0.0, seconds_since(launch.started, datetime.now(UTC))))
+    since = f"{launch.started[:19]}Z"
+    where = f"  {launch.launch_id} on {launch.host}, process {launch.pid}, since {since}"
+    worker = launch.kind == "worker"
+    if launch.alive:
+        return Text(f"{where}: {'worker, ' if worker else ''}alive for {age}")
+    hint = "run the same launch command again to continue"
+    if worker:
+        hint = "other workers take its trials"
+    return Text(f"{where}: ").append("dead", style="red").append(f"; {hint}")
+
+
+def document(status: Status, database: str) -> dict[str, Any]:
+    """Return the status as a JSON document."""
+    launches = [{name: getattr(one, name) for name in _LAUNCH} for one in status.launches]
+    for launch in launches:
+        launch["argv"] = [without_password(word) for word in launch["argv"]]
+    return {
+        "database": database,
+        "trials": {"all": status.total, **status.counts},
+        "complete": not status.left,
+        "per_second": status.rate,
+        "seconds_left": status.seconds_left,
+        "configs": [{name: getattr(one, name) for name in _CONFIG} for one in status.configs],
+        "failures": [
+            {**{name: getattr(kind, name) for name in _FAILURE}, "places": sorted(kind.places)}
+            for kind in status.failures
+        ],
+        "launches": launches,
+        "detached": [one.launch_id for one in status.detached],
+        "explorations": [asdict(one) for one in status.explorations],
+        "mixed_code": list(status.mixed),
+    }
+
+
+def _plural(number: int, noun: str) -> str:
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
+
+
+def _first_line(text: str) -> str:
+    line = text.strip().splitlines()[0] if text.strip() else ""
+    return line if len(line) <= _MAX_LINE else f"{line[: _MAX_LINE - 1]}…"
+
+
+TERMINAL_INTERVAL_SECONDS = 2.0
+LINE_INTERVAL_SECONDS = 10.0
+
+_LINES_BESIDE_GRID = 14  # of the screen, above and below the grid
+
+Read = Callable[[], Status]
+
+
+def watch(read: Read, seconds: float | None, quiet: bool) -> Status:
+    """Show what ``read`` returns until every trial has an outcome; return the last status.
+
+    A database that cannot be reached is read again later.
+    """
+    terminal = sys.stdout.isatty() and not quiet
+    statuses = _statuses(
+        read, seconds or (TERMINAL_INTERVAL_SECONDS if terminal else LINE_INTERVAL_SECONDS)
+    )
+    if terminal:
+        _in_place(statuses)
+    else:
+        for status in statuses:
+            if not quiet:
+                say(status if isinstance(status, str) else summary(status))
+    return read()
+
+
+def _statuses(read: Read, seconds: float) -> Iterator[Status | str]:
+    """Yield the status, or the error of a failed read, until the grid is complete."""
+    while True:
+        try:
+            status = read()
+        except StoreUnavailableError as error:
+            if not error.transient:
+                raise
+            yield str(error)
+        else:
+            yield status
+            if status.configs and not status.left:
+                return
+        time.sleep(seconds)
+
+
+def _in_place(statuses: Iterable[Status | str]) -> None:
+    screen = console()
+    with Live(console=screen, auto_refresh=False) as live:
+        for status in statuses:
+            rows = max(4, screen.height - _LINES_BESIDE_GRID)
+            shown = Text(status) if isinstance(status, str) else Group(*parts(status, rows))
+            live.update(shown, refresh=True)
+
+
+def _add_work_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--until",
+        type=length_of_time("--until"),
+        metavar="TIME",
+        help="hold nothing after this time from now, such as 55m, 1h30m or 90s (default: run until "
+        "no trial is left)",
+    )
+    parser.add_argument(
+        "--processes",
+        type=positive("--processes", int),
+        metavar="N",
+        help="trials at once (default: one for each core that this process may use)",
+    )
+    number = partial(positive, number=float)
+    parser.add_argument(
+        "--timeout", type=number("--timeout"), default=3600.0, help="seconds that a trial may take"
+    )
+    parser.add_argument(
+        "--memory-gib", type=number("--memory-gib"), metavar="GIB", help="memory of one process"
+    )
+    parser.add_argument(
+        "--retry-memory",
+        type=number("--retry-memory"),
+        metavar="FACTOR",
+        help="run a trial that exceeds --memory-gib once more, with so many times as much",
+    )
+    parser.add_argument(
+        "--lease",
+        type=number("--lease"),
+        default=60.0,
+        help="seconds for which a worker that is lost keeps its trials on PostgreSQL",
+    )
+
+
+def _run_work(arguments: argparse.Namespace) -> ExitCode:
+    """Run trials until none is left, the time is over, or a signal comes."""
+    from orchestrate.runner.run_grid import Output
+    from orchestrate.runner.worker import WorkerSettings, run_worker
+
+    Reader.open(arguments.db).close()  # a worker creates no database
+    names = ("processes", "timeout", "memory_gib", "retry_memory")
+    given = {name: getattr(arguments, name) for name in names}
+    settings = WorkerSettings(arguments.db, arguments.until, lease=arguments.lease, **given)
+    answer = _to_stderr if arguments.json else say_still
+    code = run_worker(settings, Output(answer, _to_stderr, sys.stderr))
+    if arguments.json:
+        say_json({"exit_code": code.value, "complete": code in (0, ExitCode.SOME_FAILED)})
+    return code
+
+
+def _to_stderr(line: str) -> None:
+    tell(sys.stderr, f"{without_password(line)}\n")
+
+
+WORK_COMMAND = Command(
+    "work", "run registered trials on this machine", _add_work_arguments, _run_work
+)

@@ -22,7 +22,7 @@ from dopt.errors import DoptError, SpecificationError
 from dopt.policies.base import OpenLoop
 from dopt.systems import System
 from dopt.types import Array
-from orchestrate.commands.doctor import trial_key
+from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store, StoreError, StoreUnavailableError, default_url
 from orchestrate.store.doctor import examine
 from orchestrate.store.write import explorations as writing

@@ -21,7 +21,7 @@ from analysis.serve.app import create_app
 from analysis.tables.comparisons import compare_policies
 from dopt import Explorer, TrialSpec
 from orchestrate.__main__ import main
-from orchestrate.commands.doctor import trial_key
+from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store, StoreUnavailableError, explorations
 from orchestrate.store.doctor import examine
 from orchestrate.store.merging.merge import merge

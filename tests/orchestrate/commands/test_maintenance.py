@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy import create_engine
 from sqlalchemy.engine import make_url
 
-from orchestrate.commands.doctor import trial_key
+from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store
 from orchestrate.store.merging.merge import merge
 from orchestrate.store.schema import SCHEMA_VERSION

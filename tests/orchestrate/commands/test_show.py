@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dopt.result import Assessment
-from orchestrate.commands.sparkline import sparkline
+from orchestrate.commands.results import sparkline
 from orchestrate.store import Store
 from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, Answer, failure, run_now
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, result

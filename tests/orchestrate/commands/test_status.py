@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from orchestrate.commands import watching
-from orchestrate.commands.configs_table import grid_table
-from orchestrate.commands.display import plain
-from orchestrate.commands.watching import watch
+from orchestrate.commands import status
+from orchestrate.commands.command import plain
+from orchestrate.commands.results import grid_table
+from orchestrate.commands.status import watch
 from orchestrate.queries.status import Status, gather
 from orchestrate.store import Claim, ConfigRow, Reader, Store, StoreUnavailableError
 from tests.orchestrate.commands.conftest import WAITING, Answer, failure, run_now
@@ -175,7 +175,7 @@ class TestWatch:
         self, command: Run, store: Store, grid: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         pause = SimpleNamespace(sleep=lambda _: self.finish(store, grid))
-        monkeypatch.setattr(watching, "time", pause)
+        monkeypatch.setattr(status, "time", pause)
         answer = command("status", "--watch", "0.2")
         first, *_, last = answer.out.splitlines()
         assert "6 of 9 trials have an outcome" in first
@@ -215,8 +215,8 @@ def test_a_watch_waits_for_a_database_that_went_away(capsys: pytest.CaptureFixtu
 def test_in_a_terminal_it_draws_in_place(monkeypatch: pytest.MonkeyPatch) -> None:
     screen = io.StringIO()
     console = Console(file=screen, force_terminal=True, width=80, height=24, color_system=None)
-    monkeypatch.setattr(watching, "console", lambda: console)
-    watching._in_place(["gone for now", _complete()])
+    monkeypatch.setattr(status, "console", lambda: console)
+    status._in_place(["gone for now", _complete()])
     assert "gone for now" in screen.getvalue()
     assert "1 of 1 trials have an outcome" in screen.getvalue()
     assert screen.getvalue().endswith("\x1b[?25h")  # the cursor is back

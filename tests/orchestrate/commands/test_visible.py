@@ -83,7 +83,7 @@ def test_what_programs_read_stays_exact(evil: str, command: Callable[..., Answer
 
 
 def test_colours_of_the_program_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrate.commands.display import console
+    from orchestrate.commands.command import console
 
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")

@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy import text
 
 from orchestrate.__main__ import main
-from orchestrate.commands.doctor import trial_key
+from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import (
     Reader,
     SchemaVersionError,

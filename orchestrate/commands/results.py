@@ -1,0 +1,383 @@
+"""Commands that read results: ``query`` and ``show``, of a trial or of lists of trials."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from orchestrate.cli_parser import UsageError, integer, positive, tell
+from orchestrate.commands.command import (
+    Command,
+    add_filters,
+    chosen,
+    jsonable,
+    plain,
+    say_json,
+    show,
+    table,
+)
+from orchestrate.errors import ExitCode
+from orchestrate.queries.config_columns import COLUMNS, column_text, differing
+from orchestrate.queries.status import counts
+from orchestrate.queries.trial import TrialReport, report
+from orchestrate.store import ConfigRow, Reader
+from orchestrate.store import Table as Rows
+
+DEFAULT_LIMIT = 1_000
+DEFAULT_TIMEOUT_SECONDS = 60.0
+_MAX_TEXT = 60  # characters of a value in a table
+
+
+def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("sql", metavar="SQL", help="one SELECT; docs/database.md has examples")
+    parser.add_argument("--csv", action="store_true", help="print comma-separated values")
+    parser.add_argument(
+        "--limit",
+        type=positive("--limit", int),
+        help=f"most rows ({DEFAULT_LIMIT:,} in a table, all of them as CSV or JSON)",
+    )
+    parser.add_argument(
+        "--timeout",
+        type=positive("--timeout", float),
+        default=DEFAULT_TIMEOUT_SECONDS,
+        metavar="SECONDS",
+        help=f"end the query after this time ({DEFAULT_TIMEOUT_SECONDS:g})",
+    )
+
+
+def _run_query(arguments: argparse.Namespace) -> ExitCode:
+    """Print the rows, and a note on the standard error if there are more."""
+    whole = arguments.csv or arguments.json
+    limit = arguments.limit or (None if whole else DEFAULT_LIMIT)
+    with Reader.open(arguments.db) as reader:
+        rows = reader.query(arguments.sql, limit, arguments.timeout)
+    if arguments.json:
+        say_json({"columns": rows.columns, "rows": [list(row) for row in rows], "cut": rows.cut})
+    elif arguments.csv:
+        _write_csv(rows)
+    else:
+        _show(rows)
+    if rows.cut:
+        more = "--limit N gives more" if whole else "--limit N gives more, --csv gives all"
+        sys.stderr.write(f"note: only the first {len(rows):,} rows are shown, {more}.\n")
+    return ExitCode.DONE
+
+
+def _write_csv(rows: Rows) -> None:
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(rows.columns)
+    writer.writerows([jsonable(value) for value in row] for row in rows)
+    tell(sys.stdout, out.getvalue(), exact=True)
+
+
+def _show(rows: Rows) -> None:
+    numbers = {
+        name
+        for i, name in enumerate(rows.columns)
+        if all(isinstance(row[i], int | float | None) for row in rows)
+    }
+    result = table(rows.columns, numbers=numbers)
+    for row in rows:
+        result.add_row(*(plain(_text(value)) for value in row))
+    show(result)
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, bytes | memoryview):
+        return f"({len(value):,} bytes)"
+    line = " ".join(str(jsonable(value)).split())
+    return line if len(line) <= _MAX_TEXT else f"{line[: _MAX_TEXT - 1]}…"
+
+
+QUERY_COMMAND = Command("query", "run a read-only SQL query", _add_query_arguments, _run_query)
+
+
+_BYTES_PER_MIB = 2**20
+_ATTEMPT = ("attempt", "launch", "outcome", "cause", "node", "ended", "wall s", "cpu s", "peak MiB")
+
+
+def _add_show_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("trial", metavar="TRIAL", nargs="?", help="first digits of the trial's key")
+    add_filters(parser)
+    parser.add_argument("--width", type=integer("--width"), help="the trial of this width")
+    parser.add_argument("--seed", type=integer("--seed"), help="the trial of this seed")
+
+
+def _run_show(arguments: argparse.Namespace) -> ExitCode:
+    """Print the one trial that the options select."""
+    with Reader.open(arguments.db) as reader, reader.moment() as moment:
+        rows = listed(moment, arguments, width=arguments.width, seed=arguments.seed)
+        row = the_one(rows, arguments.trial)
+        found = report(moment, row.trial_id)
+    if arguments.json:
+        say_json(asdict(found))
+    else:
+        show(Text(describe(row), style="bold"), *_parts(found))
+    return ExitCode.DONE
+
+
+def _parts(found: TrialReport) -> Iterator[RenderableType]:
+    yield _outcome(found)
+    if line := sparkline(found.loss):
+        kind = "prequential loss" if found.exploration else "loss"
+        yield Text(f"{kind}, log scale, {len(found.loss)} steps  {line}")
+    yield Text("\nConfiguration", style="bold")
+    yield from _configuration(found.config)
+    for launch in found.launches:
+        yield from _launch(launch)
+    if found.attempts:
+        yield Text("\nAttempts", style="bold")
+        yield _attempts(found)
+    errors = [attempt for attempt in found.attempts if attempt["traceback"]]
+    if errors:
+        yield Text(f"\nTraceback of attempt {errors[-1]['attempt']}", style="bold red")
+        yield plain(errors[-1]["traceback"].rstrip())
+
+
+def _outcome(found: TrialReport) -> Text:
+    trial = found.trial
+    words = [found.exploration.state if found.exploration else trial["status"]]
+    if trial["diverged_at"] is not None:
+        words.append(f"at step {trial['diverged_at']:,}")
+    words += [
+        f"{name.replace('_', ' ')} {trial[name]:.6g}"
+        for name in ("final_loss", "best_loss")
+        if trial[name] is not None
+    ]
+    words += [
+        f"{name} {value:.6g}" for name, value in found.beyond_limits.items() if value is not None
+    ]
+    if trial["error_type"] is not None:
+        words.append(f"{trial['error_type']}: {trial['error_message']}")
+    return plain(" · ".join(words))
+
+
+def _configuration(config: Mapping[str, Any]) -> Iterator[Text]:
+    scalars = {name: value for name, value in config.items() if not isinstance(value, Mapping)}
+    sections = {name: value for name, value in config.items() if isinstance(value, Mapping)}
+    for name, section in {**sections, "": scalars}.items():
+        if section:
+            words = " ".join(f"{key}={value}" for key, value in section.items())
+            yield plain(f"  {name:<8} {words}")
+
+
+def _launch(launch: Mapping[str, Any]) -> Iterator[Text]:
+    yield Text(f"\nLaunch {launch['launch_id']}", style="bold")
+    commit = launch["git_commit"] or "no repository"
+    if launch["git_dirty"]:
+        commit += f", with changes (diff {str(launch['git_diff_hash'])[:12]})"
+    state = "dead" if launch["state"] == "running" and not launch["alive"] else launch["state"]
+    until = f"to {launch['ended']}" if launch["ended"] else ""
+    lines = {
+        "command": shlex.join(launch["argv"]),
+        "state": f"{state}, from {launch['started']} {until}".rstrip(),
+        "host": f"{launch['host']}, process {launch['pid']}",
+        "commit": commit,
+        "versions": " ".join(f"{name}={value}" for name, value in launch["versions"].items()),
+    }
+    yield from (plain(f"  {name:<8} {value}") for name, value in lines.items())
+
+
+def _attempts(found: TrialReport) -> Table:
+    result = table(_ATTEMPT, numbers={"attempt", "launch", "wall s", "cpu s", "peak MiB"})
+    for one in found.attempts:
+        memory = one["peak_memory_bytes"]
+        values = [
+            *(one["attempt"], one["launch_id"], one["outcome"] or "running", one["cause"]),
+            *(one["node"], (one["ended"] or "")[:19]),
+            *(_number(one["wall_seconds"]), _number(one["cpu_seconds"])),
+            _number(memory / _BYTES_PER_MIB if memory is not None else None),
+        ]
+        result.add_row(*(plain("-" if value in (None, "") else str(value)) for value in values))
+    return result
+
+
+def _number(value: float | None) -> str | None:
+    return None if value is None else f"{value:,.2f}"
+
+
+SHOW_COMMAND = Command(
+    "show",
+    "show one trial: configuration, launches, attempts, loss",
+    _add_show_arguments,
+    _run_show,
+)
+
+
+_MIN_DIGITS = 4
+_MAX_LISTED = 10
+_NAMES = ("env", "policy")
+_TRIALS = "SELECT trial_id, trial_key, config_key, width, seed, status FROM v_trial"
+
+
+@dataclass(frozen=True)
+class ListedTrial:
+    """One trial with its configuration."""
+
+    trial_id: int
+    trial_key: str
+    seed: int
+    status: str
+    config: ConfigRow
+
+
+def listed(
+    reader: Reader, arguments: argparse.Namespace, **values: int | None
+) -> list[ListedTrial]:
+    """Return the trials of the chosen configurations, in the order of their registration.
+
+    ``values`` of columns that are not None select a part of them.
+    """
+    configs = {config.config_key: config for config in chosen(reader, arguments)}
+    given = {name: value for name, value in values.items() if value is not None}
+    condition = " AND ".join(["1 = 1", *(f"{name} = :{name}" for name in given)])
+    rows = reader.rows(f"{_TRIALS} WHERE {condition} ORDER BY trial_id", **given)
+    return [
+        ListedTrial(row.trial_id, row.trial_key, row.seed, row.status, configs[row.config_key])
+        for row in rows
+        if row.config_key in configs
+    ]
+
+
+def the_one(trials: Sequence[ListedTrial], start: str | None) -> ListedTrial:
+    """Return the only trial, or the only one with a key that starts with ``start``.
+
+    Raises ``UsageError`` if there is none, or more than one.
+    """
+    if start is not None:
+        _check(start)
+        trials = [trial for trial in trials if trial.trial_key.startswith(start.lower())]
+    if len(trials) == 1:
+        return trials[0]
+    named = f"a key that starts with {start}" if start else "these names"
+    if not trials:
+        raise UsageError(
+            f"There is no trial with {named}: take a key from "
+            f'query "SELECT trial_key, env, policy, seed, status FROM v_trial".'
+        )
+    columns = differing([trial.config for trial in trials], always=(*_NAMES, "width"))
+    some = "; ".join(describe(trial, columns) for trial in trials[:_MAX_LISTED])
+    rest = f" and {len(trials) - _MAX_LISTED:,} more" if len(trials) > _MAX_LISTED else ""
+    raise UsageError(
+        f"{len(trials):,} trials have {named}, one is expected: "
+        f"give the key of one of {some}{rest}."
+    )
+
+
+def describe(trial: ListedTrial, columns: Sequence[str] = COLUMNS) -> str:
+    """Return the first digits of the key, the columns that have a value, and the seed."""
+    texts = {name: column_text(trial.config, name) for name in columns}
+    words = [f"{name}={text}" for name, text in texts.items() if text != "-"]
+    return f"{trial.trial_key[:12]} ({' '.join(words)} seed={trial.seed})"
+
+
+def _check(start: str) -> None:
+    if not re.fullmatch(rf"[0-9a-fA-F]{{{_MIN_DIGITS},64}}", start):
+        raise UsageError(
+            f"'{start}' is no key of a trial, at least its first {_MIN_DIGITS} hexadecimal digits "
+            f"are expected: give them, or --env, --policy and --seed."
+        )
+
+
+NAMES = ("env", "policy", "width")
+DETAILS = tuple(name for name in COLUMNS if name not in NAMES)
+_TEXT_COLUMNS = ("env", "policy", "model", "learner", "task", "limits")
+_STYLES = {
+    "failed": "red",
+    "diverged": "yellow",
+    "cancelled": "red",
+    "running": "cyan",
+    "pending": "dim",
+}
+
+
+def grid_table(configs: Sequence[ConfigRow], max_rows: int) -> Table:
+    """Return a table of at most ``max_rows`` rows, or of one for each environment.
+
+    Beside ``NAMES`` there is a column for each other one that tells configurations apart. Where
+    that makes too many rows, columns go, from the last one on, and the configurations of a row
+    are counted together.
+    """
+    columns = _columns(configs, max_rows)
+    rows = _grouped(configs, columns)
+    merged = len(rows) < len(configs)
+    total = counts(configs)
+    states = [state for state in _STYLES if state != "cancelled" or total[state]]
+    heads = [*columns, *(["configs"] if merged else []), "done", "of", *states]
+    footers = ["total", *[""] * (len(columns) - 1), *_numbers(configs, states, merged)]
+    styles = [_STYLES.get(head, "") for head in heads]
+    result = table(heads, numbers=set(heads) - {*_TEXT_COLUMNS}, styles=styles, footers=footers)
+    for names, group in rows.items():
+        result.add_row(*names, *_numbers(group, states, merged))
+    return result
+
+
+def _numbers(configs: Sequence[ConfigRow], states: Sequence[str], merged: bool) -> list[str]:
+    number = counts(configs)
+    words = [f"{number['done']:,}", f"{number.total():,}"]
+    words += [f"{number[state]:,}" if number[state] else "-" for state in states]
+    return [f"{len(configs):,}", *words] if merged else words
+
+
+def _columns(configs: Sequence[ConfigRow], max_rows: int) -> list[str]:
+    columns = list(NAMES)
+    for detail in DETAILS:
+        if len(_grouped(configs, [*columns, detail])) > len(_grouped(configs, columns)):
+            columns.append(detail)
+    while len(columns) > 1 and len(_grouped(configs, columns)) > max_rows:
+        columns.pop()
+    return columns
+
+
+def _grouped(
+    configs: Sequence[ConfigRow], columns: Sequence[str]
+) -> dict[tuple[str, ...], list[ConfigRow]]:
+    rows: dict[tuple[str, ...], list[ConfigRow]] = {}
+    for config in configs:
+        rows.setdefault(tuple(column_text(config, name) for name in columns), []).append(config)
+    return rows
+
+
+_BLOCKS = "▁▂▃▄▅▆▇█"
+
+
+def sparkline(values: Sequence[float | None], columns: int = 60) -> str:
+    """Return a positive curve on a logarithmic scale; parts without numbers are spaces.
+
+    Each character is the geometric mean of one part of the values.
+    """
+    numbers = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    if not np.isfinite(numbers).any():
+        return ""
+    smallest = np.min(numbers, initial=np.inf, where=numbers > 0)
+    logs = np.log(np.maximum(numbers, smallest if np.isfinite(smallest) else 1.0))
+    parts = np.array_split(logs, min(columns, len(logs)))
+    return "".join(map(_block, _levels(np.array([part.mean() for part in parts]))))
+
+
+def _levels(heights: npt.NDArray[np.float64]) -> list[float]:
+    low, high = np.nanmin(heights, initial=np.inf), np.nanmax(heights, initial=-np.inf)
+    span = high - low if high > low else 1.0
+    return [float(level) for level in (heights - low) / span * (len(_BLOCKS) - 1)]
+
+
+def _block(level: float) -> str:
+    return _BLOCKS[round(level)] if np.isfinite(level) else " "
