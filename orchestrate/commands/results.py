@@ -30,9 +30,7 @@ from orchestrate.commands.command import (
     table,
 )
 from orchestrate.errors import ExitCode
-from orchestrate.queries.config_columns import COLUMNS, column_text, differing
-from orchestrate.queries.status import counts
-from orchestrate.queries.trial import TrialReport, report
+from orchestrate.queries import COLUMNS, TrialReport, column_text, counts, differing, report
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store import Table as Rows
 

@@ -29,7 +29,7 @@ from orchestrate.commands.command import (
 from orchestrate.commands.results import grid_table
 from orchestrate.errors import ExitCode
 from orchestrate.program import say as say_still
-from orchestrate.queries.status import STATES, Status, gather, seconds_since
+from orchestrate.queries import STATES, Status, gather, seconds_since
 from orchestrate.redaction import without_password
 from orchestrate.runner.progress import duration
 from orchestrate.store import ExplorationRow, FailureKind, LaunchRow, Reader, StoreUnavailableError

@@ -13,7 +13,7 @@ from typing import Any
 from dopt import __version__
 from dopt.errors import DoptError
 from orchestrate.files import whole
-from orchestrate.queries.status import counts
+from orchestrate.queries import counts
 from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store.serialization import now

@@ -14,7 +14,7 @@ from orchestrate.commands import status
 from orchestrate.commands.command import plain
 from orchestrate.commands.results import grid_table
 from orchestrate.commands.status import watch
-from orchestrate.queries.status import Status, gather
+from orchestrate.queries import Status, gather
 from orchestrate.store import Claim, ConfigRow, Reader, Store, StoreUnavailableError
 from tests.orchestrate.commands.conftest import WAITING, Answer, failure, run_now
 from tests.orchestrate.standins import trial_of

@@ -1,1 +1,0 @@
-"""Answers about a results database: progress of a grid, one trial."""
