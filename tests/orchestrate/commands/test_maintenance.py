@@ -58,7 +58,7 @@ class TestUpgrade:
         restore(5, url)
         document = command("upgrade", "--no-backup", "--json").document
         assert document == {
-            "safe_url": url, "before": 5, "after": SCHEMA_VERSION, "backup": None, "packed": 5,
+            "safe_url": url, "before": 5, "after": SCHEMA_VERSION, "backup": None, "packed": 0,
             "changed": True,
         }  # fmt: skip
         assert not list(_path(url).parent.glob("*backup*"))
