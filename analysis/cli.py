@@ -13,22 +13,25 @@ from pathlib import Path
 
 import pandas as pd
 
-from analysis.data.config_matching import REFERENCE, Filter, read_condition
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import Selection, select
+from analysis import report
+from analysis.data.matching import REFERENCE, Filter, read_condition
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
-from analysis.figures.loss_curves.data import Axis
-from analysis.outputs.names import NAMES, partial_warning
-from analysis.plot_options import PlotOptions, Spread
-from analysis.report import command as report
+from analysis.outputs import NAMES, partial_warning
+from analysis.plot_options import Axis, PlotOptions, Spread, add_workers
 from analysis.serve import command as browser
-from analysis.stats.intervals import Statistic
-from analysis.stats.tolerance import BandKind
-from analysis.stats.trial_scores import Measure
-from analysis.tables import calibration
-from analysis.tables.registry import TABLES, TableKind, comparison
-from analysis.tables.rendering import TextTable, gaps_table
-from analysis.workers_option import add_workers
+from analysis.stats.intervals import BandKind, Statistic
+from analysis.stats.scores import Measure
+from analysis.tables.rendering import (
+    CALIBRATION,
+    CALIBRATION_HELP,
+    TABLES,
+    TableKind,
+    TextTable,
+    comparison,
+    gaps_table,
+)
 from orchestrate.cli_parser import Parser, path, positive, tell
 from orchestrate.program import answered
 from orchestrate.store import DEFAULT_URL, Reader, default_url
@@ -89,7 +92,7 @@ def parser() -> Parser:
     aggregate = _command(
         commands, "aggregate", _aggregate, "every variant against the reference, over all systems"
     )
-    calibrated = _command(commands, "calibration", _calibration, calibration.HELP, diverged=False)
+    calibrated = _command(commands, "calibration", _calibration, CALIBRATION_HELP, diverged=False)
     for table in (summary, compare, aggregate, calibrated):
         table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
     for command in (figures, compare):
@@ -205,7 +208,7 @@ def _check_complete(selection: Selection, allow_partial: bool) -> None:
 
 
 def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    from analysis.outputs.registry import build  # Matplotlib: other commands do without it
+    from analysis.outputs import build  # Matplotlib: other commands do without it
 
     plot_options = PlotOptions(
         DivergenceRule(options.diverged),
@@ -235,7 +238,7 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
 
 def _animate(options: argparse.Namespace) -> int:
     from analysis import film  # Matplotlib: other commands do without it
-    from analysis.figures.phase_portraits.data import median_seed
+    from analysis.stats.trajectories import median_seed
 
     name = f"{options.env}_{options.policy}.gif".replace("/", "_")
     target = options.out or Path("figures") / name
@@ -271,7 +274,7 @@ def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) 
 
 
 def _calibration(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    return _print_table(calibration.KIND, reader, selection, PlotOptions(), options.format)
+    return _print_table(CALIBRATION, reader, selection, PlotOptions(), options.format)
 
 
 def _print_table(

@@ -14,15 +14,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from analysis.data.learned_model import simulated_trial
-from analysis.data.trial_selection import Entry
+from analysis.data.samples import simulated_trial
+from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
-from analysis.figures.axes import angle_ticks, log_limits, log_ticks
-from analysis.figures.loss_curves.plot import loss_label
-from analysis.figures.phase_portraits.data import DrawnPlane
-from analysis.figures.style import mathematical, styled
+from analysis.figures.loss_curves import loss_label
+from analysis.figures.panels import angle_ticks, log_ticks, mathematical, styled
+from analysis.formatting import loss_unit
 from analysis.line_styles import BLACK, GREY, environment_title, policy_style
-from analysis.units import loss_unit
+from analysis.stats.curves import log_limits
+from analysis.stats.trajectories import DrawnPlane
 from dopt.geometry import body
 from dopt.rerun import rerun
 from dopt.systems import System

@@ -1,10 +1,13 @@
-"""Formatting of numbers and counts for people; the CSV beside a table has all digits."""
+"""Numbers, counts and units as texts for people; the CSV beside a table has all digits."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping
+
+from dopt.systems import System
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -80,3 +83,23 @@ def count_text(counts: Mapping[str, str]) -> str:
     common, _ = Counter(counts.values()).most_common(1)[0]
     others = [f"{name}: {count}" for name, count in counts.items() if count != common]
     return "; ".join([f"n = {common}", *others])
+
+
+def loss_unit(system: System) -> str:
+    """Return the unit of the loss: that of the learned accelerations, such as ``rad/s²``.
+
+    Where these have several units the loss is the root of a sum over them: ``m/s², rad/s²``.
+    """
+    units = [_rate(_unit_of(system.state_labels[row])) for row in system.learned_rows]
+    return ", ".join(sorted(set(units)))
+
+
+def _unit_of(label: str) -> str:
+    """Return what stands in the brackets of a label, 1 without any."""
+    found = re.search(r"\[([^\]]+)\]", label)
+    return found.group(1) if found else "1"
+
+
+def _rate(unit: str) -> str:
+    """Return a unit by second: ``rad/s`` gives ``rad/s²``."""
+    return f"{unit}²" if unit.endswith("/s") else f"{unit}/s"

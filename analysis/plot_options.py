@@ -1,14 +1,22 @@
-"""Choices that change what is shown, beside the selection of trials."""
+"""Choices that change what is shown, beside the selection of trials, and how many at a time."""
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
-from analysis.data.divergence import DivergenceRule
-from analysis.figures.loss_curves.data import Axis
-from analysis.stats.intervals import Statistic
-from analysis.stats.tolerance import BandKind
+from analysis.data.samples import DivergenceRule
+from analysis.stats.intervals import BandKind, Statistic
+from dopt.cores import usable_cores
+from orchestrate.cli_parser import UsageError
+
+
+class Axis(StrEnum):
+    """What the horizontal axis counts."""
+
+    STEPS = "steps"
+    SECONDS = "seconds"
 
 
 class Spread(StrEnum):
@@ -41,3 +49,17 @@ class PlotOptions:
 
     def as_dict(self) -> dict[str, str]:
         return {key: str(value) for key, value in asdict(self).items()}
+
+
+def add_workers(command: argparse.ArgumentParser, what: str) -> None:
+    """Add the option; ``what`` names the things."""
+    cores = usable_cores()
+    command.add_argument(
+        "--workers", type=_workers, default=cores, help=f"{what} at a time (one for each core)"
+    )
+
+
+def _workers(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise UsageError(f"--workers is {text}, but at least 1 is expected: give a whole number.")
+    return int(text)

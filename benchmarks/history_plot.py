@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from analysis.figures.axes import rows_and_columns
+from analysis.figures.panels import rows_and_columns
 from benchmarks.history import SLOWER, Run, costs
 
 PANEL = (5.0, 2.6)

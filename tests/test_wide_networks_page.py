@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from analysis.stats.intervals import standard_error
-from analysis.stats.paired_tests import compare
+from analysis.stats.scores import compare
 from tests.pages import DOCS, PAGES
 
 LOSSES = pd.read_csv(DOCS / "sketch_losses.csv").set_index(["env", "width", "form", "seed"])

@@ -1,1 +1,1 @@
-"""Figures: drawing of measured numbers, with one folder for each figure."""
+"""Figures: numbers and drawing of each, in one file."""

@@ -4,3 +4,15 @@
 ``sql`` runs statements, ``web`` reads queries and renders answers, ``state`` holds the database,
 its caches and its event stream, and ``server`` checks every request.
 """
+
+from __future__ import annotations
+
+import ipaddress
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen at is reached from this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"

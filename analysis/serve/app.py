@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
@@ -20,8 +21,7 @@ from starlette.responses import Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from analysis.serve import pages, sql
-from analysis.serve.command import is_loopback
+from analysis.serve import is_loopback, pages, sql
 from analysis.serve.server import LONGEST_QUERY, SecurityMiddleware
 from analysis.serve.state import Database, ServerState
 from analysis.serve.web import (
@@ -107,7 +107,7 @@ def _query_params(request: Request) -> QueryParams:
 
 def _page(state: ServerState, name: str, numbers: Numbers, request: Request) -> Response:
     content = numbers(state, _query_params(request))
-    query = QueryText({key: value for key, value in request.query_params.items() if value})
+    query = defaultdict(str, {k: v for k, v in request.query_params.items() if v})
     frame = {"page": name, "database": state.database.safe_url, "query": query}
     return as_page(f"{name}.html", frame | dict(content), 400 if content.get("error") else 200)
 
@@ -165,14 +165,7 @@ async def _events(state: ServerState, request: Request) -> Response:
 
 
 def _curves_table(state: ServerState, request: Request) -> Response:
-    return as_csv(pages.curves_table(state, _query_params(request)).to_csv(index=False), "curves")
-
-
-class QueryText(dict[str, str]):
-    """Query parameters as text; a missing parameter is the empty string."""
-
-    def __missing__(self, key: str) -> str:
-        return ""
+    return as_csv(pages.curves_table(state, _query_params(request)), "curves")
 
 
 def _error_response(state: ServerState, request: Request, error: Exception) -> Response:

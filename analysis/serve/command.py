@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import ipaddress
 import os
 import socket
 import sys
 from contextlib import ExitStack
 
 from analysis.errors import AnalysisError
+from analysis.serve import is_loopback
 from dopt.errors import install_command
 from orchestrate.store import DEFAULT_URL, default_url
 
@@ -49,14 +49,6 @@ def run(options: argparse.Namespace) -> int:
     finally:
         listening.close()
     return 0
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address to listen at is reached from this machine alone."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
 
 
 def _check_one_database(options: argparse.Namespace) -> None:

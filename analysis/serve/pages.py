@@ -14,20 +14,17 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.bounded_states import bounded_states
-from analysis.data.divergence import DivergenceRule
-from analysis.data.latest_configs import latest
-from analysis.data.missing_trials import absent_pairs
-from analysis.data.trial_selection import Selection, environment_rank, policy_rank
+from analysis.data.matching import latest
+from analysis.data.samples import DivergenceRule, bounded_states
+from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
 from analysis.errors import AnalysisError
-from analysis.figures.axis_break import axis_parts
-from analysis.figures.loss_curves.data import Axis, LossCurve, measure_curves, tabulate_curves
-from analysis.figures.phase_portraits.data import DrawnPlane
 from analysis.line_styles import policy_style
+from analysis.plot_options import Axis
 from analysis.serve.state import ServerState, read_progress
 from analysis.serve.web import NotFoundError, QueryParams, truncated
+from analysis.stats.curves import LossCurve, axis_parts, measure_curves, tabulate_curves
 from analysis.stats.intervals import mean, standard_error
-from analysis.stats.spectrum import periodogram
+from analysis.stats.trajectories import DrawnPlane, periodogram
 from dopt.errors import SpecificationError
 from dopt.spec.added_fields import completed
 from dopt.spec.label import flatten, labels
@@ -297,9 +294,9 @@ def curves(state: ServerState, params: QueryParams) -> Content:
     }
 
 
-def curves_table(state: ServerState, params: QueryParams) -> pd.DataFrame:
-    """Return the curves as a table with the columns of figure 1's CSV file."""
-    return tabulate_curves(_measured(state, params)[1])
+def curves_table(state: ServerState, params: QueryParams) -> str:
+    """Return the curves as a CSV with the columns of figure 1's file."""
+    return tabulate_curves(_measured(state, params)[1]).to_csv(index=False)
 
 
 def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple[LossCurve, ...]]:

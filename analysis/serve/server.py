@@ -24,7 +24,7 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from analysis.serve.command import is_loopback
+from analysis.serve import is_loopback
 
 METHODS = ("GET", "HEAD")
 _STATEMENTS = re.compile(r"/sql|/api/sql(\.csv)?")

@@ -17,8 +17,8 @@ from typing import Any, TypeVar, cast
 from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import Selection, select
+from analysis.data.matching import Filter
+from analysis.data.selection import Selection, select
 from dopt.errors import DoptError
 from orchestrate.store import Reader
 from orchestrate.store.database_url import parse, read_login, safe, sqlite_path
@@ -209,12 +209,7 @@ class Events:
 class ServerState:
     """The database with its event stream, and caches of computed values.
 
-    Attributes
-    ----------
-    exposed
-        Whether other machines reach the server.
-    token
-        Secret of the forms of this process, which no page of another site knows.
+    ``exposed``: other machines reach the server. ``token``: secret of this process's forms.
     """
 
     database: Database

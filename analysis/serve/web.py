@@ -15,7 +15,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from starlette.responses import HTMLResponse, Response
 
-from analysis.data.config_matching import Filter, read_condition
+from analysis.data.matching import Filter, read_condition
 from analysis.errors import AnalysisError
 from analysis.formatting import number, plus_minus
 from analysis.line_styles import environment_title

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.config_matching import Candidate, choose
-from analysis.data.trial_selection import (
+from analysis.data.matching import Candidate, choose
+from analysis.data.selection import (
     Entry,
     Selection,
     environment_rank,
@@ -27,7 +27,7 @@ from analysis.data.trial_selection import (
 )
 from analysis.formatting import but_lost
 from analysis.stats.intervals import CONFIDENCE, band
-from analysis.stats.trial_scores import Scores
+from analysis.stats.scores import Scores
 from orchestrate.store import Assessments, Reader
 
 Array = npt.NDArray[np.float64]

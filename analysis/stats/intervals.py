@@ -4,11 +4,17 @@ Three statistics over the trials of a configuration, each with the interval that
 with Student's interval, and the median and the interquartile mean (IQM: the mean of the middle
 half; Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", 2021)
 with a percentile bootstrap that draws whole trials.
+
+Tolerance intervals say what one run does, where an interval of the mean says what they do together.
+They are distribution-free, by order statistics (Wilks, "Determination of sample sizes for setting
+tolerance limits", 1941): of n independent runs sorted by value, the share of the distribution
+between the r-th smallest and the s-th smallest has the distribution Beta(s - r, n - s + r + 1).
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -42,6 +48,14 @@ _ROUNDING = 1e-14
 
 STUDENT_RANGE = f"Student's below {FEWEST_BOOTSTRAP_VALUES} and above {MOST_BOOTSTRAP_VALUES}"
 """Numbers of values whose interval is Student's, for the notes of tables and figures."""
+
+CONTENT = 0.9
+"""Share of the runs that an interval is to hold."""
+
+FEWEST = 46
+"""Runs below which no two of them hold that share with that confidence."""
+
+RESAMPLES = 9999
 
 
 class Statistic(StrEnum):
@@ -203,3 +217,107 @@ _CENTRES: dict[Statistic, Any] = {
     Statistic.MEDIAN: np.median,
     Statistic.IQM: _interquartile_mean,
 }
+
+
+class BandKind(StrEnum):
+    """Kind of interval around a curve: of the centre of the runs, or of single runs."""
+
+    CONFIDENCE = "confidence"
+    TOLERANCE = "tolerance"
+
+    def label(self, statistic: Statistic) -> str:
+        """Return the name in a caption, beside a centre."""
+        if self is BandKind.CONFIDENCE:
+            return statistic.band
+        return (
+            f"tolerance interval, {CONTENT:.0%} of runs with {CONFIDENCE:.0%} confidence".replace(
+                "%", " %"
+            )
+        )
+
+
+def tolerance_band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
+    """Return the centre of trials (n, T) and the limits that hold 90 % of runs, at each step.
+
+    Below :data:`FEWEST` trials the limits are NaN.
+    """
+    n = len(values)
+    middle, places = centre(values, statistic), tolerance_places(n)
+    if places is None:
+        nothing = np.full_like(middle, np.nan)
+        return Band(middle, nothing, nothing, n)
+    low, high = np.sort(values, axis=0)[list(places)]
+    return Band(middle, low, high, n)
+
+
+@functools.cache
+def tolerance_places(n: int) -> tuple[int, int] | None:
+    """Return the places, from 0, of the two limits among n sorted runs; None for too few.
+
+    As many runs are left out above as below, and as many as the confidence allows.
+    """
+    from scipy.special import betainc
+
+    left_out = np.arange(1, (n + 1) // 2)
+    inside = n + 1 - 2 * left_out
+    confident = 1 - betainc(inside, n + 1 - inside, CONTENT) >= CONFIDENCE
+    if not confident.any():
+        return None
+    most = int(left_out[confident].max())
+    return most - 1, n - most
+
+
+@dataclass(frozen=True)
+class StratifiedMean:
+    """A mean over systems of means over runs with its interval, each (k,)."""
+
+    centre: Array
+    low: Array
+    high: Array
+
+
+def stratified_mean(strata: Sequence[Array]) -> StratifiedMean:
+    """Return the mean over S systems of the means over their runs (n_s, k), each n_s at least 1.
+
+    The interval of 95 % is a percentile bootstrap, pointwise in k; NaN where a system has one run.
+    All draws come from a stream of their own, so that those of the same numbers of runs are the
+    same.
+    """
+    centre = np.mean([np.mean(values, axis=0) for values in strata], axis=0)
+    if min(map(len, strata)) < 2:
+        nothing = np.full_like(centre, np.nan)
+        return StratifiedMean(centre, nothing, nothing)
+    drawn = np.zeros((RESAMPLES, *centre.shape))
+    for place, values in enumerate(strata):
+        drawn += _weights(len(values), place) @ values / len(strata)
+    tail = 100 * (1 - CONFIDENCE) / 2
+    low, high = np.percentile(drawn, [tail, 100 - tail], axis=0)
+    return StratifiedMean(centre, low, high)
+
+
+@functools.lru_cache(maxsize=8)
+def _weights(n: int, place: int) -> Array:
+    """Return the share that each of n runs of a system has in each draw, (RESAMPLES, n)."""
+    rng = np.random.default_rng(place)
+    return np.asarray(rng.multinomial(n, np.full(n, 1 / n), size=RESAMPLES) / n)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A geometric mean over trials with its 95 % interval, NaN for fewer than two."""
+
+    value: float
+    low: float
+    high: float
+
+
+def geometric_mean(values: Array) -> Estimate:
+    """Return the geometric mean of (n,); NaN for none and where a value has no logarithm.
+
+    The interval is that of the mean logarithm: a BCa bootstrap, Student's for few trials.
+    """
+    if not len(values) or not np.all((values > 0) & np.isfinite(values)):
+        return Estimate(*[float("nan")] * 3)
+    logs = np.log(values)
+    low, high = interval_of_mean(logs, np.random.default_rng(0))
+    return Estimate(*(float(np.exp(end)) for end in (np.mean(logs), low, high)))

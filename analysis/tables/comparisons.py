@@ -1,6 +1,6 @@
 """Paired comparisons: every variant against one reference, over the seeds that they share.
 
-All tables, the report and the browser take their ratios from :func:`against_reference`. A ratio is
+All tables and the report take their ratios from :func:`against_reference`. A ratio is
 always variant / reference: below 1 the variant has the lower value. An environment has one
 reference; where variants are grouped by the policy and other settings, each one is compared with
 the reference policy under the same other settings (:func:`references`).
@@ -10,37 +10,45 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import Entry, Selection
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError
 from analysis.stats.control import relative_costs, scores_at
-from analysis.stats.paired_tests import (
+from analysis.stats.intervals import Statistic, centre, standard_error, stratified_mean
+from analysis.stats.scores import (
     Comparison,
+    Measure,
+    Scores,
     benjamini_hochberg,
     compare,
     compare_hitting_times,
+    final_losses,
+    mean_losses,
+    steps_to,
     without_ratio,
 )
-from analysis.stats.trial_scores import Measure, Scores, final_losses, mean_losses, steps_to
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]
 BySeed = Mapping[int, float]
 Score = Callable[[Reader, Entry, str, DivergenceRule], Scores]
-Pair = tuple[Scores, Scores, dict[str, object]]
-"""The scores of a variant and of its reference, and what the row says of the two."""
+
+Judged = Mapping[str, object]
+"""Columns that compare a variant with its reference."""
 
 EPSILON_POLICY = "random"
 """The policy whose median final loss is the ε that others are to reach."""
 
 _SCORES: dict[Measure, Score] = {Measure.FINAL: final_losses, Measure.AUC: mean_losses}
+ScoredPair = tuple[Scores, Scores]
 
 
 def against_reference(
@@ -75,13 +83,11 @@ def compare_policies(
     ``p_adjusted`` is the Benjamini-Hochberg adjustment of the Wilcoxon p over the whole table.
     """
     name = "auc" if measure is Measure.AUC else column
-    rows = []
+    rows: list[dict[str, object]] = []
     selection = selection.simulated()
     for env in selection.environments:
         scores = [_SCORES[measure](reader, entry, column, rule) for entry in selection.of(env)]
-        for own, reference, row in _pairs(scores, selection, env):
-            found = against_reference(own.by_seed, reference.by_seed, env, own.label, name)
-            rows.append(row | asdict(found) | _diverged(own, reference))
+        rows += _rows(selection, env, scores, lambda own, other: asdict(_against(own, other, name)))
     return _adjusted(rows, selection)
 
 
@@ -107,7 +113,7 @@ def compare_steps(
             f"The loss to reach, --epsilon, is {epsilon:g}, but a positive number is expected: "
             f"choose one between the losses of figure 1."
         )
-    rows = []
+    rows: list[dict[str, object]] = []
     selection = selection.simulated()
     for env in selection.environments:
         entries = selection.of(env)
@@ -118,9 +124,7 @@ def compare_steps(
             continue
         scores = [steps_to(reader, entry, column, rule, threshold) for entry in entries]
         facts = {"epsilon": threshold, "horizon": entries[0].config.horizon}
-        for own, reference, row in _pairs(scores, selection, env):
-            found = compare_hitting_times(*paired(own.by_seed, reference.by_seed))
-            rows.append(row | facts | asdict(found) | _diverged(own, reference))
+        rows += _rows(selection, env, scores, partial(_race, facts))
     if not rows and selection.compared().entries and len(selection.entries) > 1:
         raise AnalysisError(
             f"Steps to a loss need that loss or trials of {EPSILON_POLICY}, whose median final "
@@ -147,7 +151,7 @@ def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
     cost. An episode's own loss counts as the worst in the test; where the true model's was lost,
     nothing is known.
     """
-    rows = []
+    rows: list[dict[str, object]] = []
     for env in selection.environments:
         entries = selection.of(env)
         steps = sorted({int(t) for entry in entries for t in relative_costs(reader, entry).t})
@@ -156,15 +160,7 @@ def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
                 continue
             successes = {entry.label: _successes(reader, entry, t) for entry in entries}
             scores = [scores_at(reader, entry, t) for entry in entries]
-            for own, reference, row in _pairs(scores, selection, env):
-                values = paired(own.by_seed, reference.by_seed)
-                found = against_reference(
-                    own.by_seed, reference.by_seed, env, own.label, f"control/{t}"
-                )
-                row |= {"t": t, "success": successes[own.label]}
-                row |= {"success_reference": successes[reference.label]} | asdict(found)
-                row |= {"n_lost": without_ratio(*values)} | _diverged(own, reference)
-                rows.append(row)
+            rows += _rows(selection, env, scores, partial(_controlled, t, successes))
     return _adjusted(rows, selection)
 
 
@@ -215,27 +211,41 @@ def _group(entry: Entry, selection: Selection) -> tuple[object, ...]:
     return tuple(value for key, value in pairs if key != "policy")
 
 
-def _pairs(scores: list[Scores], selection: Selection, env: str) -> Iterator[Pair]:
-    """Yield the scores of each variant of an environment with those of its reference."""
+def _rows(
+    selection: Selection,
+    env: str,
+    scores: Sequence[Scores],
+    judge: Callable[[Scores, Scores], Judged],
+) -> Iterator[dict[str, object]]:
+    """Yield a row for each variant of an environment: names, what ``judge`` says, and counts."""
     found = {one.label: one for one in scores}
     keys = _other_keys(selection)
     for entry, other, same_group in references(selection, env):
-        own, reference = found.get(entry.label), found.get(other.label)
-        if own is None or reference is None:
-            continue
-        row: dict[str, object] = {
-            "env": own.env,
-            "policy": own.policy,
-            "variant": own.label,
-            "reference": reference.label,
-        }
+        own, reference = found[entry.label], found[other.label]
+        names = {"env": env, "policy": own.policy, "variant": own.label}
+        names["reference"] = reference.label
         if keys:
-            row["same"] = ", ".join(keys) if same_group else ""
-        yield own, reference, row
+            names["same"] = ", ".join(keys) if same_group else ""
+        diverged = own.n_diverged + reference.n_diverged
+        yield {**names, **judge(own, reference), "n_diverged": diverged}
 
 
-def _diverged(own: Scores, reference: Scores) -> dict[str, object]:
-    return {"n_diverged": own.n_diverged + reference.n_diverged}
+def _against(own: Scores, reference: Scores, measure: str) -> Comparison:
+    return against_reference(own.by_seed, reference.by_seed, own.env, own.label, measure)
+
+
+def _race(facts: Judged, own: Scores, reference: Scores) -> Judged:
+    return {**facts, **asdict(compare_hitting_times(*paired(own.by_seed, reference.by_seed)))}
+
+
+def _controlled(t: int, successes: Mapping[str, float], own: Scores, reference: Scores) -> Judged:
+    return {
+        "t": t,
+        "success": successes[own.label],
+        "success_reference": successes[reference.label],
+        **asdict(_against(own, reference, f"control/{t}")),
+        "n_lost": without_ratio(*paired(own.by_seed, reference.by_seed)),
+    }
 
 
 def _adjusted(rows: list[dict[str, object]], selection: Selection) -> pd.DataFrame:
@@ -254,3 +264,86 @@ def nothing_to_compare(selection: Selection) -> AnalysisError:
         f"variant in one environment, but {selected} is selected: run the others, ask wider, "
         f"or choose another --reference."
     )
+
+
+def aggregate(
+    reader: Reader, selection: Selection, rule: DivergenceRule = DivergenceRule.EXCLUDE
+) -> pd.DataFrame:
+    """Return the ratio of final losses over all systems, one row for each variant.
+
+    It is the geometric mean over systems of the geometric means over shared seeds of variant /
+    reference, with the interval of :func:`analysis.stats.intervals.stratified_mean`. Every system
+    counts alike. A variant is compared over those that have it: ``systems``.
+
+    Raises
+    ------
+    AnalysisError
+        If the reference shares no seed with another variant.
+    """
+    found: dict[str, list[ScoredPair]] = {}
+    selection = selection.simulated()
+    for env in selection.environments:
+        for own, reference, _ in references(selection, env):
+            ours, theirs = (final_losses(reader, one, "loss", rule) for one in (own, reference))
+            if set(ours.by_seed) & set(theirs.by_seed):
+                found.setdefault(own.label, []).append((ours, theirs))
+    if not found:
+        raise nothing_to_compare(selection)
+    return pd.DataFrame([_aggregate_row(variant, pairs) for variant, pairs in found.items()])
+
+
+def _aggregate_row(variant: str, pairs: list[ScoredPair]) -> dict[str, object]:
+    logs = [_log_ratios(own, reference) for own, reference in pairs]
+    mean = stratified_mean(logs)
+    return {
+        "variant": variant,
+        "reference": pairs[0][1].label,
+        "systems": ", ".join(own.env for own, _ in pairs),
+        "ratio": float(np.exp(mean.centre)),
+        "low": float(np.exp(mean.low)),
+        "high": float(np.exp(mean.high)),
+        "n_pairs": sum(map(len, logs)),
+        "n_diverged": sum(own.n_diverged + reference.n_diverged for own, reference in pairs),
+    }
+
+
+def _log_ratios(own: Scores, reference: Scores) -> Array:
+    """Return the logarithms of the ratios (n,); NaN for a loss that has none."""
+    ours, theirs = paired(own.by_seed, reference.by_seed)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs: Array = np.log(ours / theirs)
+    return np.where(np.isfinite(logs), logs, np.nan)
+
+
+def summarise(
+    reader: Reader, selection: Selection, rule: DivergenceRule = DivergenceRule.EXCLUDE
+) -> pd.DataFrame:
+    """Return centres of the final losses, one row for each environment and policy.
+
+    For both losses the mean with two standard errors, the median and the interquartile mean.
+    """
+    return pd.DataFrame([_summary(reader, entry, rule) for entry in selection.entries])
+
+
+def _summary(reader: Reader, entry: Entry, rule: DivergenceRule) -> dict[str, object]:
+    grid = final_losses(reader, entry, "loss", rule)
+    reachable = final_losses(reader, entry, "reachable_loss", rule)
+    return {
+        "env": grid.env,
+        "policy": grid.policy,
+        "label": grid.label,
+        **_centres("loss", grid),
+        **_centres("reachable_loss", reachable),
+        "n": len(grid.by_seed),
+        "n_diverged": grid.n_diverged,
+    }
+
+
+def _centres(name: str, scores: Scores) -> dict[str, float]:
+    values = scores.values
+    return {
+        name: float(centre(values, Statistic.MEAN)),
+        f"{name}_2se": 2 * float(standard_error(values)),
+        f"{name}_median": float(centre(values, Statistic.MEDIAN)),
+        f"{name}_iqm": float(centre(values, Statistic.IQM)),
+    }

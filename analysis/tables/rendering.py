@@ -1,16 +1,20 @@
-"""Rendering of tables as Markdown or LaTeX."""
+"""Kinds of tables: what each one needs, how it is measured, and its Markdown or LaTeX."""
 
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
+import numpy as np
 import pandas as pd
 from tabulate import tabulate
 
-from analysis.data.missing_trials import Gap
+from analysis.data.samples import learned_model
+from analysis.data.selection import Entry, Gap, Selection
+from analysis.errors import AnalysisError
 from analysis.formatting import (
     but_diverged,
     but_lost,
@@ -21,8 +25,38 @@ from analysis.formatting import (
     steps_text,
     within,
 )
+from analysis.plot_options import PlotOptions
+from analysis.stats.control import control_part
 from analysis.stats.intervals import STUDENT_RANGE
-from analysis.stats.trial_scores import Measure
+from analysis.stats.scores import Measure
+from analysis.tables.comparisons import (
+    EPSILON_POLICY,
+    aggregate,
+    compare_control,
+    compare_policies,
+    compare_steps,
+    summarise,
+)
+from dopt.calibration import HeldOutFit, held_out_fit
+from dopt.types import Array
+from orchestrate.store import Reader
+
+_ESCAPED = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+_ESCAPED |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
+_ESCAPED |= {"<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}"}
+_SIGNS = {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
+_SIGNS |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
+
+_JUDGED = {
+    Measure.FINAL: "final loss",
+    Measure.AUC: "loss over the whole curve (geometric mean over the steps)",
+}
+
+_RATIO = "variant / reference, below 1 the variant is better"
+_TESTED = "then adjusted over the table (Benjamini-Hochberg)"
+_DEFAULT = PlotOptions()
+CALIBRATION_HELP = "fit at held-out states, coverage of their intervals, energy of the inputs"
+SETS = ("grid", "reachable")
 
 
 @dataclass(frozen=True)
@@ -49,13 +83,6 @@ class TextTable:
         begin = rf"\begin{{tabular}}{{{'l' * len(self.headers)}}}"
         parts = [begin, r"\hline", lines[0], r"\hline", *lines[1:], r"\hline", r"\end{tabular}"]
         return note + "\n".join(parts) + "\n"
-
-
-_ESCAPED = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-_ESCAPED |= {letter: f"\\{letter}" for letter in "&%$#_{}"}
-_ESCAPED |= {"<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}"}
-_SIGNS = {"±": r"$\pm$", "–": "--", "−": "$-$", "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$"}
-_SIGNS |= {"ε": r"$\varepsilon$", "φ": r"$\varphi$", "µ": r"$\mu$", "²": "$^2$", "·": r"$\cdot$"}
 
 
 def _latex_text(text: object) -> str:
@@ -108,14 +135,6 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
         f"Diverged trials: {rule}."
     )
     return TextTable(headers, rows, note)
-
-
-_JUDGED = {
-    Measure.FINAL: "final loss",
-    Measure.AUC: "loss over the whole curve (geometric mean over the steps)",
-}
-_RATIO = "variant / reference, below 1 the variant is better"
-_TESTED = "then adjusted over the table (Benjamini-Hochberg)"
 
 
 def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.FINAL) -> TextTable:
@@ -256,3 +275,179 @@ def gaps_table(gaps: Iterable[Gap]) -> TextTable:
     """Return the table of what is missing."""
     rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, gap.describe_seeds()] for gap in gaps]
     return TextTable(["env", "policy", "missing", "state", "seeds"], rows)
+
+
+class Part(Protocol):
+    """Cuts a selection down to what a table shows."""
+
+    def __call__(self, selection: Selection, options: PlotOptions = ..., /) -> Selection: ...
+
+
+@dataclass(frozen=True)
+class TableKind:
+    """A kind of table; ``part`` cuts the selection, without entries the table is not made."""
+
+    title: str
+    part: Part
+    measure: Callable[[Reader, Selection, PlotOptions], pd.DataFrame]
+    render: Callable[[pd.DataFrame, PlotOptions], TextTable]
+
+
+def comparison(column: str, measure: Measure) -> TableKind:
+    """Return the comparison of one measure of one column of losses."""
+    where = "grid" if column == "loss" else "reachable set"
+    if measure is Measure.STEPS:
+        return TableKind(
+            f"Steps to a loss, {where}", _raced, partial(_measure_steps, column=column), _race
+        )
+    title = "Final loss" if measure is Measure.FINAL else "Loss over the whole curve"
+    return TableKind(
+        f"{title} against the reference, {where}",
+        _compared,
+        partial(_measure_ratios, column=column, measure=measure),
+        partial(_ratios, measure=measure),
+    )
+
+
+def _whole(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
+    return selection
+
+
+def _compared(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
+    compared = selection.simulated().compared()
+    return compared if len(compared.labels) > 1 else Selection(())
+
+
+def _raced(selection: Selection, options: PlotOptions = _DEFAULT) -> Selection:
+    """Return the environments that have the yardstick's trials too, if these give the loss."""
+    compared = _compared(selection)
+    if options.epsilon is not None:
+        return compared
+    return compared.only(
+        entry.config.env
+        for entry in compared.entries
+        if entry.config.policy == EPSILON_POLICY and entry.final_losses()
+    )
+
+
+def _controlled(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
+    """Return the environments with a task in which the reference and a variant were assessed."""
+    controlled = control_part(selection).compared()
+    return controlled if len(controlled.labels) > 1 else Selection(())
+
+
+def _measure_ratios(
+    reader: Reader, selection: Selection, options: PlotOptions, column: str, measure: Measure
+) -> pd.DataFrame:
+    return compare_policies(reader, selection, column, options.rule, measure)
+
+
+def _ratios(table: pd.DataFrame, options: PlotOptions, measure: Measure) -> TextTable:
+    return comparison_table(table, options.rule, measure)
+
+
+def _measure_steps(
+    reader: Reader, selection: Selection, options: PlotOptions, column: str
+) -> pd.DataFrame:
+    return compare_steps(reader, selection, column, options.rule, options.epsilon)
+
+
+def _race(table: pd.DataFrame, options: PlotOptions) -> TextTable:
+    return hitting_times_table(table, options.rule)
+
+
+TABLES = {
+    "summary": TableKind(
+        "Final losses",
+        _whole,
+        lambda reader, selection, options: summarise(reader, selection, options.rule),
+        lambda table, options: summary_table(table, options.rule),
+    ),
+    "aggregate": TableKind(
+        "Final loss against the reference, all systems",
+        _compared,
+        lambda reader, selection, options: aggregate(reader, selection, options.rule),
+        lambda table, options: aggregate_table(table, options.rule),
+    ),
+    "comparison": comparison("loss", Measure.FINAL),
+    "comparison_auc": comparison("loss", Measure.AUC),
+    "comparison_steps": comparison("loss", Measure.STEPS),
+    "comparison_reachable": comparison("reachable_loss", Measure.FINAL),
+    "comparison_control": TableKind(
+        "Cost of control against the reference",
+        _controlled,
+        lambda reader, selection, _: compare_control(reader, selection),
+        lambda table, _: control_table(table),
+    ),
+}
+
+
+def measure_calibration(reader: Reader, selection: Selection) -> pd.DataFrame:
+    """Return medians over the trials that are done, one row for each environment and variant.
+
+    Of each measure of :class:`dopt.calibration.HeldOutFit` on the grid and on the reachable set,
+    and of the mean of ‖u‖²/γ² over the steps, ``energy``. Of the share covered it is the mean: that
+    of all states of all trials.
+
+    Raises
+    ------
+    AnalysisError
+        If no selected trial is done.
+    """
+    entries = [one for one in selection.simulated().entries if one.final_losses()]
+    if not entries:
+        raise AnalysisError(
+            "No selected trial is done, but the fit of a learned model needs some: run the grid, "
+            "or ask for more."
+        )
+    return pd.DataFrame([_calibration_row(reader, entry) for entry in entries])
+
+
+def _calibration_row(reader: Reader, entry: Entry) -> dict[str, object]:
+    trials = pd.DataFrame([_calibrated_trial(reader, entry, seed) for seed in entry.final_losses()])
+    shares = {f"{kind}_covered": trials[f"{kind}_covered"].mean() for kind in SETS}
+    names = {"env": entry.config.env, "policy": entry.config.policy, "label": entry.label}
+    return {**names, **trials.median(), **shares, "n": len(trials)}
+
+
+def _calibrated_trial(reader: Reader, entry: Entry, seed: int) -> dict[str, float]:
+    learned = learned_model(reader, entry.config, seed)
+    stored = reader.trajectory(entry.config.config_key, seed)
+    fits = held_out_fit(learned.spec, learned.parameters, stored.states, stored.inputs)
+    row = {
+        f"{kind}_{name}": float(getattr(fit, name))
+        for kind, fit in zip(SETS, fits, strict=True)
+        for name in HeldOutFit._fields
+    }
+    return row | {"energy": _energy(stored.inputs, learned.spec.system.gamma)}
+
+
+def _energy(inputs: Array, gamma: float) -> float:
+    return float(np.mean(np.sum(inputs**2, axis=1)) / gamma**2)
+
+
+def calibration_table(table: pd.DataFrame) -> TextTable:
+    """Return the table for people."""
+    written = {"r_squared": number, "covered": share, "log_loss": number}
+    rows = [
+        [row["env"], row["label"]]
+        + [text(row[f"{kind}_{name}"]) for name, text in written.items() for kind in SETS]
+        + [number(row["energy"]), row["n"]]
+        for row in table.to_dict("records")
+    ]
+    titles = ("R²", "within 90 %", "log loss")
+    headers = [f"{title}, {kind}" for title in titles for kind in SETS]
+    note = (
+        "Accelerations on the evaluation grid and the reachable set, medians over n trials. Within "
+        "90 %: share of all within their interval of 90 %; log loss: mean negative log likelihood "
+        "[nat]; a dash where the model has no covariance. Energy: mean of ‖u‖²/γ²."
+    )
+    return TextTable(["env", "variant", *headers, "energy", "n"], rows, note)
+
+
+CALIBRATION = TableKind(
+    "Fit at held-out states",
+    lambda selection, _=None: selection,
+    lambda reader, selection, _: measure_calibration(reader, selection),
+    lambda table, _: calibration_table(table),
+)

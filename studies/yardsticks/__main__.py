@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from analysis import outputs
 from analysis.cli import add_database, add_selection, wanted
-from analysis.data import provenance
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import Entry, Selection
+from analysis.data.matching import Filter
+from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError, IncompleteError
-from analysis.outputs import publish
 from analysis.tables.rendering import TextTable
 from orchestrate.cli_parser import Parser, path, tell
 from orchestrate.program import answered, run
@@ -91,10 +90,10 @@ def _written(
     """Write the table of trials, that of the page and the provenance; return what is shown."""
     trials = one.measure(reader, entries)
     table = one.tabulate(trials)
-    publish.write_table(trials, folder, f"{one.name}_trials")
-    publish.write_table(table, folder, one.name)
-    facts = provenance.describe(reader, Selection(tuple(entries))) | {"name": one.name}
-    publish.write_provenance(facts, folder, one.name)
+    outputs.write_table(trials, folder, f"{one.name}_trials")
+    outputs.write_table(table, folder, one.name)
+    facts = outputs.describe(reader, Selection(tuple(entries))) | {"name": one.name}
+    outputs.write_provenance(facts, folder, one.name)
     return one.tables(table)
 
 

@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.latest_configs import latest
-from analysis.data.trial_selection import Entry
+from analysis.data.matching import latest
+from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
 from analysis.formatting import within
 from analysis.stats.intervals import CONFIDENCE

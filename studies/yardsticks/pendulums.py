@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.data.config_matching import Filter
-from analysis.data.curves import read_curves
-from analysis.data.trial_selection import Entry, policy_rank
+from analysis.data.matching import Filter
+from analysis.data.samples import read_curves
+from analysis.data.selection import Entry, policy_rank
 from analysis.formatting import steps_text, within
-from analysis.stats.trial_scores import last_passage
+from analysis.stats.scores import last_passage
 from analysis.tables.rendering import TextTable
 from dopt.parameter_error import loss_by_parameter_error
 from dopt.spec.prequential import system_of

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.data.config_matching import Filter
-from analysis.data.learned_model import learned_model
-from analysis.data.trial_selection import Entry, policy_rank
+from analysis.data.matching import Filter
+from analysis.data.samples import learned_model
+from analysis.data.selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
 from dopt.models import GreyBox

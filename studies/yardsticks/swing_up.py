@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import Entry, environment_rank, policy_rank
+from analysis.data.matching import Filter
+from analysis.data.selection import Entry, environment_rank, policy_rank
 from analysis.formatting import p_text, share, steps_text
-from analysis.stats.paired_tests import benjamini_hochberg, compare_hitting_times
-from analysis.stats.trial_scores import first_passage, last_passage
+from analysis.stats.scores import (
+    benjamini_hochberg,
+    compare_hitting_times,
+    first_passage,
+    last_passage,
+)
 from analysis.tables.comparisons import paired
 from analysis.tables.rendering import TextTable
 from dopt.systems import Cartpole, Pendulum

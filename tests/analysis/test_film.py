@@ -11,8 +11,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from analysis.cli import main
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import select
+from analysis.data.matching import Filter
+from analysis.data.selection import select
 from analysis.errors import AnalysisError
 from analysis.film import Story, shoot, tell
 from dopt.run import run_trial

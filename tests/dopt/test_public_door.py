@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import dopt
-from analysis.data.provenance import versions
+from analysis.outputs import versions
 from dopt.errors import SpecificationError
 from orchestrate.runner.saving import launch_record
 from tests.paths import ROOT

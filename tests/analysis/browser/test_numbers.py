@@ -10,11 +10,12 @@ import pandas as pd
 import pytest
 from starlette.testclient import TestClient
 
-from analysis.data.config_matching import Filter
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import select
-from analysis.figures.loss_curves.data import Axis, measure_curves, tabulate_curves
-from analysis.tables.summary import summarise
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import select
+from analysis.plot_options import Axis
+from analysis.stats.curves import measure_curves, tabulate_curves
+from analysis.tables.comparisons import summarise
 from orchestrate.store import Reader
 
 

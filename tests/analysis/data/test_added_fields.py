@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from analysis.cli import main
-from analysis.data.config_matching import Filter, defaults, nearness
-from analysis.data.latest_configs import newest
-from analysis.data.trial_selection import select
+from analysis.data.matching import Filter, defaults, nearness, newest
+from analysis.data.selection import select
 from analysis.errors import AnalysisError
 from analysis.tables.comparisons import compare_policies
 from dopt.spec.trial import TrialSpec

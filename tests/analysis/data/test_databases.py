@@ -5,15 +5,15 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from analysis.data.config_matching import Filter
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import select
-from analysis.figures.input_spectrum.data import measure_spectra, tabulate_spectra
-from analysis.figures.loss_curves.data import measure_curves, tabulate_curves
-from analysis.figures.phase_portraits.data import measure_portraits, tabulate_portraits
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import select
+from analysis.figures.input_spectrum import measure_spectra, tabulate_spectra
+from analysis.figures.phase_portraits import measure_portraits, tabulate_portraits
 from analysis.plot_options import PlotOptions
+from analysis.stats.curves import measure_curves, tabulate_curves
 from analysis.stats.intervals import Statistic
-from analysis.tables.registry import TABLES
+from analysis.tables.rendering import TABLES
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, controlled
 from tests.analysis.synthetic import fill, make_grid

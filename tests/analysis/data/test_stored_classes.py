@@ -10,8 +10,8 @@ from typing import Any, cast
 
 import pytest
 
-from analysis.data.learned_model import learned_model, simulated_trial
-from analysis.data.missing_trials import is_possible
+from analysis.data.samples import learned_model, simulated_trial
+from analysis.data.selection import is_possible
 from dopt.errors import SpecificationError
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import ConfigRow, Reader

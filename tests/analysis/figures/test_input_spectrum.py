@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import select
-from analysis.figures.input_spectrum.data import measure_spectra, tabulate_spectra, unit_of
-from analysis.figures.input_spectrum.plot import caption
+from analysis.data.matching import Filter
+from analysis.data.selection import select
+from analysis.figures.input_spectrum import caption, measure_spectra, tabulate_spectra, unit_of
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import fill, make_grid

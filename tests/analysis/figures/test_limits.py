@@ -10,17 +10,21 @@ import numpy as np
 import pytest
 
 from analysis.cli import main
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import select
-from analysis.figures.limits.data import (
+from analysis.data.matching import Filter
+from analysis.data.selection import select
+from analysis.figures.limits import (
     MOST_SEEDS,
     Panel,
     Panels,
+    caption,
+    draw,
     limits_part,
     measure_panels,
+    rows_of,
+    share_text,
     tabulate_panels,
+    view,
 )
-from analysis.figures.limits.plot import caption, draw, rows_of, share_text, view
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, limited
 from tests.analysis.synthetic import fill, make_grid

@@ -10,14 +10,21 @@ import numpy as np
 import pytest
 
 from analysis.cli import main
-from analysis.data.config_matching import Filter
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import select
-from analysis.figures.pareto.data import Point, measure_points, pareto_part, policies_of
-from analysis.figures.pareto.plot import draw, pareto_plot, policy_colours
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import select
+from analysis.figures.pareto import (
+    Point,
+    draw,
+    measure_points,
+    pareto_part,
+    pareto_plot,
+    policies_of,
+    policy_colours,
+)
 from analysis.plot_options import PlotOptions
-from analysis.stats.geometric_means import Estimate
-from analysis.stats.pareto import on_front
+from analysis.stats.intervals import Estimate
+from analysis.stats.scores import on_front
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader

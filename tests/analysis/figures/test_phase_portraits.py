@@ -5,14 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import select
+from analysis.data.matching import Filter
+from analysis.data.selection import select
 from analysis.errors import AnalysisError
-from analysis.figures.phase_portraits.data import (
-    measure_portraits,
-    median_seed,
-    tabulate_portraits,
-)
+from analysis.figures.phase_portraits import measure_portraits, tabulate_portraits
+from analysis.stats.trajectories import median_seed
 from dopt.coverage import Plane
 from dopt.systems import SYSTEMS
 from orchestrate.store import Reader

@@ -9,10 +9,15 @@ import numpy as np
 import pytest
 
 from analysis.cli import main
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import select
-from analysis.figures.profiles.data import measure_profiles, profiles_part, tabulate_profiles
-from analysis.figures.profiles.plot import caption, draw
+from analysis.data.matching import Filter
+from analysis.data.selection import select
+from analysis.figures.profiles import (
+    caption,
+    draw,
+    measure_profiles,
+    profiles_part,
+    tabulate_profiles,
+)
 from analysis.tables.comparisons import compare_policies
 from orchestrate.store import Reader
 

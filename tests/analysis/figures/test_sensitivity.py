@@ -7,11 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.data.config_matching import Filter
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import select
-from analysis.figures.sensitivity.data import Line, measure_lines, sensitivity_part
-from analysis.figures.sensitivity.plot import caption, draw, sensitivity_plot
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import select
+from analysis.figures.sensitivity import (
+    Line,
+    caption,
+    draw,
+    measure_lines,
+    sensitivity_part,
+    sensitivity_plot,
+)
 from analysis.plot_options import PlotOptions
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT

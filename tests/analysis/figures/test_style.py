@@ -10,10 +10,17 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from analysis.figures.axes import angle_text, log_limits, log_text, log_ticks, rows_and_columns
-from analysis.figures.input_spectrum.plot import GREYS
-from analysis.figures.style import mathematical, styled
+from analysis.figures.input_spectrum import GREYS
+from analysis.figures.panels import (
+    angle_text,
+    log_text,
+    log_ticks,
+    mathematical,
+    rows_and_columns,
+    styled,
+)
 from analysis.line_styles import SEQUENCE, policy_style, sequence_style
+from analysis.stats.curves import log_limits
 from dopt.policies import POLICIES
 
 PAPER = ("oracle", "periodic", "d_optimal", "uniform", "random")

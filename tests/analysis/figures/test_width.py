@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.data.config_matching import Filter
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import Selection, select
-from analysis.figures.width.data import (
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import Selection, select
+from analysis.figures.width import (
     exponent,
     measure_costs,
     measure_losses,
@@ -16,7 +16,7 @@ from analysis.figures.width.data import (
     tabulate_losses,
     width_part,
 )
-from analysis.outputs.registry import build
+from analysis.outputs import build
 from analysis.plot_options import PlotOptions
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader

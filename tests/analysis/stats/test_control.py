@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import analysis
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import Selection, select
-from analysis.figures.control.plot import caption_control, draw_control
-from analysis.outputs.registry import build
+from analysis.data.matching import Filter
+from analysis.data.selection import Selection, select
+from analysis.figures.control import caption_control, draw_control
+from analysis.outputs import build
 from analysis.plot_options import PlotOptions
 from analysis.stats.control import (
     ControlCurve,

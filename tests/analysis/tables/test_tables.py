@@ -1,24 +1,32 @@
+"""Tables as Markdown and LaTeX, and the calibration of intervals."""
+
 from __future__ import annotations
 
+import io
 import math
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.data.config_matching import Filter
-from analysis.data.divergence import DivergenceRule
-from analysis.data.trial_selection import select
+from analysis.cli import main
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import select
 from analysis.errors import AnalysisError
-from analysis.figures.loss_curves.data import Axis, measure_curves, tabulate_curves
 from analysis.formatting import count_text, number, p_text, plus_minus
-from analysis.report.page import CAPTION, EXPLAINED
-from analysis.stats.trial_scores import Measure
-from analysis.tables.comparisons import compare_policies
+from analysis.plot_options import Axis
+from analysis.report import CAPTION, EXPLAINED
+from analysis.stats.curves import measure_curves, tabulate_curves
+from analysis.stats.scores import Measure
+from analysis.tables.comparisons import compare_policies, summarise
 from analysis.tables.rendering import comparison_table, control_table, summary_table
-from analysis.tables.summary import summarise
+from dopt.calibration import held_out_fit
+from dopt.run import run_trial
 from orchestrate.store import Reader
-from tests.analysis.synthetic import fake_result, make_spec
+from tests.analysis.synthetic import fake_result, fill, make_spec, simulated
+from tests.dopt.trials import trial
 
 SEEDS = range(5)
 
@@ -172,3 +180,57 @@ def test_every_caption_says_what_is_divided_by_what() -> None:
 def test_count_text() -> None:
     assert count_text({"a": "5", "b": "5"}) == "n = 5"
     assert count_text({"a": "5", "b": "4/5, 1 diverged", "c": "5"}) == ("n = 5; b: 4/5, 1 diverged")
+
+
+LEARNER = {"name": "gauss_newton"}
+
+
+TAUGHT = [trial("pendulum", "d_optimal", seed, learner=LEARNER) for seed in range(3)]
+
+
+UNSURE = [trial("pendulum", "random", seed, learner={"name": "adam_window"}) for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> str:
+    address = f"sqlite:///{tmp_path_factory.mktemp('calibration')}/results.db"
+    fill(address, TAUGHT + UNSURE, edit=simulated)
+    return address
+
+
+def test_rows_are_the_medians_of_the_trials(small: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibration", "--db", small, "--format", "csv"]) == 0
+    table = pd.read_csv(io.StringIO(capsys.readouterr().out)).set_index("policy")
+    results = [run_trial(spec) for spec in TAUGHT]
+    fits = [
+        held_out_fit(spec, one.parameters, one.states, one.inputs)
+        for spec, one in zip(TAUGHT, results, strict=True)
+    ]
+    row = table.loc["d_optimal"]
+    for name in ("r_squared", "covered", "log_loss"):
+        for kind in ("grid", "reachable"):
+            average = np.mean if name == "covered" else np.median
+            expected = average([getattr(getattr(fit, kind), name) for fit in fits])
+            assert row[f"{kind}_{name}"] == pytest.approx(expected, rel=1e-3)
+    assert row.energy == pytest.approx(1.0)  # every input is on the sphere
+    assert row.n == 3
+    assert np.isnan(table.loc["random", "grid_covered"])
+
+
+def test_a_model_without_a_covariance_has_a_dash(
+    small: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibration", "--db", small, "--policy", "random"]) == 0
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "pendulum" in line]
+    cells = [cell.strip() for cell in row.split("|")[1:-1]]
+    assert cells[4:8] == ["–"] * 4
+    assert "–" not in cells[2:4] + cells[8:]
+
+
+def test_a_database_without_a_finished_trial_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    address = f"sqlite:///{tmp_path}/none.db"
+    fill(address, TAUGHT, skipped=TAUGHT)
+    assert main(["calibration", "--db", address, "--allow-partial"]) == 2
+    assert "No selected trial is done" in capsys.readouterr().err

@@ -14,8 +14,8 @@ from starlette.testclient import TestClient
 import analysis
 import analysis.cli
 import dopt
-from analysis.data.config_matching import Filter
-from analysis.data.trial_selection import select
+from analysis.data.matching import Filter
+from analysis.data.selection import select
 from analysis.errors import AnalysisError
 from analysis.serve.app import create_app
 from analysis.tables.comparisons import compare_policies

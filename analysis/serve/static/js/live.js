@@ -4,22 +4,11 @@ const AGAIN = 2000;
 const state = document.getElementById("state");
 const words = document.getElementById("state-text");
 let token = document.body.dataset.token;
-/** @type {EventSource|null} */
 let stream = null;
-/** @type {Progress|null} */
 let newest = null;
 let busy = false;
 
-/**
- * @typedef {object} Progress
- * @property {string} token changes whenever a trial does
- * @property {Object<string, number>} counts trials by status
- * @property {number} total
- * @property {number} ended
- * @property {number} launches_running
- */
-
-/** Show the progress of the grid in the header. @param {Progress} progress */
+/** Show the progress of the grid in the header. @param {object} progress the server's read_progress */
 function say(progress) {
   const writing = progress.launches_running > 0 && progress.ended < progress.total;
   state.dataset.mode = writing ? "writing" : "still";
@@ -58,7 +47,7 @@ async function refresh() {
   }
 }
 
-/** Show the progress, and update the page if a trial has changed. @param {Progress} progress */
+/** Show the progress, and update the page if a trial has changed. */
 async function show(progress) {
   if ("retry" in document.body.dataset) location.reload();
   say(progress);

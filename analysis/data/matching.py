@@ -1,0 +1,402 @@
+"""Which stored configuration stands for a policy in an environment.
+
+A database may hold the paper's grid beside other widths, bounds and learners. A picture compares
+policies under one setting of an environment: its env, model, learner and limits. A setting with the
+reference policy and a baseline goes before one with the reference alone, such as another width;
+then the one with most trials wins, then the one nearest to the defaults, which are the paper's
+setting. A policy that exists only with a model of its own (the oracle) is taken with that model, in
+the same env section and under the same limits. What was left out is said; a tie is an error.
+
+Configurations of older code are left out, and of those that differ in the state of a user's file
+alone all but the one whose trials were registered last.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from analysis.errors import AnalysisError
+from dopt.declare.registry import SOURCE, TARGET
+from dopt.errors import SpecificationError
+from dopt.limits import Limits
+from dopt.spec.label import flatten
+from dopt.spec.trial import TrialSpec
+from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader
+
+REFERENCE = "d_optimal"
+"""The policy that all others are compared with, unless another one is asked for."""
+
+APART = "oracle"
+"""The policy that knows the form of the physics: on an axis of ratios others would have no room."""
+
+USUAL = {"model": "mlp", "learner": "adam_window"}
+"""Names of what a launch takes by itself."""
+
+COLUMNS = tuple(name for name in CONFIG_COLUMNS if name not in ("env", "label"))
+"""Settings that have a column of their own."""
+
+Setting = tuple[str, str, str, str]
+"""JSON of the sections env, limits, model and learner; null for none."""
+
+_WORLD = 2
+"""Number of sections, from the first, that all policies of a picture share."""
+
+_LAST = (
+    "SELECT max(r.trial_id) AS last FROM trial r JOIN config c ON c.config_id = r.config_id "
+    "WHERE c.config_key = :config_key"
+)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A configuration and the number of its registered trials."""
+
+    config: ConfigRow
+    n_trials: int
+
+
+@dataclass(frozen=True)
+class Filter:
+    """What a user asked for; empty means everything.
+
+    ``where`` maps a dotted path of the configuration, such as ``model.width``, to a value; it says
+    nothing of a configuration that has no such path, such as the linear model of the oracle.
+    ``group_by`` are the settings of which each combination of values is shown once; ``reference``
+    is the policy, or the value of the setting, that all others are compared with.
+    """
+
+    environments: tuple[str, ...] = ()
+    policies: tuple[str, ...] = ()
+    where: Mapping[str, object] = field(default_factory=dict)
+    reference: str = REFERENCE
+    group_by: tuple[str, ...] = ("policy",)
+
+    def accepts(self, config: ConfigRow) -> bool:
+        return (
+            (not self.environments or config.env in self.environments)
+            and (not self.policies or config.policy in self.policies)
+            and all(
+                flatten(config.config).get(path, value) == value
+                for path, value in self.where.items()
+            )
+        )
+
+    def check_where(self, configs: Sequence[ConfigRow]) -> None:
+        """Raise AnalysisError for a condition that no stored configuration meets."""
+        flat = [flatten(config.config) for config in configs]
+        for path, value in self.where.items():
+            stored = {json.dumps(entry[path]) for entry in flat if path in entry}
+            if not stored:
+                near = difflib.get_close_matches(path, sorted(set().union(*flat)), n=3, cutoff=0.3)
+                raise AnalysisError(
+                    f"--where {path} names no value of a stored configuration: "
+                    f"choose for instance one of {', '.join(near) or 'model.width, env.gamma'}."
+                )
+            if not any(entry.get(path) == value for entry in flat if path in entry):
+                text = json.dumps(value, default=str)
+                raise AnalysisError(
+                    f"--where {path}={text} fits no stored configuration, "
+                    f"stored are {', '.join(sorted(stored))}: choose one of these."
+                )
+
+
+def read_condition(text: str) -> tuple[str, object] | None:
+    """Return path and value, as JSON or text, of ``PATH=VALUE``; None if it is not so written."""
+    path, equals, value = text.partition("=")
+    if not equals or not path:
+        return None
+    try:
+        return path, json.loads(value)
+    except (ValueError, RecursionError):
+        return path, value
+
+
+def choose(candidates: Iterable[Candidate], reference: str = REFERENCE) -> list[ConfigRow]:
+    """Return one configuration for each (environment, policy); raise AnalysisError on a tie."""
+    groups: dict[str, list[Candidate]] = {}
+    for candidate in candidates:
+        groups.setdefault(candidate.config.env, []).append(candidate)
+    return [config for group in groups.values() for config in _choose_policies(group, reference)]
+
+
+def choose_by(
+    candidates: Iterable[Candidate], keys: Sequence[str], reference: str = REFERENCE
+) -> list[ConfigRow]:
+    """Return one configuration for each environment and combination of values of some settings.
+
+    Where a combination has several policies it is the reference's, if there is one, else the first
+    by name. Configurations without one of the settings are left out.
+    """
+    groups: dict[tuple[object, ...], list[Candidate]] = {}
+    for candidate in candidates:
+        values = [setting_value(candidate.config, key) for key in keys]
+        if None not in values:
+            groups.setdefault((candidate.config.env, *map(repr, values)), []).append(candidate)
+    chosen = [_choose_policies(group, reference) for group in groups.values()]
+    return [
+        min(configs, key=lambda one: (one.policy != reference, one.policy)) for configs in chosen
+    ]
+
+
+def setting_value(config: ConfigRow, key: str) -> object:
+    """Return a value by column (``width``) or by dotted path (``env.gamma``), None without one."""
+    if key in COLUMNS:
+        return getattr(config, key)
+    return flatten(config.config).get(key)
+
+
+def check_keys(keys: Sequence[str], configs: Sequence[ConfigRow]) -> None:
+    """Raise AnalysisError for a setting that no configuration has."""
+    for key in keys:
+        if all(setting_value(config, key) is None for config in configs):
+            known = {
+                *COLUMNS,
+                *(path for config in configs for path in flatten(config.config)),
+            }
+            near = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.4)
+            raise AnalysisError(
+                f"'{key}' is no setting of a stored configuration, but a column or a dotted path "
+                f"is expected: choose for instance one of "
+                f"{', '.join(near) or 'policy, learner, width, env.gamma'}."
+            )
+
+
+def _choose_policies(group: Sequence[Candidate], reference: str) -> list[ConfigRow]:
+    setting = _setting(_reference(group, reference).config)
+    chosen = []
+    for policy in sorted({candidate.config.policy for candidate in group}):
+        own = [candidate for candidate in group if candidate.config.policy == policy]
+        same = [candidate for candidate in own if _setting(candidate.config) == setting]
+        world = [
+            candidate
+            for candidate in own
+            if _setting(candidate.config)[:_WORLD] == setting[:_WORLD]
+        ]
+        if same or world:
+            chosen.append(_most(same or world).config)
+    return chosen
+
+
+def _reference(group: Sequence[Candidate], reference: str) -> Candidate:
+    """Return the candidate that fixes the setting; see the top of this file for the order."""
+    pool = [candidate for candidate in group if candidate.config.policy == reference] or group
+    totals: Counter[Setting] = Counter()
+    policies: dict[Setting, set[str]] = {}
+    for candidate in group:
+        setting = _setting(candidate.config)
+        totals[setting] += candidate.n_trials
+        policies.setdefault(setting, set()).add(candidate.config.policy)
+
+    def rank(candidate: Candidate) -> tuple[int, ...]:
+        setting = _setting(candidate.config)
+        alone = len(policies[setting]) < 2
+        return -alone, totals[setting], candidate.n_trials, *nearness(candidate.config)
+
+    best = _first(pool, rank)
+    if len({_setting(candidate.config) for candidate in best}) > 1:
+        raise _tie(best)
+    return best[0]
+
+
+def _most(candidates: Sequence[Candidate]) -> Candidate:
+    best = _first(candidates, lambda one: (one.n_trials, *nearness(one.config)))
+    if len(best) > 1:
+        raise _tie(best)
+    return best[0]
+
+
+def _first(
+    candidates: Sequence[Candidate], rank: Callable[[Candidate], tuple[int, ...]]
+) -> list[Candidate]:
+    """Return the candidates of the highest rank."""
+    top = max(map(rank, candidates))
+    return [candidate for candidate in candidates if rank(candidate) == top]
+
+
+def nearness(config: ConfigRow) -> tuple[int, int, int]:
+    """Return a key by which the configuration that is nearest to the defaults is the largest.
+
+    The model and the learner that a launch takes by itself come first, then fewer values that are
+    not defaults of what is named, then no task: it changes nothing of the trial.
+    """
+    usual, parts = defaults(config), _sections(config)
+    task = parts.pop("task", None) is not None
+    own = flatten(parts) if usual else {}
+    names = [parts.get(section, {}).get("name") != name for section, name in USUAL.items()]
+    return -sum(names), -sum(usual.get(path) != value for path, value in own.items()), -task
+
+
+def defaults(config: ConfigRow) -> dict[str, object]:
+    """Return the defaults of what a configuration names, without its task, as dotted paths.
+
+    Of limits these are all settings but the name, so that none are nearer than any. There are none
+    where it holds a system or policy of a user's own, which is not registered here.
+    """
+    names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
+    names.pop("task", None)
+    limits = Limits().to_section() if names.pop("limits", None) else {}
+    limits.pop("name", None)
+    try:
+        usual = TrialSpec.from_mapping(names).to_mapping()
+        return flatten({**usual, "limits": limits})
+    except (SpecificationError, KeyError):  # a plant is more than its name
+        return {}
+
+
+def _sections(config: ConfigRow) -> dict[str, Mapping[str, Any]]:
+    return {key: value for key, value in config.config.items() if isinstance(value, Mapping)}
+
+
+def _tie(pool: Sequence[Candidate]) -> AnalysisError:
+    first = pool[0]
+    path, values = difference([candidate.config.config for candidate in pool])
+    listed = ", ".join(json.dumps(value, ensure_ascii=False) for value in values)
+    return AnalysisError(
+        f"{len(pool)} configurations of {first.config.env} × {first.config.policy} have "
+        f"{first.n_trials} trials each and differ in {path} ({listed}): "
+        f"choose one with --where {path}={json.dumps(values[0], ensure_ascii=False)}."
+    )
+
+
+def _setting(config: ConfigRow) -> Setting:
+    env, limits, model, learner = (
+        json.dumps(config.config.get(section), sort_keys=True)
+        for section in ("env", "limits", "model", "learner")
+    )
+    return env, limits, model, learner
+
+
+def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]:
+    """Return the first dotted path in which configurations differ, and its values.
+
+    One that all of them have goes before one that some lack.
+    """
+    flat = [flatten(config) for config in configs]
+    paths = set().union(*flat)
+    for path in sorted(paths, key=lambda one: (not all(one in entry for entry in flat), one)):
+        values = [entry.get(path) for entry in flat]
+        if any(value != values[0] for value in values):
+            return path, values
+    return "config_key", [None for _ in configs]
+
+
+def check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:
+    """Raise AnalysisError for a name that is not stored."""
+    for name in given:
+        if name not in stored:
+            raise AnalysisError(
+                f"The database has no trial of {kind} '{name}', "
+                f"choose one of {', '.join(sorted(stored)) or 'none: it is empty'}."
+            )
+
+
+def latest(reader: Reader, configs: list[ConfigRow]) -> list[ConfigRow]:
+    """Return the configurations of the newest code, and of the last state of users' files."""
+    return latest_sources(reader, newest(configs))
+
+
+def newest(configs: list[ConfigRow]) -> list[ConfigRow]:
+    """Return the configurations of the newest code version: other versions' numbers do not mix.
+
+    Of those with a task, whose assessments have a version of their own, the newest of these; and of
+    those that differ in the version of the criterion of their plans alone, the newest.
+    """
+    code = max((config.config.get("code_version", 0) for config in configs), default=0)
+    assessment = max((_assessment_version(config) or 0 for config in configs), default=0)
+    found = [
+        config
+        for config in configs
+        if config.config.get("code_version", 0) == code
+        and _assessment_version(config) in (None, assessment)
+    ]
+    criteria: dict[str, int] = {}
+    for config in found:
+        content, version = _criterion(config)
+        criteria[content] = max(version, criteria.get(content, version))
+    return [config for config in found if _criterion(config)[1] == criteria[_criterion(config)[0]]]
+
+
+def _criterion(config: ConfigRow) -> tuple[str, int]:
+    """Return the configuration but for the version of the criterion of plans, and this version."""
+    content = dict(config.config)
+    version = int(content.pop("criterion_version", 1))
+    return json.dumps(content, sort_keys=True), version
+
+
+def _assessment_version(config: ConfigRow) -> int | None:
+    return int(config.config.get("assessment_version", 1)) if config.config.get("task") else None
+
+
+def latest_sources(
+    reader: Reader, configs: Sequence[ConfigRow], apart: Collection[str] = ()
+) -> list[ConfigRow]:
+    """Return the configurations without those that another one of a later file replaces.
+
+    Digests at the dotted paths ``apart``, such as ``env.source``, are told apart as settings are.
+    """
+    groups: dict[str, list[ConfigRow]] = {}
+    for config in configs:
+        groups.setdefault(_without_sources(config, apart), []).append(config)
+    replaced: set[str] = set()
+    for group in groups.values():
+        if len(group) > 1:
+            latest = max(group, key=lambda config: _last_trial(reader, config))
+            replaced |= {config.config_key for config in group if config is not latest}
+    return [config for config in configs if config.config_key not in replaced]
+
+
+def source_notes(configs: Iterable[ConfigRow], chosen: Sequence[ConfigRow]) -> Iterable[str]:
+    """Yield sentences on configurations of other files than those that are shown."""
+    shown: dict[tuple[str, str, object], set[str]] = {}
+    for config in chosen:
+        for path, (target, digest) in _sources(config).items():
+            shown.setdefault((config.env, path, target), set()).add(digest)
+    others: dict[tuple[str, str, object], set[str]] = {}
+    for config in configs:
+        for path, (target, digest) in _sources(config).items():
+            place = config.env, path, target
+            if digest not in shown.get(place, {digest}):
+                others.setdefault(place, set()).add(digest)
+    for (env, path, target), digests in sorted(others.items(), key=lambda item: str(item[0])):
+        here = ", ".join(sorted(shown[env, path, target]))
+        ways = " or ".join(f"--where {path}={_argument(digest)}" for digest in sorted(digests))
+        yield (
+            f"{env}: {path} differs, as the file of {target} was edited: these trials have {here}, "
+            f"those of other states of the file are not part of this (see {ways})"
+        )
+
+
+def _sources(config: ConfigRow) -> dict[str, tuple[object, str]]:
+    """Return class and digest of each section of a user's class, by the path of the digest."""
+    return {
+        f"{key}.{SOURCE}": (section[TARGET], str(section[SOURCE]))
+        for key, section in config.config.items()
+        if isinstance(section, Mapping) and TARGET in section and SOURCE in section
+    }
+
+
+def _without_sources(config: ConfigRow, apart: Collection[str]) -> str:
+    """Return the text of a configuration without the digests that are not told apart."""
+    content = dict(config.config)
+    for path in _sources(config):
+        key = path.partition(".")[0]
+        if path not in apart:
+            content[key] = {k: v for k, v in content[key].items() if k != SOURCE}
+    return json.dumps(content, sort_keys=True)
+
+
+def _last_trial(reader: Reader, config: ConfigRow) -> int:
+    """Return the identifier of the trial that was registered last, -1 where there is none."""
+    (row,) = reader.rows(_LAST, config_key=config.config_key)
+    return -1 if row.last is None else int(row.last)
+
+
+def _argument(digest: str) -> str:
+    """Return a digest as a condition takes it; one that reads as a number is quoted."""
+    is_text = read_condition(f"{SOURCE}={digest}") == (SOURCE, digest)
+    return digest if is_text else f"'{json.dumps(digest)}'"

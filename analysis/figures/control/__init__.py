@@ -1,1 +1,0 @@
-"""Control with the learned model (Figure 5)."""

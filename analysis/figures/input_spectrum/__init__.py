@@ -1,1 +1,0 @@
-"""Spectrum of inputs (Figure 2, right)."""

@@ -1,1 +1,0 @@
-"""Loss curves (Figure 1)."""

@@ -1,0 +1,475 @@
+"""Figure 6: final loss against the time of a step, one panel per environment.
+
+A configuration is a policy, a model and a learner with all their settings. Environments are
+compared in one env section and under one section of limits each, those of most trials.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+
+from analysis.data.matching import APART
+from analysis.data.samples import DivergenceRule, read_sample
+from analysis.data.selection import (
+    Entry,
+    Selection,
+    environment_rank,
+    labelled,
+    labels_of,
+    number_of_trials,
+    one_each,
+    one_world,
+    policy_rank,
+    section_text,
+    unfinished,
+)
+from analysis.figures.loss_curves import loss_label
+from analysis.figures.panels import (
+    GUIDE,
+    MARKERS,
+    TEXT_WIDTH,
+    Plot,
+    legend_below,
+    log_scale,
+    log_ticks,
+    rows_and_columns,
+    sheet,
+)
+from analysis.formatting import count_text, loss_unit
+from analysis.line_styles import (
+    BLACK,
+    GREY,
+    SEQUENCE,
+    environment_title,
+    policy_style,
+    text_by_environment,
+)
+from analysis.stats.curves import log_limits
+from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
+from analysis.stats.scores import final_losses, on_front
+from dopt.spec.prequential import system_of
+from orchestrate.store import Reader
+
+USUAL = "mlp"
+"""Model that goes without saying."""
+
+FEWEST = 2
+"""Configurations of an environment from which they are compared."""
+
+PANEL_HEIGHT = 3.2
+
+INNER = (TEXT_WIDTH / 2 - 0.6, PANEL_HEIGHT - 0.6)
+"""Least width and height between the axes of a panel, without titles and labels [inches]."""
+
+LEGEND_ROW = 0.16
+LEGEND_COLUMNS = 3
+
+LIST_SIZE = 5.2
+"""Size of the letters in the list of the front [points]."""
+
+LIST_LINE = 1.35 * LIST_SIZE / 72
+"""Height of one of its lines [inches]."""
+
+_HALO = [withStroke(linewidth=1.2, foreground="white")]
+
+LETTER = 0.53 * LIST_SIZE / 72
+"""Usual width of one of its letters [inches]."""
+
+_RULES = {
+    DivergenceRule.EXCLUDE: "in none of its numbers",
+    DivergenceRule.WORST: "with the worst final loss of the others",
+    DivergenceRule.MEDIAN: "with the median final loss of the others",
+}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One configuration in one environment.
+
+    Attributes
+    ----------
+    label : str
+        Settings that differ among the configurations of the environment.
+    policy, policy_words, learner_words : str
+        Name of the policy; the policy and the learner with those of their settings that differ. The
+        learner's are followed by the model, where it is another one than the network.
+    us : float
+        Microseconds of planning and learning in a step: mean over the steps of a trial, median over
+        trials that did not diverge; NaN without any.
+    loss : Estimate
+        Final loss, geometric mean over trials, in ``unit``; NaN where none is left.
+    n, n_finished, n_diverged : int
+        Trials in the loss, those that ended and those of them that diverged.
+    counts : str
+        These numbers as a text.
+    limit_us : float
+        Time between two steps, dt [µs].
+    on_front : bool
+        No other configuration of the environment has a lower loss in a step that is as fast, or
+        the same loss in a faster one.
+    """
+
+    env: str
+    label: str
+    policy: str
+    policy_words: str
+    learner_words: str
+    us: float
+    loss: Estimate
+    unit: str
+    n: int
+    n_finished: int
+    n_diverged: int
+    counts: str
+    limit_us: float
+    on_front: bool = False
+
+    @property
+    def known(self) -> bool:
+        """Whether it can be drawn."""
+        return bool(np.isfinite(self.us) and np.isfinite(self.loss.value))
+
+
+Points = tuple[Point, ...]
+
+
+def pareto_part(selection: Selection) -> Selection:
+    """Return all configurations of the environments that have several, without the oracle's."""
+    kept: list[Entry] = []
+    for _, group in itertools.groupby(
+        sorted(selection.stored, key=lambda one: environment_rank(one.config.env)),
+        key=lambda one: one.config.env,
+    ):
+        finished = [one for one in group if one.finished and one.config.policy != APART]
+        world = one_world(one_world(finished), "limits") if finished else []
+        own = one_each(world, number_of_trials)
+        kept += own if len(own) >= FEWEST else []
+    entries = tuple(labelled(kept))
+    return Selection(entries, notes=tuple(unfinished(entries)))
+
+
+def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -> Points:
+    """Return a point for each entry, those of an environment by their time."""
+    policies = section_words(selection.entries, "policy")
+    learners = learner_words(selection.entries)
+    points = [
+        _point(reader, entry, policies[section_text(entry, "policy")], learner, rule)
+        for entry, learner in zip(selection.entries, learners, strict=True)
+    ]
+    return tuple(
+        point
+        for env in selection.environments
+        for point in _with_front([one for one in points if one.env == env])
+    )
+
+
+def learner_words(entries: Sequence[Entry]) -> list[str]:
+    """Return the words of the learner of each entry, and of a model that is not the network."""
+    learners, models = (section_words(entries, name) for name in ("learner", "model"))
+    several = len({entry.config.model for entry in entries}) > 1
+    return [
+        learners[section_text(entry, "learner")]
+        + (f", {models[section_text(entry, 'model')]}" if several and model != USUAL else "")
+        for entry, model in ((entry, entry.config.model) for entry in entries)
+    ]
+
+
+def section_words(entries: Sequence[Entry], section: str) -> dict[str, str]:
+    """Return for each section, as JSON, its name with the settings that differ.
+
+    They are the words of labels of configurations that differ in this section alone.
+    """
+    first = {section_text(entry, section): entry.config for entry in entries}
+    rest = {key: own for key, own in entries[0].config.config.items() if key != "limits"}
+    alike = [
+        replace(config, config={**rest, section: config.config[section]})
+        for config in first.values()
+    ]
+    names = [str(config.config[section]["name"]) for config in first.values()]
+    words = labels_of(alike) if len(alike) > 1 or section == "policy" else names
+    return dict(zip(first, words, strict=True))
+
+
+def _point(reader: Reader, entry: Entry, policy: str, learner: str, rule: DivergenceRule) -> Point:
+    scores = final_losses(reader, entry, "loss", rule)
+    system = system_of(entry.config.config)
+    return Point(
+        env=entry.config.env,
+        label=entry.label,
+        policy=entry.config.policy,
+        policy_words=policy,
+        learner_words=learner,
+        us=step_us(reader, entry),
+        loss=geometric_mean(scores.values),
+        unit=loss_unit(system),
+        n=len(scores.by_seed),
+        n_finished=scores.n_finished,
+        n_diverged=scores.n_diverged,
+        counts=scores.describe(),
+        limit_us=1e6 * system.dt,
+    )
+
+
+def step_us(reader: Reader, entry: Entry) -> float:
+    """Return the microseconds of planning and learning in a step, NaN without a whole trial.
+
+    The mean over the steps of a trial counts what is done in some of them only, such as the fit of
+    every tenth step; the median over trials leaves out those that the machine held up.
+    """
+    plan, learn = (
+        read_sample(reader, entry, column, DivergenceRule.EXCLUDE).values
+        for column in ("plan_us", "learn_us")
+    )
+    return float(np.median(np.mean(plan + learn, axis=1))) if len(plan) else float("nan")
+
+
+def _with_front(points: Sequence[Point]) -> Iterator[Point]:
+    """Yield the points of an environment by their time, with their place on the front."""
+    front = on_front(np.array([(point.us, point.loss.value) for point in points]))
+    placed = [replace(one, on_front=bool(is_on)) for one, is_on in zip(points, front, strict=True)]
+    yield from sorted(placed, key=lambda one: (not one.known, one.us))
+
+
+def policies_of(points: Points) -> dict[str, str]:
+    """Return the words of the policies with their names, in the order of the titles."""
+    found = {point.policy_words: point.policy for point in points}
+    return dict(sorted(found.items(), key=lambda one: (policy_rank(one[1]), len(one[0]), one[0])))
+
+
+def learners_of(points: Points) -> tuple[str, ...]:
+    """Return the words of the learners by name."""
+    return tuple(sorted({point.learner_words for point in points}))
+
+
+def tabulate_points(points: Points) -> pd.DataFrame:
+    """Return what is drawn, one row for each environment and configuration."""
+    return pd.DataFrame([_row(point) for point in points])
+
+
+def _row(point: Point) -> Mapping[str, object]:
+    return {
+        "env": point.env,
+        "label": point.label,
+        "policy": point.policy,
+        "policy_label": point.policy_words,
+        "learner_label": point.learner_words,
+        "us_per_step": point.us,
+        "loss": point.loss.value,
+        "low": point.loss.low,
+        "high": point.loss.high,
+        "n": point.n,
+        "n_diverged": point.n_diverged,
+        "on_front": point.on_front,
+    }
+
+
+Numbers = tuple[DivergenceRule, Points]
+
+
+def pareto_plot(name: str) -> Plot[Numbers]:
+    """Return final loss against the time of a step, with the Pareto front."""
+    return Plot(
+        name=name,
+        title="Final loss against the time of a step",
+        statistic="geometric mean over trials of the final loss; median over trials of the mean "
+        "microseconds of planning and learning in a step",
+        band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
+        part=pareto_part,
+        measure=lambda reader, selection, options: (
+            options.rule,
+            measure_points(reader, selection, options.rule),
+        ),
+        tabulate=lambda numbers: tabulate_points(numbers[1]),
+        draw=lambda numbers: draw(numbers[1]),
+        caption=caption,
+    )
+
+
+def draw(points: Points) -> Figure:
+    """Draw a panel for each environment, with a legend of policies and learners below all."""
+    environments = list(dict.fromkeys(point.env for point in points))
+    colours = policy_colours(policies_of(points))
+    markers = dict(zip(learners_of(points), itertools.cycle(MARKERS), strict=False))
+    handles = _handles(points, colours, markers)
+    rows, columns = rows_and_columns(len(environments), 2)
+    legend = LEGEND_ROW * math.ceil(len(handles) / LEGEND_COLUMNS)
+    figure, panels = sheet(rows, columns, PANEL_HEIGHT, legend)
+    for axes, env in zip(panels.flat, environments, strict=False):
+        _panel(axes, [point for point in points if point.env == env], colours, markers)
+    for axes in panels.flat[len(environments) :]:
+        axes.remove()
+    legend_below(figure, LEGEND_COLUMNS, handles=handles, fontsize=6.5, handlelength=1.2)
+    return figure
+
+
+def policy_colours(policies: Mapping[str, str]) -> dict[str, str]:
+    """Return a colour for the words of each policy: its own, or a free one where that is taken.
+
+    Colours of lines repeat, since dashes tell lines apart; those of points must not. Grey is left
+    where there are more policies than colours.
+    """
+    found: dict[str, str] = {}
+    for words, policy in policies.items():
+        own = policy_style(policy).colour
+        if own not in found.values():
+            found[words] = own
+    free = (colour for colour in SEQUENCE if colour not in found.values())
+    return {words: found.get(words) or next(free, GREY) for words in policies}
+
+
+def _panel(
+    axes: Axes, points: Sequence[Point], colours: Mapping[str, str], markers: Mapping[str, str]
+) -> None:
+    known = [point for point in points if point.known]
+    front = [point for point in known if point.on_front]
+    for point in known:
+        _dot(axes, point, colours[point.policy_words], markers[point.learner_words])
+    _limits(axes, known, front)
+    _front(axes, front)
+    usual = _counts(points).partition(";")[0]
+    axes.set_title(f"{environment_title(points[0].env)} ({usual}, {len(points)} configurations)")
+    axes.set_xlabel("planning and learning in a step [µs]")
+    axes.set_ylabel(f"final {loss_label('loss', points[0].unit)}")
+
+
+def _dot(axes: Axes, point: Point, colour: str, marker: str) -> None:
+    loss = point.loss
+    ends = np.nan_to_num([[loss.value - loss.low], [loss.high - loss.value]])
+    face = "white" if point.n_diverged else colour
+    axes.errorbar(
+        point.us, loss.value, yerr=ends, fmt=marker, ms=4.2 if point.on_front else 3.4,
+        color=colour, mfc=face, mec=BLACK if point.on_front else colour, mew=0.6, elinewidth=0.6,
+        alpha=1.0 if point.on_front else 0.6, zorder=4 if point.on_front else 3,
+    )  # fmt: skip
+
+
+def _limits(axes: Axes, known: Sequence[Point], front: Sequence[Point]) -> None:
+    """Set logarithmic axes around all points, with room for the list of the front below it."""
+    times = np.array([point.us for point in known])
+    ends = [(one.loss.value, one.loss.low, one.loss.high) for one in known]
+    left, right = log_limits(times, margin=1.6)
+    low, high = log_limits(np.array(ends).ravel(), margin=1.3)
+    low /= 1.2  # for the number of the lowest point
+    axes.set_xscale("log")
+    axes.set_xlim(left, right)
+    log_ticks(axes.xaxis, left, right)
+    width, height = _list_share(front)
+    above = [
+        math.log(min(one.loss.value, one.loss.low))
+        for one in known
+        if math.log(one.us / left) < width * math.log(right / left)
+    ]  # fmt: skip
+    room = [(y - height * math.log(high)) / (1 - height) for y in above]
+    log_scale(axes, math.exp(min([math.log(low), *room])), high)
+    limit = known[0].limit_us if known else math.nan
+    if left < limit < right:
+        axes.axvline(limit, **GUIDE)
+        axes.annotate(
+            f"dt = {limit / 1e3:g} ms", (limit, 1), xycoords=("data", "axes fraction"),
+            xytext=(-2, -2), textcoords="offset points", rotation=90, ha="right", va="top",
+            fontsize=6,
+        )  # fmt: skip
+
+
+def _list_share(front: Sequence[Point]) -> tuple[float, float]:
+    """Return the parts of the panel's width and height that the list of the front takes."""
+    longest = max((len(_line(place, one)) for place, one in enumerate(front, 1)), default=0)
+    return min(1.0, LETTER * longest / INNER[0]), LIST_LINE * (len(front) + 1) / INNER[1]
+
+
+def _line(place: int, point: Point) -> str:
+    return f"{place}  {point.label}"
+
+
+def _front(axes: Axes, front: Sequence[Point]) -> None:
+    """Draw the front as steps, number its members and list them in the corner below it."""
+    if not front:
+        return
+    times = [point.us for point in front]
+    losses = [point.loss.value for point in front]
+    steps = ([times[0], *times, axes.get_xlim()[1]], [axes.get_ylim()[1], *losses, losses[-1]])
+    axes.plot(*steps, drawstyle="steps-post", color=BLACK, lw=0.7, zorder=2)
+    for group in _close(axes, front):
+        last = front[group[-1] - 1]
+        axes.annotate(
+            ", ".join(map(str, group)), (last.us, last.loss.value), xytext=(-3, -3),
+            textcoords="offset points", ha="right", va="top", fontsize=LIST_SIZE, weight="bold",
+            zorder=5, path_effects=_HALO,
+        )  # fmt: skip
+    axes.annotate(
+        "\n".join(_line(place, point) for place, point in enumerate(front, 1)), (0, 0),
+        xycoords="axes fraction", xytext=(3, 3), textcoords="offset points", va="bottom",
+        fontsize=LIST_SIZE, linespacing=1.25,
+    )  # fmt: skip
+
+
+def _close(axes: Axes, front: Sequence[Point]) -> list[list[int]]:
+    """Return the numbers of the front, those in one list that would cover each other."""
+    limits = np.log([axes.get_xlim(), axes.get_ylim()])
+    places = np.log([(point.us, point.loss.value) for point in front])
+    inches = (places - limits[:, 0]) / np.diff(limits)[:, 0] * INNER
+    groups: list[list[int]] = []
+    for number in range(1, len(front) + 1):
+        if groups and np.all(np.abs(inches[number - 1] - inches[groups[-1][0] - 1]) < LIST_LINE):
+            groups[-1].append(number)
+        else:
+            groups.append([number])
+    return groups
+
+
+def _handles(
+    points: Points, colours: Mapping[str, str], markers: Mapping[str, str]
+) -> list[Line2D]:
+    handles = [
+        Line2D([], [], ls="", marker="o", ms=4, color=colour, label=words)
+        for words, colour in colours.items()
+    ]
+    handles += [
+        Line2D([], [], ls="", marker=marker, ms=4, color=GREY, label=words)
+        for words, marker in markers.items()
+    ]
+    if any(point.known and point.n_diverged for point in points):
+        handles.append(Line2D([], [], ls="", marker="o", ms=4, color=GREY, mfc="white",
+                              label="some trials diverged"))  # fmt: skip
+    handles.append(Line2D([], [], color=BLACK, lw=0.7, label="Pareto front"))
+    return handles
+
+
+def caption(numbers: Numbers) -> str:
+    """Return the caption, with what a point is, n and the configurations without a point."""
+    rule, points = numbers
+    counts = text_by_environment(points, _counts)
+    return (
+        "Root mean square error of the model over the evaluation grid after the last step, against "
+        "the time that planning and learning take in a step, both on logarithmic axes. A point is "
+        "a configuration; colours are policies, markers learners; the oracle is left out. Loss: "
+        f"geometric mean over trials with its 95 % interval (BCa bootstrap, {STUDENT_RANGE} "
+        "trials). Time: mean over the steps of a trial, median over trials. Line: Pareto front; "
+        "no configuration is both as good and as fast as one on it, and better in one of the two. "
+        "Its members are numbered by their time; a label leaves out what is usual, such as the "
+        "learner adam_window with a network. Dashed, where it is in range: the time between two "
+        "steps, dt. Open markers: some "
+        f"trials diverged; a diverged trial counts {_RULES[rule]}. {_missing(points)}"
+        f"Trials: {counts}."
+    )
+
+
+def _counts(points: Sequence[Point]) -> str:
+    return count_text({one.label: one.counts for one in points if one.known})
+
+
+def _missing(points: Points) -> str:
+    """Return which configurations have no point, or nothing."""
+    lost = [f"{environment_title(one.env)}, {one.label} ({one.counts})"
+            for one in points if not one.known]  # fmt: skip
+    return f"No point, as no trial has a positive final loss: {'; '.join(lost)}. " if lost else ""

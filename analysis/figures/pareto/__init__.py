@@ -1,1 +1,0 @@
-"""Final loss against the time of a step, with the Pareto front (Figure 6)."""

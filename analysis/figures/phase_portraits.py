@@ -1,0 +1,255 @@
+"""Figure 2, left and middle: phase portraits, one panel per policy, same seed and axes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+
+from analysis.data.matching import REFERENCE
+from analysis.data.selection import Entry, Selection
+from analysis.errors import AnalysisError
+from analysis.figures.panels import (
+    TEXT_WIDTH,
+    Plot,
+    angle_ticks,
+    legend_below,
+    mathematical,
+    rows_and_columns,
+    sheet,
+)
+from analysis.formatting import plus_minus
+from analysis.line_styles import BLACK, environment_title, policy_style
+from analysis.stats.intervals import mean, standard_error
+from analysis.stats.trajectories import DrawnPlane, median_seed
+from dopt.coverage import CELLS
+from dopt.spec.prequential import system_of
+from orchestrate.store import Reader
+
+Array = npt.NDArray[np.float64]
+SEED_RULE = "the seed whose D-optimal final loss is the median (the lower one of two)"
+PANEL_HEIGHT = 2.1
+MARGIN = 0.04
+
+BOX: dict[str, Any] = {
+    "facecolor": "#f3f3f3",
+    "edgecolor": "#707070",
+    "linestyle": (0, (3, 2)),
+    "linewidth": 0.8,
+}
+
+
+@dataclass(frozen=True)
+class Portrait:
+    """The trajectory of one policy, and how much of the box its trials visit.
+
+    Attributes
+    ----------
+    line : (n, 2)
+        Drawn points: angles wrapped, rows of NaN where the line is broken. Empty when the policy
+        has no finished trial of that seed.
+    start : (2,)
+    diverged : bool
+    coverage, coverage_error : float
+        Mean share of visited cells over the trials that did not diverge, and its standard error.
+    n, n_diverged : int
+        Trials in that mean, and trials left out of it.
+    """
+
+    policy: str
+    line: Array
+    start: Array
+    diverged: bool
+    coverage: float
+    coverage_error: float
+    n: int
+    n_diverged: int
+
+
+@dataclass(frozen=True)
+class Portraits:
+    """All portraits of one environment, of the same seed."""
+
+    env: str
+    seed: int
+    plane: DrawnPlane
+    panels: tuple[Portrait, ...]
+
+
+def choose_seed(entries: Iterable[Entry]) -> int:
+    """Return the seed to draw: that of the median among the reference policy's final losses."""
+    for entry in entries:
+        if entry.config.policy == REFERENCE and entry.final_losses():
+            return median_seed(entry.final_losses())
+    raise AnalysisError(
+        f"A phase portrait shows {SEED_RULE}, but no finished trial of {REFERENCE} is stored: "
+        f"run one, or leave this figure out."
+    )
+
+
+def measure_portraits(reader: Reader, selection: Selection, env: str) -> Portraits:
+    """Return the portraits of one environment."""
+    entries = selection.of(env)
+    seed = choose_seed(entries)
+    plane = DrawnPlane.of(system_of(entries[0].config.config))
+    panels = tuple(_portrait(reader, entry, seed, plane) for entry in entries)
+    return Portraits(env, seed, plane, panels)
+
+
+def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Portrait:
+    key, finished = entry.config.config_key, entry.finished
+    status = {trial.seed: trial.status for trial in finished}
+    points = np.empty((0, 2))
+    if seed in status:
+        points = plane.project(reader.trajectory(key, seed).states)
+        points = points[np.isfinite(points).all(axis=1)]
+    shares = np.array([_share(reader, key, seed, plane) for seed in entry.final_losses()])
+    return Portrait(
+        policy=entry.config.policy,
+        line=plane.line(points) if len(points) else points,
+        start=plane.wrapped(points[:1])[0] if len(points) else np.full(2, np.nan),
+        diverged=status.get(seed) == "diverged",
+        coverage=float(mean(shares)),
+        coverage_error=float(standard_error(shares)),
+        n=len(shares),
+        n_diverged=len(finished) - len(shares),
+    )
+
+
+def _share(reader: Reader, key: str, seed: int, plane: DrawnPlane) -> float:
+    return plane.coverage(reader.trajectory(key, seed).states)
+
+
+def tabulate_portraits(portraits: Portraits) -> pd.DataFrame:
+    """Return what is drawn, one row for each point of a line; empty fields break the line."""
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    "env": portraits.env,
+                    "policy": panel.policy,
+                    "seed": portraits.seed,
+                    "x": panel.line[:, 0],
+                    "y": panel.line[:, 1],
+                    "coverage": panel.coverage,
+                    "coverage_se": panel.coverage_error,
+                    "n": panel.n,
+                    "n_diverged": panel.n_diverged,
+                }
+            )
+            for panel in portraits.panels
+        ],
+        ignore_index=True,
+    )
+
+
+def phase_plot(env: str) -> Plot[Portraits]:
+    """Return the phase portraits of one environment."""
+    return Plot(
+        name=f"figure2_phase_{env}",
+        title=f"Phase portraits, {environment_title(env)}",
+        statistic=f"one trajectory per policy: {SEED_RULE}; coverage: mean over trials",
+        band="± 2 standard errors of the mean coverage (printed)",
+        part=lambda selection: selection.only([env]).compared(),
+        measure=lambda reader, selection, _: measure_portraits(reader, selection, env),
+        tabulate=tabulate_portraits,
+        draw=draw,
+        caption=caption,
+    )
+
+
+def draw(portraits: Portraits) -> Figure:
+    """Draw one panel for each policy, all with the same axes."""
+    rows, columns = rows_and_columns(len(portraits.panels), 3)
+    width = TEXT_WIDTH * max(columns, 2) / 3
+    figure, grid = sheet(rows, columns, PANEL_HEIGHT, 0.6, width, sharex=True, sharey=True)
+    panels = grid.ravel()
+    for axes, portrait in zip(panels, portraits.panels, strict=False):
+        _panel(axes, portrait, portraits.plane)
+    last = len(portraits.panels)
+    for axes in panels[last:]:
+        axes.set_axis_off()
+    _set_axes(panels[0], portraits)
+    x_label, y_label = (mathematical(label) for label in portraits.plane.labels)
+    for index, axes in enumerate(panels[:last]):
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label if index % columns == 0 else "")
+    handles = _handles(portraits.seed)
+    if last < len(panels):
+        panels[-1].legend(handles=handles, loc="center")
+    else:
+        legend_below(figure, min(3, columns + 1), handles=handles)
+    return figure
+
+
+def _panel(axes: Axes, portrait: Portrait, plane: DrawnPlane) -> None:
+    (left, right), (bottom, top) = plane.box
+    axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, zorder=0.5, **BOX))
+    style = policy_style(portrait.policy)
+    axes.plot(portrait.line[:, 0], portrait.line[:, 1], color=style.colour, lw=0.7, zorder=2)
+    axes.plot(*portrait.start, marker="o", ms=4, mfc="white", mec=BLACK, mew=1, zorder=3)
+    axes.set_title(
+        f"{style.label}\n{coverage_text(portrait)} ({count_text(portrait)})", fontsize=7.5
+    )
+    if not len(portrait.line):
+        axes.text(0.5, 0.5, "no finished trial", transform=axes.transAxes, ha="center")
+    elif portrait.diverged:
+        axes.text(0.06, 0.07, "this trial diverged", transform=axes.transAxes, fontsize=6.5)
+
+
+def count_text(portrait: Portrait) -> str:
+    """Return the number of trials behind the coverage."""
+    left_out = f", {portrait.n_diverged} diverged" if portrait.n_diverged else ""
+    return f"n = {portrait.n}{left_out}"
+
+
+def coverage_text(portrait: Portrait) -> str:
+    """Return the mean coverage in per cent ± 2 standard errors."""
+    if not portrait.n:
+        return "coverage unknown"
+    error = portrait.coverage_error if portrait.n > 1 else 0.0
+    return f"coverage {plus_minus(100 * portrait.coverage, 200 * error)} %"
+
+
+def _set_axes(axes: Axes, portraits: Portraits) -> None:
+    # Not by the axis, whose view interval the panels that share it would not see.
+    axes.set(xlim=_limits(portraits, 0), ylim=_limits(portraits, 1))
+    for dimension, axis in enumerate((axes.xaxis, axes.yaxis)):
+        if portraits.plane.angles[dimension]:
+            angle_ticks(axis)
+
+
+def _limits(portraits: Portraits, dimension: int) -> tuple[float, float]:
+    values = np.concatenate([panel.line[:, dimension] for panel in portraits.panels])
+    values = np.concatenate([values[np.isfinite(values)], portraits.plane.box[dimension]])
+    low, high = float(values.min()), float(values.max())
+    margin = MARGIN * (high - low)
+    return low - margin, high + margin
+
+
+def _handles(seed: int) -> list[Line2D | Patch]:
+    return [
+        Line2D([], [], color="#404040", lw=0.9, label=f"trajectory of seed {seed}"),
+        Line2D([], [], ls="", marker="o", ms=4, mfc="white", mec=BLACK, mew=1, label="start"),
+        Patch(**BOX, label="evaluation box"),
+    ]
+
+
+def caption(portraits: Portraits) -> str:
+    """Return the caption, with the rule for the seed and what coverage is."""
+    return (
+        f"Phase portraits of the {environment_title(portraits.env)}, one panel per policy, "
+        f"all of seed {portraits.seed} ({SEED_RULE}). Angles are wrapped around the stable "
+        f"equilibrium and the line is broken where it wraps. Circle: start. Dashed: evaluation "
+        f"box. Coverage: share of the {CELLS} × {CELLS} cells of that box which a trial visits, "
+        f"mean over n trials ± 2 standard errors."
+    )

@@ -1,1 +1,0 @@
-"""Phase portraits (Figure 2, left and middle)."""

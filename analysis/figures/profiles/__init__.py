@@ -1,1 +1,0 @@
-"""Performance profiles over all systems (Figure 7)."""

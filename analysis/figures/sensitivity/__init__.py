@@ -1,1 +1,0 @@
-"""Final loss against single settings (Figure 8)."""

@@ -1,1 +1,0 @@
-"""Cost and loss against the width of the network (Figure 4)."""

@@ -1,0 +1,509 @@
+"""Outputs of ``analysis figures``: which there are, where they come from, and how they are written.
+
+Files are written whole, and only if their content has changed. The provenance has no times, so that
+equal data give equal bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import json
+import multiprocessing
+import os
+import platform
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import wait as futures_wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import pandas as pd
+
+from analysis.data.selection import Selection
+from analysis.errors import AnalysisError
+from analysis.plot_options import PlotOptions
+from analysis.tables.rendering import TABLES, TableKind
+from dopt import __version__
+from orchestrate.files import make_folder, whole
+from orchestrate.program import COMMIT_VARIABLE, commit_of, git
+from orchestrate.store import Reader
+
+LIBRARIES = ("matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")
+PACKAGE = Path(__file__).parent
+"""The folder of the analysis."""
+
+FIGURES = (
+    "figure1",
+    "figure1_reachable",
+    "figure2_phase_pendulum",
+    "figure2_phase_cartpole",
+    "figure2_spectrum",
+    "figure4_width",
+    "figure4_width_loss",
+    "figure5_control",
+    "figure6_pareto",
+    "figure7_profiles",
+    "figure8_sensitivity",
+    "figure9_limits",
+)
+"""Figures in the order of the registry."""
+
+NAMES = (*FIGURES, *TABLES)
+
+WITH_EXPLORATIONS = ("figure1", *(name for name in FIGURES if name[:7] == "figure2"), "summary")
+"""Outputs that compare no losses, and so show explorations too."""
+
+TABLE_FILES = ("md", "tex", "csv")
+
+PAGE = "README.md"
+
+PICTURES = ("pdf", "svg", "png")
+
+INTERRUPT_INTERVAL = 0.1
+"""Seconds between two looks for Ctrl-C."""
+
+T = TypeVar("T")
+
+
+@functools.cache
+def plots() -> dict[str, Plot[Any]]:
+    """Return all figures by name, in their order; Matplotlib is loaded by the first call."""
+    from analysis.figures.control import control_plot
+    from analysis.figures.input_spectrum import spectrum_plot
+    from analysis.figures.limits import limits_plot
+    from analysis.figures.loss_curves import loss_plot
+    from analysis.figures.pareto import pareto_plot
+    from analysis.figures.phase_portraits import phase_plot
+    from analysis.figures.profiles import profiles_plot
+    from analysis.figures.sensitivity import sensitivity_plot
+    from analysis.figures.width import cost_plot, loss_against_width_plot
+
+    found = (
+        loss_plot("figure1", "loss"),
+        loss_plot("figure1_reachable", "reachable_loss"),
+        phase_plot("pendulum"),
+        phase_plot("cartpole"),
+        spectrum_plot("cartpole", "figure2_spectrum"),
+        cost_plot("figure4_width"),
+        loss_against_width_plot("figure4_width_loss"),
+        control_plot("figure5_control"),
+        pareto_plot("figure6_pareto"),
+        profiles_plot("figure7_profiles"),
+        sensitivity_plot("figure8_sensitivity"),
+        limits_plot("figure9_limits"),
+    )
+    return {plot.name: plot for plot in found}
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What happened to one output: drawn, unchanged, or nothing stored for it."""
+
+    name: str
+    state: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """An output that is to be written: its trials, its provenance and its fingerprint."""
+
+    name: str
+    selection: Selection
+    options: PlotOptions
+    folder: Path
+    facts: Mapping[str, Any]
+    mark: str
+
+
+def build(
+    reader: Reader,
+    selection: Selection,
+    options: PlotOptions,
+    folder: Path,
+    names: tuple[str, ...] = NAMES,
+    *,
+    force: bool = False,
+    workers: int = 1,
+) -> Iterator[Outcome]:
+    """Write the named outputs and the page of all into a folder; say of each what happened.
+
+    ``workers`` outputs are written at a time, each in a process of its own if there are several.
+    """
+    make_folder(folder)
+    planned = {name: _plan(name, reader, selection, options, folder, force) for name in names}
+    tasks = {name: one for name, one in planned.items() if isinstance(one, Task)}
+    with written(_write_output, reader, tasks, workers) as write:
+        for name, one in planned.items():
+            if isinstance(one, str):
+                yield Outcome(name, one)
+            else:
+                write(name)
+                yield Outcome(name, "written")
+    if write_page(folder, FIGURES, TABLES):
+        yield Outcome(PAGE, "written")
+
+
+def _plan(
+    name: str,
+    reader: Reader,
+    selection: Selection,
+    options: PlotOptions,
+    folder: Path,
+    force: bool,
+) -> Task | str:
+    """Return what is to be written, or why nothing is."""
+    part = _part(name, selection, options)
+    if not part.entries:
+        return "not drawn, nothing is stored for it"
+    facts = describe(reader, part) | {"request": options.as_dict(), "name": name}
+    mark = _mark(facts)
+    endings = (*PICTURES, "csv", "txt") if name in FIGURES else TABLE_FILES
+    if not force and is_current(folder, name, endings, mark):
+        return "unchanged"
+    return Task(name, part, options, folder, facts, mark)
+
+
+def _write_output(reader: Reader, task: Task) -> None:
+    if task.name in FIGURES:
+        words = _draw(plots()[task.name], reader, task)
+    else:
+        words = _tabulate(TABLES[task.name], reader, task)
+    facts = {**task.facts, **words, "fingerprint": task.mark}
+    write_provenance(facts, task.folder, task.name)
+
+
+def _part(name: str, selection: Selection, options: PlotOptions) -> Selection:
+    if name not in WITH_EXPLORATIONS:
+        selection = selection.simulated()
+    if name in FIGURES:
+        return plots()[name].part(selection)
+    return TABLES[name].part(selection, options)
+
+
+def _mark(facts: dict[str, Any]) -> str:
+    """Return the fingerprint; where the data lie and which commit was checked out is no part."""
+    parts = ("selection", "request", "versions", "name", "notes")
+    content = {key: facts[key] for key in parts} | {"code": code_hash()}
+    return fingerprint(content)
+
+
+def _draw(plot: Plot[Any], reader: Reader, task: Task) -> dict[str, str]:
+    folder = task.folder
+    from analysis.figures.panels import styled
+
+    with styled():
+        drawing = plot.make(reader, task.selection, task.options)
+        caption = drawing.caption
+        if task.selection.gaps:
+            warning = partial_warning(task.selection)
+            caption = f"{warning} {caption}"
+            drawing.figure.suptitle(warning, fontsize=8, color="#b00020", weight="bold")
+        write_pictures(drawing.figure, folder, plot.name, plot.title, task.mark)
+    write_table(drawing.table, folder, plot.name)
+    write_text(caption + "\n", folder / f"{plot.name}.txt")
+    return plot.words(task.options) | {"caption": caption}
+
+
+def _tabulate(kind: TableKind, reader: Reader, task: Task) -> dict[str, str]:
+    name, folder = task.name, task.folder
+    table = kind.measure(reader, task.selection, task.options)
+    text_table = kind.render(table, task.options)
+    warning = f"{partial_warning(task.selection)}\n\n" if task.selection.gaps else ""
+    write_table(table, folder, name)
+    write_text(warning + text_table.markdown(), folder / f"{name}.md")
+    write_text(_commented(warning) + text_table.latex(), folder / f"{name}.tex")
+    return {"title": kind.title, "caption": warning + text_table.note}
+
+
+def _commented(warning: str) -> str:
+    return f"% {warning.rstrip()}\n" if warning else ""
+
+
+def partial_warning(selection: Selection) -> str:
+    """Return the mark of an output that lacks trials."""
+    return f"PARTIAL: {sum(len(gap.seeds) for gap in selection.gaps)} trials missing."
+
+
+@functools.cache
+def versions() -> dict[str, str | None]:
+    """Return the versions of Python and the libraries; None where one is not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version(), "dopt": __version__}
+    for library in LIBRARIES:
+        try:
+            found[library] = importlib.metadata.version(library)
+        except importlib.metadata.PackageNotFoundError:
+            found[library] = None
+    return found
+
+
+@functools.cache
+def git_state() -> dict[str, str | bool | None]:
+    """Return commit and dirty flag of the code; None outside a repository of its own.
+
+    A repository that merely holds an installed copy is another one; ``DOPT_COMMIT`` then gives the
+    commit. As at the first call: code that changes later does not run in this process.
+    """
+    commit = commit_of(PACKAGE.parent)
+    if commit is None:
+        return {"commit": os.environ.get(COMMIT_VARIABLE) or None, "dirty": None}
+    return {
+        "commit": commit,
+        "dirty": bool(git(PACKAGE.parent, "status", "--porcelain", "--untracked-files=no")),
+    }
+
+
+def code_hash() -> str:
+    """Return the SHA-256 of the files of the analysis: a changed drawing is drawn again."""
+    digest = hashlib.sha256()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        digest.update(path.relative_to(PACKAGE).as_posix().encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def describe(reader: Reader, selection: Selection) -> dict[str, Any]:
+    """Return what every output says of its origin."""
+    missing = {(gap.env, gap.policy): len(gap.seeds) for gap in selection.gaps}
+    return {
+        "database": reader.safe_url,
+        "schema": reader.schema_version(),
+        "selection": selection.fingerprint(),
+        "git": git_state(),
+        "versions": versions(),
+        # The key of released files, of what is a configuration everywhere else.
+        "cells": [
+            {
+                "env": entry.config.env,
+                "policy": entry.config.policy,
+                "model": entry.config.model,
+                "learner": entry.config.learner,
+                "width": entry.config.width,
+                "config_key": entry.config.config_key,
+                "n_registered": len(entry.trials),
+                "n_finished": len(entry.finished),
+                "n_diverged": sum(trial.status == "diverged" for trial in entry.trials),
+                "n_missing": missing.get((entry.config.env, entry.config.policy), 0),
+            }
+            for entry in selection.entries
+        ],
+        "absent": [
+            [env, policy]
+            for env, policy in missing
+            if all((e.config.env, e.config.policy) != (env, policy) for e in selection.entries)
+        ],
+        "launches": [
+            {"commit": one.git_commit, "dirty": bool(one.git_dirty), "host": one.host}
+            for one in reader.launches()
+        ],
+        "notes": list(selection.notes),
+    }
+
+
+def write_page(folder: Path, pictures: Iterable[str], tables: Iterable[str]) -> bool:
+    """Write the page of those outputs that the folder holds; False if it was the same already."""
+    sections = [_table(folder, name) for name in tables] + [_picture(folder, n) for n in pictures]
+    found = [section for section in sections if section]
+    if not found:
+        return False
+    text = "\n\n".join(["# Figures and tables", _origin(folder), *found]) + "\n"
+    target = folder / PAGE
+    if target.is_file() and target.read_text(encoding="utf-8") == text:
+        return False
+    write_text(text, target)
+    return True
+
+
+def _picture(folder: Path, name: str) -> str | None:
+    facts = _facts(folder, name)
+    if not facts or not (folder / f"{name}.png").is_file():
+        return None
+    caption = facts["caption"]
+    return (
+        f"## {facts['title']}\n\n![{facts['title']}]({name}.png)\n\n{caption}\n\n"
+        f"{_links(name, ('pdf', 'svg', 'csv', 'json'))}"
+    )
+
+
+def _table(folder: Path, name: str) -> str | None:
+    facts, path = _facts(folder, name), folder / f"{name}.md"
+    if not facts or not path.is_file():
+        return None
+    text = path.read_text(encoding="utf-8").rstrip()
+    return f"## {facts['title']}\n\n{text}\n\n{_links(name, ('csv', 'tex', 'json'))}"
+
+
+def _links(name: str, endings: tuple[str, ...]) -> str:
+    return " · ".join(f"[{name}.{ending}]({name}.{ending})" for ending in endings)
+
+
+def _origin(folder: Path) -> str:
+    """Return a sentence on the databases and the code that the outputs come from."""
+    all_facts = [_facts(folder, path.stem) for path in sorted(folder.glob("*.json"))]
+    known = [facts for facts in all_facts if facts]
+    databases = sorted({str(facts["database"]) for facts in known})
+    versions = sorted({str(facts["versions"]["dopt"]) for facts in known})
+    return (
+        f"Made by dopt {', '.join(versions)} from {', '.join(f'`{url}`' for url in databases)}. "
+        f"Each output has its numbers as CSV and its provenance as JSON beside it."
+    )
+
+
+def _facts(folder: Path, name: str) -> Mapping[str, Any] | None:
+    """Return what an output says of itself, None where it is not there or not whole."""
+    try:
+        found = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    wanted = {"title", "caption", "database", "versions"}
+    return found if isinstance(found, dict) and wanted <= found.keys() else None
+
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from analysis.figures.panels import Plot
+
+
+def fingerprint(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of everything that an output depends on."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def is_current(folder: Path, name: str, endings: tuple[str, ...], mark: str) -> bool:
+    """Whether all files of an output exist and were made from the same content."""
+    if not all((folder / f"{name}.{ending}").is_file() for ending in (*endings, "json")):
+        return False
+    try:
+        found = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    except ValueError:
+        return False
+    return bool(isinstance(found, dict) and found.get("fingerprint") == mark)
+
+
+def write_pictures(figure: Figure, folder: Path, name: str, title: str, mark: str) -> None:
+    """Write a figure in every format, with its title and fingerprint, in the context of the style.
+
+    The layout is computed once, so that all formats show the same picture and none is drawn twice.
+    """
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        layout.execute(figure)
+        figure.set_layout_engine(None)
+    for ending in PICTURES:
+        with whole(folder / f"{name}.{ending}") as part:
+            figure.savefig(part, format=ending, metadata=_metadata(ending, title, mark))
+
+
+def _metadata(ending: str, title: str, mark: str) -> dict[str, Any]:
+    """Return metadata without a clock; with SOURCE_DATE_EPOCH set, matplotlib writes that date."""
+    about = f"fingerprint {mark}, see the JSON file beside this one"
+    undated = "SOURCE_DATE_EPOCH" not in os.environ
+    if ending == "pdf":
+        return {"Title": title, "Subject": about} | ({"CreationDate": None} if undated else {})
+    if ending == "svg":
+        return {"Title": title, "Description": about} | ({"Date": None} if undated else {})
+    return {"Title": title, "Description": about}
+
+
+def write_table(table: pd.DataFrame, folder: Path, name: str) -> None:
+    """Write the CSV of a table; NaN is an empty field, numbers have all their digits."""
+    write_text(table.to_csv(index=False, lineterminator="\n"), folder / f"{name}.csv")
+
+
+def write_provenance(content: Mapping[str, Any], folder: Path, name: str) -> None:
+    """Write the JSON beside an output; the last of its files, so that it vouches for the others."""
+    text = json.dumps(content, indent=2, sort_keys=True, ensure_ascii=False)
+    write_text(text + "\n", folder / f"{name}.json")
+
+
+def write_text(text: str, target: Path) -> None:
+    """Write a file whole or not at all."""
+    with whole(target) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def written(
+    write: Callable[[Reader, T], None], reader: Reader, tasks: Mapping[str, T], workers: int
+) -> Iterator[Callable[[str], None]]:
+    """Yield a function that returns when the task of a name is written, by one of ``workers``.
+
+    With one worker or one task it writes in this process. Several are forks of it, which import
+    nothing anew, and each opens the database for itself. The function raises what ``write`` does,
+    ``AnalysisError`` if a process was killed, and ``KeyboardInterrupt`` after Ctrl-C.
+    """
+    processes = min(workers, len(tasks))
+    if processes < 2:
+        yield lambda name: write(reader, tasks[name])
+        return
+    context = multiprocessing.get_context("fork")
+    with (
+        _deferred_interrupt() as raise_interrupt,
+        ProcessPoolExecutor(processes, context, _ignore_interrupt) as pool,
+    ):
+        try:
+            futures = {
+                name: pool.submit(_write_apart, write, reader.url, tasks[name]) for name in tasks
+            }
+        except (OSError, RuntimeError):  # no further process or thread
+            for process in multiprocessing.active_children():
+                process.kill()  # it would wait for work for ever
+            raise
+
+        def wait(name: str) -> None:
+            raise_interrupt()
+            while not futures_wait([futures[name]], timeout=INTERRUPT_INTERVAL).done:
+                raise_interrupt()
+            try:
+                futures[name].result()
+            except BrokenProcessPool as error:
+                raise AnalysisError(
+                    f"A process was killed before {name} was written, perhaps as memory ran "
+                    f"out: give --workers 1."
+                ) from error
+
+        try:
+            yield wait
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _write_apart(write: Callable[[Reader, T], None], url: str, task: T) -> None:
+    with Reader.open(url) as reader:
+        write(reader, task)
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[Callable[[], None]]:
+    """Yield a function that raises ``KeyboardInterrupt`` if Ctrl-C came; nothing else does.
+
+    Raised at once, it could come between two statements of the pool that hold its locks. Threads
+    other than the main one never get it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    received: list[int] = []
+
+    def raise_interrupt() -> None:
+        if received:
+            raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    try:
+        yield raise_interrupt
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    raise_interrupt()
+
+
+def _ignore_interrupt() -> None:
+    """Leave Ctrl-C, which the whole group of processes gets, to the first of them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

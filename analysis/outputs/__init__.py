@@ -1,1 +1,0 @@
-"""Outputs: the registry of figures and tables, and what is written for each."""

@@ -1,0 +1,396 @@
+"""``python -m analysis report``: everything that a database holds, compared on one page.
+
+The page is Markdown; its pictures and its numbers stand beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import pandas as pd
+
+from analysis import outputs
+from analysis.data.matching import Filter
+from analysis.data.selection import Gap, Selection
+from analysis.errors import IncompleteError
+from analysis.formatting import but_lost, number, p_text, plus_minus, share, steps_text, within
+from analysis.line_styles import environment_title
+from analysis.stats.intervals import STUDENT_RANGE
+from analysis.tables.rendering import TextTable, gaps_table
+from analysis.tables.variants import (
+    SAME,
+    SIGNIFICANCE,
+    TRUTH,
+    VariantGroup,
+    adjust,
+    tabulate_control_of,
+    tabulate_group,
+    variant_groups,
+    verdict,
+)
+from dopt.policies import POLICIES
+from orchestrate.cli_parser import path
+from orchestrate.files import make_folder
+from orchestrate.store import Reader
+
+Row = Mapping[str, object]
+
+HELP = "compare every policy, model and learner with the reference, on one page"
+NAME = "report"
+CONTROL = f"{NAME}_control"
+
+NOTE = (
+    "Success: share of trials whose planned episode reached its goal, with the Wilson interval; "
+    f"with a star where the adjusted p is below {SIGNIFICANCE}: exact McNemar test against the "
+    "first row, paired over seeds, the false discovery rate of all variants and numbers of steps "
+    "of the report (Benjamini-Hochberg). Cost: geometric mean of the episode's cost by that of the "
+    "true model under the same planner, noise and draws, with Student's interval. True "
+    "model: what the "
+    "same planner achieves that predicts with the true system, on the same seeds; no explored step "
+    "changes it, and its cost is the unit. Lost: episodes in no mean of costs, as theirs or that "
+    "of the true model is not finite; they are in the success. Loss: that on the grid after as "
+    "many steps, geometric mean. Free run: root mean square error of predictions that run free, by "
+    "that of the prediction that nothing changes, mean at the end of the trial without those lost "
+    "as the error is not finite."
+)
+
+LOSSES = (
+    "variant", "final loss", "ratio [95 %]", "adjusted p", "same setting, ratio", "adjusted p",
+    "reachable set, ratio", "curve, ratio", "n",
+)  # fmt: skip
+
+EFFORT = (
+    "variant", "steps to ε (share)", "adjusted p", "coverage", "control cost, ratio", "plan [µs]",
+    "learn [µs]", "runs on",
+)  # fmt: skip
+
+CAPTION = (
+    "Ratio of final losses, variant / reference: left of the line, below 1, the variant is "
+    "better. Geometric mean over shared seeds with its 95 % interval, the best at the top. "
+    "Circles: better, squares: worse, diamonds: not told apart, as the adjusted p is not below "
+    f"{SIGNIFICANCE} or the interval holds 1. The oracle, which knows the form of the physics and "
+    "is orders of magnitude below, is in the tables alone."
+)
+"""Caption of the picture of a system."""
+
+EXPLAINED = (
+    "Final loss: root mean square error of the learned accelerations over the evaluation grid "
+    "after the last step, in their units, mean ± 2 standard errors.",
+    "Ratio: variant / reference (the first row of a table), below 1 the variant is better: the "
+    "geometric mean over shared seeds, of losses and of control costs alike, with its unadjusted "
+    f"95 % interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
+    "pairs. Reachable set: of the final loss over states that the true "
+    "system visits under strong inputs; where it and the grid disagree, the order of two variants "
+    "depends on where a model is judged. Curve: "
+    "of the loss over all steps (geometric mean).",
+    "Adjusted p: two-sided Wilcoxon signed-rank test of the final losses, sign test of the steps; "
+    "the false discovery rate over all rows of the report, for each measure (Benjamini-Hochberg). "
+    "Few pairs bound it from below: 20 allow 2e-6 before it is adjusted. The test is of ranks and "
+    "the interval of the mean: they need not agree, and a variant is called better or worse only "
+    "where both say so.",
+    "Steps to ε: median number of inputs after which the loss stays at most ε, the median final "
+    "loss of random inputs, and the share of trials that get there; others count as later.",
+    "Coverage: share of the cells of the phase plane's box that a trial visits, mean ± 2 standard "
+    "errors. Control cost: of an episode with the model learned until the first assessment after "
+    "explored steps, as a ratio too; – where the variant was not assessed. Lost: pairs without a "
+    "ratio, as one of the episodes or the true model's has no finite cost.",
+    "Microseconds: median over all steps and trials, on the machine that ran them, the update of "
+    "the information matrix with the plan; a plan is in time for real where both together are "
+    "below dt. Runs on: the compiled kernel, or the torch reference, whose microseconds are those "
+    "of an implementation that nobody made fast.",
+    "Same setting: the ratio to the reference policy with the variant's own model and learner, its "
+    "adjusted p beside it; – where that is the reference itself or was not run.",
+    "n: trials that did not diverge; by default diverged ones are in no mean and in no ratio.",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options that only this command has."""
+    parser.add_argument("--out", type=path("--out"), default="report", help="folder (report/)")
+
+
+def run(options: argparse.Namespace, wanted: Filter) -> int:
+    """Write the page, the pictures, the CSV and the provenance; 0."""
+    from analysis.figures.forest import draw_forest
+    from analysis.figures.panels import styled  # Matplotlib: other commands do without it
+
+    with Reader.open(options.db) as reader, reader.moment() as moment:
+        found = variant_groups(moment, wanted)
+        gaps = [gap for group in found for gap in _gaps(group)]
+        if gaps and not options.allow_partial:
+            raise IncompleteError(_refusal(gaps))
+        table = adjust([tabulate_group(moment, group, options.diverged) for group in found])
+        controlled = tabulate_control_of(moment, found)
+        selection = Selection(tuple(one for group in found for one in group.variants))
+        facts = outputs.describe(moment, selection)
+    make_folder(options.out)
+    pictures = {}
+    with styled():
+        mark = outputs.fingerprint({"cells": facts["cells"], "selection": facts["selection"]})
+        for env, rows in table.groupby("env", sort=False):
+            pictures[str(env)] = f"{NAME}_{env}"
+            title = f"Ratios of final losses: {env}"
+            outputs.write_pictures(draw_forest(rows), options.out, pictures[str(env)], title, mark)
+    outputs.write_table(table, options.out, NAME)
+    if controlled is not None:
+        outputs.write_table(controlled, options.out, CONTROL)
+    notes = [f"{group.env}: {note}" for group in found for note in group.notes]
+    if gaps:
+        notes.insert(0, f"PARTIAL: {sum(len(gap.seeds) for gap in gaps)} trials are missing")
+    text = write_report(
+        table,
+        notes,
+        _origin(facts, controlled=controlled is not None),
+        pictures,
+        [] if controlled is None else [control_section(controlled)],
+    )
+    outputs.write_text(text, options.out / outputs.PAGE)
+    outputs.write_provenance(facts, options.out, NAME)
+    sys.stdout.write(f"{options.out / outputs.PAGE}: {len(table)} variants\n")
+    return 0
+
+
+def _origin(facts: dict[str, object], *, controlled: bool) -> str:
+    versions = facts["versions"]
+    assert isinstance(versions, dict)
+    configs = facts["cells"]
+    assert isinstance(configs, list)
+    trials = sum(config["n_finished"] for config in configs)
+    control = f" and [{CONTROL}.csv]({CONTROL}.csv)" if controlled else ""
+    return (
+        f"Made by dopt {versions['dopt']} from {trials:,} trials of {len(configs)} configurations "
+        f"in `{facts['database']}`. The numbers are in [{NAME}.csv]({NAME}.csv){control}, where "
+        f"they come from in [{NAME}.json]({NAME}.json)."
+    )
+
+
+def _gaps(group: VariantGroup) -> Iterable[Gap]:
+    """Yield what is registered of a variant and not finished.
+
+    Variants may have different numbers of seeds: a ratio is over the shared ones.
+    """
+    for one in group.variants:
+        missing = {trial.seed for trial in one.trials} - {trial.seed for trial in one.finished}
+        if missing:
+            yield Gap(group.env, one.label, tuple(sorted(missing)), f"{len(missing)} not finished")
+
+
+def _refusal(gaps: list[Gap]) -> str:
+    missing = sum(len(gap.seeds) for gap in gaps)
+    return (
+        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, but all that are "
+        f"registered are expected: run the launch again, narrow the request by --env, --policy "
+        f"and --where, or give --allow-partial to go on with what there is."
+    )
+
+
+def write_report(
+    table: pd.DataFrame,
+    notes: Sequence[str],
+    origin: str,
+    pictures: Mapping[str, str],
+    more: Sequence[str] = (),
+) -> str:
+    """Return the page of a table of :func:`analysis.tables.variants.adjust`.
+
+    ``pictures`` are files, without their ending, by environment, and ``more`` further sections,
+    already in Markdown.
+    """
+    parts = {str(env): _rows_of(part) for env, part in table.groupby("env", sort=False)}
+    sections = [
+        f"# Every variant against {table['variant'].iloc[0]}",
+        origin,
+        "## What was found",
+        "\n".join(_finding(env, rows) for env, rows in parts.items()),
+        "## How to read it",
+        "\n\n".join((*EXPLAINED, f"Pictures: {CAPTION}")),
+        "## What was compared",
+        _described(table),
+        *(_section(env, rows, pictures.get(env)) for env, rows in parts.items()),
+        *more,
+    ]
+    if notes:
+        sections.append("## Notes\n\n" + "\n".join(f"- {note}" for note in notes))
+    return "\n\n".join(sections) + "\n"
+
+
+def _rows_of(part: pd.DataFrame) -> list[Row]:
+    return [{str(key): value for key, value in row.items()} for row in part.to_dict("records")]
+
+
+def _finding(env: str, rows: Sequence[Row]) -> str:
+    """Return what is better, what worse, and what is not told apart, the best first."""
+    said = [f"  - {line}" for line in _judged(rows[1:], "loss")]
+    for reference, same in _same_settings(rows).items():
+        said += [f"  - against {reference}, {line}" for line in _judged(same, f"{SAME}_loss")]
+    turned = [
+        f"{row['variant']} ({number(_number(row, 'reachable_loss_ratio'))})"
+        for row in rows[1:]
+        if {verdict(row), verdict(row, "reachable_loss")} == {"better", "worse"}
+    ]
+    if turned:
+        said.append(f"  - the other way round on the reachable set: {'; '.join(turned)}")
+    return "\n".join([f"- **{environment_title(env)}** (ratio, p < {SIGNIFICANCE})", *said])
+
+
+def _judged(rows: Sequence[Row], measure: str) -> list[str]:
+    """Return which rows are better, worse and not told apart, the best first."""
+    judged: dict[str, list[str]] = {"better": [], "worse": [], "open": []}
+    for row in sorted(rows, key=lambda row: _number(row, f"{measure}_ratio")):
+        words = f"{row['variant']} ({number(_number(row, f'{measure}_ratio'))})"
+        judged[verdict(row, measure)].append(words)
+    names = {"better": "better", "worse": "worse", "open": "not told apart"}
+    return [f"{names[kind]}: {'; '.join(found) or 'none'}" for kind, found in judged.items()]
+
+
+def _same_settings(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Return the rows by the reference of their own setting, those of the first row left out."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows[1:]:
+        reference = str(row[f"{SAME}_reference"])
+        if reference not in ("", rows[0]["variant"]):
+            groups.setdefault(reference, []).append(row)
+    return groups
+
+
+def _described(table: pd.DataFrame) -> str:
+    """Return what each policy of the package does, in the words of its class."""
+    labels = dict(zip(table["policy"], table["policy_label"], strict=True))
+    lines = [
+        f"- {label}: {_summary(POLICIES[policy])}"
+        for policy, label in labels.items()
+        if policy in POLICIES
+    ]
+    return "\n".join(lines)
+
+
+def _summary(policy: type) -> str:
+    return (policy.__doc__ or "").strip().splitlines()[0]
+
+
+def _section(env: str, rows: Sequence[Row], picture: str | None) -> str:
+    title = environment_title(env)
+    epsilon, dt = _number(rows[0], "epsilon"), _number(rows[0], "dt")
+    facts = f"{rows[0]['horizon']} steps of dt = {1e3 * dt:g} ms."
+    if not math.isnan(epsilon):
+        facts += f" ε = {number(epsilon)}."
+    parts = [f"## {title}", facts]
+    if picture is not None:
+        parts.append(f"![Ratios of final losses: {title}]({picture}.png)")
+    parts.append(TextTable(LOSSES, [_losses(row) for row in rows]).markdown())
+    parts.append(TextTable(EFFORT, [_effort(row) for row in rows]).markdown())
+    return "\n\n".join(parts)
+
+
+def _losses(row: Row) -> list[object]:
+    diverged = f", {row['n_diverged']} diverged" if row["n_diverged"] else ""
+    return [
+        row["variant"],
+        plus_minus(_number(row, "loss"), _number(row, "loss_2se")),
+        _ratio(row, "loss"),
+        p_text(_number(row, "loss_p_adjusted")),
+        _ratio(row, f"{SAME}_loss"),
+        p_text(_number(row, f"{SAME}_loss_p_adjusted")),
+        _ratio(row, "reachable_loss"),
+        _ratio(row, "auc"),
+        f"{row['n']}{diverged}",
+    ]
+
+
+def _effort(row: Row) -> list[object]:
+    steps = steps_text(_number(row, "steps"), int(_number(row, "horizon")))
+    reached = _number(row, "reached")
+    return [
+        row["variant"],
+        steps if math.isnan(reached) else f"{steps} ({share(reached)})",
+        p_text(_number(row, "steps_p_adjusted")),
+        plus_minus(_number(row, "coverage"), _number(row, "coverage_2se")),
+        but_lost(_ratio(row, "control"), int(_number(row, "control_lost"))),
+        number(_number(row, "plan_us")),
+        number(_number(row, "learn_us")),
+        row["path"],
+    ]
+
+
+def _ratio(row: Row, measure: str) -> str:
+    return within(*(_number(row, f"{measure}_{name}") for name in ("ratio", "low", "high")))
+
+
+def _number(row: Row, column: str) -> float:
+    value = row[column]
+    return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def control_section(table: pd.DataFrame) -> str:
+    """Return the section in Markdown of a table of :func:`tabulate_control_of`."""
+    parts = [_part(str(env), rows) for env, rows in table.groupby("env", sort=False)]
+    return "\n\n".join(["## Control with the learned model", NOTE, *parts])
+
+
+def _part(env: str, table: pd.DataFrame) -> str:
+    rows: dict[str, dict[int, Row]] = {}
+    for row in table.to_dict("records"):
+        rows.setdefault(str(row["variant"]), {})[int(row["t"])] = {
+            str(key): value for key, value in row.items()
+        }
+    steps = sorted({t for found in rows.values() for t in found})
+    success = TextTable(
+        ["variant", *(f"success after {t}" for t in steps), "n"],
+        [
+            [label, *(_entry_text(found, t, _success) for t in steps), _last(found)["described"]]
+            for label, found in rows.items()
+        ],
+    )
+    worth = TextTable(
+        [
+            "variant",
+            *(f"cost after {t}" for t in steps),
+            *(f"loss after {t}" for t in steps if t),
+            "free run",
+        ],
+        [
+            [
+                label,
+                *(_entry_text(found, t, _cost) for t in steps),
+                *(
+                    _entry_text(found, t, lambda row: number(_number(row, "loss")))
+                    for t in steps
+                    if t
+                ),
+                _entry_text(found, steps[-1], _free_run_text),
+            ]
+            for label, found in rows.items()
+        ],
+    )
+    return f"### {environment_title(env)}\n\n{success.markdown()}\n\n{worth.markdown()}"
+
+
+def _last(found: Mapping[int, Row]) -> Row:
+    return found[max(found)]
+
+
+def _entry_text(found: Mapping[int, Row], t: int, text: Callable[[Row], str]) -> str:
+    """Return the text of a number of steps, a dash where there is none."""
+    return text(found[t]) if t in found else "–"
+
+
+def _success(row: Row) -> str:
+    centre, low, high = (_number(row, f"success{end}") for end in ("", "_low", "_high"))
+    star = "*" if _number(row, "success_p_adjusted") < SIGNIFICANCE else ""
+    return number(math.nan) if math.isnan(low) else f"{centre:.2f}{star} [{low:.2f}, {high:.2f}]"
+
+
+def _cost(row: Row) -> str:
+    centre, low, high = (_number(row, f"cost{end}") for end in ("", "_low", "_high"))
+    alone = "1" if row["variant"] == TRUTH and centre == 1 else number(centre)
+    text = alone if math.isnan(low) else within(centre, low, high)
+    return but_lost(text, int(_number(row, "lost")))
+
+
+def _free_run_text(row: Row) -> str:
+    if row["variant"] == TRUTH:
+        return number(math.nan)
+    return but_lost(number(_number(row, "free_run")), int(_number(row, "free_run_lost")))

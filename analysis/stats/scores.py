@@ -1,0 +1,287 @@
+"""Scores: one number for each trial, which tables average, and their paired comparison.
+
+Policies are compared in the same environment on the same seeds, with common random numbers. The
+import of scipy.stats takes longer than most commands: it is done where a test is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from analysis.data.samples import DivergenceRule, read_sample
+from analysis.data.selection import Entry
+from analysis.stats.intervals import interval_of_mean
+from orchestrate.store import Reader
+
+Array = npt.NDArray[np.float64]
+
+
+class Measure(StrEnum):
+    """Measure by which a trial is judged.
+
+    ``FINAL`` is the loss after the last step, ``AUC`` the geometric mean of the loss over all
+    steps, whose logarithm is the area under the logarithmic loss curve by its length, and ``STEPS``
+    the number of inputs until the loss first is at most ε.
+    """
+
+    FINAL = "final"
+    AUC = "auc"
+    STEPS = "steps"
+
+
+@dataclass(frozen=True)
+class Scores:
+    """One number for each seed of an entry, the divergence rule applied, and counts."""
+
+    env: str
+    policy: str
+    label: str
+    by_seed: Mapping[int, float]
+    n_finished: int
+    n_diverged: int
+
+    @property
+    def values(self) -> Array:
+        """The numbers (n,), by seed."""
+        return np.array([self.by_seed[seed] for seed in sorted(self.by_seed)], dtype=float)
+
+    def describe(self) -> str:
+        """Return the count to print, such as ``98/100, 2 diverged``."""
+        used = len(self.by_seed)
+        if not self.n_diverged:
+            return str(used)
+        return f"{used}/{self.n_finished}, {self.n_diverged} diverged"
+
+
+def final_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Scores:
+    """Return the loss after the last step of each trial; from the summary column where it is."""
+    if column != "loss" or rule is not DivergenceRule.EXCLUDE:
+        return _scores(reader, entry, column, rule, lambda values: values[:, -1])
+    return _counted(entry, entry.final_losses())
+
+
+def mean_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Scores:
+    """Return the geometric mean of the loss over all steps of each trial."""
+    return _scores(reader, entry, column, rule, mean_over_steps)
+
+
+def steps_to(
+    reader: Reader, entry: Entry, column: str, rule: DivergenceRule, threshold: float
+) -> Scores:
+    """Return the steps until the loss first is at most the threshold, inf where it never is."""
+    return _scores(reader, entry, column, rule, lambda values: first_passage(values, threshold))
+
+
+def lasting_steps(
+    reader: Reader, entry: Entry, column: str, rule: DivergenceRule, threshold: float
+) -> Scores:
+    """Return the steps until the loss stays at most the threshold, inf where it does not."""
+    return _scores(reader, entry, column, rule, lambda values: last_passage(values, threshold))
+
+
+def mean_over_steps(values: Array) -> Array:
+    """Return exp of the mean logarithm along the steps of losses (n, T); 0 where one of them is."""
+    with np.errstate(divide="ignore"):
+        found: Array = np.exp(np.mean(np.log(values), axis=1))
+    return found
+
+
+def first_passage(values: Array, threshold: float) -> Array:
+    """Return the number of inputs until a curve of (n, T) first is at most the threshold.
+
+    The first loss counts as one input. A curve that never gets there is censored: inf.
+    """
+    reached = values <= threshold
+    return np.where(reached.any(axis=1), reached.argmax(axis=1) + 1.0, np.inf)
+
+
+def last_passage(values: Array, threshold: float) -> Array:
+    """Return the number of inputs after which a curve of (n, T) stays at most the threshold.
+
+    The first loss counts as one input. A curve that ends above it is censored: inf.
+    """
+    above = ~(values <= threshold)
+    n_steps = values.shape[1]
+    last = np.where(above.any(axis=1), n_steps - above[:, ::-1].argmax(axis=1), 0)
+    return np.where(last < n_steps, last + 1.0, np.inf)
+
+
+def _scores(
+    reader: Reader,
+    entry: Entry,
+    column: str,
+    rule: DivergenceRule,
+    score: Callable[[Array], Array],
+) -> Scores:
+    sample = read_sample(reader, entry, column, rule)
+    scores = score(sample.values).tolist()
+    return _counted(entry, dict(zip(sample.seeds.tolist(), scores, strict=True)))
+
+
+def _counted(entry: Entry, by_seed: Mapping[int, float]) -> Scores:
+    diverged = sum(trial.status == "diverged" for trial in entry.trials)
+    names = entry.config.env, entry.config.policy, entry.label
+    return Scores(*names, by_seed, len(entry.finished), diverged)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Comparison of the losses of a variant with those of a reference over shared seeds.
+
+    Attributes
+    ----------
+    n_pairs : int
+        Seeds on which neither diverged.
+    ratio, low, high : float
+        Geometric mean of loss / reference loss over the pairs of which both are finite, and its
+        paired interval; below 1 the variant is better. NaN, as the p-value is, where a loss is 0
+        and has no logarithm.
+    improvement : float
+        Probability of improvement: share of pairs with the lower loss, ties counted half.
+    p_value : float
+        Two-sided Wilcoxon signed-rank test of the logarithms' differences.
+    """
+
+    n_pairs: int
+    ratio: float
+    low: float
+    high: float
+    improvement: float
+    p_value: float
+
+
+def compare(loss: Array, reference: Array, rng: np.random.Generator) -> Comparison:
+    """Compare losses, both (n,) and paired by position; NaN where n is too small.
+
+    A loss may be inf, worse than every finite one: it has no ratio, but counts in the probability
+    of improvement and as the largest difference in the test; two of a pair are equal. A pair with a
+    NaN is left out.
+    """
+    known = ~(np.isnan(loss) | np.isnan(reference))
+    loss, reference = loss[known], reference[known]
+    n, unknown = len(loss), float("nan")
+    if not n:
+        return Comparison(0, *[unknown] * 5)
+    wins = float(np.mean(loss < reference) + np.mean(loss == reference) / 2)
+    if np.min(loss) <= 0 or np.min(reference) <= 0:
+        return Comparison(n, unknown, unknown, unknown, wins, unknown)
+    both_lost = np.isinf(loss) & np.isinf(reference)
+    ours, theirs = (np.log(np.where(both_lost, 1.0, one)) for one in (loss, reference))
+    finite = np.isfinite(loss) & np.isfinite(reference)
+    difference = ours - theirs
+    p_value = signed_rank(difference)
+    if not finite.any():
+        return Comparison(n, unknown, unknown, unknown, wins, p_value)
+    low, high = np.exp(interval_of_mean(difference[finite], rng))
+    ratio = float(np.exp(np.mean(difference[finite])))
+    return Comparison(n, ratio, float(low), float(high), wins, p_value)
+
+
+def without_ratio(loss: Array, reference: Array) -> int:
+    """Return how many pairs of (n,) are in no ratio, as one of the two is not finite."""
+    return int(np.sum(~(np.isfinite(loss) & np.isfinite(reference))))
+
+
+def signed_rank(differences: Array) -> float:
+    """Return the two-sided Wilcoxon signed-rank p of (n,); 1 when nothing differs."""
+    if not np.any(differences):
+        return 1.0
+    from scipy import stats
+
+    return float(stats.wilcoxon(differences).pvalue)
+
+
+def benjamini_hochberg(p_values: Sequence[float]) -> list[float]:
+    """Return p adjusted for the false discovery rate over a table; NaN is no test and stays."""
+    p = np.asarray(p_values, dtype=float)
+    tested = np.isfinite(p)
+    adjusted = np.full(p.shape, np.nan)
+    if tested.any():
+        from scipy import stats
+
+        adjusted[tested] = stats.false_discovery_control(p[tested], method="bh")
+    return [float(value) for value in adjusted]
+
+
+@dataclass(frozen=True)
+class HittingTimes:
+    """Comparison of the steps in which a variant and a reference reach a loss, over shared seeds.
+
+    A trial that never reaches it is censored at the end of the trial: it lost to any that did, and
+    two such trials are a tie.
+
+    Attributes
+    ----------
+    n_pairs : int
+        Seeds on which neither diverged.
+    reached, reached_reference : int
+        Trials that reached it.
+    median, median_reference : float
+        Median number of steps, the upper one of two; inf unless more than half reached it.
+    improvement : float
+        Share of pairs in which the variant was earlier, ties counted half.
+    p_value : float
+        Two-sided sign test of the pairs that are no tie.
+    """
+
+    n_pairs: int
+    reached: int
+    reached_reference: int
+    median: float
+    median_reference: float
+    improvement: float
+    p_value: float
+
+
+def compare_hitting_times(steps: Array, reference: Array) -> HittingTimes:
+    """Compare steps, both (n,) and paired by position, inf where the loss was never reached."""
+    earlier, later = int(np.sum(steps < reference)), int(np.sum(steps > reference))
+    n = len(steps)
+    return HittingTimes(
+        n_pairs=n,
+        reached=int(np.isfinite(steps).sum()),
+        reached_reference=int(np.isfinite(reference).sum()),
+        median=censored_median(steps),
+        median_reference=censored_median(reference),
+        improvement=(earlier + (n - earlier - later) / 2) / n if n else float("nan"),
+        p_value=sign_test(earlier, later) if n else float("nan"),
+    )
+
+
+def mcnemar(successes: Array, reference: Array) -> float:
+    """Return the exact two-sided McNemar p of successes, 0 or 1, both (n,) and paired by position.
+
+    It is the sign test of the pairs of which one succeeded alone.
+    """
+    return sign_test(int(np.sum(successes > reference)), int(np.sum(successes < reference)))
+
+
+def censored_median(steps: Array) -> float:
+    """Return the median of (n,), the upper one of two; inf where it is censored, NaN for none."""
+    return float(np.sort(steps)[len(steps) // 2]) if len(steps) else float("nan")
+
+
+def sign_test(wins: int, losses: int) -> float:
+    """Return the two-sided p of the sign test; 1 when nothing differs."""
+    if not wins + losses:
+        return 1.0
+    from scipy import stats
+
+    return float(stats.binomtest(wins, wins + losses).pvalue)
+
+
+def on_front(costs: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Return which of n choices are on the Pareto front of their costs (n, k), lower is better.
+
+    A choice is dominated by another that costs at most as much in every respect and less in one.
+    Equal choices do not dominate each other. One with an unknown cost, NaN, is not on the front.
+    """
+    one, other = costs[:, None, :], costs[None, :, :]
+    dominated = np.any(np.all(other <= one, axis=2) & np.any(other < one, axis=2), axis=1)
+    found: npt.NDArray[np.bool_] = ~dominated & ~np.isnan(costs).any(axis=1)
+    return found

@@ -1,0 +1,458 @@
+"""Variants of an environment, everything that was run in it, as rows of a report.
+
+Figures and tables compare policies under one setting of model and learner. A report compares the
+settings too: a variant is a policy together with what sets it apart from the others of its name.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+
+from analysis.data.matching import Filter, difference, latest_sources, nearness, newest
+from analysis.data.samples import DivergenceRule, read_curves
+from analysis.data.selection import (
+    Entry,
+    Selection,
+    environment_rank,
+    labels_of,
+    one_each,
+    one_world,
+    policy_rank,
+    section_text,
+)
+from analysis.errors import AnalysisError
+from analysis.stats.control import TrueModel, common_task, measure_control, scores_at, task_of
+from analysis.stats.intervals import mean, standard_error
+from analysis.stats.scores import (
+    benjamini_hochberg,
+    censored_median,
+    compare_hitting_times,
+    final_losses,
+    lasting_steps,
+    mcnemar,
+    mean_losses,
+    without_ratio,
+)
+from analysis.tables.comparisons import (
+    BySeed,
+    against_reference,
+    loss_of_random_inputs,
+    paired,
+)
+from dopt.coverage import Plane
+from dopt.policies.titles import policy_title
+from dopt.spec.prequential import is_prequential, system_of
+from orchestrate.store import Assessments, Reader
+
+_SETTING = ("model", "learner", "limits")
+
+MEASURES = ("loss", "reachable_loss", "auc", "coverage", "control")
+"""Measures by which variants are compared; of coverage more is better, of the others less.
+
+``control`` is the cost of an episode with the model learned so far by that with the true model, at
+the first number of steps that the task names; only trials of the environment's task have it. An
+episode without a finite cost is in no mean and in no ratio (``control_lost`` pairs), and the worst
+in the test.
+"""
+
+SAME = "same"
+"""Start of the columns that compare with the reference policy under the variant's own setting."""
+
+SAME_MEASURES = ("loss", "reachable_loss", "auc")
+"""Measures that are compared under the same setting too."""
+
+SIGNIFICANCE = 0.05
+"""Adjusted p below which a report says that a variant is better or worse."""
+
+TRUTH = "true model"
+SUCCESS, FREE_RUN = "control_success", "free_run_error"
+ESTIMATES = ("success", "success_low", "success_high", "cost", "cost_low", "cost_high")
+Array = npt.NDArray[np.float64]
+Row = Mapping[str, object]
+
+
+@dataclass(frozen=True)
+class VariantGroup:
+    """The variants of one environment, the reference first, and what was left out.
+
+    ``task`` is the one by which control is compared, as JSON, None where no trial was assessed.
+    """
+
+    env: str
+    variants: tuple[Entry, ...]
+    notes: tuple[str, ...] = ()
+    task: str | None = None
+
+    @property
+    def reference(self) -> Entry:
+        return self.variants[0]
+
+    @property
+    def assessed(self) -> tuple[Entry, ...]:
+        """The variants whose control is compared: those that were assessed by the common task."""
+        if self.task is None:
+            return ()
+        return tuple(one for one in self.variants if task_of(one) == self.task)
+
+    def reference_with_setting_of(self, variant: Entry) -> Entry | None:
+        """Return the reference policy with the model, learner and limits of a variant, if any.
+
+        Among several it is the one nearest to the defaults.
+        """
+        setting = _setting(variant)
+        same = [
+            one
+            for one in self.variants
+            if one.config.policy == self.reference.config.policy and _setting(one) == setting
+        ]
+        return max(same, key=lambda one: nearness(one.config), default=None)
+
+
+def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
+    """Return the variants of every environment that has the reference policy and another.
+
+    Explorations are left out: their losses are errors on paths of their own.
+
+    Raises
+    ------
+    AnalysisError
+        If no environment has both.
+    """
+    current = [
+        config
+        for config in newest(list(reader.configs()))
+        if wanted.accepts(config) and not is_prequential(config.config)
+    ]
+    configs = latest_sources(reader, current)
+    entries = [Entry(config, tuple(reader.trials(config.config_key))) for config in configs]
+    names = sorted({config.env for config in configs}, key=environment_rank)
+    found = [
+        _group(env, [entry for entry in entries if entry.config.env == env], wanted.reference)
+        for env in names
+    ]
+    whole = [group for group in found if group is not None]
+    if not whole:
+        raise AnalysisError(
+            f"A report needs trials of {wanted.reference} and of another variant in one "
+            f"environment, but {reader.safe_url} has none: run 'python orchestrate/launch.py -m "
+            f"experiment=beyond', or choose another --reference."
+        )
+    return whole
+
+
+def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | None:
+    world = one_world(entries)
+    task = common_task(world)
+    kept = _one_each(world, task)
+    references = [entry for entry in kept if entry.config.policy == policy]
+    if not references or len(kept) < 2:
+        return None
+    reference = max(references, key=lambda entry: (_company(entry, kept), *nearness(entry.config)))
+    words = labels_of(entry.config for entry in kept)
+    variants = [replace(entry, label=label) for entry, label in zip(kept, words, strict=True)]
+    first = next(one for one in variants if one.config is reference.config)
+    rest = [one for one in variants if one is not first]
+    rest.sort(key=lambda one: (policy_rank(one.config.policy), one.label))
+    left = len(entries) - len(kept)
+    notes = [f"{left} configurations of another env section, task or fewer trials"] if left else []
+    notes += [*_of_unequal_seeds([first, *rest]), *_of_other_tasks([first, *rest], task)]
+    return VariantGroup(env, (first, *rest), tuple(notes), task)
+
+
+def _of_unequal_seeds(variants: Sequence[Entry]) -> Iterator[str]:
+    """Say how many seeds the variants have, where they differ."""
+    numbers = Counter(len({trial.seed for trial in one.trials}) for one in variants)
+    if len(numbers) > 1:
+        counts = ", ".join(
+            f"{n} seeds: {count} variant{'s' if count > 1 else ''}"
+            for n, count in sorted(numbers.items())
+        )
+        yield f"{counts}; a ratio is over the seeds that both variants of it have"
+
+
+def _of_other_tasks(variants: Sequence[Entry], task: str | None) -> Iterator[str]:
+    """Say which variants are not in the section on control, and in what their task differs."""
+    others: dict[str, list[str]] = {}
+    for one in variants:
+        own = task_of(one)
+        if own is not None and own != task:
+            others.setdefault(own, []).append(one.label)
+    for other, names in others.items():
+        path, (value, usual) = difference([json.loads(other), json.loads(task or "{}")])
+        yield (
+            f"control with {'; '.join(names)}: assessed by another task than most trials "
+            f"({path} = {value} instead of {usual}), so these costs and successes are not compared"
+        )
+
+
+def _company(entry: Entry, entries: Sequence[Entry]) -> int:
+    """Return how many entries share the model, the learner and the limits of this one."""
+    own = _setting(entry)
+    return sum(_setting(one) == own for one in entries)
+
+
+def _setting(entry: Entry) -> list[str]:
+    return [section_text(entry, name) for name in _SETTING]
+
+
+def _one_each(entries: Sequence[Entry], task: str | None) -> list[Entry]:
+    """Return one entry for each policy and setting: of the task, if any, and with most trials."""
+
+    def weight(entry: Entry) -> tuple[int, ...]:
+        return task is not None and task_of(entry) == task, len(entry.trials)
+
+    return one_each(entries, weight)
+
+
+def tabulate_group(
+    reader: Reader, group: VariantGroup, rule: DivergenceRule = DivergenceRule.EXCLUDE
+) -> pd.DataFrame:
+    """Return one row for each variant of an environment, the reference first."""
+    plane = Plane.of(system_of(group.reference.config.config))
+    epsilon = loss_of_random_inputs(reader, group.variants, "loss", rule)
+    scores = {one.label: _scores(reader, one, plane, rule) for one in group.variants}
+    costs = _control_costs(reader, group)
+    for label, own in scores.items():
+        own["control"] = costs.get(label, {})
+    return pd.DataFrame(
+        [
+            _variant_row(reader, group, one, scores[one.label], scores)
+            | _under_same_setting(group, one, scores)
+            | _samples(reader, group, one, math.nan if epsilon is None else epsilon, rule)
+            for one in group.variants
+        ]
+    )
+
+
+def adjust(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Join the tables and adjust each measure's p-values over the whole report."""
+    table = pd.concat(tables, ignore_index=True)
+    for measure in (*MEASURES, *(f"{SAME}_{one}" for one in SAME_MEASURES), "steps"):
+        table[f"{measure}_p_adjusted"] = benjamini_hochberg(table[f"{measure}_p"].tolist())
+    return table
+
+
+def verdict(row: Mapping[str, object], measure: str = "loss") -> str:
+    """Return "better" or "worse" than the reference, or "open".
+
+    It is open unless both tell: the test, of ranks and adjusted, and the interval, of the mean.
+    """
+    p, ratio, low, high = (
+        _float(row[f"{measure}_{name}"]) for name in ("p_adjusted", "ratio", "low", "high")
+    )
+    if not p < SIGNIFICANCE or not (high < 1 or low > 1):
+        return "open"
+    return "better" if (ratio < 1) != (measure == "coverage") else "worse"
+
+
+def _float(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _scores(
+    reader: Reader, variant: Entry, plane: Plane, rule: DivergenceRule
+) -> dict[str, BySeed]:
+    entry = variant
+    return {
+        "loss": final_losses(reader, entry, "loss", rule).by_seed,
+        "reachable_loss": final_losses(reader, entry, "reachable_loss", rule).by_seed,
+        "auc": mean_losses(reader, entry, "loss", rule).by_seed,
+        "coverage": _coverages(reader, variant, plane),
+    }
+
+
+def _control_costs(reader: Reader, group: VariantGroup) -> dict[str, BySeed]:
+    """Return the relative costs of the assessed variants after the first steps of their task."""
+    keys = {one.label: one.config.config_key for one in group.assessed}
+    steps = {t for key in keys.values() for t in reader.assessments(key, "control_cost").t.tolist()}
+    first = min((t for t in steps if t > 0), default=0)
+    return {one.label: scores_at(reader, one, first).by_seed for one in group.assessed}
+
+
+def _coverages(reader: Reader, variant: Entry, plane: Plane) -> BySeed:
+    key = variant.config.config_key
+    seeds = variant.final_losses()
+    return {seed: plane.coverage(reader.trajectory(key, seed).states) for seed in seeds}
+
+
+def _variant_row(
+    reader: Reader,
+    group: VariantGroup,
+    variant: Entry,
+    own: Mapping[str, BySeed],
+    scores: Mapping[str, Mapping[str, BySeed]],
+) -> dict[str, object]:
+    trials = variant.finished
+    row: dict[str, object] = {
+        "env": group.env,
+        "variant": variant.label,
+        "policy": variant.config.policy,
+        "policy_label": policy_title(variant.config.policy),
+        "model": variant.config.model,
+        "learner": variant.config.learner,
+        "path": variant.config.config["path"],
+        "dt": variant.config.config["env"]["dt"],
+        "n": len(own["loss"]),
+        "n_diverged": sum(trial.status == "diverged" for trial in trials),
+        "plan_us": _typical(reader, variant, "plan_us"),
+        "learn_us": _typical(reader, variant, "learn_us"),
+    }
+    reference = scores[group.reference.label]
+    for measure in MEASURES:
+        values = np.array(list(own[measure].values()))
+        values = values[np.isfinite(values)]
+        row[measure] = float(mean(values)) if len(values) else math.nan
+        row[f"{measure}_2se"] = 2 * float(standard_error(values)) if len(values) else math.nan
+        row |= _against(own[measure], reference[measure], group.env, variant.label, measure)
+    row["control_lost"] = without_ratio(*paired(own["control"], reference["control"]))
+    return row
+
+
+def _under_same_setting(
+    group: VariantGroup, variant: Entry, scores: Mapping[str, Mapping[str, BySeed]]
+) -> dict[str, object]:
+    """Compare with the reference policy under the same model and learner; NaN where it has none."""
+    reference = group.reference_with_setting_of(variant)
+    own = scores[variant.label]
+    with_setting = own if reference is None else scores[reference.label]
+    row: dict[str, object] = {
+        f"{SAME}_reference": "" if reference in (None, variant) else reference.label
+    }
+    for measure in SAME_MEASURES:
+        found = _against(own[measure], with_setting[measure], group.env, variant.label, measure)
+        row |= {f"{SAME}_{column}": value for column, value in found.items()}
+    return row
+
+
+def _samples(
+    reader: Reader, group: VariantGroup, variant: Entry, epsilon: float, rule: DivergenceRule
+) -> dict[str, float]:
+    """Return how many inputs it takes until the loss stays at most ε.
+
+    They are the median over the trials, the share of those that get there, and the p of the sign
+    test against the reference. A trial that does not get there is censored: later than any that
+    does.
+    """
+    known = not math.isnan(epsilon)
+    own, reference = (
+        lasting_steps(reader, one, "loss", rule, epsilon).by_seed
+        for one in (variant, group.reference)
+    )
+    steps = np.array(list(own.values()))
+    compared = known and variant is not group.reference
+    return {
+        "epsilon": epsilon,
+        "horizon": variant.config.horizon,
+        "steps": censored_median(steps) if known else math.nan,
+        "reached": float(np.mean(np.isfinite(steps))) if known and len(steps) else math.nan,
+        "steps_p": _hitting_time_p(own, reference) if compared else math.nan,
+    }
+
+
+def _hitting_time_p(own: BySeed, reference: BySeed) -> float:
+    return compare_hitting_times(*paired(own, reference)).p_value
+
+
+def _against(
+    own: BySeed, reference: BySeed, env: str, variant: str, measure: str
+) -> dict[str, float]:
+    """Return the ratio to the reference; nothing for the reference itself."""
+    columns = ("ratio", "low", "high", "improvement", "p")
+    if own is reference:
+        return {f"{measure}_{column}": math.nan for column in columns}
+    found = against_reference(own, reference, env, variant, measure)
+    values = (found.ratio, found.low, found.high, found.improvement, found.p_value)
+    return {f"{measure}_{column}": value for column, value in zip(columns, values, strict=True)}
+
+
+def _typical(reader: Reader, variant: Entry, column: str) -> float:
+    """Return the median over all steps of all trials."""
+    values = read_curves(reader, variant, column).values
+    return float(np.nanmedian(values)) if np.isfinite(values).any() else math.nan
+
+
+def tabulate_control_of(reader: Reader, groups: Sequence[VariantGroup]) -> pd.DataFrame | None:
+    """Return one row for each environment, variant and number of steps, None without a task."""
+    rows = [row for group in groups if group.assessed for row in _control_rows(reader, group)]
+    if not rows:
+        return None
+    table = pd.DataFrame(rows)
+    table["success_p_adjusted"] = benjamini_hochberg(table["success_p"].tolist())
+    return table
+
+
+def _control_rows(reader: Reader, group: VariantGroup) -> Iterator[dict[str, object]]:
+    assessed = group.assessed
+    curves = measure_control(reader, Selection(assessed))
+    successes = [reader.assessments(one.config.config_key, SUCCESS) for one in assessed]
+    reference = successes[0] if assessed[0] is group.reference else None
+    for one, curve, own in zip(assessed, curves, successes, strict=True):
+        losses = read_curves(reader, one, "loss").values
+        free_runs = reader.assessments(one.config.config_key, FREE_RUN)
+        for k, t in enumerate(curve.t.tolist()):
+            yield {
+                "env": group.env,
+                "variant": one.label,
+                "t": t,
+                "n": int(curve.n[k]),
+                **{name: float(getattr(curve, name)[k]) for name in ESTIMATES},
+                "lost": int(curve.lost[k]),
+                "success_p": _test(own, reference, t),
+                "loss": _geometric_mean(losses[:, t - 1]) if t else math.nan,
+                **_free_run(free_runs, t, int(curve.n[k])),
+                "described": curve.described,
+            }
+    steps = sorted({int(t) for curve in curves for t in curve.t})
+    yield from (_truth(group.env, curves[0].truth, t) for t in steps)
+
+
+def _truth(env: str, truth: TrueModel, t: int) -> dict[str, object]:
+    """Return a row of the true model: the same after any number of steps, its cost the unit."""
+    return {
+        "env": env,
+        "variant": TRUTH,
+        "t": t,
+        "n": truth.n,
+        "success": truth.success,
+        "success_low": truth.success_low,
+        "success_high": truth.success_high,
+        "cost": 1.0 if truth.lost < truth.n else math.nan,
+        "lost": truth.lost,
+        "described": str(truth.n),
+    }
+
+
+def _test(own: Assessments, reference: Assessments | None, t: int) -> float:
+    """Return p of the successes after t explored steps, over the seeds that reached them."""
+    if reference is None or own is reference or t == 0:
+        return math.nan
+    ours, theirs = (_at(found, t) for found in (own, reference))
+    seeds = sorted(set(ours) & set(theirs))
+    return mcnemar(*(np.array([each[seed] for seed in seeds]) for each in (ours, theirs)))
+
+
+def _at(found: Assessments, t: int) -> dict[int, float]:
+    """Return the number of each seed that reached t steps."""
+    rows, columns = np.nonzero(np.isfinite(found.values) & (found.t == t))
+    return dict(zip(found.seeds[rows].tolist(), found.values[rows, columns].tolist(), strict=True))
+
+
+def _geometric_mean(values: Array) -> float:
+    known = values[np.isfinite(values) & (values > 0)]
+    return float(np.exp(np.mean(np.log(known)))) if len(known) else math.nan
+
+
+def _free_run(found: Assessments, t: int, reached: int) -> dict[str, object]:
+    """Return the mean error after t steps, and of how many trials it is not finite."""
+    errors = found.values[:, found.t == t]
+    finite = errors[np.isfinite(errors)]
+    mean = float(np.mean(finite)) if len(finite) else math.nan
+    return {"free_run": mean, "free_run_lost": max(0, reached - len(finite))}

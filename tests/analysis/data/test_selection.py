@@ -1,0 +1,303 @@
+"""The trials that are selected, grouped or missing, and rules for diverged ones."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from analysis.cli import main
+from analysis.data.matching import Filter, newest
+from analysis.data.samples import DivergenceRule, apply_rule
+from analysis.data.selection import Entry, Selection, environment_rank, policy_rank, ranges, select
+from analysis.errors import AnalysisError
+from analysis.tables.comparisons import compare_policies, references
+from dopt.policies import POLICIES
+from dopt.spec import config
+from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS
+from orchestrate.store import ConfigRow, Reader, TrialRow
+from tests.analysis.conftest import SHORT
+from tests.analysis.synthetic import fill, make_grid, make_spec
+
+
+def stored(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) -> Selection:
+    address = f"sqlite:///{folder}/results.db"
+    for specs, skipped in fillings:
+        fill(address, specs, skipped=skipped)
+    with Reader.open(address) as reader:
+        return select(reader, Filter())
+
+
+def test_a_complete_grid_has_no_gap_though_periodic_cannot_fly(reader: Reader) -> None:
+    selection = select(reader, Filter())
+    assert selection.gaps == ()
+    assert selection.environments == ("pendulum", "cartpole", "quadrotor")
+    assert selection.policies == ("d_optimal", "oracle", "uniform", "periodic", "random")
+    assert [entry.config.policy for entry in selection.of("quadrotor")] == [
+        "d_optimal",
+        "oracle",
+        "uniform",
+        "random",
+    ]
+
+
+def test_a_diverged_trial_is_finished_and_has_no_final_loss(reader: Reader) -> None:
+    (entry,) = select(reader, Filter(("cartpole",), ("random",))).entries
+    assert len(entry.finished) == 5
+    assert sorted(entry.final_losses()) == [0, 1, 3, 4]
+
+
+def test_pending_trials_are_a_gap(tmp_path: Path) -> None:
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(6), **SHORT)
+    skipped = [s for s in specs if s.policy.name == "random" and s.seed in (1, 2, 5)]
+    (gap,) = stored(tmp_path, (specs, skipped)).gaps
+    assert (gap.env, gap.policy, gap.states) == ("pendulum", "random", "3 pending")
+    assert gap.describe_seeds() == "1-2, 5"
+
+
+def test_seeds_that_only_another_policy_has_are_a_gap(tmp_path: Path) -> None:
+    specs = make_grid(("pendulum",), ("d_optimal",), range(4), **SHORT)
+    specs += make_grid(("pendulum",), ("random",), range(3), **SHORT)
+    (gap,) = stored(tmp_path, (specs, [])).gaps
+    assert (gap.policy, gap.seeds, gap.states) == ("random", (3,), "1 not registered")
+
+
+def test_a_policy_that_an_environment_lacks_is_a_gap_where_it_makes_sense(tmp_path: Path) -> None:
+    specs = make_grid(("pendulum",), ("d_optimal", "periodic"), range(2), **SHORT)
+    specs += make_grid(("cartpole", "quadrotor"), ("d_optimal",), range(2), **SHORT)
+    (gap,) = stored(tmp_path, (specs, [])).gaps
+    assert (gap.env, gap.policy, gap.seeds) == ("cartpole", "periodic", (0, 1))
+
+
+def test_other_configurations_are_noted(tmp_path: Path) -> None:
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(3), **SHORT)
+    single = make_spec("pendulum", "random", 0, env={"gamma": 0.5, "horizon": 60})
+    selection = stored(tmp_path, (specs, []), ([single], []))
+    assert selection.gaps == ()
+    assert len(selection.entries) == 2
+    assert selection.notes == (
+        "pendulum: 1 other stored configurations are not part of this (see --where)",
+    )
+
+
+def test_assessments_of_different_versions_do_not_mix(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = {"task": {"name": "control", "checkpoints": [10]}}
+    policies = ("d_optimal", "random")
+    plain = make_grid(("pendulum",), policies, range(2))
+    new = make_grid(("pendulum",), policies, range(2), **task)
+    keys = {one.trial_key for one in (*plain, *new)}
+    monkeypatch.setattr(config, "ASSESSMENT_VERSION", 1)
+    old = make_grid(("pendulum",), policies, range(2), **task)
+    assert keys.isdisjoint(one.trial_key for one in old)
+    url = f"sqlite:///{tmp_path}/versions.db"
+    fill(url, [*plain, *old, *new])
+    with Reader.open(url) as opened:
+        kept = {row.config_key for row in newest(list(opened.configs()))}
+    assert kept == {one.config_key for one in (*plain, *new)}
+
+
+def test_fingerprint_tells_outcomes_apart(tmp_path: Path, reader: Reader) -> None:
+    whole = select(reader, Filter())
+    assert whole.fingerprint() == select(reader, Filter()).fingerprint()
+    assert whole.fingerprint() != whole.only(["pendulum"]).fingerprint()
+    specs = make_grid(("pendulum",), ("random",), range(2), **SHORT)
+    before = stored(tmp_path, (specs, specs[:1])).fingerprint()
+    assert before != stored(tmp_path, (specs, [])).fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "sentence"),
+    [
+        (Filter(("submarine",)), r"environment 'submarine', choose one of cartpole, pendulum"),
+        (Filter(policies=("greedy",)), r"policy 'greedy', choose one of d_optimal"),
+        (Filter(("quadrotor",), ("periodic",)), r"No configuration .* fits"),
+    ],
+)
+def test_requests_without_an_answer_are_sentences(
+    reader: Reader, wanted: Filter, sentence: str
+) -> None:
+    with pytest.raises(AnalysisError, match=sentence):
+        select(reader, wanted)
+
+
+def test_every_registered_name_has_a_place_in_the_order() -> None:
+    assert len({policy_rank(name)[0] for name in POLICIES}) == len(POLICIES)
+    assert len({environment_rank(name)[0] for name in SYSTEMS}) == len(SYSTEMS)
+
+
+def test_ranges() -> None:
+    assert ranges([4, 0, 1, 2, 7, 8]) == "0-2, 4, 7-8"
+    assert ranges([]) == ""
+
+
+@pytest.fixture(scope="module")
+def bounds_url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a database of two policies under three bounds of the input."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('bounds')}/results.db"
+    specs = []
+    for gamma in (2, 3, 10):
+        env = {"horizon": 40, "gamma": gamma}
+        specs += make_grid(("pendulum",), ("d_optimal", "random"), range(4), env=env)
+    fill(url, specs)
+    return url
+
+
+@pytest.fixture
+def bounds(bounds_url: str) -> Iterator[Reader]:
+    with Reader.open(bounds_url) as opened:
+        yield opened
+
+
+def test_each_value_is_shown_once_in_the_order_of_the_numbers(bounds: Reader) -> None:
+    selection = select(bounds, Filter(group_by=("env.gamma",)))
+    assert selection.labels == ("γ=2", "γ=3", "γ=10")
+    assert {entry.config.policy for entry in selection.entries} == {"d_optimal"}
+    one = select(bounds, Filter(policies=("random",), group_by=("gamma",)))
+    assert {entry.config.policy for entry in one.entries} == {"random"}
+
+
+def test_settings_can_be_combined(bounds: Reader) -> None:
+    selection = select(bounds, Filter(group_by=("policy", "gamma")))
+    assert selection.labels == (
+        *("D-optimal, γ=2", "D-optimal, γ=3", "D-optimal, γ=10"),
+        *("random, γ=2", "random, γ=3", "random, γ=10"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "name"), [("d_optimal", "γ=2"), ("10.0", "γ=10"), ("γ=3", "γ=3")]
+)
+def test_values_are_compared_with_the_default_or_the_one_that_is_named(
+    bounds: Reader, given: str, name: str
+) -> None:
+    table = compare_policies(
+        bounds, select(bounds, Filter(reference=given, group_by=("env.gamma",)))
+    )
+    assert set(table.reference) == {name}
+    assert len(table) == 2
+
+
+def test_policies_are_compared_under_the_same_setting(
+    bounds_url: str, bounds: Reader, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = compare_policies(bounds, select(bounds, Filter(group_by=("policy", "env.gamma"))))
+    assert dict(zip(table.variant, table.reference, strict=True)) == {
+        f"random, γ={gamma}": f"D-optimal, γ={gamma}" for gamma in (2, 3, 10)
+    }
+    assert main(["compare", "--db", bounds_url, "--group-by", "policy", "env.gamma"]) == 0
+    assert "| reference (same env.gamma) " in capsys.readouterr().out
+    named = Filter(reference="D-optimal, γ=3", group_by=("policy", "env.gamma"))
+    table = compare_policies(bounds, select(bounds, named))
+    assert set(table.reference) == {"D-optimal, γ=3"}
+    assert len(table) == 5
+
+
+GROUPS = [
+    (policy, gamma, width)
+    for policy in ("d_optimal", "random", "uniform")
+    for gamma in (2.0, 3.0)
+    for width in (4, 8)
+]
+
+
+@given(
+    chosen=st.lists(st.sampled_from(GROUPS), min_size=1, unique=True),
+    reference=st.sampled_from(["d_optimal", "random"]),
+    diverged=st.sets(st.sampled_from(GROUPS)),
+)
+def test_a_reference_differs_in_the_policy_alone_wherever_it_is_stored(
+    chosen: list[tuple[str, float, int]], reference: str, diverged: set[tuple[str, float, int]]
+) -> None:
+    entries = tuple(entry(*one, diverged=one in diverged) for one in chosen)
+    keys = ("policy", "env.gamma", "width")
+    selection = Selection(entries, reference=reference, group_by=keys)
+    overall = selection.reference_of("pendulum")
+    rows = list(references(selection, "pendulum"))
+    assert len({id(one) for one, _, _ in rows}) == len(rows)
+    for one, other, same in rows:
+        stored = (reference, *one.group[1:])
+        assert one is not other
+        assert same == (stored in chosen and stored not in diverged and one.group != stored)
+        assert other.group == stored if same else other is overall
+    left_out = [one for one in entries if all(one is not row[0] for row in rows)]
+    if overall is not None:
+        assert {one.config.policy for one in left_out} <= {overall.config.policy}
+        assert all(one is overall or one.config.policy == reference for one in left_out)
+
+
+def entry(policy: str, gamma: float, width: int, *, diverged: bool) -> Entry:
+    """Return a configuration with one trial."""
+    specification = make_spec("pendulum", policy, 0, env={"gamma": gamma}, model={"width": width})
+    config = {k: v for k, v in specification.to_mapping().items() if k != "seed"}
+    row = ConfigRow(
+        *(f"{policy}{gamma}{width}", "pendulum", policy, "mlp", "adam_window", width, 2, 40, 0.02),
+        *(gamma, "", 1, 0, 0, 0, 0, 0, config),
+    )
+    values = dict.fromkeys(one.name for one in dataclasses.fields(TrialRow))
+    status, loss = ("diverged", None) if diverged else ("done", 1.0)
+    trial = TrialRow(**values | {"seed": 0, "status": status, "final_loss": loss})  # type: ignore[arg-type]
+    return Entry(row, (trial,), f"{policy}, {gamma}, {width}", (policy, gamma, width))
+
+
+def test_a_setting_that_nothing_has_is_a_sentence(bounds: Reader) -> None:
+    with pytest.raises(AnalysisError, match=r"'env.gama' is no setting .* env.gamma"):
+        select(bounds, Filter(group_by=("env.gama",)))
+
+
+def test_figure_1_is_coloured_by_the_setting(bounds_url: str, tmp_path: Path) -> None:
+    grouped = ["--group-by", "policy", "env.gamma", "--color-by", "env.gamma"]
+    only = ["--only", "figure1", "--only", "summary", "--out", str(tmp_path)]
+    assert main(["figures", "--db", bounds_url, *only, *grouped]) == 0
+    table = (tmp_path / "figure1.csv").read_text().splitlines()
+    assert {line.split(",")[2] for line in table[1:]} == {'"D-optimal', '"random'}
+    assert "| random, γ=10 |" in " ".join((tmp_path / "summary.md").read_text().split())
+
+
+NAN = np.nan
+
+
+SEEDS = np.array([0, 1, 2, 3])
+
+
+VALUES = np.array([[4.0, 2.0], [6.0, 8.0], [5.0, NAN], [5.0, 5.0]])
+
+
+DIVERGED = np.array([False, False, True, False])
+
+
+def test_a_diverged_trial_leaves_its_whole_curve() -> None:
+    sample = apply_rule(SEEDS, VALUES, DIVERGED, DivergenceRule.EXCLUDE)
+    assert sample.seeds.tolist() == [0, 1, 3]
+    assert sample.values.tolist() == [[4, 2], [6, 8], [5, 5]]
+    assert sample.describe() == "3/4, 1 diverged"
+
+
+@pytest.mark.parametrize(
+    ("rule", "lent"), [(DivergenceRule.WORST, [6, 8]), (DivergenceRule.MEDIAN, [5, 5])]
+)
+def test_the_others_lend_a_value_at_every_step(rule: DivergenceRule, lent: list[float]) -> None:
+    sample = apply_rule(SEEDS, VALUES, DIVERGED, rule)
+    assert sample.values[2].tolist() == lent
+    assert np.array_equal(sample.values[[0, 1, 3]], VALUES[[0, 1, 3]])
+    assert sample.n_diverged == 1
+
+
+@pytest.mark.parametrize("rule", list(DivergenceRule))
+def test_without_survivors_the_sample_is_empty(rule: DivergenceRule) -> None:
+    sample = apply_rule(SEEDS, VALUES, np.full(4, True), rule)
+    assert sample.values.shape == (0, 2)
+    assert sample.describe() == "0/4, 4 diverged"
+
+
+def test_without_divergence_the_count_is_a_number() -> None:
+    kept = ~DIVERGED
+    sample = apply_rule(SEEDS[kept], VALUES[kept], DIVERGED[kept], DivergenceRule.WORST)
+    assert sample.describe() == "3"

@@ -1,0 +1,383 @@
+"""Scores of trials, their paired comparison, and Pareto fronts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import select
+from analysis.errors import AnalysisError
+from analysis.stats.intervals import (
+    MOST_BOOTSTRAP_VALUES,
+    geometric_mean,
+    interval_of_mean,
+    standard_error,
+    student_quantile,
+)
+from analysis.stats.scores import (
+    Measure,
+    benjamini_hochberg,
+    censored_median,
+    compare,
+    compare_hitting_times,
+    first_passage,
+    last_passage,
+    mean_losses,
+    mean_over_steps,
+    on_front,
+    sign_test,
+    signed_rank,
+    steps_to,
+    without_ratio,
+)
+from analysis.tables.comparisons import compare_policies, compare_steps
+from analysis.tables.rendering import TextTable, hitting_times_table
+from orchestrate.store import Reader
+from tests.analysis.synthetic import fake_result, make_spec
+
+INF = math.inf
+
+
+SEEDS = range(5)
+
+
+def curve(env: str, policy: str, seed: int) -> np.ndarray:
+    return fake_result(make_spec(env, policy, seed, env={"horizon": 60})).loss
+
+
+def test_geometric_mean_by_hand() -> None:
+    values = np.array([[1.0, 4.0, 16.0], [3.0, 3.0, 3.0]])
+    np.testing.assert_allclose(mean_over_steps(values), [4.0, 3.0])
+    assert mean_over_steps(np.array([[0.0, 1.0]])).tolist() == [0.0]
+
+
+def test_first_passage_by_hand() -> None:
+    curves = np.array([[5.0, 2, 3, 1], [5.0, 4, 4, 4], [1.0, 9, 9, 9], [5.0, 4, 3, 2]])
+    assert first_passage(curves, 2.0).tolist() == [2, INF, 1, 4]
+
+
+def test_last_passage_by_hand() -> None:
+    """It is the first step of the last stretch below, so that a dip does not count."""
+    curves = np.array([[5.0, 2, 3, 1], [5.0, 1, 4, 4], [1.0, 2, 1, 2], [5.0, 4, 3, 2]])
+    assert last_passage(curves, 2.0).tolist() == [4, INF, 1, 4]
+    assert last_passage(np.array([[1.0, math.nan], [math.nan, 1.0]]), 2.0).tolist() == [INF, 2]
+
+
+def test_a_scale_moves_threshold_and_curve_alike() -> None:
+    curves = np.random.default_rng(0).lognormal(size=(20, 30))
+    np.testing.assert_array_equal(first_passage(curves, 0.7), first_passage(10 * curves, 7.0))
+
+
+def test_race_by_hand() -> None:
+    found = compare_hitting_times(np.array([3.0, 5, INF, INF, 7]), np.array([4.0, 5, 8, INF, INF]))
+    assert (found.n_pairs, found.reached, found.reached_reference) == (5, 3, 3)
+    assert found.improvement == (2 + 2 / 2) / 5  # earlier twice, tied twice
+    assert found.p_value == pytest.approx(1.0)  # two wins and one loss of three
+    assert (found.median, found.median_reference) == (7, 8)
+
+
+def test_swapping_the_sides_swaps_the_race() -> None:
+    steps = np.random.default_rng(1).integers(1, 9, size=(2, 40)).astype(float)
+    steps[steps > 7] = INF
+    forth, back = compare_hitting_times(*steps), compare_hitting_times(*steps[::-1])
+    assert forth.improvement + back.improvement == pytest.approx(1)
+    assert forth.p_value == pytest.approx(back.p_value)
+    assert forth.median == back.median_reference
+
+
+def test_sign_test_of_a_textbook_case() -> None:
+    assert sign_test(9, 1) == pytest.approx(2 * (1 + 10) / 2**10)
+    assert sign_test(0, 0) == 1.0
+
+
+def test_the_sign_test_rejects_a_true_null_as_rarely_as_it_says() -> None:
+    draws = np.random.default_rng(2).exponential(size=(2000, 2, 41))
+    censored = np.where(draws > 1.0, INF, draws)
+    rejected = np.mean([compare_hitting_times(*pair).p_value < 0.05 for pair in censored])
+    assert rejected < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 2000)
+
+
+def test_a_median_past_the_horizon_is_censored() -> None:
+    assert censored_median(np.array([1.0, INF, INF])) == INF
+    assert censored_median(np.array([1.0, 2.0, INF])) == 2
+    assert censored_median(np.array([1.0, 2.0, INF, INF])) == INF  # just half of them reached it
+    assert math.isnan(censored_median(np.empty(0)))
+
+
+def test_race_of_no_pair_is_nan() -> None:
+    found = compare_hitting_times(np.empty(0), np.empty(0))
+    assert found.n_pairs == 0
+    assert math.isnan(found.improvement)
+    assert math.isnan(found.p_value)
+
+
+def test_scores_are_those_of_the_stored_curves(reader: Reader) -> None:
+    (entry,) = select(reader, Filter(("pendulum",), ("uniform",))).entries
+    curves = np.array([curve("pendulum", "uniform", seed) for seed in SEEDS])
+    arguments = (reader, entry, "loss", DivergenceRule.EXCLUDE)
+    np.testing.assert_allclose(
+        mean_losses(*arguments).values, np.exp(np.mean(np.log(curves), axis=1))
+    )
+    middle = float(np.median(curves))
+    np.testing.assert_array_equal(
+        steps_to(*arguments, middle).values, first_passage(curves, middle)
+    )
+
+
+def test_a_diverged_trial_is_left_out_of_the_scores_and_counted(reader: Reader) -> None:
+    (entry,) = select(reader, Filter(("cartpole",), ("random",))).entries
+    scores = mean_losses(reader, entry, "loss", DivergenceRule.EXCLUDE)
+    assert sorted(scores.by_seed) == [0, 1, 3, 4]
+    assert scores.describe() == "4/5, 1 diverged"
+
+
+def test_the_area_compares_whole_curves(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",), ("d_optimal", "random")))
+    row = compare_policies(reader, selection, measure=Measure.AUC).iloc[0]
+    logs = [
+        np.mean(np.log(curve("pendulum", "random", s)) - np.log(curve("pendulum", "d_optimal", s)))
+        for s in SEEDS
+    ]
+    assert row.ratio == pytest.approx(math.exp(np.mean(logs)))
+
+
+def test_steps_to_what_random_inputs_know_at_the_end(reader: Reader) -> None:
+    table = compare_steps(reader, select(reader, Filter()))
+    row = table[(table.env == "pendulum") & (table.policy == "uniform")].iloc[0]
+    finals = [curve("pendulum", "random", seed)[-1] for seed in SEEDS]
+    assert row.epsilon == pytest.approx(np.median(finals))
+    ours = np.array([curve("pendulum", "d_optimal", seed) for seed in SEEDS])
+    assert row["median_reference"] == np.median(first_passage(ours, row.epsilon))
+    assert row.reached_reference == np.sum(ours.min(axis=1) <= row.epsilon)
+
+
+def test_an_epsilon_that_nobody_reaches_is_a_tie(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",), ("d_optimal", "periodic")))
+    table = compare_steps(reader, selection, epsilon=1e-9)
+    assert (table.improvement.item(), table.p_value.item()) == (0.5, 1.0)
+    assert "> 60" in hitting_times_table(table, "exclude").markdown()
+
+
+@pytest.mark.parametrize("epsilon", [0.0, -1.0, INF, math.nan])
+def test_an_epsilon_that_is_no_loss_is_refused(reader: Reader, epsilon: float) -> None:
+    with pytest.raises(AnalysisError, match="a positive number is expected"):
+        compare_steps(reader, select(reader, Filter()), epsilon=epsilon)
+
+
+def test_without_random_inputs_an_epsilon_is_needed(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",), ("d_optimal", "periodic")))
+    with pytest.raises(AnalysisError, match="--epsilon"):
+        compare_steps(reader, selection)
+
+
+def test_a_table_in_latex_needs_no_package(reader: Reader) -> None:
+    table = hitting_times_table(compare_steps(reader, select(reader, Filter())), "exclude")
+    text = table.latex()
+    lines = [line for line in text.splitlines() if not line.startswith("%")]
+    assert text.isascii()
+    assert text.startswith("% Steps")
+    assert lines[0] == r"\begin{tabular}{llllllllllll}"
+    assert lines[-1] == r"\end{tabular}"
+    rows = [line for line in lines if line.endswith(r"\\")]
+    assert len(rows) == 1 + len(table.rows)
+    assert {row.count(" & ") for row in rows} == {11}
+    assert [line for line in lines if line not in rows] == [
+        lines[0],
+        *[r"\hline"] * 3,
+        r"\end{tabular}",
+    ]
+    assert r"$\varepsilon$" in rows[0]
+
+
+def test_every_letter_of_a_label_compiles() -> None:
+    row = ["adam_replay ×30", "γ=3 & λ", "50 % of #1 {x}", "q̇₁ ~ a^b", "[2, 3] m/s²"]
+    text = TextTable(["a", "b", "c", "d", "e"], [row], "rad/s²\nµs").latex()
+    assert text.startswith("% rad/s2\n% ")
+    assert text.isascii()
+    assert r"adam\_replay $\times$30 & $\gamma$=3 \& $\lambda$ & 50 \% of \#1 \{x\} & " in text
+    assert r"q1 \textasciitilde{} a\textasciicircum{}b & {[}2, 3] m/s$^2$ \\" in text
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_ratio_is_the_geometric_mean_of_the_pairs() -> None:
+    found = compare(np.array([1.0, 8.0]), np.array([4.0, 4.0]), rng())
+    assert found.ratio == pytest.approx(math.sqrt(0.25 * 2))
+    assert found.improvement == 0.5
+    assert found.n_pairs == 2
+
+
+def test_a_constant_factor_is_found_without_spread() -> None:
+    baseline = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    found = compare(baseline / 2, baseline, rng())
+    assert found.ratio == pytest.approx(0.5)
+    assert (found.low, found.high) == pytest.approx((0.5, 0.5))
+    assert found.improvement == 1.0
+    assert found.p_value == pytest.approx(2 / 2**5)  # exact: all five signs agree
+
+
+def test_values_that_differ_by_rounding_have_no_spread() -> None:
+    values = np.full(100, -1.0)
+    values[:50] = np.nextafter(-1.0, 0.0)
+    assert interval_of_mean(values, rng()) == pytest.approx((-1.0, -1.0), rel=1e-12)
+
+
+def test_what_was_lost_is_the_worst_in_the_test_and_in_no_ratio() -> None:
+    ours = np.array([1.0, 2.0, np.inf, 4.0, np.inf, np.nan, 1.0])
+    theirs = np.array([2.0, 4.0, 1.0, 1.0, np.inf, 1.0, np.nan])
+    found = compare(ours, theirs, rng())
+    assert found.n_pairs == 5  # but those of which nothing is known
+    assert without_ratio(ours, theirs) == 4
+    assert found.ratio == pytest.approx(1.0)  # 1/2 · 1/2 · 4
+    assert found.improvement == (2 + 0.5) / 5
+    largest = np.log([1 / 2, 1 / 2, 1e9, 4.0, 1.0])
+    assert found.p_value == pytest.approx(signed_rank(largest))
+    nothing = compare(np.full(8, np.inf), np.arange(1.0, 9.0), rng())
+    assert math.isnan(nothing.ratio)
+    assert nothing.p_value == pytest.approx(2 / 2**8)
+
+
+def test_equal_losses_are_no_difference() -> None:
+    losses = np.array([1.0, 2.0, 3.0])
+    found = compare(losses, losses, rng())
+    assert (found.ratio, found.p_value, found.improvement) == (1.0, 1.0, 0.5)
+
+
+def test_swapping_the_policies_inverts_the_ratio() -> None:
+    a, b = rng().lognormal(size=(2, 30))
+    forth, back = compare(a, b, rng()), compare(b, a, rng())
+    assert forth.ratio * back.ratio == pytest.approx(1)
+    assert forth.p_value == pytest.approx(back.p_value)
+    assert forth.improvement + back.improvement == pytest.approx(1)
+    assert forth.low < forth.ratio < forth.high
+
+
+def test_the_pairing_matters() -> None:
+    seeds = rng().normal(scale=2.0, size=40)  # what both policies share of a seed
+    a, b = np.exp(seeds + 0.1 * rng().normal(size=40) - 0.2), np.exp(seeds)
+    paired, shuffled = compare(a, b, rng()), compare(a, np.roll(b, 7), rng())
+    assert paired.ratio == pytest.approx(shuffled.ratio)
+    assert paired.high - paired.low < 0.2 * (shuffled.high - shuffled.low)
+    assert paired.p_value < 1e-3 < shuffled.p_value
+
+
+def test_too_few_pairs_have_no_interval() -> None:
+    none = compare(np.empty(0), np.empty(0), rng())
+    assert none.n_pairs == 0
+    assert math.isnan(none.ratio)
+    one = compare(np.array([2.0]), np.array([1.0]), rng())
+    assert one.ratio == pytest.approx(2.0)
+    assert math.isnan(one.low)
+    assert one.p_value == 1.0
+
+
+def test_a_loss_of_zero_is_counted_but_has_no_ratio() -> None:
+    found = compare(np.array([0.0, 0.0, 1.0, 3.0]), np.array([0.0, 1.0, 0.0, 4.0]), rng())
+    assert found.improvement == (2 + 1 / 2) / 4
+    assert found.n_pairs == 4
+    assert np.isnan([found.ratio, found.low, found.high, found.p_value]).all()
+
+
+def test_signed_rank_of_a_textbook_case() -> None:
+    # ranks 1..6 with the smallest negative: W = 1, of 64 sign patterns 2 have W <= 1
+    assert signed_rank(np.array([-1.0, 2, 3, 4, 5, 6])) == pytest.approx(2 * 2 / 64)
+
+
+def test_the_bootstrap_covers_the_mean_about_as_often_as_it_says() -> None:
+    repeats, n = 250, 30
+    draws = np.random.default_rng(1).normal(loc=-0.5, size=(repeats, n))
+    intervals = [interval_of_mean(values, np.random.default_rng(2)) for values in draws]
+    covered = np.mean([low <= -0.5 <= high for low, high in intervals])
+    assert 0.89 < covered < 0.985
+
+
+@pytest.mark.parametrize("family", ["normal", "exponential"])
+def test_the_interval_of_many_values_is_near_the_bootstrap(family: str) -> None:
+    draw = getattr(np.random.default_rng(3), family)
+    values = draw(size=MOST_BOOTSTRAP_VALUES + 1)
+    half = student_quantile(MOST_BOOTSTRAP_VALUES) * float(standard_error(values))
+    found = interval_of_mean(values, rng())
+    assert found == pytest.approx((values.mean() - half, values.mean() + half), abs=1e-12)
+    bootstrap = interval_of_mean(values[:-1], rng())
+    np.testing.assert_allclose(found, bootstrap, atol=0.07 * half)
+    assert found != pytest.approx(bootstrap, abs=1e-9)
+
+
+def test_benjamini_hochberg_by_hand() -> None:
+    # sorted p times m / rank, then the running minimum from the right
+    assert benjamini_hochberg([0.01, 0.04, 0.03, 0.5]) == pytest.approx(
+        [0.04, 0.16 / 3, 0.16 / 3, 0.5]
+    )
+
+
+def test_benjamini_hochberg_leaves_out_what_was_not_tested() -> None:
+    adjusted = benjamini_hochberg([0.02, math.nan, 0.5])
+    assert adjusted[0] == pytest.approx(0.04)
+    assert math.isnan(adjusted[1])
+    assert benjamini_hochberg([]) == []
+
+
+@pytest.mark.parametrize("n", [3, 5, 8])
+def test_the_interval_of_few_pairs_covers_as_often_as_it_says(n: int) -> None:
+    repeats = 4000
+    draws = np.random.default_rng(n).normal(loc=-0.5, size=(repeats, n))
+    intervals = [interval_of_mean(values, rng()) for values in draws]
+    covered = np.mean([low <= -0.5 <= high for low, high in intervals])
+    assert covered == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / repeats))
+
+
+COSTS = arrays(
+    float, st.tuples(st.integers(1, 12), st.integers(1, 3)), elements=st.integers(0, 5).map(float)
+)  # few values, so that ties are common
+
+
+def dominates(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> bool:
+    return all(a <= b for a, b in zip(one, other, strict=True)) and any(
+        a < b for a, b in zip(one, other, strict=True)
+    )
+
+
+@given(COSTS)
+def test_a_choice_is_on_the_front_exactly_if_no_other_dominates_it(
+    costs: npt.NDArray[np.float64],
+) -> None:
+    front = on_front(costs)
+    assert front.any()
+    for choice, is_on in zip(costs, front, strict=True):
+        assert is_on == (not any(dominates(other, choice) for other in costs))
+
+
+@given(COSTS)
+def test_every_choice_off_the_front_is_dominated_by_one_on_it(
+    costs: npt.NDArray[np.float64],
+) -> None:
+    front = on_front(costs)
+    for choice in costs[~front]:
+        assert any(dominates(member, choice) for member in costs[front])
+
+
+def test_a_front_by_hand() -> None:
+    costs = np.array([[1, 9], [2, 5], [2, 6], [3, 5], [4, 1], [np.nan, 0], [4, 1]])
+    assert on_front(costs).tolist() == [True, True, False, False, True, False, True]
+
+
+def test_nothing_has_no_front_and_no_geometric_mean() -> None:
+    assert not len(on_front(np.empty((0, 2))))
+    assert np.isnan(geometric_mean(np.empty(0)).value)
+
+
+def test_the_interval_is_that_of_the_logarithms() -> None:
+    found = geometric_mean(np.array([1.0, 10.0, 100.0]))
+    half = 4.302652729911275 / np.sqrt(3)  # t quantile of 2 degrees of freedom
+    assert found.value == pytest.approx(10.0)
+    assert np.log10([found.low, found.high]) == pytest.approx([1 - half, 1 + half])
