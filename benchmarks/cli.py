@@ -1,4 +1,4 @@
-"""Command line of the benchmarks: a table, and the history of runs that it is added to."""
+"""Command line of the benchmarks: a table, and the history that its run is added to."""
 
 from __future__ import annotations
 
@@ -11,37 +11,21 @@ from pathlib import Path
 
 from tabulate import tabulate
 
-from benchmarks import calibration, history
-from benchmarks.history import Run
-from benchmarks.machine import describe
-from benchmarks.rows import Row, number
+from benchmarks import history
+from benchmarks.history import Run, describe
+from benchmarks.rows import Row, fixed_seconds, number
 
-QUESTIONS = (
-    "step",
-    "compiled_plugins",
-    "black_box",
-    "numpy_parts",
-    "jax_scan",
-    "reference",
-    "linearisation_gap",
-    "sensor_noise",
-    "adaptive_seeds",
-    "evaluation",
-    "trial",
-    "step_times",
-    "width",
-    "long_trials",
-    "store",
-    "orchestration",
-    "scaling",
-    "paper",
-    "startup",
-    "expansion",
-    "figures",
-    "pages",
-)
+QUESTIONS = {
+    **dict.fromkeys(("step", "reference", "evaluation", "trial"), "kernel"),
+    "jax_scan": "jax_scan",
+    **dict.fromkeys(
+        ("store", "orchestration", "scaling", "paper", "startup", "expansion"), "grids"
+    ),
+    **dict.fromkeys(("figures", "pages"), "reading"),
+}
+"""Modules that answer the questions, each by a function of its name."""
+
 HEADERS = ("question", "what", "measured", "target", "of target", "others", "× others", "note")
-HISTORY = Path("results/benchmarks.jsonl")
 LEGEND = (
     "target: number of the target and its bound; of target: 1 or more meets it; others: the same "
     "in other people's code, measured as follows, and how many times faster this is."
@@ -62,14 +46,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows = _ask_for(run, question, options.quick)
         except Exception as error:
             failed.append(question)
-            rows = [Row("failed", None, note=_first_line(error))]
+            rows = [Row("failed", None, note=f"{type(error).__name__}: {error}".splitlines()[0])]
         lines += [[question, row.what, *row.cells()] for row in rows]
         others |= {f"{number(row.anchor.value)}: {row.anchor.source}" for row in rows if row.anchor}
     table = tabulate(lines, headers=HEADERS, tablefmt="github", disable_numparse=True)
     mode = "quick, for a look only" if options.quick else "means, quickest of several runs"
     seconds = f"{time.perf_counter() - start:.0f} s in all"
     _say("\n".join([*about, f"{mode}, {seconds}", "", table, "", LEGEND, *sorted(others)]))
-    _keep(options.history, run)
+    history.append(options.history, run)
     slower = history.slower(known, run)
     for row in slower:
         _say(f"slower: {row}")
@@ -79,24 +63,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def ask(question: str, quick: bool) -> list[Row]:
     """Return the rows of one question; what it measures is imported now, not before."""
     sys.stderr.write(f"{question} ...\n")
-    rows: list[Row] = importlib.import_module(f"benchmarks.{question}").measure(quick)
+    module = importlib.import_module(f"benchmarks.{QUESTIONS[question]}")
+    rows: list[Row] = getattr(module, question)(quick)
     return rows
 
 
 def _ask_for(run: Run, question: str, quick: bool) -> list[Row]:
     """Return the rows of one question, and add them to a run."""
-    before = calibration.seconds()
+    before = fixed_seconds()
     rows = ask(question, quick)
-    run.add(question, rows, min(before, calibration.seconds()))
+    run.add(question, rows, min(before, fixed_seconds()))
     return rows
-
-
-def _keep(path: Path, run: Run) -> None:
-    """Add a run to the history, and draw that."""
-    from benchmarks.history_plot import draw  # Matplotlib, which the tests of the table do without
-
-    history.append(path, run)
-    draw(history.read(path), path.with_suffix(".png"))
 
 
 def parser() -> argparse.ArgumentParser:
@@ -105,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--only",
         type=_questions,
-        default=QUESTIONS,
+        default=tuple(QUESTIONS),
         metavar="A,B",
         help=f"only these questions: {', '.join(QUESTIONS)}",
     )
@@ -113,9 +90,9 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--history",
         type=Path,
-        default=HISTORY,
+        default=Path("results/benchmarks.jsonl"),
         metavar="FILE",
-        help="file that the run is added to; it is drawn beside it (default: %(default)s)",
+        help="file that the run is added to (default: %(default)s)",
     )
     parser.add_argument(
         "--against",
@@ -137,10 +114,5 @@ def _questions(text: str) -> tuple[str, ...]:
     return names
 
 
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0]
-
-
 def _say(text: str) -> None:
     sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()

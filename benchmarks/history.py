@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 
-from benchmarks.machine import describe, processor
 from benchmarks.processes import ROOT
 from benchmarks.rows import TIMES, Row, Timing
+from dopt.cores import usable_cores
 
 FEWEST = 3
 """Runs of a row before its median says anything."""
@@ -126,3 +130,32 @@ def _commit() -> str:
     command = ["git", "describe", "--always", "--dirty"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     return done.stdout.strip() or "unknown"
+
+
+LIBRARIES = ("numpy", "numba", "llvmlite", "torch", "jax", "ray", "sqlalchemy", "matplotlib")
+
+
+def describe() -> list[str]:
+    """Return lines about the processor, its load, and the versions of the libraries."""
+    cores = usable_cores()
+    load = os.getloadavg()[0]
+    found = [f"{name} {version(name)}" for name in LIBRARIES if find_spec(name)]
+    return [
+        f"machine: {processor()}, {cores} cores, {platform.system()} {platform.release()}, "
+        f"load {load:.1f} before the start",
+        f"versions: Python {platform.python_version()}, {', '.join(found)}",
+    ]
+
+
+def processor() -> str:
+    """Return the name of the processor as the kernel knows it, with its generation."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.machine()
+    pairs = [line.partition(":") for line in lines]
+    known = {key.strip(): value.strip() for key, _, value in reversed(pairs)}
+    if "model name" not in known:
+        return platform.machine()
+    family, model = known.get("cpu family", "?"), known.get("model", "?")
+    return f"{known['model name']} (family {family}, model {model})"

@@ -28,7 +28,7 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.features import feature_values
 
 
-def measure(quick: bool) -> list[Row]:
+def jax_scan(quick: bool) -> list[Row]:
     """Return the cost of a step of the scan, run in turn with the kernel.
 
     Both are the quickest of several trials, and the scan is timed by the processor's seconds: on

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks import calibration
+from benchmarks.rows import fixed_seconds
 from dopt.kernel.information.primal import PENDING_ROWS
 from dopt.result import TrialResult
 from dopt.run import run_trial
@@ -95,7 +95,7 @@ def run_in_turn(
     for seed in range(rounds):
         for name, spec in specs.items():
             results[name].append(run(spec.with_seed(seed)))
-            fixed.append(calibration.seconds())
+            fixed.append(fixed_seconds())
     return results, min(fixed)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,10 +10,10 @@ from typing import cast
 import numpy as np
 import pytest
 
-from benchmarks import calibration, history, step
+from benchmarks import cli, history, kernel
 from benchmarks.cli import main
 from benchmarks.history import FEWEST, Run, append, costs, read, slower
-from benchmarks.rows import Row, Timing
+from benchmarks.rows import Row, Timing, algebra, fixed_seconds, interpreter
 from benchmarks.trials import CYCLE, cost, step_us
 from dopt.result import TrialResult
 from dopt.run import run_trial
@@ -96,14 +95,13 @@ def test_what_is_no_time_is_left_out() -> None:
 def test_the_command_fails_where_a_row_became_slower(
     past: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(calibration, "seconds", lambda: 0.01)
+    monkeypatch.setattr(cli, "fixed_seconds", lambda: 0.01)
     arguments = ["--only", "step", "--history", str(tmp_path / "history.jsonl")]
     arguments += ["--against", str(past)]
     monkeypatch.setattr(history, "processor", lambda: "usual")
     for value, status in ((101.0, 0), (170.0, 1)):
         rows = [Row("D-optimal", value, "µs")]
-        module = SimpleNamespace(measure=lambda _, rows=rows: rows)
-        monkeypatch.setitem(sys.modules, "benchmarks.step", module)
+        monkeypatch.setattr(kernel, "step", lambda _, rows=rows: rows)
         assert main(arguments) == status
     assert "slower: step: D-optimal: 1.70 times the median of 3 runs" in capsys.readouterr().out
     assert len(read(tmp_path / "history.jsonl")) == 2
@@ -159,15 +157,15 @@ def test_a_slower_kernel_is_found_where_it_is_measured(
     past, new = tmp_path / "past.jsonl", tmp_path / "new.jsonl"
     for _ in range(FEWEST):
         assert main(["--quick", "--only", "step", "--history", str(past)]) == 0
-    monkeypatch.setattr(step, "run_trial", half_as_long_again)
+    monkeypatch.setattr(kernel, "run_trial", half_as_long_again)
     command = ["--quick", "--only", "step", "--history", str(new), "--against", str(past)]
     assert main(command) == 1
     assert "slower: step: D-optimal, window of 100: 1." in capsys.readouterr().out
 
 
 def test_the_calibration_takes_time() -> None:
-    for work in (calibration.algebra, calibration.interpreter):
-        assert 0.0 < calibration.seconds(work) < 1.0
+    for work in (algebra, interpreter):
+        assert fixed_seconds(work) > 0.0
 
 
 def test_the_stored_history_holds_enough_runs_of_what_is_checked() -> None:

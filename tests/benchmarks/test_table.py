@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import math
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import pytest
 
 from benchmarks.cli import HEADERS, QUESTIONS, main, parser
 from benchmarks.history import read
-from benchmarks.launches import _accounts
+from benchmarks.processes import _accounts
 from benchmarks.rows import Anchor, Row, Target
 from tests.paths import ROOT
 
@@ -41,7 +42,6 @@ def test_the_step_is_measured_beside_its_targets(tmp_path: Path) -> None:
     assert "numba " in done.stdout
     (run,) = read(history)
     assert [f"step: {row['what']}" for row in rows] == list(run.rows)
-    assert history.with_suffix(".png").stat().st_size > 0
 
 
 def test_a_question_that_fails_is_said_and_the_others_are_asked(
@@ -68,10 +68,9 @@ def test_a_question_that_does_not_exist_is_refused(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
-def test_every_question_has_a_file_of_its_own(question: str) -> None:
-    text = (ROOT / "benchmarks" / f"{question}.py").read_text(encoding="utf-8")
-    assert text.startswith('"""')
-    assert "\ndef measure(" in text
+def test_every_question_is_a_function_that_says_what_it_measures(question: str) -> None:
+    module = importlib.import_module(f"benchmarks.{QUESTIONS[question]}")
+    assert getattr(module, question).__doc__.startswith("Return ")
 
 
 def test_ratios_are_above_one_where_the_target_is_met() -> None:

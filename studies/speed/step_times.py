@@ -1,6 +1,6 @@
 """Mean and longest step of the configurations among which the README lets its reader choose.
 
-``python -m benchmarks.step_times > docs/step_times.csv`` writes what the pages print.
+``python -m studies.speed.step_times > docs/step_times.csv`` writes what the pages print.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.rows import Row
 from benchmarks.trials import WINDOW, step_us
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
@@ -44,18 +43,6 @@ def times(name: str, env: str, seed: int) -> tuple[float, float, float]:
     spec = TrialSpec.from_names(env=env, seed=seed, **parts)
     steps = step_us(run_trial(spec))[WINDOW:]
     return float(steps.mean()), float(np.percentile(steps, 99)), float(steps.max())
-
-
-def measure(quick: bool) -> list[Row]:
-    """Return the mean step in the slowest system, and the longest of all steps in the note."""
-    envs, seeds = (SYSTEMS[:1], SEEDS[:1]) if quick else (SYSTEMS, SEEDS)
-    rows = []
-    for name in CONFIGURATIONS:
-        found = np.array([[times(name, env, seed) for seed in seeds] for env in envs])
-        mean, p99, longest = (found[..., i].mean(axis=1).max() for i in range(3))
-        note = f"slowest system; p99 {p99:,.0f} µs, longest step {longest:,.0f} µs"
-        rows.append(Row(name, mean, "µs", note=note))
-    return rows
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ of 38 configurations (``docs/adaptive_seeds/final_losses.csv``).
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +15,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.rows import Row
 from orchestrate.runner.seed_plan import half_width, is_narrow, looks
 
 Array = npt.NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, ...]], Array]
 
 SEEDS = 100
-CLAIMS = Path(__file__).resolve().parents[1] / "docs/adaptive_seeds/final_losses.csv"
+CLAIMS = Path(__file__).resolve().parents[2] / "docs/adaptive_seeds/final_losses.csv"
 
 SHAPES: dict[str, Draw] = {
     "normal": lambda rng, size: rng.standard_normal(size),
@@ -82,22 +82,18 @@ def _resampled(values: Array) -> Draw:
     return lambda rng, size: rng.choice(values, size)
 
 
-def measure(quick: bool) -> list[Row]:
-    """Return the simulated coverage by shape and spread of the losses, and with stored losses."""
-    return list(_coverages(100 if quick else 2_000))
-
-
-def _coverages(studies: int) -> Iterator[Row]:
+def coverages(studies: int) -> Iterator[str]:
+    """Yield lines with the simulated coverage: by shape and spread, and of stored losses."""
     for name, draw in SHAPES.items():
         for spread in (0.05, 0.1, 0.15, 0.2):
             found = coverage(draw, studies, spread)
-            yield Row(f"coverage of ci<5%, {name}, spread {spread:g}", found.value, note=found.note)
+            yield f"{name}, spread {spread:g}: {found.value:.3f} ({found.note})"
     by_name = resampled_coverages(studies // 2)
     lowest = min(by_name, key=lambda name: by_name[name].value)
-    yield Row(
-        "coverage of ci<5%, losses of the claims, spread 0.15",
-        float(np.mean([found.value for found in by_name.values()])),
-        note=f"mean of {len(by_name)}; lowest {by_name[lowest].value:.3f}, {' '.join(lowest)}",
+    mean = np.mean([found.value for found in by_name.values()])
+    yield (
+        f"losses of the claims, spread 0.15: {mean:.3f} (mean of {len(by_name)}; lowest "
+        f"{by_name[lowest].value:.3f}, {' '.join(lowest)})"
     )
 
 
@@ -110,3 +106,8 @@ def claimed_losses() -> dict[tuple[str, str], Array]:
             )
             for row in csv.DictReader(file)
         }
+
+
+if __name__ == "__main__":
+    for line in coverages(100 if "--quick" in sys.argv else 2_000):
+        sys.stdout.write(f"{line}\n")

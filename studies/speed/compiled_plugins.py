@@ -6,6 +6,7 @@ functions as the shipped ones.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,6 +26,7 @@ from dopt.policies import InformationPolicy
 from dopt.policies.base import CompiledPolicy
 from dopt.spec.trial import TrialSpec
 from dopt.types import Vector
+from studies.speed import show
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,3 +116,7 @@ def _with(spec: TrialSpec, section: str, cls: type) -> TrialSpec:
     """Return a trial with a class of one's own in a section."""
     own = {"_target_": f"{cls.__module__}.{cls.__qualname__}"}
     return TrialSpec.from_mapping({**spec.to_mapping(), section: own})
+
+
+if __name__ == "__main__":
+    show(measure("--quick" in sys.argv))

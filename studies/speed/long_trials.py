@@ -1,7 +1,7 @@
 """Time and memory of long trials, on systems of up to 40 dimensions.
 
-``python -m benchmarks.long_trials SYSTEM STEPS`` runs one of them and prints what its steps took.
-It is a process of its own, whose memory is that of the trial.
+``python -m studies.speed.long_trials`` runs all; with SYSTEM STEPS it runs one of them and prints
+what its steps took. It is a process of its own, whose memory is that of the trial.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from benchmarks.rows import Row
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from studies.speed import show
 
 SYSTEMS: dict[str, dict[str, object]] = {
     "cartpole": {},
@@ -43,8 +44,8 @@ def measure(quick: bool) -> list[Row]:
 
 
 def _row(name: str, steps: int) -> Row:
-    short = processes.run("-m", "benchmarks.long_trials", name, str(steps // 10))
-    done = processes.run("-m", "benchmarks.long_trials", name, str(steps))
+    short = processes.run("-m", "studies.speed.long_trials", name, str(steps // 10))
+    done = processes.run("-m", "studies.speed.long_trials", name, str(steps))
     took = json.loads(done.output.splitlines()[-1])
     note = (
         f"q = {took['parameters']:,}; {took['first_us']:.0f} µs in the second tenth; peak "
@@ -84,4 +85,7 @@ def _bytes(result: TrialResult) -> int:
 
 
 if __name__ == "__main__":
-    _run(sys.argv[1], int(sys.argv[2]))
+    if len(sys.argv) > 2:
+        _run(sys.argv[1], int(sys.argv[2]))
+    else:
+        show(measure("--quick" in sys.argv))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,6 +11,7 @@ from benchmarks.rows import Row, Target
 from benchmarks.trials import TINY_GRID, cartpole
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from studies.speed import show
 
 WIDTHS = (8, 16, 32, 64, 128, 256)
 LARGEST_MATRIX = 2**30
@@ -75,3 +77,7 @@ def _slope(sizes: list[int], costs: list[float]) -> float:
     """Return the exponent of the power law fitted to the upper half, at least three points."""
     upper = -max(3, len(sizes) // 2)
     return float(np.polyfit(np.log(sizes[upper:]), np.log(costs[upper:]), 1)[0])
+
+
+if __name__ == "__main__":
+    show(measure("--quick" in sys.argv))
