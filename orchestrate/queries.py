@@ -22,7 +22,7 @@ from orchestrate.store import (
     explorations,
     failure_kinds,
 )
-from orchestrate.store.serialization import stored_json, utc_text
+from orchestrate.store.records import stored_json, utc_text
 
 RATE_WINDOW_SECONDS = 300.0
 """Period over which the rate is averaged."""

@@ -9,8 +9,7 @@ import pytest
 
 from orchestrate import __main__ as orchestrate
 from orchestrate.store import Reader
-from orchestrate.store.schema import SCHEMA_VERSION, metadata
-from orchestrate.store.views import VIEWS
+from orchestrate.store.schema import SCHEMA_VERSION, VIEWS, metadata
 from tests.analysis.synthetic import fill, make_grid
 from tests.pages import PAGES, blocks
 from tests.test_docs import SHORT, TASK

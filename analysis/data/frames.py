@@ -27,7 +27,7 @@ from analysis.data.samples import LearnedModel, learned_model
 from analysis.data.selection import environment_rank, policy_rank
 from analysis.errors import AnalysisError
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Curves, Reader, default_url
-from orchestrate.store.serialization import stacked
+from orchestrate.store.records import stacked
 
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 _MEASURED = ("seed", "t", "measure", "value", "diverged")

@@ -24,14 +24,12 @@ from orchestrate.commands.command import (
 )
 from orchestrate.commands.results import ListedTrial, listed, the_one
 from orchestrate.errors import ExitCode
-from orchestrate.store import RETRIED, Prunable, Reader, Store, prunable
-from orchestrate.store.backup import back_up
+from orchestrate.store import RETRIED, Reader, Store
 from orchestrate.store.doctor import Finding, examine
-from orchestrate.store.merging.merge import Merged, TrialName, merge
+from orchestrate.store.maintenance import Prunable, back_up, merge_collected, prunable, vacuum
+from orchestrate.store.merge import Merged, TrialName, merge
 from orchestrate.store.migrations.upgrade import Upgrade, upgrade
-from orchestrate.store.serialization import utc_text
-from orchestrate.store.shards import merge_collected
-from orchestrate.store.vacuum import vacuum
+from orchestrate.store.records import utc_text
 
 MAX_LISTED = 10
 """Trials of a kind that are listed; the JSON has all of them."""

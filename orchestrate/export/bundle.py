@@ -35,9 +35,8 @@ from orchestrate.store.bundle import (
     primary_key,
     write_checksums,
 )
-from orchestrate.store.schema import OUTCOME, RUN_COLUMNS
-from orchestrate.store.serialization import unpack
-from orchestrate.store.views import VIEWS
+from orchestrate.store.records import unpack
+from orchestrate.store.schema import OUTCOME, RUN_COLUMNS, VIEWS
 
 CARD = "README.md"
 

@@ -16,7 +16,7 @@ from orchestrate.files import whole
 from orchestrate.queries import counts
 from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
-from orchestrate.store.serialization import now
+from orchestrate.store.records import now
 
 KINDS = ("curves", "trials", "trajectories", "assessments")
 """Exports that are one file."""

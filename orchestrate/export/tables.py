@@ -20,8 +20,8 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from orchestrate.store import ConfigRow, Reader, Trajectory
+from orchestrate.store.records import stacked, unpack
 from orchestrate.store.schema import OUTCOME_COLUMNS, trial
-from orchestrate.store.serialization import stacked, unpack
 
 _TEXT, _WHOLE, _REAL = pa.string(), pa.int64(), pa.float64()
 STEP_COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")

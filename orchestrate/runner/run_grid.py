@@ -34,7 +34,7 @@ from orchestrate.store import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.shards import collect, merge_collected
+from orchestrate.store.maintenance import collect, merge_collected
 
 POLL_OTHER_LAUNCHES_SECONDS = 1.0
 """Interval of status queries for trials that another launch runs."""

@@ -2,8 +2,8 @@
 
 :class:`Store` is the write side, used by launches; :class:`Reader` is the read side, used by the
 analysis. A trial is registered, claimed by one launch, and committed completely or rejected.
-What a command does to a whole database is in modules of their own: ``merging``, ``migrations``,
-``doctor``, ``shards``, ``backup`` and ``vacuum``.
+What a command does to a whole database is in modules of their own: ``merge``, ``bundle``,
+``migrations``, ``doctor`` and ``maintenance``.
 """
 
 from __future__ import annotations
@@ -21,30 +21,31 @@ from orchestrate.store.errors import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.read.explorations import ExplorationRow, explorations
-from orchestrate.store.read.failures import FailureKind, failure_kinds
-from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
-from orchestrate.store.read.prunable import Prunable, prunable
-from orchestrate.store.read.reader import Reader
-from orchestrate.store.read.rows import (
+from orchestrate.store.exploration import Saved
+from orchestrate.store.launches import OpenConfig, OpenTrial
+from orchestrate.store.reader import (
+    ExplorationRow,
+    FailureKind,
+    Reader,
+    explorations,
+    failure_kinds,
+)
+from orchestrate.store.records import (
     Assessments,
+    Claim,
     ConfigRow,
     Curves,
+    LaunchRecord,
     LaunchRow,
+    Registrable,
+    Registration,
+    Result,
     Table,
     Trajectory,
     TrialRow,
 )
-from orchestrate.store.records import (
-    Claim,
-    LaunchRecord,
-    Registrable,
-    Registration,
-    Result,
-)
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
 from orchestrate.store.store import Store
-from orchestrate.store.write.explorations import Saved
 
 __all__ = [
     "CONFIG_COLUMNS",
@@ -69,7 +70,6 @@ __all__ = [
     "NoDatabaseError",
     "OpenConfig",
     "OpenTrial",
-    "Prunable",
     "QueryError",
     "Reader",
     "Registrable",
@@ -87,5 +87,4 @@ __all__ = [
     "default_url",
     "explorations",
     "failure_kinds",
-    "prunable",
 ]

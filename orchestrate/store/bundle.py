@@ -21,14 +21,14 @@ import numpy as np
 from sqlalchemy import Connection, Double, LargeBinary
 from sqlalchemy.types import Integer
 
-from orchestrate.store import schema_version
+from orchestrate.store import schema
 from orchestrate.store.backends.driver_errors import translated_file
 from orchestrate.store.backends.sqlite_engine import driver_of, filling_engine
 from orchestrate.store.doctor import TrialKey
 from orchestrate.store.errors import SchemaVersionError, StoreError, StoreUnavailableError
-from orchestrate.store.merging.merge import Merged, merge
+from orchestrate.store.merge import Merged, merge
+from orchestrate.store.records import DTYPE
 from orchestrate.store.schema import SCHEMA_VERSION, alembic_version, curve, metadata
-from orchestrate.store.serialization import DTYPE
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -147,7 +147,7 @@ def fill(path: Path, folder: Path) -> None:
     engine = filling_engine(path)
     try:
         with engine.begin() as connection:
-            schema_version.create(connection)
+            schema.create(connection)
             for table in TABLES:
                 _insert(connection, table, folder / file_name(table))
     finally:

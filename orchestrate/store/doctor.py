@@ -15,7 +15,7 @@ from typing import Literal
 
 from orchestrate.store import database_url, packed_curves
 from orchestrate.store.errors import StoreUnavailableError
-from orchestrate.store.read.reader import Reader
+from orchestrate.store.reader import Reader
 from orchestrate.store.schema import N_ROWS, PREQUENTIAL, STEP_VALUES
 
 Severity = Literal["error", "note"]

@@ -7,7 +7,10 @@ stores NaN as NULL, PostgreSQL as NaN.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shlex
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
@@ -16,6 +19,7 @@ from sqlalchemy import (
     BigInteger,
     CheckConstraint,
     Column,
+    Connection,
     Double,
     ForeignKey,
     Index,
@@ -27,9 +31,13 @@ from sqlalchemy import (
     Text,
     UniqueConstraint,
     func,
+    inspect,
     select,
+    text,
 )
 from sqlalchemy.types import TypeEngine
+
+from orchestrate.store.errors import SchemaVersionError
 
 SCHEMA_VERSION = 7
 """Number of the newest script in ``migrations/versions``."""
@@ -279,3 +287,228 @@ def alike(launch_id: int) -> Select[tuple[int]]:
     mine = select(func.coalesce(launch.c.fingerprint, "")).where(launch.c.launch_id == launch_id)
     same = func.coalesce(launch.c.fingerprint, "") == mine.scalar_subquery()
     return select(launch.c.launch_id).where(same)
+
+
+_CONFIG = "c.config_key, c.label, c.env, c.policy, c.model, c.learner, c.width, c.depth"
+
+_OUTCOME = ", ".join(f"r.{name}" for name in OUTCOME_COLUMNS)
+
+_TRIAL = f"""
+SELECT {_CONFIG}, c.horizon, c.dt, c.gamma,
+       r.seed, r.trial_id, r.trial_key, r.status, r.attempt, {_OUTCOME}, r.launch_id,
+       e.type AS error_type, e.message AS error_message
+FROM trial r
+JOIN config c ON c.config_id = r.config_id
+LEFT JOIN error e ON e.error_id = r.error_id
+"""
+
+# SQLite keeps the order of a CROSS JOIN: it would read the steps of all configurations otherwise.
+_CURVE = f"""
+SELECT {_CONFIG}, r.seed, s.t, s.loss, s.reachable_loss
+FROM config c CROSS JOIN trial r CROSS JOIN step s
+WHERE r.config_id = c.config_id AND s.trial_id = r.trial_id
+"""
+
+# One pass is exact enough: losses of different seeds differ by far more than 1e-6 of their mean,
+# so cancellation in the variance costs less than 1e-3 of the error. The outer CASE keeps rounding
+# from making the variance of equal losses negative. The square of a loss above 1e150 overflows,
+# for which PostgreSQL refuses the whole query: such losses, of diverging models, have no error.
+_CURVE_STATS = """
+SELECT config_key, label, env, policy, model, learner, width, depth, t, n, n_finite, mean,
+       CASE WHEN n_finite < 2 OR n_squares < n_finite THEN NULL
+            WHEN squares <= n_finite * mean * mean THEN 0.0
+            ELSE sqrt((squares - n_finite * mean * mean) / (n_finite - 1) / n_finite)
+       END AS standard_error
+FROM (SELECT config_key, label, env, policy, model, learner, width, depth, t,
+             count(*) AS n, count(loss) AS n_finite, avg(loss) AS mean,
+             count(CASE WHEN abs(loss) < 1e150 THEN 1 END) AS n_squares,
+             sum(CASE WHEN abs(loss) < 1e150 THEN loss * loss END) AS squares
+      FROM v_curve
+      GROUP BY config_key, label, env, policy, model, learner, width, depth, t) AS sums
+"""
+
+
+def _count(status: str) -> str:
+    return f"count(*) FILTER (WHERE r.status = '{status}') AS n_{status}"
+
+
+_COUNTS = ",\n       ".join(
+    _count(status) for status in ("done", "diverged", "failed", "cancelled", "pending", "running")
+)
+
+_PROGRESS = f"""
+SELECT {_CONFIG}, c.horizon, c.dt, c.gamma, count(*) AS n,
+       {_COUNTS}
+FROM config c
+JOIN trial r ON r.config_id = c.config_id
+GROUP BY c.config_id, {_CONFIG}, c.horizon, c.dt, c.gamma
+"""
+
+_FAILURES = f"""
+SELECT {_CONFIG}, r.seed, r.trial_key, r.status, a.attempt, a.launch_id, a.node, a.ended,
+       a.cause, e.type, e.message, e.traceback
+FROM attempt a
+JOIN error e ON e.error_id = a.error_id
+JOIN trial r ON r.trial_id = a.trial_id
+JOIN config c ON c.config_id = r.config_id
+"""
+
+_ASSESSMENT = f"""
+SELECT {_CONFIG}, c.horizon, r.seed, r.trial_key, r.status, a.t, a.measure, a.value
+FROM config c
+JOIN trial r ON r.config_id = c.config_id
+JOIN assessment a ON a.trial_id = r.trial_id
+"""
+
+# In the order of creation.
+VIEWS = {
+    "v_trial": _TRIAL,
+    "v_curve": _CURVE,
+    "v_curve_stats": _CURVE_STATS,
+    "v_progress": _PROGRESS,
+    "v_failures": _FAILURES,
+    "v_assessment": _ASSESSMENT,
+}
+
+
+def create_views(connection: Connection) -> None:
+    """Create the views, in place of those that an older program of this version has created."""
+    if connection.dialect.name == "sqlite":
+        drop_views(connection)
+        create = "CREATE VIEW"
+    else:
+        create = "CREATE OR REPLACE VIEW"  # those of others may depend on them
+    for name, query in VIEWS.items():
+        connection.execute(text(f"{create} {name} AS {query}"))
+
+
+def drop_views(connection: Connection) -> None:
+    """Drop the views of this program, and no others."""
+    existing = set(inspect(connection).get_view_names())
+    for name in reversed(VIEWS):
+        if name in existing:
+            connection.execute(text(f"DROP VIEW {name}"))
+
+
+OLDEST = 5
+"""Oldest schema that is upgraded."""
+
+CHECK_SECONDS = 10.0
+"""Time that the check of a database may take, which a stranger may have made."""
+
+_PROGRESS_STEPS = 10_000  # instructions of SQLite's virtual machine, well below a millisecond
+
+# Of tables alone: a view may never end. Nor does a generated column hold what is in the file.
+_COLUMNS = {
+    "sqlite": "SELECT l.name, x.name, CASE x.hidden WHEN 0 THEN x.type END "
+    "FROM pragma_table_list AS l, pragma_table_xinfo(l.name) AS x "
+    "WHERE l.schema = 'main' AND l.type = 'table' AND l.strict = 1",
+    "postgresql": "SELECT c.relname, a.attname, "
+    "CASE a.attgenerated WHEN '' THEN upper(format_type(a.atttypid, NULL)) END "
+    "FROM pg_class AS c JOIN pg_attribute AS a ON a.attrelid = c.oid WHERE c.relkind = 'r' "
+    "AND c.relnamespace = to_regnamespace(current_schema()) AND a.attnum > 0 AND a.atttypid > 0",
+}
+
+
+def create_or_check(connection: Connection, safe_url: str) -> None:
+    """Create the tables of an empty database; raise ``SchemaVersionError`` for another version."""
+    if is_empty(connection):
+        create(connection)
+    else:
+        check(connection, safe_url)
+
+
+def is_empty(connection: Connection) -> bool:
+    return set(inspect(connection).get_table_names()) <= {LOCK_TABLE}
+
+
+def create(connection: Connection) -> None:
+    """Create the newest tables and views in an empty database."""
+    metadata.create_all(connection, checkfirst=False)
+    create_views(connection)
+    stamp = alembic_version.insert().values(version_num=str(SCHEMA_VERSION))
+    connection.execute(stamp)
+
+
+def check(connection: Connection, safe_url: str) -> int:
+    """Return the version of the schema; raise ``SchemaVersionError`` for another one.
+
+    Raises it too if a table is a view, or has not the columns of this program.
+    """
+    with _limited(connection):
+        version = _check_version(connection, safe_url)
+        _check_tables(connection, safe_url)
+    return version
+
+
+@contextmanager
+def _limited(connection: Connection) -> Iterator[None]:
+    """End a statement of the block that takes too long."""
+    if connection.dialect.name == "postgresql":
+        connection.exec_driver_sql(f"SET LOCAL statement_timeout = {1000 * CHECK_SECONDS:.0f}")
+        yield
+        connection.exec_driver_sql("SET LOCAL statement_timeout = DEFAULT")
+        return
+    driver, end = connection.connection.driver_connection, time.monotonic() + CHECK_SECONDS
+    driver.set_progress_handler(lambda: time.monotonic() > end, _PROGRESS_STEPS)  # type: ignore[union-attr]
+    try:
+        yield
+    finally:
+        driver.set_progress_handler(None, 0)  # type: ignore[union-attr]
+
+
+def _check_tables(connection: Connection, safe_url: str) -> None:
+    rows = connection.exec_driver_sql(_COLUMNS[connection.dialect.name])
+    found = {(table, column): kind for table, column, kind in rows}
+    generated = {table for (table, _), kind in found.items() if kind is None}
+    tables = [one for one in metadata.sorted_tables if one is not alembic_version]
+    for table in tables:
+        kinds = {one.name: one.type.compile(connection.dialect) for one in table.columns}
+        whole = all(found.get((table.name, name)) == kind for name, kind in kinds.items())
+        if not whole or table.name in generated:
+            raise SchemaVersionError(
+                f"{safe_url} is not a results database of this program ({table.name} is no table, "
+                "or has other columns): give the URL of another one, or of a new one."
+            )
+
+
+def _check_version(connection: Connection, safe_url: str) -> int:
+    version = version_of(connection, safe_url)
+    if version < SCHEMA_VERSION:
+        command = f"python -m orchestrate upgrade --db {shlex.quote(safe_url)}"
+        raise SchemaVersionError(
+            f"The results database {safe_url} was written by an older program (its schema is "
+            f"version {version}, this program reads version {SCHEMA_VERSION}): run '{command}', "
+            "which makes a backup first."
+        )
+    check_not_newer(version, safe_url)
+    return version
+
+
+def check_not_newer(version: int, safe_url: str) -> None:
+    if version > SCHEMA_VERSION:
+        raise SchemaVersionError(
+            f"The results database {safe_url} was written by a newer program (its schema is "
+            f"version {version}, this program reads version {SCHEMA_VERSION}): update the program."
+        )
+
+
+def version_of(connection: Connection, safe_url: str) -> int:
+    """Return the version of the schema; raise ``SchemaVersionError`` for others and old ones."""
+    tables = inspect(connection).get_table_names()
+    found = "1" if "schema_version" in tables else None  # before the program used Alembic
+    if alembic_version.name in tables:
+        found = connection.execute(text("SELECT max(version_num) FROM alembic_version")).scalar()
+    if "trial" not in tables or not str(found).isdecimal():
+        raise SchemaVersionError(
+            f"{safe_url} is not a results database of this program (it has no table "
+            f"'{alembic_version.name}' with the number of a schema): give the URL of another one, "
+            "or of a new one."
+        )
+    version = int(str(found))
+    if version < OLDEST:
+        raise SchemaVersionError(
+            f"The results database {safe_url} has schema {version}, but only schemas from {OLDEST} "
+            "on are upgraded: export it with the release of this program that wrote it."
+        )
+    return version

@@ -6,28 +6,12 @@ from collections.abc import Iterable, Sequence
 from typing import Self
 
 from orchestrate.records import Failure, RunRecord
-from orchestrate.store import database_url, schema_version
+from orchestrate.store import database_url, exploration, launches, results, schema
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, PATIENCE_SECONDS, make_backend
-from orchestrate.store.read import open_trials
-from orchestrate.store.read.final_losses import final_losses
-from orchestrate.store.read.open_trials import OpenConfig, OpenTrial
-from orchestrate.store.records import (
-    Claim,
-    LaunchRecord,
-    Registrable,
-    Registration,
-    Result,
-)
-from orchestrate.store.write import (
-    claims,
-    explorations,
-    launches,
-    pruning,
-    registration,
-    results,
-)
-from orchestrate.store.write.explorations import Saved
+from orchestrate.store.exploration import Saved
+from orchestrate.store.launches import OpenConfig, OpenTrial, final_losses
+from orchestrate.store.records import Claim, LaunchRecord, Registrable, Registration, Result
 
 
 class Store:
@@ -52,7 +36,7 @@ class Store:
         backend = make_backend(database_url.parse(url), lease_seconds, patience)
         try:
             with backend.creation() as connection:
-                schema_version.create_or_check(connection, backend.safe_url)
+                schema.create_or_check(connection, backend.safe_url)
         except BaseException:
             backend.close()
             raise
@@ -105,9 +89,9 @@ class Store:
 
     def register(self, launch: int, specs: Iterable[Registrable]) -> Registration:
         """Register a grid and return the state of its trials; repeated calls are harmless."""
-        grid = registration.GridRows(specs)
+        grid = launches.GridRows(specs)
         with self._backend.transaction() as connection:
-            return registration.register(connection, self._backend, launch, grid)
+            return launches.register(connection, self._backend, launch, grid)
 
     def final_losses(self, trial_keys: Sequence[str]) -> dict[str, float]:
         """Return the final loss of those of the trials that are done and did not diverge."""
@@ -120,7 +104,7 @@ class Store:
         Only trials count that a launch with the fingerprint of this one has registered.
         """
         with self._backend.transaction() as connection:
-            return open_trials.open_configs(connection, launch)
+            return launches.open_configs(connection, launch)
 
     def others(self, launch: int) -> list[tuple[dict[str, str] | None, int]]:
         """Return the other fingerprints with which open trials were registered, and their counts.
@@ -128,7 +112,7 @@ class Store:
         None is the fingerprint of a program that stored none.
         """
         with self._backend.transaction() as connection:
-            return open_trials.others(connection, launch)
+            return launches.others(connection, launch)
 
     def open_trials(self, launch: int, config_id: int, size: int, losses: int) -> list[OpenTrial]:
         """Return some pending trials of a configuration that lost fewer launches than ``losses``.
@@ -137,12 +121,12 @@ class Store:
         so that workers rarely choose the same ones.
         """
         with self._backend.transaction() as connection:
-            return open_trials.open_trials(connection, launch, config_id, size, losses)
+            return launches.open_trials(connection, launch, config_id, size, losses)
 
     def suspects(self, launch: int, losses: int) -> list[OpenTrial]:
         """Return the pending trials, as above, whose launch was lost at least ``losses`` times."""
         with self._backend.transaction() as connection:
-            return open_trials.suspects(connection, launch, losses)
+            return launches.suspects(connection, launch, losses)
 
     def claim(self, launch: int, trial_keys: Sequence[str], *, alike: bool = False) -> list[Claim]:
         """Claim those of the trials that are pending, in the given order.
@@ -151,7 +135,7 @@ class Store:
         """
         with self._backend.transaction() as connection:
             launches.renew(connection, self._backend, launch)
-            return claims.claim(connection, self._backend, launch, trial_keys, alike)
+            return launches.claim(connection, self._backend, launch, trial_keys, alike)
 
     def commit(self, claim: Claim, result: Result, run: RunRecord) -> bool:
         """Write a finished trial with its curve and trajectory; return False if the claim is lost.
@@ -177,7 +161,7 @@ class Store:
     def holds_more(self, spec: Registrable, result: Result) -> bool:
         """Return whether more steps of an exploration are stored; raises as :meth:`save`."""
         with self._backend.transaction() as connection:
-            return explorations.is_longer(connection, self._backend, spec, result)
+            return exploration.is_longer(connection, self._backend, spec, result)
 
     def save(
         self,
@@ -195,7 +179,7 @@ class Store:
         """
         self.check()
         with self._backend.transaction() as connection:
-            return explorations.save(connection, self._backend, launch, spec, result, run, last)
+            return exploration.save(connection, self._backend, launch, spec, result, run, last)
 
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
         """Write a failed trial with its error; return False if the claim is lost."""
@@ -216,7 +200,7 @@ class Store:
         """
         only = None if trial_keys is None else self._backend.members(trial_keys)
         with self._backend.transaction() as connection:
-            return claims.free_claims(connection, [launch], "released", only, cause)
+            return launches.free_claims(connection, [launch], "released", only, cause)
 
     def retry(self, status: str = "failed", trial_keys: Sequence[str] | None = None) -> int:
         """Put finished trials of a status back to pending and return their number.
@@ -225,7 +209,7 @@ class Store:
         them to a grid. The rows of a diverged trial are deleted.
         """
         with self._backend.transaction() as connection:
-            return claims.retry(connection, self._backend, status, trial_keys)
+            return launches.retry(connection, self._backend, status, trial_keys)
 
     def prune(self, trial_keys: Sequence[str]) -> int:
         """Delete those of the trials that have an outcome, and return their number.
@@ -234,12 +218,12 @@ class Store:
         launches wait for none of them long; one that was interrupted can be repeated.
         """
         deleted = 0
-        for start in range(0, len(trial_keys), pruning.PAGE):
+        for start in range(0, len(trial_keys), results.PAGE):
             with self._backend.transaction() as connection:
-                page = trial_keys[start : start + pruning.PAGE]
-                deleted += pruning.prune(connection, self._backend, page)
+                page = trial_keys[start : start + results.PAGE]
+                deleted += results.prune(connection, self._backend, page)
         with self._backend.transaction() as connection:
-            pruning.prune_unused(connection, self._backend)
+            results.prune_unused(connection, self._backend)
         return deleted
 
     def close(self) -> None:

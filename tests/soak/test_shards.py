@@ -12,7 +12,7 @@ from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.share import Share
 from orchestrate.errors import ExitCode
 from orchestrate.runner.run_grid import Work, launch_grid
-from orchestrate.store.shards import merge_collected
+from orchestrate.store.maintenance import merge_collected
 from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.faults.outcome import flaws, results
 from tests.orchestrate.faults.trials import outcome

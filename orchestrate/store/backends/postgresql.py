@@ -35,9 +35,8 @@ from orchestrate.store import database_url
 from orchestrate.store.backends.backups import back_up_to, dump
 from orchestrate.store.backends.base import ANNOUNCE_SECONDS, Backend, LaunchLife, NewTrial, log
 from orchestrate.store.errors import StoreError, StoreUnavailableError
-from orchestrate.store.records import Array
+from orchestrate.store.records import Array, finite_list
 from orchestrate.store.schema import LOCK_TABLE, STEP_VALUES, launch
-from orchestrate.store.serialization import finite_list
 
 if TYPE_CHECKING:
     import psycopg

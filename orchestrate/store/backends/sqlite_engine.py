@@ -16,7 +16,7 @@ from orchestrate.store import database_url
 from orchestrate.store.backends.driver_errors import translated_file
 from orchestrate.store.backends.file_locks import patiently
 from orchestrate.store.errors import NoDatabaseError, StoreUnavailableError
-from orchestrate.store.views import VIEWS
+from orchestrate.store.schema import VIEWS
 
 BUSY_TIMEOUT_SECONDS = 30.0
 

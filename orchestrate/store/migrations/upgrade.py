@@ -10,16 +10,21 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection, bindparam, select, update
 
 from dopt.spec.label import config_label
-from orchestrate.store import database_url, migrations, packed_curves, schema_version
+from orchestrate.store import database_url, launches, packed_curves, schema
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import make_backend
-from orchestrate.store.schema import SCHEMA_VERSION, config, curve
-from orchestrate.store.write import launches
+from orchestrate.store.schema import SCHEMA_VERSION, config, create_views, curve, drop_views
+
+if TYPE_CHECKING:
+    from alembic.config import Config
+
+LOCATION = Path(__file__).parent
 
 
 @dataclass(frozen=True)
@@ -79,19 +84,19 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
     name = None
     try:
         with backend.rebuilding() as connection:
-            if schema_version.is_empty(connection):
-                schema_version.create(connection)
+            if schema.is_empty(connection):
+                schema.create(connection)
                 return Upgrade(backend.safe_url, None, SCHEMA_VERSION, None)
-            before = schema_version.version_of(connection, backend.safe_url)
-            schema_version.check_not_newer(before, backend.safe_url)
+            before = schema.version_of(connection, backend.safe_url)
+            schema.check_not_newer(before, backend.safe_url)
             if before < SCHEMA_VERSION:
                 launches.refuse_living(connection, backend)
                 name = backend.back_up(connection, before) if backup else None
-                migrations.migrate(connection)
+                migrate(connection)
                 curve.create(connection, checkfirst=True)
                 _write_labels(connection)
             else:
-                migrations.create_views(connection)
+                create_views(connection)
     except BaseException:
         if name is not None:
             Path(name).unlink(missing_ok=True)
@@ -110,3 +115,25 @@ def _write_labels(connection: Connection) -> None:
     if rows:
         statement = update(config).where(config.c.config_id == bindparam("id"))
         connection.execute(statement.values(label=bindparam("text")), rows)
+
+
+def migrate(connection: Connection) -> None:
+    """Migrate a database to the newest schema, in the transaction of the caller.
+
+    The views are dropped and created again: not every database can change a table below a view.
+    """
+    from alembic import command  # a sixth of the start of every program, and used by none but this
+
+    drop_views(connection)
+    command.upgrade(_configuration(connection), "head")
+    create_views(connection)
+
+
+def _configuration(connection: Connection) -> Config:
+    from alembic.config import Config
+
+    configuration = Config()
+    # The configuration parser interpolates %.
+    configuration.set_main_option("script_location", str(LOCATION).replace("%", "%%"))
+    configuration.attributes["connection"] = connection
+    return configuration

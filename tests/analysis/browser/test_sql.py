@@ -9,7 +9,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from analysis.serve import sql
-from orchestrate.store.views import VIEWS
+from orchestrate.store.schema import VIEWS
 from tests.analysis.browser.forms import post
 
 Visit = Callable[..., TestClient]

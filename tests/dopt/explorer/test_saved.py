@@ -24,7 +24,7 @@ from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store, StoreUnavailableError, explorations
 from orchestrate.store.doctor import examine
-from orchestrate.store.merging.merge import merge
+from orchestrate.store.merge import merge
 from tests.dopt.explorer.saves import content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN
 from tests.orchestrate.store.test_heartbeat import wait_for_renewals

@@ -11,7 +11,7 @@ from sqlalchemy.engine import make_url
 
 from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store
-from orchestrate.store.merging.merge import merge
+from orchestrate.store.merge import merge
 from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import Answer
 from tests.orchestrate.standins import specification

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from orchestrate.store import Store
-from orchestrate.store.backup import back_up
-from orchestrate.store.serialization import utc_text
+from orchestrate.store.maintenance import back_up
+from orchestrate.store.records import utc_text
 from tests.orchestrate.commands.conftest import BAD, DONE, RUNNING, WAITING, Answer
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result

@@ -15,7 +15,7 @@ from orchestrate.executors.base import Event, Executor, Task, WorkerLost
 from orchestrate.executors.task import run_task
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
 from orchestrate.store import Claim, Store, StoreUnavailableError
-from orchestrate.store.serialization import utc_text
+from orchestrate.store.records import utc_text
 from tests.orchestrate.conftest import Launches
 from tests.orchestrate.losses import lose
 from tests.orchestrate.standins import BROKEN_SEED, quick, raising

@@ -15,10 +15,11 @@ from typing import Any
 
 import sqlalchemy
 
-from orchestrate.store import Claim, Store, migrations
-from orchestrate.store.merging import merge as merging
-from orchestrate.store.merging import source as merge_source
-from orchestrate.store.merging.merge import merge
+from orchestrate.store import Claim, Store
+from orchestrate.store import merge as merge_source
+from orchestrate.store import merge as merging
+from orchestrate.store.merge import merge
+from orchestrate.store.migrations import upgrade as migration
 from orchestrate.store.migrations.upgrade import upgrade
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
 from tests.waiting import PATIENCE_SECONDS
@@ -151,7 +152,7 @@ def upgrade_and_tell(pipe: Pipe, url: str, barrier: Barrier | None, stops: bool 
             pipe.send("half")
             time.sleep(PATIENCE_SECONDS)
 
-        migrations.create_views = stop
+        migration.create_views = stop
     if barrier is not None:
         barrier.wait(PATIENCE_SECONDS)
     pipe.send("upgraded" if upgrade(url).changed else "nothing to do")

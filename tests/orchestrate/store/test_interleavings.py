@@ -11,8 +11,7 @@ from sqlalchemy import event
 
 from orchestrate.store import Failure, Reader, Store
 from orchestrate.store.doctor import examine
-from orchestrate.store.merging.merge import merge
-from orchestrate.store.merging.source import Source
+from orchestrate.store.merge import Source, merge
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged
 
 FAILURE = Failure("ValueError", "bad", "here")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from orchestrate.store import Reader, Store
-from orchestrate.store.serialization import DTYPE, finite_list, pack, unpack, utc_text
+from orchestrate.store.records import DTYPE, finite_list, pack, unpack, utc_text
 from tests.orchestrate.store.fakes import LAUNCH, Array
 
 

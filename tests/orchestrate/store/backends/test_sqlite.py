@@ -19,9 +19,9 @@ from orchestrate.store import (
     Store,
     StoreError,
     StoreUnavailableError,
+    launches,
 )
 from orchestrate.store.backends.sqlite_engine import _is_read_only, read_address
-from orchestrate.store.write import launches
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.processes import eight_open
 

@@ -12,8 +12,8 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from orchestrate.store import Claim, Failure, NoDatabaseError, Reader, Store, StoreError
-from orchestrate.store.merging import source
-from orchestrate.store.merging.merge import Merged, merge
+from orchestrate.store import merge as source
+from orchestrate.store.merge import Merged, merge
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
 from tests.orchestrate.store.processes import hear, kill, merge_and_tell, running

@@ -6,7 +6,7 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from orchestrate.store import Store
-from orchestrate.store.merging.merge import merge
+from orchestrate.store.merge import merge
 from tests.orchestrate.store.everything import everything
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed
 

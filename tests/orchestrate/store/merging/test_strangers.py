@@ -10,14 +10,9 @@ from sqlalchemy import text
 
 from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
-from orchestrate.store import (
-    Reader,
-    SchemaVersionError,
-    Store,
-    StoreUnavailableError,
-    schema_version,
-)
-from orchestrate.store.merging.merge import merge
+from orchestrate.store import Reader, SchemaVersionError, Store, StoreUnavailableError
+from orchestrate.store import schema as schema_version
+from orchestrate.store.merge import merge
 from orchestrate.store.schema import metadata
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.places import execute

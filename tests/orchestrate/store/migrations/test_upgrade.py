@@ -19,12 +19,11 @@ from orchestrate.store import (
     SchemaVersionError,
     Store,
     StoreUnavailableError,
-    migrations,
 )
 from orchestrate.store.backends.file_locks import LaunchLocks
+from orchestrate.store.migrations import upgrade as migration
 from orchestrate.store.migrations.upgrade import upgrade
-from orchestrate.store.schema import SCHEMA_VERSION
-from orchestrate.store.schema_version import OLDEST
+from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
 from tests.orchestrate.store.fakes import LAUNCH, Spec
 from tests.orchestrate.store.migrations.released import VERSIONS
 from tests.orchestrate.store.places import backups, execute, file_of
@@ -62,22 +61,22 @@ def with_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[st
 
     def add(script: str) -> None:
         location = tmp_path / "50% migrations"
-        shutil.copytree(migrations.LOCATION, location)
+        shutil.copytree(migration.LOCATION, location)
         script = script.format(head=SCHEMA_VERSION)
         (location / "versions" / "version_99.py").write_text(script)
-        monkeypatch.setattr(migrations, "LOCATION", location)
+        monkeypatch.setattr(migration, "LOCATION", location)
 
     return add
 
 
 def test_there_is_a_script_for_each_version_and_one_database() -> None:
-    scripts = {path.stem for path in (migrations.LOCATION / "versions").glob("version_*.py")}
+    scripts = {path.stem for path in (migration.LOCATION / "versions").glob("version_*.py")}
     assert scripts == {f"version_{n}" for n in range(OLDEST, SCHEMA_VERSION + 1)}
     assert list(range(OLDEST, SCHEMA_VERSION)) == VERSIONS
 
 
 def test_a_script_uses_no_code_that_may_change() -> None:
-    for path in (migrations.LOCATION / "versions").glob("version_*.py"):
+    for path in (migration.LOCATION / "versions").glob("version_*.py"):
         imported = {
             alias.name if isinstance(node, ast.Import) else str(node.module)
             for node in ast.walk(ast.parse(path.read_text()))

@@ -1,10 +1,11 @@
-"""Read side of the results database, which cannot write or create anything."""
+"""Launches with their provenance and liveness."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from itertools import chain
 from types import ModuleType
@@ -14,13 +15,13 @@ import numpy as np
 from sqlalchemy import URL, Connection, Engine, bindparam, select, text
 
 from dopt.errors import suggestion
-from orchestrate.store import database_url, schema_version
+from orchestrate.store import database_url, schema
 from orchestrate.store.backends import postgresql, sqlite
+from orchestrate.store.backends.base import LaunchLife
 from orchestrate.store.backends.driver_errors import translated
 from orchestrate.store.errors import QueryError
-from orchestrate.store.read import liveness
-from orchestrate.store.read.curves import read_curves
-from orchestrate.store.read.rows import (
+from orchestrate.store.packed_curves import read_curves
+from orchestrate.store.records import (
     Assessments,
     ConfigRow,
     Curves,
@@ -28,17 +29,58 @@ from orchestrate.store.read.rows import (
     Table,
     Trajectory,
     TrialRow,
+    stored_json,
+    unpack,
 )
-from orchestrate.store.read.user_query import run_select
 from orchestrate.store.schema import (
     FINISHED,
+    PREQUENTIAL,
     STEP_VALUES,
     assessment,
     config,
+    launch,
     trajectory,
     trial,
 )
-from orchestrate.store.serialization import stored_json, unpack
+from orchestrate.store.user_query import run_select
+
+Dead = Callable[[Connection, Sequence[LaunchLife]], list[LaunchLife]]
+
+_LAUNCHES = select(launch).order_by(launch.c.launch_id)
+
+
+def launch_rows(connection: Connection, dead: Dead) -> list[LaunchRow]:
+    """Return all launches, the oldest first; ``dead`` selects the dead ones among the running."""
+    rows = [row._asdict() for row in connection.execute(_LAUNCHES)]
+    running = [
+        LaunchLife(row["launch_id"], row["token"], row["lease_until"])
+        for row in rows
+        if row["state"] == "running"
+    ]
+    gone = {one.launch_id for one in dead(connection, running)}
+    alive = {one.launch_id for one in running} - gone
+    return [_launch(row, row["launch_id"] in alive) for row in rows]
+
+
+def _launch(row: Mapping[str, Any], alive: bool) -> LaunchRow:
+    dirty = row["git_dirty"]
+    return LaunchRow(
+        launch_id=row["launch_id"],
+        state=row["state"],
+        alive=alive,
+        started=row["started"],
+        ended=row["ended"],
+        host=row["host"],
+        pid=row["pid"],
+        argv=stored_json(row["argv"], list),
+        overrides=stored_json(row["overrides"], list),
+        git_commit=row["git_commit"],
+        git_dirty=None if dirty is None else bool(dirty),
+        git_diff_hash=row["git_diff_hash"],
+        versions=stored_json(row["versions"], dict),
+        fingerprint=row["fingerprint"] and stored_json(row["fingerprint"], dict),
+    )
+
 
 _CONFIGS = text(
     "SELECT p.config_key, p.env, p.policy, p.model, p.learner, p.width, p.depth, p.horizon, p.dt, "
@@ -122,7 +164,7 @@ class Reader:
     def schema_version(self) -> str:
         """Return the version of the database's schema."""
         with self._snapshot() as connection:
-            return str(schema_version.check(connection, self.safe_url))
+            return str(schema.check(connection, self.safe_url))
 
     def size(self) -> int:
         """Return the bytes of the database."""
@@ -143,7 +185,7 @@ class Reader:
     def launches(self) -> list[LaunchRow]:
         """Return all launches that wrote to the database, the oldest first."""
         with self._snapshot() as connection:
-            return liveness.launches(connection, partial(self._kind.dead, self._url))
+            return launch_rows(connection, partial(self._kind.dead, self._url))
 
     def mixed_code(self) -> list[str]:
         """Return the keys of configurations whose finished trials were run by different code."""
@@ -290,3 +332,132 @@ def _config(connection: Connection, config_key: str) -> tuple[int, int]:
             "take one of those that configs() returns."
         )
     return row[0], row[1]
+
+
+_FAILURES = """
+SELECT c.config_key, a.cause, a.error_id, e.type, e.message, count(*) AS attempts,
+       sum(CASE WHEN r.status = 'failed' AND r.attempt = a.attempt THEN 1 ELSE 0 END) AS trials
+FROM attempt a
+JOIN trial r ON r.trial_id = a.trial_id
+JOIN config c ON c.config_id = r.config_id
+LEFT JOIN error e ON e.error_id = a.error_id
+WHERE a.cause IS NOT NULL
+GROUP BY c.config_key, a.cause, a.error_id, e.type, e.message
+ORDER BY a.error_id
+"""
+_TRACEBACK = "SELECT traceback FROM error WHERE error_id = :error_id"
+_NUMBER = re.compile(r"0x[0-9a-f]+|\d+(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNORECASE)
+
+
+@dataclass
+class FailureKind:
+    """Failures with one cause, type and message, up to the numbers in the message.
+
+    Attributes
+    ----------
+    trials
+        Trials whose last attempt failed in this way.
+    attempts
+        Attempts that failed in this way, including those followed by a successful one.
+    places
+        Names (env, policy) of the configurations.
+    """
+
+    cause: str
+    type: str | None
+    message: str | None
+    error_id: int | None
+    trials: int = 0
+    attempts: int = 0
+    places: set[tuple[str, str]] = field(default_factory=set)
+    traceback: str = ""
+
+    @property
+    def last_line(self) -> str:
+        """Last line of the traceback."""
+        lines = self.traceback.strip().splitlines()
+        return lines[-1].strip() if lines else ""
+
+    @property
+    def place(self) -> str:
+        """Innermost frame of the traceback."""
+        frames = re.findall(r"^ *File (.+)$", self.traceback, flags=re.MULTILINE)
+        return frames[-1] if frames else ""
+
+
+def failure_kinds(
+    reader: Reader, configs: Mapping[str, ConfigRow], tracebacks: int
+) -> list[FailureKind]:
+    """Return the failures of the configurations, given by key, the commonest kind first.
+
+    The commonest ``tracebacks`` kinds have the traceback of one of their attempts.
+    """
+    found: dict[tuple[str, ...], FailureKind] = {}
+    for row in reader.rows(_FAILURES):
+        if row.config_key in configs:
+            name = (row.cause, row.type or "", _NUMBER.sub("#", row.message or ""))
+            new = FailureKind(row.cause, row.type, row.message, row.error_id)
+            kind = found.setdefault(name, new)
+            kind.attempts += row.attempts
+            kind.trials += row.trials
+            config = configs[row.config_key]
+            kind.places.add((config.env, config.policy))
+    kinds = sorted(found.values(), key=lambda kind: (-kind.trials, -kind.attempts, kind.cause))
+    for kind in kinds[:tracebacks]:
+        if kind.error_id is not None:
+            kind.traceback = str(reader.rows(_TRACEBACK, error_id=kind.error_id)[0][0])
+    return kinds
+
+
+_EXPLORATIONS = f"""
+SELECT v.trial_key, v.config_key, v.env, v.label, v.seed, v.status, v.n_steps, v.horizon,
+       v.launch_id
+FROM v_trial v
+JOIN config c ON c.config_key = v.config_key
+WHERE c.config_json LIKE '{PREQUENTIAL}' AND v.status IN ('done', 'diverged')
+ORDER BY v.trial_id
+"""
+
+
+@dataclass(frozen=True)
+class ExplorationRow:
+    """Exploration that was saved.
+
+    Attributes
+    ----------
+    n_steps, horizon
+        Steps that are stored, and the most that there can be.
+    is_running
+        Whether the process that saves it is alive and can add steps.
+    """
+
+    trial_key: str
+    config_key: str
+    env: str
+    label: str
+    seed: int
+    status: str
+    n_steps: int
+    horizon: int
+    is_running: bool
+
+    @property
+    def state(self) -> str:
+        """Status and steps, such as ``running, 1,234 of 20,000 steps``."""
+        word = "running" if self.is_running else self.status
+        return f"{word}, {self.n_steps:,} of {self.horizon:,} steps"
+
+
+def explorations(reader: Reader) -> list[ExplorationRow]:
+    """Return all stored explorations, the oldest first."""
+    rows = list(reader.rows(_EXPLORATIONS))
+    if not rows:
+        return []
+    alive = {one.launch_id for one in reader.launches() if one.state == "running" and one.alive}
+    return [_exploration(row._asdict(), alive) for row in rows]
+
+
+def _exploration(values: dict[str, Any], alive: set[int]) -> ExplorationRow:
+    is_saved = values.pop("launch_id") in alive
+    can_grow = values["status"] == "done" and values["n_steps"] < values["horizon"]
+    return ExplorationRow(**values, is_running=is_saved and can_grow)

@@ -1,4 +1,4 @@
-"""Outcome of an attempt, written in one transaction by the launch that holds its claim."""
+"""Outcomes of attempts: checked, written by the holder of the claim, and pruned."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from sqlalchemy import (
     Connection,
     Integer,
     bindparam,
+    delete,
     insert,
     literal_column,
+    or_,
     select,
     text,
+    union,
     update,
 )
 
@@ -23,19 +26,13 @@ from orchestrate.records import Failure, RunRecord
 from orchestrate.redaction import without_password
 from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
-from orchestrate.store.records import Array, Claim, Result
-from orchestrate.store.schema import (
-    FINISHED,
-    OUTCOME_COLUMNS,
-    RUN_COLUMNS,
-    STEP_VALUES,
-    assessment,
-    attempt,
-    trajectory,
-    trial,
-)
-from orchestrate.store.serialization import (
+from orchestrate.store.errors import InvalidResultError
+from orchestrate.store.launches import living
+from orchestrate.store.records import (
     DTYPE,
+    Array,
+    Claim,
+    Result,
     finite,
     not_before,
     pack,
@@ -43,7 +40,86 @@ from orchestrate.store.serialization import (
     storable,
     utc_text,
 )
-from orchestrate.store.write.result_validation import check_horizon, check_result
+from orchestrate.store.schema import (
+    ENDED,
+    FINISHED,
+    OUTCOME_COLUMNS,
+    RUN_COLUMNS,
+    STEP_VALUES,
+    assessment,
+    attempt,
+    config,
+    curve,
+    error,
+    step,
+    trajectory,
+    trial,
+)
+
+
+def check_result(trial_key: str, result: Result) -> None:
+    """Raise ``InvalidResultError`` if the arrays of a result are inconsistent."""
+    n = len(result.loss)
+    for name in STEP_VALUES:
+        _expect_shape(trial_key, result, name, (n,))
+    _expect_shape(trial_key, result, "states", (n + 1, None))
+    _expect_shape(trial_key, result, "inputs", (n, None))
+    _expect_shape(trial_key, result, "parameters", (None,))
+    _check_divergence(trial_key, result)
+    _check_assessments(trial_key, result)
+
+
+def _expect_shape(
+    trial_key: str, result: Result, name: str, expected: tuple[int | None, ...]
+) -> None:
+    shape = np.shape(getattr(result, name))
+    fits = len(shape) == len(expected) and all(
+        want is None or got == want for got, want in zip(shape, expected, strict=True)
+    )
+    if not fits:
+        raise _refusal(
+            trial_key, f"'{name}' has shape {shape}, expected {expected} (None means any length)"
+        )
+
+
+def _check_divergence(trial_key: str, result: Result) -> None:
+    loss = np.isfinite(np.asarray(result.loss, dtype=np.float64))
+    at = result.diverged_at
+    if at is None and not loss.all():
+        raise _refusal(
+            trial_key,
+            f"the loss of step {int(np.argmin(loss))} is not finite, but 'diverged_at' is None",
+        )
+    if at is not None and not 0 <= at < len(loss):
+        raise _refusal(trial_key, f"'diverged_at' is {at}, expected a step below {len(loss)}")
+    if at is not None and loss[at:].any():
+        raise _refusal(trial_key, f"there are losses after the divergence at step {at}")
+
+
+def _check_assessments(trial_key: str, result: Result) -> None:
+    seen: set[tuple[int, str]] = set()
+    for row in result.assessments:
+        if not 0 <= row.t <= result.n_steps:
+            raise _refusal(
+                trial_key,
+                f"'{row.measure}' is of step {row.t}, expected one from 0 to {result.n_steps}",
+            )
+        if (row.t, row.measure) in seen:
+            raise _refusal(trial_key, f"'{row.measure}' of step {row.t} is given twice")
+        seen.add((row.t, row.measure))
+
+
+def check_horizon(trial_key: str, n_rows: int, horizon: int) -> None:
+    """Raise ``InvalidResultError`` unless there is one row for each step of the trial."""
+    if n_rows != horizon:
+        raise _refusal(trial_key, f"there are {n_rows} steps, expected the horizon {horizon}")
+
+
+def _refusal(trial_key: str, reason: str) -> InvalidResultError:
+    return InvalidResultError(
+        f"The result of trial {trial_key[:12]} was not stored: {reason}; correct what made it."
+    )
+
 
 _RESULT_COLUMNS = tuple(name for name in OUTCOME_COLUMNS if name not in RUN_COLUMNS)
 
@@ -229,3 +305,39 @@ def _error_id(connection: Connection, failure: Failure) -> int:
 def insert_error(connection: Connection, row: Mapping[str, Any]) -> int:
     """Insert a traceback unless it is there, and return its id."""
     return int(connection.execute(_INSERT_ERROR, row).scalar_one())
+
+
+PAGE = 50
+"""Trials in one transaction, so that a launch waits for less than a second."""
+
+
+def prune(connection: Connection, backend: Backend, trial_keys: Sequence[str]) -> int:
+    """Delete those of the trials that have an outcome and none of a living launch; count them."""
+    alive = [one.launch_id for one in living(connection, backend)]
+    chosen = (
+        select(trial.c.trial_id)
+        .where(trial.c.trial_key.in_(backend.members(trial_keys)), trial.c.status.in_(ENDED))
+        .where(or_(trial.c.launch_id.is_(None), trial.c.launch_id.not_in(alive)))
+        .order_by(trial.c.trial_id)
+        .with_for_update()
+    )
+    found = list(connection.execute(chosen).scalars())
+    for table in (step, trajectory, assessment, curve, attempt, trial):
+        connection.execute(delete(table).where(table.c.trial_id.in_(found)))
+    return len(found)
+
+
+def prune_unused(connection: Connection, backend: Backend) -> None:
+    """Delete configurations without a trial, and tracebacks without a trial or an attempt."""
+    backend.exclusive(connection)
+    used = select(trial.c.config_id).where(trial.c.config_id == config.c.config_id)
+    connection.execute(delete(config).where(~used.exists()))
+    named = (select(table.c.error_id) for table in (trial, attempt))
+    kept = union(*(one.where(one.selected_columns.error_id.is_not(None)) for one in named))
+    unused = error.c.error_id.not_in(kept)
+    # Locked first: a trial that fails now may refer to one of them before it can be deleted.
+    locked = select(error.c.error_id).where(unused).with_for_update(skip_locked=True)
+    found = list(connection.execute(locked).scalars())
+    for start in range(0, len(found), PAGE):
+        page = found[start : start + PAGE]
+        connection.execute(delete(error).where(error.c.error_id.in_(page), unused))

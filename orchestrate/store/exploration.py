@@ -1,13 +1,10 @@
-"""Explorations, which grow: one trial is written again and again, each time as a whole.
-
-An exploration is done at every save: what is stored is complete up to its ``n_steps``, which may be
-fewer than the horizon, and a later save adds to it. The first save of a session compares all states
-and inputs with the stored ones and replaces the steps; the next ones append to them.
-"""
+"""Comparison of two explorations of one key: the same one after fewer steps, or another one."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, delete, insert, select, update
@@ -16,20 +13,37 @@ from orchestrate.records import RunRecord
 from orchestrate.store import packed_curves
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.errors import StoreError
-from orchestrate.store.growth import steps_ahead, unpacked
-from orchestrate.store.records import Claim, Registrable, Result
-from orchestrate.store.schema import (
-    OUTCOME_COLUMNS,
-    assessment,
-    config,
-    step,
-    trajectory,
-    trial,
-)
-from orchestrate.store.write.claims import begin_attempts
-from orchestrate.store.write.launches import renew
-from orchestrate.store.write.registration import GridRows, register
-from orchestrate.store.write.results import PreparedRows, end_attempt, prepare
+from orchestrate.store.launches import GridRows, begin_attempts, register, renew
+from orchestrate.store.records import Array, Claim, Registrable, Result, unpack
+from orchestrate.store.results import PreparedRows, end_attempt, prepare
+from orchestrate.store.schema import OUTCOME_COLUMNS, assessment, config, step, trajectory, trial
+
+ROUNDING = 1e-6
+"""Difference of two states, relative to their size or 1, that counts as none."""
+
+Path = tuple[Array, Array]
+"""States (T + 1, d) and inputs (T, m)."""
+
+
+def steps_ahead(one: Path, other: Path) -> int | None:
+    """Return how many steps the first path has more than the second; None for different paths.
+
+    The last state of the shorter one is not compared: after a gap an exploration goes on from
+    another state. States may be estimates, which another processor computes with other rounding.
+    """
+    n = min(len(one[1]), len(other[1]))
+    states = (one[0][:n], other[0][:n])
+    same = np.array_equal(one[1][:n], other[1][:n], equal_nan=True) and (
+        states[0].shape == states[1].shape
+        and np.allclose(*states, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
+    )
+    return len(one[1]) - len(other[1]) if same else None
+
+
+def unpacked(row: Mapping[str, Any]) -> Path:
+    """Return the path in a row of the table ``trajectory``."""
+    states = unpack(row["dtype"], row["states_shape"], row["states"])
+    return states, unpack(row["dtype"], row["inputs_shape"], row["inputs"])
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from typing import Any
 
 from sqlalchemy.exc import DBAPIError
 
+from orchestrate.store import query_process
 from orchestrate.store.backends.driver_errors import is_of_driver, out_of_time, translated_query
 from orchestrate.store.errors import QueryError
-from orchestrate.store.read import query_process
-from orchestrate.store.read.query_process import MEMORY_BYTES, Request
-from orchestrate.store.read.rows import Table
+from orchestrate.store.query_process import MEMORY_BYTES, Request
+from orchestrate.store.records import Table
 
 RESULT_BYTES = 50_000_000
 """Most bytes of an answer."""

@@ -1,0 +1,594 @@
+"""Source database of a merge: its complete trials in pages, read from one snapshot."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import accumulate, groupby
+from operator import itemgetter
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Row, bindparam, delete, insert, select, update
+
+from orchestrate.store import database_url, packed_curves
+from orchestrate.store.backends import sqlite
+from orchestrate.store.backends.base import Backend
+from orchestrate.store.doctor import TrialKey
+from orchestrate.store.errors import StoreError
+from orchestrate.store.exploration import steps_ahead, unpacked
+from orchestrate.store.reader import Reader
+from orchestrate.store.records import DTYPE, Array, stored_json, unpack
+from orchestrate.store.results import insert_error
+from orchestrate.store.schema import (
+    FINISHED,
+    N_ROWS,
+    OUTCOME_COLUMNS,
+    PREQUENTIAL,
+    STEP_VALUES,
+    assessment,
+    attempt,
+    config,
+    error,
+    launch,
+    trial,
+)
+from orchestrate.store.schema import step as step_table
+from orchestrate.store.schema import trajectory as trajectory_table
+from orchestrate.store.store import Store
+
+PAGE = 50
+"""Trials in one transaction, so that a concurrent launch waits for less than a second."""
+
+PAGE_STEPS = 5_000
+"""Steps in one transaction, unless its only trial has more, which bounds the memory."""
+
+_TRIALS = (
+    f"SELECT r.*, c.config_key, {N_ROWS} AS n_rows, c.env, c.policy, e.hash AS error_hash, "
+    f"CASE WHEN c.config_json LIKE '{PREQUENTIAL}' THEN 1 ELSE 0 END AS grows FROM trial r "
+    "JOIN config c ON c.config_id = r.config_id LEFT JOIN error e ON e.error_id = r.error_id "
+    "WHERE r.trial_id > :last AND r.status IN ('done', 'diverged', 'failed', 'cancelled') "
+    "ORDER BY r.trial_id LIMIT :size"
+)
+_ATTEMPTS = (
+    "SELECT a.*, e.hash AS error_hash FROM attempt a "
+    "LEFT JOIN error e ON e.error_id = a.error_id "
+    "WHERE a.trial_id BETWEEN :first AND :last AND a.outcome IS NOT NULL "
+    "ORDER BY a.trial_id, a.attempt"
+)
+_FINISHED = (
+    "trial_id IN (SELECT trial_id FROM trial WHERE trial_id BETWEEN :first AND :last "
+    "AND status IN ('done', 'diverged'))"
+)
+_STEPS = (
+    f"SELECT trial_id, t, {', '.join(STEP_VALUES)} FROM step WHERE {_FINISHED} ORDER BY trial_id, t"
+)
+_TRAJECTORIES = f"SELECT * FROM trajectory WHERE {_FINISHED}"
+_ASSESSMENTS = (
+    f"SELECT trial_id, t, measure, value FROM assessment WHERE {_FINISHED} "
+    "ORDER BY trial_id, t, measure"
+)
+# All trials of a configuration have the same number of assessments, but for explorations.
+_EXPECTED = (
+    "SELECT config_id, max(n) FROM (SELECT r.config_id, count(*) AS n FROM assessment a "
+    "JOIN trial r ON r.trial_id = a.trial_id JOIN config c ON c.config_id = r.config_id "
+    f"WHERE r.status = 'done' AND c.config_json NOT LIKE '{PREQUENTIAL}' "
+    "GROUP BY a.trial_id, r.config_id) AS counts GROUP BY config_id"
+)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Steps, trajectory and assessments of a finished trial.
+
+    Attributes
+    ----------
+    steps : (T, number of STEP_VALUES)
+    trajectory
+        Row of the table, without the trial_id.
+    assessments
+        Rows of the table: step, measure, value.
+    """
+
+    steps: Array
+    trajectory: dict[str, Any]
+    assessments: list[tuple[int, str, float | None]]
+
+
+@dataclass(frozen=True)
+class Page:
+    """Trials of one transaction, and their rows in other tables, by trial_id.
+
+    Attributes
+    ----------
+    trials
+        Trials that have an outcome.
+    attempts
+        Finished attempts at a trial, the oldest first.
+    curves
+        Rows of the finished trials; none for a trial of which some are missing.
+    contradictory
+        Trials whose key is not that of their configuration, or whose arrays have other shapes.
+    """
+
+    trials: list[dict[str, Any]]
+    attempts: Mapping[int, list[dict[str, Any]]]
+    curves: Mapping[int, Curve]
+    contradictory: Set[int]
+
+
+class Source:
+    """Queries to a snapshot of the source database; ``trial_key`` is as in :func:`merge`."""
+
+    def __init__(self, moment: Reader, trial_key: TrialKey | None = None) -> None:
+        self._moment, self._trial_key = moment, trial_key
+        self._texts: dict[int, str] = {}  # JSON of configurations, empty for another than its key
+        self._expected = dict(map(tuple, moment.rows(_EXPECTED)))
+
+    def launches(self) -> list[dict[str, Any]]:
+        self._moment.launches()  # refuses texts that the readers of the target could not read
+        return self._dicts("SELECT * FROM launch ORDER BY launch_id")
+
+    def pages(self) -> Iterator[Page]:
+        """Yield the trials that have an outcome, with their rows."""
+        last = 0
+        while trials := _first(self._dicts(_TRIALS, last=last, size=PAGE)):
+            first, last = trials[0]["trial_id"], trials[-1]["trial_id"]
+            attempts = defaultdict(list)
+            for row in self._dicts(_ATTEMPTS, first=first, last=last):
+                attempts[row["trial_id"]].append(row)
+            curves = self._curves(trials)
+            wrong = {
+                row["trial_id"]
+                for row in trials
+                if not (self._has_its_key(row) and _agree(row, curves.get(row["trial_id"])))
+            }
+            yield Page(trials, attempts, curves, wrong)
+
+    def _has_its_key(self, row: Mapping[str, Any]) -> bool:
+        """Return whether keys are hashes of what is stored: no specification is built of it."""
+        if (config_id := row["config_id"]) not in self._texts:
+            text = self.config(config_id)["config_json"]
+            same = hashlib.sha256(text.encode()).hexdigest() == row["config_key"]
+            with suppress(StoreError):
+                stored_json(text, dict)
+                self._texts[config_id] = text if same else ""
+        text = self._texts.get(config_id, "")
+        key = self._trial_key(text, row["seed"]) if self._trial_key else row["trial_key"]
+        return bool(text) and key == row["trial_key"]
+
+    def config(self, config_id: int) -> dict[str, Any]:
+        (row,) = self._dicts("SELECT * FROM config WHERE config_id = :id", id=config_id)
+        return row
+
+    def error(self, digest: str) -> dict[str, Any]:
+        (row,) = self._dicts("SELECT * FROM error WHERE hash = :hash", hash=digest)
+        return row
+
+    def _curves(self, trials: Sequence[dict[str, Any]]) -> dict[int, Curve]:
+        ends = {"first": trials[0]["trial_id"], "last": trials[-1]["trial_id"]}
+        steps = _by_trial(self._moment.rows(_STEPS, **ends))
+        assessments = _by_trial(self._moment.rows(_ASSESSMENTS, **ends))
+        trajectories = {row.pop("trial_id"): row for row in self._dicts(_TRAJECTORIES, **ends)}
+        curves = {}
+        for row in trials:
+            trial_id = row["trial_id"]
+            values = np.array(steps.get(trial_id, []), np.float64).reshape(-1, 1 + len(STEP_VALUES))
+            assessed = assessments.get(trial_id, [])
+            expected = self._expected.get(row["config_id"]) if row["status"] == "done" else None
+            if (
+                trial_id in trajectories
+                and len(values) == row["n_rows"]
+                and np.array_equal(values[:, 0], np.arange(len(values)))
+                and expected in (None, len(assessed))
+            ):
+                packed = {name: _bytes(one) for name, one in trajectories[trial_id].items()}
+                curves[trial_id] = Curve(values[:, 1:], packed, assessed)
+        return curves
+
+    def _dicts(self, sql: str, **values: Any) -> list[dict[str, Any]]:
+        table = self._moment.rows(sql, **values)
+        return [dict(zip(table.columns, row, strict=True)) for row in table]
+
+
+def _agree(row: Mapping[str, Any], curve: Curve | None) -> bool:
+    """Return whether the arrays of a trial have their shapes, and as many steps as the trial."""
+    if curve is None:
+        return True
+    packed, names = curve.trajectory, ("states", "inputs", "parameters")
+    try:
+        arrays = [unpack(DTYPE, packed[f"{name}_shape"], packed[name]) for name in names]
+        states, inputs, parameters = arrays
+        sizes = states.ndim, inputs.ndim, parameters.ndim, len(states), packed["dtype"]
+        steps = len(inputs)
+    except (StoreError, TypeError):
+        return False
+    same = all(packed[f"{names[i]}_shape"] == json.dumps(arrays[i].shape) for i in range(3))
+    fits = row["grows"] or row["n_rows"] == steps
+    return bool(same and fits and sizes == (2, 2, 1, steps + 1, DTYPE))
+
+
+def _first(trials: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the trials that fit into one transaction by their steps, and at least one."""
+    steps = accumulate(row["n_rows"] or 0 for row in trials)
+    fitting = sum(n <= PAGE_STEPS for n in steps)
+    return trials[: max(fitting, 1)]
+
+
+def _by_trial(rows: Iterable[tuple[Any, ...]]) -> dict[int, list[tuple[Any, ...]]]:
+    """Return the rows without their trial_id, the first column, by which they are sorted."""
+    groups = groupby(rows, key=itemgetter(0))
+    return {trial_id: [row[1:] for row in group] for trial_id, group in groups}
+
+
+def _bytes(value: Any) -> Any:
+    return bytes(value) if isinstance(value, memoryview) else value
+
+
+_COPIED = ("status", *OUTCOME_COLUMNS)
+_NUMBERS = [STEP_VALUES.index(name) for name in ("loss", "reachable_loss")]
+_ASSESSMENTS_HERE = select(assessment.c.t, assessment.c.measure, assessment.c.value).order_by(
+    assessment.c.t, assessment.c.measure
+)
+_INSERT_TRIALS = insert(trial).returning(trial.c.trial_key, trial.c.trial_id)
+_UPDATE_TRIAL = update(trial).where(trial.c.trial_id == bindparam("here"))
+_STEPS_HERE = select(*(step_table.c[name] for name in STEP_VALUES)).order_by(step_table.c.t)
+
+
+@dataclass(frozen=True)
+class _Added:
+    """Trial of the source, its row in this database, and what is new here."""
+
+    row: Mapping[str, Any]
+    here: Row[Any] | None
+    attempts: Sequence[Mapping[str, Any]]
+    curve: Curve | None
+
+    @property
+    def attempt(self) -> int:
+        """Number of its last attempt in this database."""
+        return (0 if self.here is None else int(self.here.attempt)) + len(self.attempts)
+
+
+class Target:
+    """Transaction of a merge."""
+
+    def __init__(
+        self,
+        connection: Connection,
+        backend: Backend,
+        source: Source,
+        launches: Mapping[int, int],
+    ) -> None:
+        self._connection = connection
+        self._backend = backend
+        self._source = source
+        self._launches = launches
+        self._configs: dict[str, int] = {}  # config_id here by key, filled on the way
+        self._added: list[_Added] = []
+
+    def known(self, keys: Sequence[str]) -> dict[str, Row[Any]]:
+        """Return the trials with these keys, locked until the end of the transaction."""
+        statement = select(trial).where(trial.c.trial_key.in_(self._backend.members(keys)))
+        # Locked in the order of a commit, which avoids deadlocks.
+        statement = statement.order_by(trial.c.trial_id).with_for_update()
+        rows = self._connection.execute(statement)
+        return {row.trial_key: row for row in rows}
+
+    def new_attempts(
+        self, there: list[dict[str, Any]], here: Row[Any] | None
+    ) -> list[dict[str, Any]]:
+        """Return the attempts at a trial of the source that are new in this database."""
+        if here is None:
+            return there
+        statement = select(attempt.c.launch_id, attempt.c.claimed)
+        known = {
+            tuple(one)
+            for one in self._connection.execute(
+                statement.where(attempt.c.trial_id == here.trial_id)
+            )
+        }
+        return [a for a in there if (self._launches[a["launch_id"]], a["claimed"]) not in known]
+
+    def add(
+        self,
+        row: Mapping[str, Any],
+        here: Row[Any] | None,
+        attempts: Sequence[Mapping[str, Any]],
+        curve: Curve | None,
+    ) -> None:
+        """Note a trial with its outcome, for :meth:`write`."""
+        self._added.append(_Added(row, here, attempts, curve))
+
+    def write(self) -> None:
+        """Write the noted trials, with one statement for each table."""
+        ids = self._write_trials()
+        attempts: list[dict[str, Any]] = []
+        curves, trajectories, assessments = [], [], []
+        for one in self._added:
+            trial_id = ids[one.row["trial_key"]]
+            attempts += self._attempt_rows(trial_id, one)
+            if one.curve is not None:
+                self._backend.insert_steps(self._connection, trial_id, one.curve.steps)
+                curves.append((trial_id, one.attempt, one.curve.steps))
+                trajectories.append({"trial_id": trial_id, **one.curve.trajectory})
+                assessments += [
+                    {"trial_id": trial_id, "t": t, "measure": measure, "value": value}
+                    for t, measure, value in one.curve.assessments
+                ]
+        packed_curves.write(self._connection, curves)
+        for table, rows in (
+            (attempt, attempts),
+            (trajectory_table, trajectories),
+            (assessment, assessments),
+        ):
+            if rows:
+                self._connection.execute(insert(table), rows)
+
+    def is_same(self, here: Row[Any], row: Mapping[str, Any], there: Curve) -> bool:
+        """Return whether both databases hold equal numbers; times may differ."""
+        if any(getattr(here, name) != row[name] for name in ("status", "n_steps", "diverged_at")):
+            return False
+        where = here.trial_id
+        steps = self._connection.execute(_STEPS_HERE.where(step_table.c.trial_id == where)).all()
+        mine = np.array([tuple(one) for one in steps], dtype=np.float64)
+        arrays = self._connection.execute(
+            select(trajectory_table).where(trajectory_table.c.trial_id == where)
+        ).one_or_none()
+        rows = self._connection.execute(_ASSESSMENTS_HERE.where(assessment.c.trial_id == where))
+        return (
+            sorted(map(tuple, rows)) == sorted(there.assessments)
+            and mine.shape == there.steps.shape
+            and np.array_equal(mine[:, _NUMBERS], there.steps[:, _NUMBERS], equal_nan=True)
+            and arrays is not None
+            and all(getattr(arrays, name) == value for name, value in there.trajectory.items())
+        )
+
+    def steps_ahead(self, here: Row[Any], there: Curve) -> int | None:
+        """Return by how many steps an exploration is longer here; None if it is another one."""
+        statement = select(trajectory_table).where(trajectory_table.c.trial_id == here.trial_id)
+        mine = self._connection.execute(statement).mappings().one_or_none()
+        if mine is None:
+            return None
+        return steps_ahead(unpacked(dict(mine)), unpacked(there.trajectory))
+
+    def clear(self, here: Row[Any]) -> None:
+        """Delete the rows of an exploration that has more steps in the source."""
+        for table in (step_table, trajectory_table, assessment):
+            self._connection.execute(delete(table).where(table.c.trial_id == here.trial_id))
+
+    def _write_trials(self) -> dict[str, int]:
+        """Return the ids of the noted trials by their keys."""
+        ids, new = {}, []
+        for one in self._added:
+            row = one.row
+            values = {name: row[name] for name in _COPIED} | {"attempt": one.attempt}
+            for name in ("launch_id", "registered_by"):
+                values[name] = self._launches.get(row[name])
+            values["error_id"] = self._error(row["error_hash"])
+            if one.here is None:
+                values |= {"trial_key": row["trial_key"], "seed": row["seed"]}
+                new.append(
+                    values | {"config_id": self._config(row["config_key"], row["config_id"])}
+                )
+            else:
+                ids[row["trial_key"]] = one.here.trial_id
+                self._connection.execute(_UPDATE_TRIAL, {"here": one.here.trial_id, **values})
+        if new:
+            ids |= dict(map(tuple, self._connection.execute(_INSERT_TRIALS, new)))
+        return ids
+
+    def _attempt_rows(self, trial_id: int, one: _Added) -> Iterator[dict[str, Any]]:
+        for number, row in enumerate(one.attempts, start=one.attempt - len(one.attempts) + 1):
+            values = {name: row[name] for name in attempt.c.keys()}  # noqa: SIM118  not a dict
+            yield values | {
+                "trial_id": trial_id,
+                "attempt": number,
+                "launch_id": self._launches[row["launch_id"]],
+                "error_id": self._error(row["error_hash"]),
+            }
+
+    def _config(self, config_key: str, there: int) -> int:
+        if config_key not in self._configs:
+            self._configs[config_key] = self._find_config(config_key, there)
+        return self._configs[config_key]
+
+    def _find_config(self, config_key: str, there: int) -> int:
+        statement = select(config.c.config_id).where(config.c.config_key == config_key)
+        here = self._connection.execute(statement).scalar()
+        if here is None:
+            values = self._source.config(there)
+            del values["config_id"]
+            adding = insert(config).values(values).returning(config.c.config_id)
+            here = self._connection.execute(adding).scalar_one()
+        return int(here)
+
+    def _error(self, digest: str | None) -> int | None:
+        if digest is None:
+            return None
+        statement = select(error.c.error_id).where(error.c.hash == digest)
+        here = self._connection.execute(statement).scalar()
+        if here is None:
+            values = self._source.error(digest)
+            del values["error_id"]
+            return insert_error(self._connection, values)
+        return int(here)
+
+
+def add_launches(
+    connection: Connection, rows: Sequence[Mapping[str, Any]]
+) -> tuple[dict[int, int], int]:
+    """Insert the launches of the source; return their ids here, and the number of new ones.
+
+    A launch that is running there is inserted as lost; a later merge updates it.
+    """
+    known = {row.token: row for row in connection.execute(select(launch))}
+    numbers, added = {}, 0
+    for row in rows:
+        values = {name: row[name] for name in launch.c.keys() if name != "launch_id"}  # noqa: SIM118
+        running = row["state"] == "running"
+        values |= {"lease_until": None, "state": "lost" if running else row["state"]}
+        here = known.get(row["token"])
+        if here is None:
+            adding = insert(launch).values(values).returning(launch.c.launch_id)
+            numbers[row["launch_id"]] = int(connection.execute(adding).scalar_one())
+            added += 1
+            continue
+        numbers[row["launch_id"]] = here.launch_id
+        if here.state == "lost" and here.ended is None and not running:
+            where = launch.c.launch_id == here.launch_id
+            connection.execute(update(launch).where(where).values(values))
+    return numbers, added
+
+
+@dataclass(frozen=True)
+class TrialName:
+    """Trial with a conflict or with missing rows."""
+
+    trial_key: str
+    env: str
+    policy: str
+    seed: int
+
+
+@dataclass
+class Merged:
+    """Result of a merge.
+
+    Attributes
+    ----------
+    added
+        Copied trials, by status.
+    identical
+        Trials finished in both databases with equal numbers.
+    kept
+        Trials that failed or were cancelled there and have an outcome here, and explorations that
+        have more steps here.
+    running
+        Trials that a launch is running here, which were not copied.
+    conflicts
+        Trials finished in both databases with different numbers, which were not copied.
+    incomplete
+        Trials with missing rows there, which were not copied.
+    contradictory
+        Trials there whose key is not that of their configuration and seed, or whose arrays have
+        other shapes than they say, which were not copied.
+    launches
+        New launches.
+    """
+
+    added: dict[str, int] = field(default_factory=dict)
+    identical: int = 0
+    kept: int = 0
+    running: int = 0
+    conflicts: list[TrialName] = field(default_factory=list)
+    incomplete: list[TrialName] = field(default_factory=list)
+    contradictory: list[TrialName] = field(default_factory=list)
+    launches: int = 0
+
+    def include(self, other: Merged) -> None:
+        """Add the counts of one more merge into the same database."""
+        for status, count in other.added.items():
+            self.added[status] = self.added.get(status, 0) + count
+        for name in vars(self).keys() - {"added"}:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+    @property
+    def changed(self) -> bool:
+        return bool(self.added or self.launches)
+
+
+def merge(url: str, other_url: str, trial_key: TrialKey | None = None) -> Merged:
+    """Bring the trials with an outcome of ``other_url`` into ``url``, and what belongs to them.
+
+    Either may be SQLite or PostgreSQL; the first is created where there is none, the other is only
+    read. ``trial_key`` is as in :func:`orchestrate.store.examine`. Raises ``StoreError`` as the
+    opening of a store and of a reader do.
+    """
+    _refuse_itself(url, other_url)
+    merged = Merged()
+    with Reader.open(other_url) as reader, reader.moment() as moment, Store.open(url) as store:
+        store.recover()
+        source = Source(moment, trial_key)
+        with store._backend.transaction() as connection:
+            store._backend.exclusive(connection)
+            launches, merged.launches = add_launches(connection, source.launches())
+        for page in source.pages():
+            with store._backend.transaction() as connection:
+                store._backend.exclusive(connection)
+                target = Target(connection, store._backend, source, launches)
+                found = _merge_page(target, page)
+            _count(merged, found)
+    return merged
+
+
+Found = list[tuple[str, dict[str, Any]]]
+
+
+def _merge_page(target: Target, page: Page) -> Found:
+    known = target.known([row["trial_key"] for row in page.trials])
+    found = [
+        (_merge_trial(target, page, row, known.get(row["trial_key"])), row) for row in page.trials
+    ]
+    target.write()
+    return found
+
+
+def _merge_trial(target: Target, page: Page, row: dict[str, Any], here: Row[Any] | None) -> str:
+    """Copy one trial if it is new here; return the outcome as a field of :class:`Merged`."""
+    if row["trial_id"] in page.contradictory:
+        return "contradictory"
+    finished = row["status"] in FINISHED
+    if here is not None and here.status == "running":
+        return "running"
+    if here is not None and not finished and here.status != "pending":
+        return "kept"
+    curve = page.curves.get(row["trial_id"])
+    if finished and curve is None:
+        return "incomplete"
+    if curve is not None and here is not None and here.status in FINISHED:
+        if target.is_same(here, row, curve):
+            return "identical"
+        ahead = target.steps_ahead(here, curve) if row["grows"] else None
+        if ahead is None or ahead == 0:
+            return "conflict"
+        if ahead > 0:
+            return "kept"
+        target.clear(here)
+    attempts = target.new_attempts(page.attempts[row["trial_id"]], here)
+    if here is not None and row["status"] != "done" and not attempts:
+        return "kept"  # it was merged before, and a new run was requested here since
+    target.add(row, here, attempts, curve)
+    return "added"
+
+
+def _count(merged: Merged, found: Found) -> None:
+    for fate, row in found:
+        if fate == "added":
+            merged.added[row["status"]] = merged.added.get(row["status"], 0) + 1
+        elif fate == "conflict":
+            merged.conflicts.append(_named(row))
+        elif fate in ("incomplete", "contradictory"):
+            getattr(merged, fate).append(_named(row))
+        else:
+            setattr(merged, fate, getattr(merged, fate) + 1)
+
+
+def _named(row: Mapping[str, Any]) -> TrialName:
+    return TrialName(row["trial_key"], row["env"], row["policy"], row["seed"])
+
+
+def _refuse_itself(url: str, other_url: str) -> None:
+    one, other = database_url.parse(url), database_url.parse(other_url)
+    if one.get_backend_name() == other.get_backend_name() == "sqlite":
+        same = database_url.sqlite_path(one) == sqlite.existing_path(other)
+    else:
+        same = one == other
+    if same:
+        raise StoreError(
+            f"Both databases are {database_url.safe(one)}: give another one to merge into it."
+        )

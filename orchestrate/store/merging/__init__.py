@@ -1,1 +1,0 @@
-"""Merging of one results database into another."""

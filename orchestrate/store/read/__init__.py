@@ -1,1 +1,0 @@
-"""Read side of the results database: typed rows, queries of users, which launches live."""

@@ -1,1 +1,0 @@
-"""Write side of the results database: registration, claims, results, launches."""
