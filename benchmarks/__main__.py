@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orchestrate.executors.worker_environment import pin_threads
+from orchestrate.executors.limits import pin_threads
 from orchestrate.program import run
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ if __package__ in (None, ""):
     sys.path[: not sys.flags.safe_path] = [str(Path(__file__).resolve().parents[1])]
 
 from dopt.garbage_collection import collect_rarely
-from orchestrate.executors.worker_environment import pin_threads
+from orchestrate.executors.limits import pin_threads
 from orchestrate.program import run
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from orchestrate.executors.base import Event, Executor, Run, Task
+from orchestrate.executors.base import Event, Executor, Run, Task, run_task
 from orchestrate.executors.factory import ExecutorFactory, limits_of
 from orchestrate.executors.limits import NO_LIMITS, Limits
-from orchestrate.executors.task import run_task
 
 
 class InProcessExecutor(Executor):

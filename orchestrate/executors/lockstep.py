@@ -19,9 +19,8 @@ from dopt.result import TrialResult
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.value_checks import count, text
 from orchestrate.errors import LaunchError
-from orchestrate.executors.base import Event, Executor, Task, TaskDone
+from orchestrate.executors.base import BYTES_PER_KIB, Event, Executor, Task, TaskDone, failure_of
 from orchestrate.executors.factory import ExecutorFactory
-from orchestrate.executors.task import BYTES_PER_KIB, failure_of
 from orchestrate.records import Failure, RunRecord
 
 DEVICE = "cpu"

@@ -10,11 +10,9 @@ from collections.abc import Mapping
 
 from dopt.errors import unknown_name
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.executors import inprocess, local, lockstep
+from orchestrate.executors import inprocess, local, lockstep, ray, slurm
 from orchestrate.executors.base import Executor, Prepare, Run
 from orchestrate.executors.factory import ExecutorFactory, Job
-from orchestrate.executors.ray import factory as ray
-from orchestrate.executors.slurm import factory as slurm
 
 EXECUTORS: Mapping[str, ExecutorFactory] = {
     "inprocess": inprocess.FACTORY,

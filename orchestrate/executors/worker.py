@@ -18,10 +18,14 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from dopt.garbage_collection import collect_rarely
-from orchestrate.executors.base import Run, Task
-from orchestrate.executors.limits import Limits, die_with_parent, ended_after, limit_memory
-from orchestrate.executors.task import run_task
-from orchestrate.executors.worker_environment import pin_threads
+from orchestrate.executors.base import Run, Task, run_task
+from orchestrate.executors.limits import (
+    Limits,
+    die_with_parent,
+    ended_after,
+    limit_memory,
+    pin_threads,
+)
 
 HANDLED_BY_DRIVER = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 """Ctrl-C, and warnings before a preemption, which some batch systems send to every process."""

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from dopt import __version__
 from dopt.result import TrialResult
-from orchestrate.executors.task import BYTES_PER_KIB
+from orchestrate.executors.base import BYTES_PER_KIB
 from orchestrate.fingerprint import fingerprint
 from orchestrate.program import COMMIT_VARIABLE, commit_of, git
 from orchestrate.redaction import without_password_in_word

@@ -1,12 +1,20 @@
-"""Connection to a running Ray cluster, whose machines may join and leave."""
+"""Connection to a running Ray cluster, whose machines may join and leave, and its health.
+
+Without its head a cluster continues for a while and then ends the launch with no Python exception;
+the check detects the loss before that. A query may block for any time, so that a thread of its own
+sends it, and the launch only reads the last answer.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import platform
 import re
 import socket
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,12 +23,10 @@ import ray
 from ray import cloudpickle
 
 from orchestrate import fingerprint as alike
-from orchestrate.errors import LaunchError
+from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import Prepare, Run, Task
-from orchestrate.executors.limits import Limits
+from orchestrate.executors.limits import ONE_THREAD, Limits
 from orchestrate.executors.ray.connection import TASK_OPTIONS, Connection, unreachable
-from orchestrate.executors.ray.health import ClusterWatch
-from orchestrate.executors.worker_environment import ONE_THREAD
 from orchestrate.fingerprint import Fingerprint, fingerprint
 
 CONNECT_SECONDS = 5.0
@@ -94,7 +100,7 @@ def run_where_alike(expected: Fingerprint, payload: bytes) -> Iterator[Any]:
     """Run a chunk, or yield one clause that names the difference.
 
     ``payload`` holds the pickled arguments of
-    :func:`orchestrate.executors.ray.chunk.run_chunk`, whose outcomes are yielded.
+    :func:`orchestrate.executors.ray.connection.run_chunk`, whose outcomes are yielded.
 
     Ray finds a function on a worker by its name, in the code installed there. This one and what it
     calls are pickled by value instead: they run before any module of this project is imported on
@@ -109,5 +115,77 @@ def run_where_alike(expected: Fingerprint, payload: bytes) -> Iterator[Any]:
                 yield f"on node {platform.node()} the {name} is {found[name]}, here it is {value}"
                 return
         _verified.append(True)
-    chunk = importlib.import_module("orchestrate.executors.ray.chunk")
+    chunk = importlib.import_module("orchestrate.executors.ray.connection")
     yield from chunk.run_chunk(*cloudpickle.loads(payload))
+
+
+QUERY_INTERVAL_SECONDS = 1.0
+HEAD_TIMEOUT_SECONDS = 3.0
+"""Time without an answer after which the head is lost; Ray ended launches after 5 s."""
+
+NO_CORES_TIMEOUT_SECONDS = 60.0
+"""Time for which a cluster may have no cores."""
+
+
+class ClusterWatch:
+    """Thread that queries the head at ``address``, HOST:PORT.
+
+    Attributes
+    ----------
+    cores : int
+        Cores of the living nodes at the last answer.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.cores = 0
+        self._address = address
+        self._answers = 0
+        self._heard = 0
+        self._silence = 0.0
+        self._no_cores_since = self._checked = time.monotonic()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._ask, name="cluster watch", daemon=True)
+        self._thread.start()
+
+    def check(self) -> None:
+        """Raise ``InfrastructureError`` if the head does not answer, or all nodes are gone."""
+        now = time.monotonic()
+        # A launch that was itself suspended got no answers either: its pause does not count.
+        self._silence += min(now - self._checked, QUERY_INTERVAL_SECONDS / 2)
+        self._checked = now
+        if self._answers != self._heard:
+            self._heard, self._silence = self._answers, 0.0
+        if self._silence > HEAD_TIMEOUT_SECONDS:
+            raise InfrastructureError(
+                f"The head of the Ray cluster at {self._address} has not answered for "
+                f"{HEAD_TIMEOUT_SECONDS:.0f} s: when it is back, run the same command again to "
+                "continue."
+            )
+        if self.cores:
+            self._no_cores_since = now
+        if now - self._no_cores_since > NO_CORES_TIMEOUT_SECONDS:
+            raise InfrastructureError(
+                f"The Ray cluster at {self._address} has had no cores for "
+                f"{NO_CORES_TIMEOUT_SECONDS:.0f} s: start nodes that join it, and run the same "
+                "command again to continue."
+            )
+
+    def stop(self) -> None:
+        """Stop the thread."""
+        self._over.set()
+        self._thread.join(timeout=QUERY_INTERVAL_SECONDS)
+
+    def _ask(self) -> None:
+        host, port = self._address.rsplit(":", 1)
+        while not self._over.is_set():
+            with contextlib.suppress(Exception):  # any error means "no answer"
+                # Ray itself would wait for a lost head.
+                socket.create_connection((host, int(port)), QUERY_INTERVAL_SECONDS).close()
+                self.cores = _cores()
+                self._answers += 1
+            self._over.wait(QUERY_INTERVAL_SECONDS)
+
+
+def _cores() -> int:
+    nodes = ray.nodes()  # type: ignore[no-untyped-call]
+    return int(sum(node["Resources"].get("CPU", 0) for node in nodes if node["Alive"]))

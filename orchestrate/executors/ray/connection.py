@@ -1,18 +1,19 @@
-"""Interface of a connection to Ray: an instance of our own, or a running cluster."""
+"""Connection to Ray, an instance of our own or a running cluster, and a chunk on its workers."""
 
 from __future__ import annotations
 
 import logging
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from typing import Any
 
 import ray
 
 from dopt.errors import DoptError
 from orchestrate.errors import InfrastructureError, LaunchError
-from orchestrate.executors.base import Run, Task
-from orchestrate.executors.limits import Limits
+from orchestrate.executors.base import Prepare, Run, Task, TaskDone, run_task
+from orchestrate.executors.limits import Limits, ended_after, limit_memory, pin_threads
 from orchestrate.program import exit_code
 
 TASK_OPTIONS: dict[str, Any] = {"num_cpus": 1, "max_retries": 0, "num_returns": "streaming"}
@@ -83,3 +84,27 @@ def first_line(error: Exception) -> str:
 
 
 def _print_nothing(*_: object, **__: object) -> None: ...
+
+
+_STDERR = 2  # Ray writes it to a log file of the worker on its node
+
+
+def run_chunk(
+    run: Run,
+    tasks: list[Task],
+    limits: Limits,
+    prepare: Prepare | None = None,
+) -> Iterator[TaskDone | None]:
+    """Run tasks in order; yield None when the first begins, then each outcome as it ends.
+
+    ``prepare`` is called first, on machines where the launch has not called it.
+    """
+    pin_threads()
+    if prepare:
+        prepare()
+    yield None
+    for task in tasks:
+        limit_memory(limits, task.memory_factor)
+        with ended_after(limits, _STDERR):
+            finished = run_task(run, task, limits)
+        yield finished

@@ -18,11 +18,9 @@ from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
-from orchestrate.executors.exit_status import CrashReport
+from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost, run_task
 from orchestrate.executors.limits import Limits, TrialTimeoutError, interrupted_after
-from orchestrate.executors.local import LocalExecutor
-from orchestrate.executors.task import run_task
+from orchestrate.executors.local import CrashReport, LocalExecutor
 from orchestrate.records import Failure
 from tests.dopt.trials import trial
 from tests.orchestrate.conftest import Launches
@@ -246,7 +244,7 @@ def test_the_cause_of_an_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     counts = tmp_path / "vmstat"
-    monkeypatch.setattr("orchestrate.executors.exit_status._KERNEL_COUNTERS", counts)
+    monkeypatch.setattr("orchestrate.executors.local._KERNEL_COUNTERS", counts)
     counts.write_text(f"nr_free_pages 7\noom_kill {before}\n")
     words = CrashReport()
     os.write(words.descriptor, said.encode())

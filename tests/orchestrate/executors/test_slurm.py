@@ -18,8 +18,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from orchestrate.errors import LaunchError
-from orchestrate.executors.slurm.job import TASK
-from orchestrate.executors.slurm.options import SlurmOptions
+from orchestrate.executors.slurm import TASK, SlurmOptions
 from orchestrate.store import Reader
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS, until

@@ -22,7 +22,7 @@ import psycopg
 
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
-from orchestrate.executors import exit_status
+from orchestrate.executors import local
 from orchestrate.runner import launch, worker
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
@@ -101,7 +101,7 @@ def _launch(order: Order) -> int:
     if order.executor == "ray":
         lean_ray.leave_services_out()
     # Those of the whole machine, to which another test may add one at any moment.
-    exit_status._kills_for_memory = lambda: 0
+    local._kills_for_memory = lambda: 0
     run = Gated(Standin(order.seconds, order.trouble), Gate(Path(order.gate)))
     work = Work(run, prepare=lambda: None)
     if order.worker is not None:

@@ -11,8 +11,7 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from orchestrate.errors import ExitCode, InfrastructureError
-from orchestrate.executors.base import Event, Executor, Task, WorkerLost
-from orchestrate.executors.task import run_task
+from orchestrate.executors.base import Event, Executor, Task, WorkerLost, run_task
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
 from orchestrate.store import Claim, Store, StoreUnavailableError
 from orchestrate.store.records import utc_text

@@ -11,9 +11,8 @@ import pytest
 
 from dopt.kernel.run import KernelTrial
 from dopt.run import run_trial
-from orchestrate.executors.base import Task
+from orchestrate.executors.base import Task, run_task
 from orchestrate.executors.limits import Limits
-from orchestrate.executors.task import run_task
 from orchestrate.records import Failure
 from orchestrate.runner.retrying_store import Heartbeat
 from orchestrate.store import Store
