@@ -9,6 +9,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from operator import itemgetter
 
 import pandas as pd
 
@@ -16,10 +17,19 @@ from analysis import outputs
 from analysis.data.matching import Filter
 from analysis.data.selection import Gap, Selection
 from analysis.errors import IncompleteError
-from analysis.formatting import but_lost, number, p_text, plus_minus, share, steps_text, within
+from analysis.formatting import (
+    but_diverged,
+    but_lost,
+    number,
+    p_text,
+    plus_minus,
+    share,
+    steps_text,
+    within,
+)
 from analysis.line_styles import environment_title
 from analysis.stats.intervals import STUDENT_RANGE
-from analysis.tables.rendering import TextTable, gaps_table
+from analysis.tables.rendering import Columns, Row, TextTable, gaps_table, records, rendered
 from analysis.tables.variants import (
     SAME,
     SIGNIFICANCE,
@@ -35,8 +45,6 @@ from dopt.policies import POLICIES
 from orchestrate.cli_parser import path
 from orchestrate.files import make_folder
 from orchestrate.store import Reader
-
-Row = Mapping[str, object]
 
 HELP = "compare every policy, model and learner with the reference, on one page"
 NAME = "report"
@@ -56,16 +64,6 @@ NOTE = (
     "that of the prediction that nothing changes, mean at the end of the trial without those lost "
     "as the error is not finite."
 )
-
-LOSSES = (
-    "variant", "final loss", "ratio [95 %]", "adjusted p", "same setting, ratio", "adjusted p",
-    "reachable set, ratio", "curve, ratio", "n",
-)  # fmt: skip
-
-EFFORT = (
-    "variant", "steps to ε (share)", "adjusted p", "coverage", "control cost, ratio", "plan [µs]",
-    "learn [µs]", "runs on",
-)  # fmt: skip
 
 CAPTION = (
     "Ratio of final losses, variant / reference: left of the line, below 1, the variant is "
@@ -199,7 +197,7 @@ def write_report(
     ``pictures`` are files, without their ending, by environment, and ``more`` further sections,
     already in Markdown.
     """
-    parts = {str(env): _rows_of(part) for env, part in table.groupby("env", sort=False)}
+    parts = {str(env): records(part) for env, part in table.groupby("env", sort=False)}
     sections = [
         f"# Every variant against {table['variant'].iloc[0]}",
         origin,
@@ -215,10 +213,6 @@ def write_report(
     if notes:
         sections.append("## Notes\n\n" + "\n".join(f"- {note}" for note in notes))
     return "\n\n".join(sections) + "\n"
-
-
-def _rows_of(part: pd.DataFrame) -> list[Row]:
-    return [{str(key): value for key, value in row.items()} for row in part.to_dict("records")]
 
 
 def _finding(env: str, rows: Sequence[Row]) -> str:
@@ -280,43 +274,53 @@ def _section(env: str, rows: Sequence[Row], picture: str | None) -> str:
     parts = [f"## {title}", facts]
     if picture is not None:
         parts.append(f"![Ratios of final losses: {title}]({picture}.png)")
-    parts.append(TextTable(LOSSES, [_losses(row) for row in rows]).markdown())
-    parts.append(TextTable(EFFORT, [_effort(row) for row in rows]).markdown())
+    parts += [rendered(rows, columns).markdown() for columns in (LOSSES, EFFORT)]
     return "\n\n".join(parts)
 
 
-def _losses(row: Row) -> list[object]:
-    diverged = f", {row['n_diverged']} diverged" if row["n_diverged"] else ""
-    return [
-        row["variant"],
-        plus_minus(_number(row, "loss"), _number(row, "loss_2se")),
-        _ratio(row, "loss"),
-        p_text(_number(row, "loss_p_adjusted")),
-        _ratio(row, f"{SAME}_loss"),
-        p_text(_number(row, f"{SAME}_loss_p_adjusted")),
-        _ratio(row, "reachable_loss"),
-        _ratio(row, "auc"),
-        f"{row['n']}{diverged}",
-    ]
+def _losses_of(row: Row) -> str:
+    return plus_minus(_number(row, "loss"), _number(row, "loss_2se"))
 
 
-def _effort(row: Row) -> list[object]:
+def _steps(row: Row) -> str:
     steps = steps_text(_number(row, "steps"), int(_number(row, "horizon")))
     reached = _number(row, "reached")
-    return [
-        row["variant"],
-        steps if math.isnan(reached) else f"{steps} ({share(reached)})",
-        p_text(_number(row, "steps_p_adjusted")),
-        plus_minus(_number(row, "coverage"), _number(row, "coverage_2se")),
-        but_lost(_ratio(row, "control"), int(_number(row, "control_lost"))),
-        number(_number(row, "plan_us")),
-        number(_number(row, "learn_us")),
-        row["path"],
-    ]
+    return steps if math.isnan(reached) else f"{steps} ({share(reached)})"
 
 
-def _ratio(row: Row, measure: str) -> str:
-    return within(*(_number(row, f"{measure}_{name}") for name in ("ratio", "low", "high")))
+def _ratio(measure: str) -> Callable[[Row], str]:
+    names = [f"{measure}_{name}" for name in ("ratio", "low", "high")]
+    return lambda row: within(*(_number(row, name) for name in names))
+
+
+def _p(measure: str) -> Callable[[Row], str]:
+    return lambda row: p_text(_number(row, f"{measure}_p_adjusted"))
+
+
+LOSSES: Columns = (
+    ("variant", itemgetter("variant")),
+    ("final loss", _losses_of),
+    ("ratio [95 %]", _ratio("loss")),
+    ("adjusted p", _p("loss")),
+    ("same setting, ratio", _ratio(f"{SAME}_loss")),
+    ("adjusted p", _p(f"{SAME}_loss")),
+    ("reachable set, ratio", _ratio("reachable_loss")),
+    ("curve, ratio", _ratio("auc")),
+    ("n", lambda row: but_diverged(row["n"], row["n_diverged"])),
+)
+EFFORT: Columns = (
+    ("variant", itemgetter("variant")),
+    ("steps to ε (share)", _steps),
+    ("adjusted p", _p("steps")),
+    ("coverage", lambda row: plus_minus(_number(row, "coverage"), _number(row, "coverage_2se"))),
+    (
+        "control cost, ratio",
+        lambda row: but_lost(_ratio("control")(row), int(_number(row, "control_lost"))),
+    ),
+    ("plan [µs]", lambda row: number(_number(row, "plan_us"))),
+    ("learn [µs]", lambda row: number(_number(row, "learn_us"))),
+    ("runs on", itemgetter("path")),
+)
 
 
 def _number(row: Row, column: str) -> float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from operator import itemgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -111,48 +111,73 @@ def _ascii_letter(letter: str) -> str:
     return "" if unicodedata.combining(letter) else name.rpartition(" ")[2]
 
 
+Row = Mapping[str, Any]
+Columns = Sequence[tuple[str, Callable[[Row], object]]]
+"""Heading and text of each column."""
+
+
+def rendered(rows: Iterable[Row], columns: Columns, note: str = "") -> TextTable:
+    """Return rows as a table of texts."""
+    texts = [[text(row) for _, text in columns] for row in rows]
+    return TextTable([heading for heading, _ in columns], texts, note)
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of a table as mappings."""
+    return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
+
+
+def ratio_text(row: Row, measure: str = "") -> str:
+    """Return a ratio with its interval; ``measure`` is the beginning of the columns' names."""
+    return within(*(row[f"{measure}{name}"] for name in ("ratio", "low", "high")))
+
+
+def _paired(
+    table: pd.DataFrame, better: str, test: str, own: Columns, first: Columns = ()
+) -> Columns:
+    """Return the columns that all paired comparisons have around their own ones.
+
+    The last ones are the share of seeds on which the variant is better, p, adjusted p, and the
+    pairs, with how many trials of the two policies diverged, if any.
+    """
+    return (
+        ("env", itemgetter("env")),
+        *first,
+        ("variant", itemgetter("variant")),
+        (_reference(table), itemgetter("reference")),
+        *own,
+        (f"P({better})", lambda row: share(row["improvement"])),
+        (f"{test} p", lambda row: p_text(row["p_value"])),
+        ("BH-adjusted p", lambda row: p_text(row["p_adjusted"])),
+        ("pairs", lambda row: but_diverged(row["n_pairs"], row["n_diverged"])),
+    )
+
+
 def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
     """Return the table of final losses: mean ± 2 SE, median, IQM and n."""
-    rows = [
-        [
-            row["env"],
-            row["label"],
-            plus_minus(row["loss"], row["loss_2se"]),
-            number(row["loss_median"]),
-            number(row["loss_iqm"]),
-            plus_minus(row["reachable_loss"], row["reachable_loss_2se"]),
-            row["n"],
-            row["n_diverged"],
-        ]
-        for row in table.to_dict("records")
-    ]
-    headers = [
-        "env", "variant", "final loss", "median", "IQM", "final reachable-set loss", "n",
-        "diverged",
-    ]  # fmt: skip
+    columns: Columns = (
+        ("env", itemgetter("env")),
+        ("variant", itemgetter("label")),
+        ("final loss", lambda row: plus_minus(row["loss"], row["loss_2se"])),
+        ("median", lambda row: number(row["loss_median"])),
+        ("IQM", lambda row: number(row["loss_iqm"])),
+        (
+            "final reachable-set loss",
+            lambda row: plus_minus(row["reachable_loss"], row["reachable_loss_2se"]),
+        ),
+        ("n", itemgetter("n")),
+        ("diverged", itemgetter("n_diverged")),
+    )
     note = (
         "Loss: mean ± 2 standard errors over n trials; IQM: mean of the middle half. "
         f"Diverged trials: {rule}."
     )
-    return TextTable(headers, rows, note)
+    return rendered(records(table), columns, note)
 
 
 def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.FINAL) -> TextTable:
     """Return the paired comparison of losses."""
-    rows = [
-        [
-            row["env"],
-            row["variant"],
-            row["reference"],
-            within(row["ratio"], row["low"], row["high"]),
-            *_test_columns(row),
-        ]
-        for row in table.to_dict("records")
-    ]
-    headers = [
-        "env", "variant", _reference(table), "loss ratio [95 %]", "P(improvement)", "Wilcoxon p",
-        "BH-adjusted p", "pairs",
-    ]  # fmt: skip
+    columns = _paired(table, "improvement", "Wilcoxon", [("loss ratio [95 %]", ratio_text)])
     note = (
         f"Ratio: {_RATIO}; geometric mean over seeds of the "
         f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
@@ -160,50 +185,36 @@ def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.
         f"p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
         f"Diverged trials: {rule}."
     )
-    return TextTable(headers, rows, note)
+    return rendered(records(table), columns, note)
 
 
 def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
     """Return the comparison over all systems."""
-    rows = [
-        [
-            row["variant"],
-            row["reference"],
-            within(row["ratio"], row["low"], row["high"]),
-            row["systems"],
-            but_diverged(row["n_pairs"], row["n_diverged"]),
-        ]
-        for row in table.to_dict("records")
-    ]
-    headers = ["variant", "reference", "loss ratio [95 %]", "systems", "pairs"]
+    columns: Columns = (
+        ("variant", itemgetter("variant")),
+        ("reference", itemgetter("reference")),
+        ("loss ratio [95 %]", ratio_text),
+        ("systems", itemgetter("systems")),
+        ("pairs", lambda row: but_diverged(row["n_pairs"], row["n_diverged"])),
+    )
     note = (
         f"Ratio: {_RATIO}; geometric mean over systems, each counted alike, of the geometric mean "
         "over shared seeds of the final loss; interval: percentile bootstrap over pairs, "
         "stratified by system. Compare only rows of the same systems. "
         f"Diverged trials: {rule}."
     )
-    return TextTable(headers, rows, note)
+    return rendered(records(table), columns, note)
 
 
 def control_table(table: pd.DataFrame) -> TextTable:
     """Return the paired comparison of the costs of control, with the shares of successes."""
-    rows = [
-        [
-            row["env"],
-            row["t"],
-            row["variant"],
-            row["reference"],
-            share(row["success"]),
-            share(row["success_reference"]),
-            but_lost(within(row["ratio"], row["low"], row["high"]), row["n_lost"]),
-            *_test_columns(row),
-        ]
-        for row in table.to_dict("records")
-    ]
-    headers = [
-        "env", "explored steps", "variant", _reference(table), "success", "success of reference",
-        "cost ratio [95 %]", "P(improvement)", "Wilcoxon p", "BH-adjusted p", "pairs",
-    ]  # fmt: skip
+    own: Columns = (
+        ("success", lambda row: share(row["success"])),
+        ("success of reference", lambda row: share(row["success_reference"])),
+        ("cost ratio [95 %]", lambda row: but_lost(ratio_text(row), row["n_lost"])),
+    )
+    steps = [("explored steps", itemgetter("t"))]
+    columns = _paired(table, "improvement", "Wilcoxon", own, steps)
     note = (
         "Success: share of the episodes of the variant and of the reference that succeed, planned "
         f"by the model learned so far. Cost ratio: {_RATIO}; geometric mean over seeds of the "
@@ -214,30 +225,19 @@ def control_table(table: pd.DataFrame) -> TextTable:
         "no finite cost; a lost episode counts as the worst in P(improvement) and p, one "
         "whose true model's was lost in neither. Trials that diverged before a step are left out."
     )
-    return TextTable(headers, rows, note)
+    return rendered(records(table), columns, note)
 
 
 def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
     """Return the paired comparison of the steps to a loss."""
-    rows = [
-        [
-            row["env"],
-            row["variant"],
-            row["reference"],
-            number(row["epsilon"]),
-            steps_text(row["median"], row["horizon"]),
-            steps_text(row["median_reference"], row["horizon"]),
-            f"{row['reached']}/{row['n_pairs']}",
-            f"{row['reached_reference']}/{row['n_pairs']}",
-            *_test_columns(row),
-        ]
-        for row in table.to_dict("records")
-    ]
-    headers = [
-        "env", "variant", _reference(table), "ε", "steps", "steps of reference", "reached",
-        "reference reached",
-        "P(earlier)", "sign p", "BH-adjusted p", "pairs",
-    ]  # fmt: skip
+    own: Columns = (
+        ("ε", lambda row: number(row["epsilon"])),
+        ("steps", lambda row: steps_text(row["median"], row["horizon"])),
+        ("steps of reference", lambda row: steps_text(row["median_reference"], row["horizon"])),
+        ("reached", lambda row: f"{row['reached']}/{row['n_pairs']}"),
+        ("reference reached", lambda row: f"{row['reached_reference']}/{row['n_pairs']}"),
+    )
+    columns = _paired(table, "earlier", "sign", own)
     note = (
         "Steps: median number of inputs until the loss first is at most ε, of the variant and of "
         "the reference, over shared seeds (of an even number the upper one of two); ε: median "
@@ -246,7 +246,7 @@ def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
         "P(earlier): share of seeds on which the variant is earlier, "
         f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: {rule}."
     )
-    return TextTable(headers, rows, note)
+    return rendered(records(table), columns, note)
 
 
 def _reference(table: pd.DataFrame) -> str:
@@ -260,15 +260,6 @@ def _reference(table: pd.DataFrame) -> str:
         return "reference"
     [keys] = same
     return f"reference (same {keys}{', if stored' if '' in set(table['same']) else ''})"
-
-
-def _test_columns(row: Mapping[Hashable, Any]) -> list[str]:
-    """Return the share of seeds on which the variant is better, p, adjusted p, and the pairs.
-
-    With the number of pairs comes how many trials of the two policies diverged, if any.
-    """
-    pairs = but_diverged(row["n_pairs"], row["n_diverged"])
-    return [share(row["improvement"]), p_text(row["p_value"]), p_text(row["p_adjusted"]), pairs]
 
 
 def gaps_table(gaps: Iterable[Gap]) -> TextTable:
@@ -298,14 +289,21 @@ def comparison(column: str, measure: Measure) -> TableKind:
     where = "grid" if column == "loss" else "reachable set"
     if measure is Measure.STEPS:
         return TableKind(
-            f"Steps to a loss, {where}", _raced, partial(_measure_steps, column=column), _race
+            f"Steps to a loss, {where}",
+            _raced,
+            lambda reader, selection, options: compare_steps(
+                reader, selection, column, options.rule, options.epsilon
+            ),
+            lambda table, options: hitting_times_table(table, options.rule),
         )
     title = "Final loss" if measure is Measure.FINAL else "Loss over the whole curve"
     return TableKind(
         f"{title} against the reference, {where}",
         _compared,
-        partial(_measure_ratios, column=column, measure=measure),
-        partial(_ratios, measure=measure),
+        lambda reader, selection, options: compare_policies(
+            reader, selection, column, options.rule, measure
+        ),
+        lambda table, options: comparison_table(table, options.rule, measure),
     )
 
 
@@ -334,26 +332,6 @@ def _controlled(selection: Selection, _: PlotOptions = _DEFAULT) -> Selection:
     """Return the environments with a task in which the reference and a variant were assessed."""
     controlled = control_part(selection).compared()
     return controlled if len(controlled.labels) > 1 else Selection(())
-
-
-def _measure_ratios(
-    reader: Reader, selection: Selection, options: PlotOptions, column: str, measure: Measure
-) -> pd.DataFrame:
-    return compare_policies(reader, selection, column, options.rule, measure)
-
-
-def _ratios(table: pd.DataFrame, options: PlotOptions, measure: Measure) -> TextTable:
-    return comparison_table(table, options.rule, measure)
-
-
-def _measure_steps(
-    reader: Reader, selection: Selection, options: PlotOptions, column: str
-) -> pd.DataFrame:
-    return compare_steps(reader, selection, column, options.rule, options.epsilon)
-
-
-def _race(table: pd.DataFrame, options: PlotOptions) -> TextTable:
-    return hitting_times_table(table, options.rule)
 
 
 TABLES = {
@@ -428,21 +406,24 @@ def _energy(inputs: Array, gamma: float) -> float:
 
 def calibration_table(table: pd.DataFrame) -> TextTable:
     """Return the table for people."""
-    written = {"r_squared": number, "covered": share, "log_loss": number}
-    rows = [
-        [row["env"], row["label"]]
-        + [text(row[f"{kind}_{name}"]) for name, text in written.items() for kind in SETS]
-        + [number(row["energy"]), row["n"]]
-        for row in table.to_dict("records")
-    ]
-    titles = ("R²", "within 90 %", "log loss")
-    headers = [f"{title}, {kind}" for title in titles for kind in SETS]
+    measures = (("R²", "r_squared", number), ("within 90 %", "covered", share))
+    columns: Columns = (
+        ("env", itemgetter("env")),
+        ("variant", itemgetter("label")),
+        *(
+            (f"{title}, {kind}", lambda row, key=f"{kind}_{name}", text=text: text(row[key]))
+            for title, name, text in (*measures, ("log loss", "log_loss", number))
+            for kind in SETS
+        ),
+        ("energy", lambda row: number(row["energy"])),
+        ("n", itemgetter("n")),
+    )
     note = (
         "Accelerations on the evaluation grid and the reachable set, medians over n trials. Within "
         "90 %: share of all within their interval of 90 %; log loss: mean negative log likelihood "
         "[nat]; a dash where the model has no covariance. Energy: mean of ‖u‖²/γ²."
     )
-    return TextTable(["env", "variant", *headers, "energy", "n"], rows, note)
+    return rendered(records(table), columns, note)
 
 
 CALIBRATION = TableKind(
