@@ -56,7 +56,7 @@ def steps_text(median: float, horizon: int) -> str:
 
 
 def within(value: float, low: float, high: float) -> str:
-    """Return a number with its interval, or alone where there is none."""
+    """Return a number with its interval, or alone without one."""
     if math.isnan(low):
         return number(value)
     return f"{number(value)} [{number(low)}, {number(high)}]"
@@ -86,7 +86,7 @@ def count_text(counts: Mapping[str, str]) -> str:
 
 
 def loss_unit(system: System) -> str:
-    """Return the unit of the loss: that of the learned accelerations, such as ``rad/s²``.
+    """Return the unit of the loss, the learned accelerations' own, such as ``rad/s²``.
 
     Where these have several units the loss is the root of a sum over them: ``m/s², rad/s²``.
     """

@@ -436,7 +436,7 @@ def written(
     """Yield a function that returns when the task of a name is written, by one of ``workers``.
 
     With one worker or one task it writes in this process. Several are forks of it, which import
-    nothing anew, and each opens the database for itself. The function raises what ``write`` does,
+    nothing again, and each opens the database for itself. The function raises what ``write`` does,
     ``AnalysisError`` if a process was killed, and ``KeyboardInterrupt`` after Ctrl-C.
     """
     processes = min(workers, len(tasks))

@@ -31,7 +31,7 @@ class PlotOptions:
     """Options of the plots; ``epsilon`` is the loss of the comparison of steps, None the default's.
 
     ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
-    each, and ``band``, what the intervals are of, are those of the loss curves.
+    each, and ``band``, what the intervals are of, belong to the loss curves.
     """
 
     rule: DivergenceRule = DivergenceRule.EXCLUDE

@@ -241,7 +241,7 @@ def _judged(rows: Sequence[Row], measure: str) -> list[str]:
 
 
 def _same_settings(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the rows by the reference of their own setting, those of the first row left out."""
+    """Return the rows by the reference of their own setting, without the first row's."""
     groups: dict[str, list[Row]] = {}
     for row in rows[1:]:
         reference = str(row[f"{SAME}_reference"])
@@ -377,7 +377,7 @@ def _last(found: Mapping[int, Row]) -> Row:
 
 
 def _entry_text(found: Mapping[int, Row], t: int, text: Callable[[Row], str]) -> str:
-    """Return the text of a number of steps, a dash where there is none."""
+    """Return the text of a number of steps, a dash without one."""
     return text(found[t]) if t in found else "–"
 
 

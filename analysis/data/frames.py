@@ -140,7 +140,7 @@ def load(
 class Results:
     """The configurations of a database that fit a request; a context manager that closes it.
 
-    Every method reads the database anew, so that it sees what a running launch has finished.
+    Every method reads the database again, and so sees what a running launch has finished.
     """
 
     def __init__(self, reader: Reader, wanted: Filter) -> None:
@@ -161,7 +161,7 @@ class Results:
     def shown(self) -> pd.DataFrame:
         """Return the configurations that figures show: one for each environment and policy.
 
-        The rows are those of :meth:`configurations`. Raises ``AnalysisError`` where two
+        Rows as in :meth:`configurations`. Raises ``AnalysisError`` where two
         configurations fit equally well.
         """
         chosen = choose(Candidate(config, config.n) for config in self._configs())

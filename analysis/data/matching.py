@@ -235,7 +235,7 @@ def defaults(config: ConfigRow) -> dict[str, object]:
     """Return the defaults of what a configuration names, without its task, as dotted paths.
 
     Of limits these are all settings but the name, so that none are nearer than any. There are none
-    where it holds a system or policy of a user's own, which is not registered here.
+    where it holds a user's system or policy, which is not registered here.
     """
     names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
     names.pop("task", None)
@@ -322,7 +322,7 @@ def newest(configs: list[ConfigRow]) -> list[ConfigRow]:
 
 
 def _criterion(config: ConfigRow) -> tuple[str, int]:
-    """Return the configuration but for the version of the criterion of plans, and this version."""
+    """Return the configuration without the version of the plans' criterion, and this version."""
     content = dict(config.config)
     version = int(content.pop("criterion_version", 1))
     return json.dumps(content, sort_keys=True), version
@@ -391,7 +391,7 @@ def _without_sources(config: ConfigRow, apart: Collection[str]) -> str:
 
 
 def _last_trial(reader: Reader, config: ConfigRow) -> int:
-    """Return the identifier of the trial that was registered last, -1 where there is none."""
+    """Return the identifier of the last registered trial, -1 without one."""
     (row,) = reader.rows(_LAST, config_key=config.config_key)
     return -1 if row.last is None else int(row.last)
 

@@ -100,7 +100,7 @@ def read_sample(reader: Reader, entry: Entry, column: str, rule: DivergenceRule)
 def bounded_states(config: Mapping[str, Any], system: System) -> dict[int, Array]:
     """Return the lower and the upper bound (2,) of each state that has one, by its place.
 
-    Bounds are in the unit of the state, infinite where there is none.
+    Bounds are in the unit of the state, infinite where a side is unbounded.
     """
     limits = limits_from(config.get("limits"))
     if limits is None:

@@ -297,8 +297,8 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
 def labelled(entries: Iterable[Entry], group_by: Sequence[str] = ("policy",)) -> list[Entry]:
     """Return entries in the order in which they are drawn, with their labels.
 
-    They are those of :func:`dopt.spec.label.labels`, or where they are grouped by other settings
-    than the policy, those of the values.
+    Labels come from :func:`dopt.spec.label.labels`; grouped by other settings than the policy, from
+    the values.
     """
     found = list(entries)
     words = labels_of([entry.config for entry in found])

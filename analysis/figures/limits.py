@@ -42,7 +42,7 @@ from orchestrate.store import Reader
 Array = npt.NDArray[np.float64]
 
 Pair = dict[bool, Entry]
-"""Configurations that are alike but for ``limits.enforced``, by its value."""
+"""Configurations that differ in ``limits.enforced`` alone, by its value."""
 
 MOST_SEEDS = 20
 """Trials that are drawn of a configuration."""
@@ -79,12 +79,12 @@ class Panel:
     seeds : tuple of int
         Drawn trials: the first :data:`MOST_SEEDS` of those that all configurations of the row have.
     bounds : (2,)
-        The lower and the upper bound, infinite where there is none.
+        The lower and the upper bound, infinite where a side is unbounded.
     share, share_error : float
         Mean over n trials of the share of their steps after which any state is beyond a bound, and
-        its standard error; NaN where there is none.
+        its standard error; NaN without trials.
     n, n_diverged : int
-        Trials in the share, and those of them that diverged: their steps before that count.
+        Trials in the share, and how many of them diverged: their steps before that count.
     """
 
     env: str
@@ -196,7 +196,7 @@ def _row_panels(reader: Reader, pair: Pair, label: str) -> Iterator[Panel]:
 
 
 def _drawn_seeds(pair: Pair) -> tuple[int, ...]:
-    """Return the first seeds that all entries have finished; without any, those of the first."""
+    """Return the first seeds that all entries have finished; without any, the first entry's."""
     own = [{trial.seed for trial in entry.finished} for entry in pair.values()]
     return tuple(sorted(set.intersection(*own) or own[0])[:MOST_SEEDS])
 

@@ -218,7 +218,7 @@ def caption(numbers: Numbers) -> str:
 
 
 def _what(column: str, curves: Sequence[LossCurve]) -> str:
-    """Return what the curves show; those of explorations that were measured have no grid."""
+    """Return what the curves show; measured explorations have no grid."""
     if column != "loss":
         return "Root mean square error of the model over the reachable set"
     kinds = {curve.is_prequential for curve in curves}

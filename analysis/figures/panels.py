@@ -35,7 +35,7 @@ from orchestrate.store import Reader
 N = TypeVar("N")
 
 NARROW = 0.62
-"""Width of a figure with one column of panels, by that of the page."""
+"""Width of a figure with one column of panels, relative to the page."""
 
 TEXT_WIDTH = 6.75
 """Width of a figure over the page [inches]."""
@@ -266,7 +266,7 @@ def mark_break(upper: Axes, lower: Axes) -> None:
 def legend_below(figure: Figure, ncols: int, **options: Any) -> Legend:
     """Add a legend of at most ``ncols`` columns; a figure grows by the rows that this adds.
 
-    ``options`` are those of ``Figure.legend``. Labels too long for one column are wrapped.
+    ``options`` go to ``Figure.legend``. Labels too long for one column are wrapped.
     """
     legend = _place_legend(figure, ncols, options)
     planned = legend.get_window_extent().height
@@ -290,5 +290,5 @@ def _place_legend(figure: Figure, ncols: int, options: dict[str, Any]) -> Legend
 
 
 def _excess(figure: Figure, legend: Legend) -> float:
-    """Return the width of a legend by that of its figure."""
+    """Return the width of a legend relative to its figure."""
     return float(legend.get_window_extent().width / figure.bbox.width)

@@ -1,7 +1,7 @@
 """Figure 6: final loss against the time of a step, one panel per environment.
 
 A configuration is a policy, a model and a learner with all their settings. Environments are
-compared in one env section and under one section of limits each, those of most trials.
+compared in one env section and one section of limits each: the ones with most trials.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Point:
     label : str
         Settings that differ among the configurations of the environment.
     policy, policy_words, learner_words : str
-        Name of the policy; the policy and the learner with those of their settings that differ. The
+        Name of the policy; the policy and the learner with their settings that differ. The
         learner's are followed by the model, where it is another one than the network.
     us : float
         Microseconds of planning and learning in a step: mean over the steps of a trial, median over
@@ -109,7 +109,7 @@ class Point:
     loss : Estimate
         Final loss, geometric mean over trials, in ``unit``; NaN where none is left.
     n, n_finished, n_diverged : int
-        Trials in the loss, those that ended and those of them that diverged.
+        Trials in the loss, trials that ended, and how many of these diverged.
     counts : str
         These numbers as a text.
     limit_us : float
@@ -159,7 +159,7 @@ def pareto_part(selection: Selection) -> Selection:
 
 
 def measure_points(reader: Reader, selection: Selection, rule: DivergenceRule) -> Points:
-    """Return a point for each entry, those of an environment by their time."""
+    """Return a point for each entry, within an environment ordered by time."""
     policies = section_words(selection.entries, "policy")
     learners = learner_words(selection.entries)
     points = [
@@ -315,7 +315,7 @@ def draw(points: Points) -> Figure:
 def policy_colours(policies: Mapping[str, str]) -> dict[str, str]:
     """Return a colour for the words of each policy: its own, or a free one where that is taken.
 
-    Colours of lines repeat, since dashes tell lines apart; those of points must not. Grey is left
+    Colours of lines repeat, since dashes tell lines apart; colours of points must not. Grey is left
     where there are more policies than colours.
     """
     found: dict[str, str] = {}

@@ -85,7 +85,7 @@ class Portraits:
 
 
 def choose_seed(entries: Iterable[Entry]) -> int:
-    """Return the seed to draw: that of the median among the reference policy's final losses."""
+    """Return the seed to draw: the median of the reference policy's final losses."""
     for entry in entries:
         if entry.config.policy == REFERENCE and entry.final_losses():
             return median_seed(entry.final_losses())

@@ -139,7 +139,7 @@ def is_own(hosts: list[str], listening: str) -> bool:
     """Whether the Host header is one that a browser sends when it means this server.
 
     A name that somebody else may own is never accepted. An address is, since no name stands for
-    it: any address where the server listens beyond this machine, else that of this machine.
+    it: any address where the server listens beyond this machine, else a loopback address.
     """
     if len(hosts) != 1:
         return False

@@ -43,7 +43,7 @@ class TrueModel:
     """Success of the planner with the true model in an environment: the ceiling of the others.
 
     ``n`` seeds, the share of successes with its Wilson interval of 95 %, and how many of the
-    episodes have no finite cost. NaN where there is none.
+    episodes have no finite cost. NaN without seeds.
     """
 
     n: int
@@ -95,7 +95,7 @@ class ControlCurve:
 
 
 def control_part(selection: Selection) -> Selection:
-    """Return the entries with a task, in each environment those of the task with most trials."""
+    """Return the entries with a task, in each environment the task with most trials."""
     asked = [entry for entry in selection.stored if task_of(entry)]
     chosen: list[Entry] = []
     for env in dict.fromkeys(entry.config.env for entry in asked):
@@ -115,7 +115,7 @@ def _of_one_task(entries: list[Entry], reference: str) -> list[Entry]:
 
 
 def common_task(entries: Iterable[Entry]) -> str | None:
-    """Return the task by which most trials were assessed, None where there is none.
+    """Return the task by which most trials were assessed, None without one.
 
     Costs and successes of different tasks are not compared.
     """
@@ -214,7 +214,7 @@ def _by_step(estimate: Estimate, values: Array) -> Array:
 
 
 def relative_costs(reader: Reader, entry: Entry) -> Assessments:
-    """Return the cost of each trial and number of steps by that of its true model.
+    """Return the cost of each trial and number of steps, relative to its true model's.
 
     It is inf where the episode has no finite cost, and NaN where there was no episode or where the
     true model's has no finite cost, so that nothing can be said.

@@ -80,7 +80,7 @@ def log_limits(values: npt.NDArray[np.float64], margin: float = 1.15) -> tuple[f
 class LossCurve:
     """One entry in one environment: t in steps (T,), x on the axis (T,), band over trials.
 
-    ``unit`` is that of the loss, which is that of an exploration where ``is_prequential``.
+    ``unit`` is the loss's; where ``is_prequential``, the curve belongs to an exploration.
     """
 
     env: str

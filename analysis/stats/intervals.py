@@ -280,8 +280,7 @@ def stratified_mean(strata: Sequence[Array]) -> StratifiedMean:
     """Return the mean over S systems of the means over their runs (n_s, k), each n_s at least 1.
 
     The interval of 95 % is a percentile bootstrap, pointwise in k; NaN where a system has one run.
-    All draws come from a stream of their own, so that those of the same numbers of runs are the
-    same.
+    The draws have a stream of their own: equal numbers of runs give equal draws.
     """
     centre = np.mean([np.mean(values, axis=0) for values in strata], axis=0)
     if min(map(len, strata)) < 2:
@@ -314,7 +313,7 @@ class Estimate:
 def geometric_mean(values: Array) -> Estimate:
     """Return the geometric mean of (n,); NaN for none and where a value has no logarithm.
 
-    The interval is that of the mean logarithm: a BCa bootstrap, Student's for few trials.
+    The interval belongs to the mean logarithm: a BCa bootstrap, Student's for few trials.
     """
     if not len(values) or not np.all((values > 0) & np.isfinite(values)):
         return Estimate(*[float("nan")] * 3)

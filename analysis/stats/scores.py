@@ -131,7 +131,7 @@ def _counted(entry: Entry, by_seed: Mapping[int, float]) -> Scores:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Comparison of the losses of a variant with those of a reference over shared seeds.
+    """Comparison of a variant's losses with a reference's over shared seeds.
 
     Attributes
     ----------

@@ -146,7 +146,7 @@ def loss_of_random_inputs(
 def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
     """Return the ratio of the costs of control, one row for each environment, step and variant.
 
-    The cost of a trial is that of the episode which its model planned, by the true model's.
+    The cost of a trial: of the episode that its model planned, relative to the true model's.
     ``n_lost`` pairs are in no ratio: one of the two episodes, or the true model's, has no finite
     cost. An episode's own loss counts as the worst in the test; where the true model's was lost,
     nothing is known.
