@@ -1,4 +1,9 @@
-"""Comparison of two explorations of one key: the same one after fewer steps, or another one."""
+"""Explorations, which grow: one trial is written again and again, each time as a whole.
+
+An exploration is done at every save: what is stored is complete up to its ``n_steps``, which may be
+fewer than the horizon, and a later save adds to it. The first save of a session compares all states
+and inputs with the stored ones and replaces the steps; the next ones append to them.
+"""
 
 from __future__ import annotations
 

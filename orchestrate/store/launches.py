@@ -1,4 +1,8 @@
-"""Launches and their claims: registration of a grid, claims, leases, recovery, and open trials."""
+"""Launches: registration of a grid, claims of its trials, leases, recovery, and open trials.
+
+A claim takes a trial from pending to a launch. It goes back when the launch releases it, or when
+another launch finds that its process is gone.
+"""
 
 from __future__ import annotations
 

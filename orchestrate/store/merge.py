@@ -1,4 +1,9 @@
-"""Source database of a merge: its complete trials in pages, read from one snapshot."""
+"""Merge of another results database into this one, without overwriting any result.
+
+The source is read from one snapshot, in pages, each of which is one transaction here. A trial is
+identified by its key, an attempt by its launch and time, a launch by its token, so that a merge
+that was killed can be repeated, and repeating a finished merge changes nothing.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Launches with their provenance and liveness."""
+"""Read side of the results database, which cannot write or create anything."""
 
 from __future__ import annotations
 

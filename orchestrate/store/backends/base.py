@@ -68,10 +68,6 @@ class Backend(ABC):
         """Open a transaction that only one process can hold at a time."""
 
     @abstractmethod
-    def rebuilding(self) -> AbstractContextManager[Connection]:
-        """Open a transaction that may change tables, as exclusive as :meth:`creation`."""
-
-    @abstractmethod
     def back_up(self, connection: Connection, version: int) -> str:
         """Copy the database of the given version to a new file and return its path."""
 

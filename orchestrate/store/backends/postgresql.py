@@ -174,11 +174,6 @@ class PostgreSQLBackend(Backend):
             self.exclusive(connection)
             yield connection
 
-    @contextmanager
-    def rebuilding(self) -> Iterator[Connection]:
-        with self.creation() as connection:
-            yield connection
-
     def back_up(self, connection: Connection, version: int) -> str:
         here, schema = connection.execute(_SCHEMA).one()
         base = f"{self._url.database}-{here}.v{version}-backup"

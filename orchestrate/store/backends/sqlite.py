@@ -18,7 +18,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from orchestrate.store import database_url
 from orchestrate.store.backends.backups import back_up_to, copy_checked, rescue
 from orchestrate.store.backends.base import Backend, LaunchLife, NewTrial
-from orchestrate.store.backends.driver_errors import translated, translated_file
+from orchestrate.store.backends.driver_errors import translated_file
 from orchestrate.store.backends.file_locks import LaunchLocks, file_lock
 from orchestrate.store.backends.network_file_systems import refuse_unsafe
 from orchestrate.store.backends.sqlite_engine import (
@@ -128,43 +128,14 @@ class SQLiteBackend(Backend):
     @contextmanager
     def creation(self) -> Iterator[Connection]:
         # The change to WAL is outside transactions and fails if two processes attempt it.
-        with self._creation_lock(), self.transaction() as connection:
-            yield connection
-
-    @contextmanager
-    def rebuilding(self) -> Iterator[Connection]:
-        with (
-            self._creation_lock(),
-            translated(self.safe_url),
-            self.engine.connect() as connection,
-        ):
-            # Dropping a table to rebuild it would violate references. The setting has no effect
-            # within a transaction.
-            driver_of(connection).execute("PRAGMA foreign_keys = OFF")
-            with connection.begin():
-                self._remember()
-                yield connection
-                self._check_references(connection)
-        self.check()
-
-    def _check_references(self, connection: Connection) -> None:
-        broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
-        if broken:
-            raise StoreUnavailableError(
-                f"{len(broken)} rows of {self.safe_url} refer to missing rows, the first one in "
-                f"the table {broken[0][0]}: nothing was changed; restore a copy."
-            )
+        with ExitStack() as stack:
+            with translated_file(self.safe_url):
+                stack.enter_context(file_lock(self._folder / "create", self._patience))
+            yield stack.enter_context(self.transaction())
 
     def back_up(self, connection: Connection, version: int) -> str:  # noqa: ARG002
         write = partial(copy_checked, self._path)
         return back_up_to(f"{self._path}.v{version}-backup", "", write)
-
-    @contextmanager
-    def _creation_lock(self) -> Iterator[None]:
-        with ExitStack() as stack:
-            with translated_file(self.safe_url):
-                stack.enter_context(file_lock(self._folder / "create", self._patience))
-            yield
 
     def exclusive(self, connection: Connection) -> None:
         """Do nothing: BEGIN IMMEDIATE lets one transaction in at a time."""

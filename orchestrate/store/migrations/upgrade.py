@@ -83,7 +83,7 @@ def upgrade(url: str, backup: bool = True) -> Upgrade:
 def _upgrade(backend: Backend, backup: bool) -> Upgrade:
     name = None
     try:
-        with backend.rebuilding() as connection:
+        with backend.creation() as connection:
             if schema.is_empty(connection):
                 schema.create(connection)
                 return Upgrade(backend.safe_url, None, SCHEMA_VERSION, None)
