@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dopt.garbage_collection import collect_rarely
+from dopt.process import collect_rarely
 from orchestrate.program import run
 
 

@@ -24,7 +24,7 @@ from analysis.line_styles import BLACK, GREY, environment_title, policy_style
 from analysis.stats.curves import log_limits
 from analysis.stats.trajectories import DrawnPlane
 from dopt.geometry import body
-from dopt.rerun import rerun
+from dopt.run import rerun
 from dopt.systems import System
 from orchestrate.files import whole
 from orchestrate.store import Reader

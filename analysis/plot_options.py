@@ -8,7 +8,7 @@ from enum import StrEnum
 
 from analysis.data.samples import DivergenceRule
 from analysis.stats.intervals import BandKind, Statistic
-from dopt.cores import usable_cores
+from dopt.process import usable_cores
 from orchestrate.cli_parser import UsageError
 
 

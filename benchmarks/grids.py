@@ -25,7 +25,7 @@ from benchmarks.processes import (
 )
 from benchmarks.rows import Row, Target, Timing, fixed_seconds, interpreter
 from benchmarks.trials import cartpole
-from dopt.cores import usable_cores
+from dopt.process import usable_cores
 from dopt.run import run_trial
 from orchestrate.store import Claim, Reader, Store
 

@@ -16,7 +16,7 @@ from statistics import median
 
 from benchmarks.processes import ROOT
 from benchmarks.rows import TIMES, Row, Timing
-from dopt.cores import usable_cores
+from dopt.process import usable_cores
 
 FEWEST = 3
 """Runs of a row before its median says anything."""

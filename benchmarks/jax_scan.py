@@ -25,7 +25,7 @@ from dopt.policies import DOptimal
 from dopt.randomness import draw
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems.features import feature_values
+from dopt.systems.base import feature_values
 
 
 def jax_scan(quick: bool) -> list[Row]:

@@ -1,27 +1,221 @@
-"""Assessment of a trial: control, free-run error and coverage after some of its steps."""
+"""Assessment of a trial: control, free-run error, coverage, parameters, violated limits."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from dopt.control.planning import Forecast, free_run_error, run_episode, run_feedback
+from dopt.control.planning import (
+    Array,
+    Forecast,
+    forecast_by,
+    forecast_by_equations,
+    free_run_error,
+    run_episode,
+    run_feedback,
+)
 from dopt.control.task import Control, Feedback
-from dopt.coverage import Plane
-from dopt.forecasts import model_forecast, true_forecast
+from dopt.errors import SpecificationError
+from dopt.evaluation import evaluation_set
 from dopt.limits import VIOLATIONS, WORST
-from dopt.models.base import Model
+from dopt.models import MLP, Linear, Model
 from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 
-Array = npt.NDArray[np.float64]
+
+def true_forecast(system: System) -> Forecast:
+    """Return the forecast by the system itself as it is at the first step, without noise."""
+    if not system.compiled:
+        return forecast_by_equations(system)
+    from dopt.kernel import forecast
+
+    return forecast.true_forecast(system)
+
+
+def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
+    """Return the forecast by a model with parameters (q,) in place of the true accelerations.
+
+    In compiled code are those of networks and of the linear form of physics.
+    """
+    if not (system.compiled and model.compiled and isinstance(model, (MLP, Linear))):
+        return forecast_by(system, lambda x, u: model.predict(system, parameters, x, u))
+    from dopt.kernel import forecast
+
+    return forecast.model_forecast(system, model, parameters)
+
+
+TURN = 2 * math.pi
+
+CELLS = 20
+"""Cells along each side of the box."""
+
+Box = tuple[tuple[float, float], tuple[float, float]]
+
+
+def wrap(angle: Array, centre: float = 0.0) -> Array:
+    """Return angles moved by whole turns into [centre - π, centre + π)."""
+    return angle - TURN * turns(angle, centre)
+
+
+def turns(angle: Array, centre: float = 0.0) -> Array:
+    """Return the number of whole turns between each angle and its wrapped value."""
+    count: Array = np.floor((angle - centre + math.pi) / TURN)
+    return count
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Phase plane of a system: state indices, labels, axes that are angles, box.
+
+    Angles are centred on the stable equilibrium, so that small oscillations about it are not split
+    at the wrap. A box that covers the whole turn moves with them.
+    Where the evaluation grid has no such axis, the box is the whole turn of an angle, and otherwise
+    what the reachable set spans.
+    """
+
+    axes: tuple[int, int]
+    labels: tuple[str, str]
+    angles: tuple[bool, bool]
+    centres: tuple[float, float]
+    box: Box
+
+    @classmethod
+    def of(cls, system: System) -> Self:
+        """Return the phase plane of a system."""
+        axes = system.phase_plane
+        rest = system.equilibrium or (0.0,) * system.n_states
+        angles = (axes[0] in system.angle_indices, axes[1] in system.angle_indices)
+        centres = (
+            rest[axes[0]] if angles[0] else 0.0,
+            rest[axes[1]] if angles[1] else 0.0,
+        )
+        given = [_given_side(system, axis) for axis in axes]
+        sides = [
+            _side(side, centre) if turning else side
+            for side, centre, turning in zip(given, centres, angles, strict=True)
+        ]
+        labels = (system.state_labels[axes[0]], system.state_labels[axes[1]])
+        return cls(axes, labels, angles, centres, (sides[0], sides[1]))
+
+    def project(self, states: Array) -> Array:
+        """Return the points (n, 2) of states (n, d), angles not wrapped."""
+        return states[:, list(self.axes)]
+
+    def wrapped(self, points: Array) -> Array:
+        """Return points (n, 2) with angles inside one turn around the centre."""
+        inside = points.copy()
+        for axis in range(2):
+            if self.angles[axis]:
+                inside[:, axis] = wrap(points[:, axis], self.centres[axis])
+        return inside
+
+    def coverage(self, states: Array) -> float:
+        """Return the share of the box that states (n, d) visit."""
+        return coverage(self.wrapped(self.project(states)), self.box)
+
+
+def _given_side(system: System, axis: int) -> tuple[float, float]:
+    """Return the ends of the box along a component of the state."""
+    given = system.grid_box()
+    if axis in given:
+        return given[axis]
+    if axis in system.angle_indices:
+        return -math.pi, math.pi
+    points = evaluation_set(system)
+    reached = points.states[points.n_grid :, axis]
+    return float(reached.min()), float(reached.max())
+
+
+def _side(side: tuple[float, float], centre: float) -> tuple[float, float]:
+    low, high = side
+    if high - low > TURN - 1e-9:
+        return centre - np.pi, centre + np.pi
+    shift = float(wrap(np.array((low + high) / 2), centre)) - (low + high) / 2
+    return low + shift, high + shift
+
+
+def coverage(points: Array, box: Box, cells: int = CELLS) -> float:
+    """Return the share of the cells² equal cells of a box that hold at least one of (n, 2) points.
+
+    Angles are to be wrapped beforehand; points outside the box and NaN count nowhere.
+    """
+    counts, _, _ = np.histogram2d(
+        points[:, 0], points[:, 1], bins=cells, range=[list(side) for side in box]
+    )
+    return float(np.mean(counts > 0))
+
+
+TOLERANCE = 1e-9
+"""Relative difference of two mean squares of regressors that counts as rounding."""
+
+
+def true_parameters(system: System, step: int = 0, names: Sequence[str] = ()) -> Array:
+    """Return the true values, (q,), of physical parameters at a step, in their units.
+
+    Without ``names`` they are the system's ``linear_parameters``.
+
+    Raises
+    ------
+    SpecificationError
+        If it has none: its learned accelerations are not linear in unknown parameters.
+    """
+    if not (names or system.linear_parameters):
+        raise SpecificationError(
+            f"env '{system.name}' has no parameters that its accelerations are linear in, but a "
+            f"parameter error needs some: choose another env."
+        )
+    row = system.history[min(step, len(system.history) - 1)]
+    values = dict(zip(system.physical, row, strict=True))
+    return np.array([values[name] for name in names or system.linear_parameters])
+
+
+def parameter_error(
+    system: System, parameters: npt.ArrayLike, step: int = 0, names: Sequence[str] = ()
+) -> float:
+    """Return ‖θ - θ*‖₂ for learned parameters θ, (q,), with θ* true at a step.
+
+    They are those of the names, or without any those of the linear model.
+    """
+    return float(np.linalg.norm(np.asarray(parameters) - true_parameters(system, step, names)))
+
+
+def loss_by_parameter_error(system: System) -> float:
+    """Return c such that the loss of the linear model is c ‖θ - θ*‖₂ for every θ.
+
+    The squared loss is (θ - θ*)ᵀ G (θ - θ*), with G the mean of ΨᵀΨ over the evaluation grid. It is
+    a multiple of the squared parameter error if G = c² I.
+
+    Raises
+    ------
+    SpecificationError
+        If G is no multiple of the identity matrix, or the system changes with time.
+    """
+    q = len(true_parameters(system))
+    points, model = evaluation_set(system), Linear()
+    at = system.points(points.states, points.inputs)[: points.n_grid]
+    offset = model.predict_at(system, np.zeros(q), at)
+    regressors = np.stack([model.predict_at(system, unit, at) - offset for unit in np.eye(q)])
+    G = np.einsum("inr,jnr->ij", regressors, regressors) / len(at)
+    square = float(G[0, 0])
+    if len(system.history) > 1 or not np.allclose(
+        G, square * np.eye(q), rtol=0.0, atol=TOLERANCE * abs(square)
+    ):
+        raise SpecificationError(
+            f"the loss of env '{system.name}' weighs its parameters differently, but a parameter "
+            f"error follows from a loss that weighs all alike: run the trials again with "
+            f"dopt.run and compare their parameters."
+        )
+    return float(np.sqrt(square))
+
 
 KEPT_OUTCOMES = 4096
 """Outcomes that trials of one seed share and that are kept: the true and the untrained model's."""

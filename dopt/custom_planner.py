@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from dopt.control.task import Feedback
-from dopt.declare.returned_part import check_returned
 from dopt.errors import SpecificationError
 from dopt.policies import POLICIES
 from dopt.policies.base import Array, CustomPolicy, Planner, TaskPolicy
 from dopt.randomness import stream
+from dopt.registry import check_returned
 from dopt.spec.trial import TrialSpec
 from dopt.trial_view import TrialView
 

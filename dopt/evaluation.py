@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.policies.base import ball_norms, on_sphere
-from dopt.systems.base import System
+from dopt.systems.base import System, next_state
 from dopt.systems.black_box import BlackBox, transitions
-from dopt.systems.equilibrium import eigenmode
-from dopt.systems.integration import next_state
+from dopt.systems.properties import eigenmode
 
 Array = npt.NDArray[np.float64]
 

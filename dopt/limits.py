@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import Validated, parameter, unvalidated
 from dopt.errors import SpecificationError, unknown_name
+from dopt.fields import Validated, parameter, unvalidated
 from dopt.systems.base import System
 from dopt.types import Array
 

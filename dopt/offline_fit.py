@@ -1,21 +1,125 @@
-"""Offline fit of the model of a trial: all samples at once, to convergence."""
+"""Samples of a trial, offline fits of its model to them, and the calibration of a learned model.
+
+In the calibration, the covariance of the parameters is that of the model's linearisation (Laplace
+approximation), with the rows of all samples at the learned parameters.
+
+======  ==========================================================  =====
+symbol  meaning                                                     shape
+======  ==========================================================  =====
+θ       learned parameters                                          q
+J       Jacobian of the accelerations in θ, at one state            r × q
+ρ       noise variance that the trial assumes                       1
+M       λρI + Σ JᵀJ over the samples                                q × q
+s²      σ²/dt, variance of an observed acceleration                 1
+V       s² J M⁻¹ Jᵀ, covariance of the accelerations at a state     r × r
+======  ==========================================================  =====
+
+Reference: D. MacKay, "A practical Bayesian framework for backpropagation networks", Neural
+Computation 4 (1992), sections 2 and 3.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import SpecificationError
-from dopt.evaluation import evaluation_set
+from dopt.evaluation import evaluation_set, random_transitions
 from dopt.models.base import Model
-from dopt.models.mlp import MLP
-from dopt.randomness import initial_weights
+from dopt.models.networks import MLP
+from dopt.policies.base import ball_norms, on_sphere
+from dopt.randomness import initial_weights, process_noise, stream
+from dopt.spec.compatibility import Information, held_information
 from dopt.spec.trial import TrialSpec
+from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
 
 Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """States, inputs, and the accelerations that were observed there.
+
+    Attributes
+    ----------
+    states : (N, d)
+    inputs : (N, m)
+        They count where the model reads inputs.
+    accelerations : (N, r)
+        Per second what the learned rows of the state are measured in, noise included.
+    """
+
+    states: Array
+    inputs: Array
+    accelerations: Array
+
+
+def uniform_samples(spec: TrialSpec) -> Samples:
+    """Return as many samples as a trial has steps, at states drawn uniformly from its grid's box.
+
+    The noise is that of the trial, w_t of equation 2. One step from a state x under any input is
+    observed as y = a(x) + w/dt in the learned rows: the known part, and with it the input, cancels.
+    Where the effect of the inputs is learned, they are drawn uniformly from the sphere ‖u‖ = γ, or
+    from the ball within for a model that is not affine in them.
+    State components without an axis in the grid are zero, as they are there. Of a system that
+    changes, the accelerations are those of the last step, by which the final loss is judged.
+
+    Of a black box that tells the truth at any state, the samples are that, without noise. Of others
+    they are transitions under random inputs, as those of its loss are, from runs of other inputs;
+    there may be fewer.
+    """
+    system, rng = spec.system, stream(spec.seed, "uniform_states")
+    states, inputs = _uniform_points(system, rng)
+    if not spec.model.affine_in_inputs:
+        inputs *= ball_norms(rng, (len(inputs), 1), system.n_inputs)
+    if isinstance(system, BlackBox):
+        truth = system.true_accelerations(states, inputs)
+        if truth is not None:
+            return Samples(states, inputs, truth)
+        rng = stream(spec.seed, "uniform_states")
+        return Samples(*random_transitions(system, system.horizon, rng))
+    noise = process_noise(system, spec.seed)[:, list(system.learned_rows)] / system.dt
+    accelerations = system.learned(states, system.horizon - 1, inputs)
+    return Samples(states, inputs, accelerations + noise)
+
+
+def _uniform_points(system: System, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return as many states, (N, d), and inputs, (N, m), as a trial has steps."""
+    states = np.zeros((system.horizon, system.n_states))
+    for index, (low, high) in system.grid_box().items():
+        states[:, index] = rng.uniform(low, high, system.horizon)
+    draws = rng.standard_normal((system.horizon, system.n_inputs))
+    return states, on_sphere(draws, system.gamma)
+
+
+def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
+    """Return the samples of a trial, from its states (T + 1, d) and inputs (T, m).
+
+    The observed accelerations are those that its learner was given: (x_{t+1} - x_t)/dt less the
+    known part at x_t and u_t, in the learned rows. With the integrator of Runge and Kutta they are
+    taken in the middle of the step, without what the learner's model adds to them. Where states are
+    measured with noise they are those of the true states, which the learner was not given.
+
+    Raises
+    ------
+    SpecificationError
+        If the trial may have begun anew in its course: its record does not say where.
+    """
+    if getattr(system, "restarts", False):
+        raise SpecificationError(
+            f"env.restarts of {system.name} is true, but the samples of a trial in one piece are "
+            f"expected, as its record does not say where it began anew: leave such trials out."
+        )
+    at = system.sampled_states(states)
+    known = system.known(tuple(at.T), tuple(inputs.T), system.parameters)
+    flow = np.stack(np.broadcast_arrays(*known, at[:, 0])[:-1], axis=-1)
+    observed = np.diff(states, axis=0) / system.dt - flow
+    return Samples(at, inputs, observed[:, list(system.learned_rows)])
+
 
 RIDGE = 1e-4
 """Weight ρ of ‖θ - θ₀‖² beside the sum of squares.
@@ -79,7 +183,7 @@ def fit_offline(
     states : (N, d)
         States x.
     accelerations : (N, r)
-        Observed accelerations y, such as those of :func:`dopt.samples.recorded_samples`.
+        Observed accelerations y, such as those of :func:`dopt.offline_fit.recorded_samples`.
     inputs : (N, m), optional
         Inputs u, for a model that reads them.
     ridge : float
@@ -229,3 +333,116 @@ def _solve(
     theta = initial.copy()
     theta[:n_free] += np.linalg.lstsq(rows, right, rcond=None)[0]
     return theta
+
+
+HALF_WIDTH = 1.6448536269514722
+"""Half of the width of an interval of 90 %, in standard deviations: the normal quantile of 0.95."""
+
+_STEP = 1e-6
+"""Change of a parameter in the central differences, beside 1 or its own size."""
+
+
+class HeldOutFit(NamedTuple):
+    """Fit of a model to accelerations, and coverage of its intervals.
+
+    Attributes
+    ----------
+    r_squared : float
+        1 - Σ e² / Σ (a - mean a)² over the states, mean over the learned components; 1 is a perfect
+        fit, 0 that of the mean.
+    covered : float
+        Share of the true accelerations within their interval of 90 %, NaN without a covariance.
+        Accelerations that depend on no parameter, as those at rest may, do not count.
+    log_loss : float
+        Mean negative log likelihood of the same accelerations, in nats; NaN without a covariance.
+    """
+
+    r_squared: float
+    covered: float
+    log_loss: float
+
+
+class HeldOut(NamedTuple):
+    """The fit on the evaluation grid and on the reachable set."""
+
+    grid: HeldOutFit
+    reachable: HeldOutFit
+
+
+def held_out_fit(spec: TrialSpec, parameters: Array, states: Array, inputs: Array) -> HeldOut:
+    """Return how well a learned model fits the evaluation points, without noise.
+
+    Parameters
+    ----------
+    parameters : (q,)
+        Learned parameters θ.
+    states, inputs : (T + 1, d), (T, m)
+        Of the trial: its samples give the covariance. There is none where the trial holds no
+        information matrix, has several networks, no noise, or states that are measured with noise.
+    """
+    system, points = spec.system, evaluation_set(spec.system)
+    truth = points.accelerations
+    if len(system.history) > 1:
+        truth = system.learned(points.states, system.horizon - 1, points.inputs)
+    errors = spec.model.predict(system, parameters, points.states, points.inputs) - truth
+    variances = np.full(truth.shape, np.nan)
+    held = _information(spec)
+    if held is not None:
+        at = Samples(points.states, points.inputs, truth)
+        samples = recorded_samples(system, states, inputs)
+        variances = predicted_variances(spec, parameters, held, samples, at)
+    parts = (slice(points.n_grid), slice(points.n_grid, None))
+    return HeldOut(*(_fit(truth[one], errors[one], variances[one]) for one in parts))
+
+
+def _information(spec: TrialSpec) -> Information | None:
+    """Return λ and ρ of a trial whose model has a covariance, None of another."""
+    system, model = spec.system, spec.model
+    if model.n_members > 1 or model.structure == "conditioning" or system.n_measured:
+        return None
+    found = held_information(
+        spec.policy, spec.learner, model.n_parameters(system), system.n_learned
+    )
+    return found if system.noise > 0.0 else None
+
+
+def predicted_variances(
+    spec: TrialSpec, parameters: Array, held: Information, samples: Samples, at: Samples
+) -> Array:
+    """Return the diagonals of V, (N, r), at N states; fixed parameters have no variance."""
+    rows, points = (jacobian(spec, parameters, one) for one in (samples, at))
+    flat = rows.reshape(-1, rows.shape[-1])
+    matrix = flat.T @ flat + held.regularization * held.noise_variance * np.eye(flat.shape[1])
+    whitened = np.linalg.solve(np.linalg.cholesky(matrix), points.reshape(-1, len(matrix)).T)
+    squares: Array = np.sum(whitened**2, axis=0).reshape(points.shape[:-1])
+    return spec.system.noise**2 / spec.system.dt * squares
+
+
+def jacobian(spec: TrialSpec, parameters: Array, at: Samples) -> Array:
+    """Return the derivatives, (N, r, q), of the accelerations in the free parameters.
+
+    By central differences, for any model: of a network they are exact to about 1e-9.
+    """
+    system, model = spec.system, spec.model
+    columns = []
+    for i in range(len(parameters) - model.n_fixed_parameters(system)):
+        step = np.zeros(len(parameters))
+        step[i] = _STEP * max(1.0, abs(parameters[i]))
+        above, below = (
+            model.predict(system, moved, at.states, at.inputs)
+            for moved in (parameters + step, parameters - step)
+        )
+        columns.append((above - below) / (2.0 * step[i]))
+    return np.stack(columns, axis=-1)
+
+
+def _fit(truth: Array, errors: Array, variances: Array) -> HeldOutFit:
+    spread = np.sum((truth - truth.mean(axis=0)) ** 2, axis=0)
+    r_squared = 1.0 - float(np.mean(np.sum(errors**2, axis=0) / spread))
+    if np.isnan(variances).any():
+        return HeldOutFit(r_squared, np.nan, np.nan)
+    unsure = variances > 0.0
+    e, v = errors[unsure], variances[unsure]
+    covered = float(np.mean(np.abs(e) <= HALF_WIDTH * np.sqrt(v)))
+    nats = 0.5 * (np.log(2.0 * np.pi * v) + e**2 / v)
+    return HeldOutFit(r_squared, covered, float(np.mean(nats)))

@@ -13,8 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
-from dopt.errors import DoptError, unknown_name
-from dopt.given_path import given_path
+from dopt.errors import DoptError, given_path, unknown_name
 
 _INSTALLED = {
     "dopt": "python -m orchestrate",

@@ -12,7 +12,7 @@ if __package__ in (None, ""):
     # Python puts a script's own folder first; the packages are in the folder above it.
     sys.path[: not sys.flags.safe_path] = [str(Path(__file__).resolve().parents[1])]
 
-from dopt.garbage_collection import collect_rarely
+from dopt.process import collect_rarely
 from orchestrate.executors.limits import pin_threads
 from orchestrate.program import run
 

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from dopt.limits import VIOLATIONS, WORST
-from dopt.spec.added_fields import completed
+from dopt.spec.config import completed
 from dopt.spec.label import limits_label
 from orchestrate.redaction import without_password
 from orchestrate.store import (

@@ -30,8 +30,8 @@ ONLY_IN = {
     "psycopg": ("orchestrate/store/",),
     "torch": ("dopt/reference/", "orchestrate/executors/lockstep.py"),
     "numba": ("dopt/kernel/",),
-    "gymnasium": ("dopt/gymnasium/",),
-    "mujoco": ("dopt/systems/mujoco/",),
+    "gymnasium": ("dopt/gymnasium.py",),
+    "mujoco": ("dopt/systems/mujoco.py",),
     "matplotlib": (
         "analysis/figures/",
         "analysis/outputs.py",

@@ -21,9 +21,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from analysis.errors import AnalysisError
-from dopt.declare.registry import SOURCE, TARGET
 from dopt.errors import SpecificationError
 from dopt.limits import Limits
+from dopt.registry import SOURCE, TARGET
 from dopt.spec.label import flatten
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import CONFIG_COLUMNS, ConfigRow, Reader

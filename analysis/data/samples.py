@@ -14,8 +14,7 @@ import numpy.typing as npt
 from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
 from dopt.limits import VIOLATIONS, limits_from
-from dopt.spec.prequential import is_prequential, stored_trial
-from dopt.spec.trial import TrialSpec
+from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
 from orchestrate.store import ConfigRow, Curves, Reader
 

@@ -27,7 +27,7 @@ from dopt.errors import IncompatibleError, SpecificationError
 from dopt.policies import POLICIES
 from dopt.policies.titles import TITLES
 from dopt.spec.label import labels, limits_label, value_label
-from dopt.spec.prequential import is_prequential, stored_trial
+from dopt.spec.trial import is_prequential, stored_trial
 from dopt.systems import NAMED_SYSTEMS
 from orchestrate.store import ConfigRow, Reader, TrialRow
 

@@ -25,8 +25,8 @@ from analysis.figures.panels import (
 from analysis.formatting import count_text
 from analysis.line_styles import environment_title, policy_style
 from analysis.stats.trajectories import Spectrum, average_spectrum
-from dopt.spec.prequential import system_of
-from dopt.systems.equilibrium import eigenmode
+from dopt.spec.trial import system_of
+from dopt.systems.properties import eigenmode
 from orchestrate.store import Reader
 
 HEIGHT = 3.0

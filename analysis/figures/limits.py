@@ -35,7 +35,7 @@ from analysis.line_styles import BLUE, GREY, environment_title
 from analysis.stats.intervals import mean, standard_error
 from dopt.policies.titles import policy_title
 from dopt.spec.label import flatten
-from dopt.spec.prequential import system_of
+from dopt.spec.trial import system_of
 from dopt.systems import System
 from orchestrate.store import Reader
 

@@ -57,7 +57,7 @@ from analysis.line_styles import (
 from analysis.stats.curves import log_limits
 from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
 from analysis.stats.scores import final_losses, on_front
-from dopt.spec.prequential import system_of
+from dopt.spec.trial import system_of
 from orchestrate.store import Reader
 
 USUAL = "mlp"

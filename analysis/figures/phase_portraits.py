@@ -30,8 +30,8 @@ from analysis.formatting import plus_minus
 from analysis.line_styles import BLACK, environment_title, policy_style
 from analysis.stats.intervals import mean, standard_error
 from analysis.stats.trajectories import DrawnPlane, median_seed
-from dopt.coverage import CELLS
-from dopt.spec.prequential import system_of
+from dopt.assessment import CELLS
+from dopt.spec.trial import system_of
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]

@@ -35,7 +35,7 @@ from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
 from analysis.stats.scores import Scores, final_losses
 from dopt.policies.titles import policy_title
 from dopt.spec.label import flatten, value_label
-from dopt.spec.prequential import system_of
+from dopt.spec.trial import system_of
 from orchestrate.store import Reader
 
 SETTINGS = ("policy.regularization", "learner.learning_rate", "learner.window")

@@ -36,7 +36,7 @@ from analysis.stats.curves import log_limits
 from analysis.stats.intervals import mean, standard_error
 from analysis.stats.scores import final_losses
 from dopt.spec.label import flatten
-from dopt.spec.prequential import system_of
+from dopt.spec.trial import system_of
 from orchestrate.store import Reader
 
 PARTS = ("plan", "learn", "evaluate")

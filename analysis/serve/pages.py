@@ -26,11 +26,11 @@ from analysis.stats.curves import LossCurve, axis_parts, measure_curves, tabulat
 from analysis.stats.intervals import mean, standard_error
 from analysis.stats.trajectories import DrawnPlane, periodogram
 from dopt.errors import SpecificationError
-from dopt.spec.added_fields import completed
+from dopt.spec.config import completed
 from dopt.spec.label import flatten, labels
-from dopt.spec.prequential import is_prequential, system_of
+from dopt.spec.trial import is_prequential, system_of
 from dopt.systems import System
-from dopt.systems.equilibrium import eigenmode
+from dopt.systems.properties import eigenmode
 from orchestrate.store import ConfigRow, LaunchRow, Reader, explorations, failure_kinds
 from orchestrate.store.errors import QueryError
 

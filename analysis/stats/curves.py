@@ -17,7 +17,7 @@ from analysis.formatting import loss_unit
 from analysis.line_styles import LineStyle, policy_style, sequence_style
 from analysis.plot_options import Axis
 from analysis.stats.intervals import Band, BandKind, Statistic, band, tolerance_band
-from dopt.spec.prequential import is_prequential, system_of
+from dopt.spec.trial import is_prequential, system_of
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from dopt.coverage import TURN, Plane, turns, wrap
+from dopt.assessment import TURN, Plane, turns, wrap
 
 Array = npt.NDArray[np.float64]
 QUANTILES = (0.1, 0.9)

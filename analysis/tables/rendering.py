@@ -37,7 +37,7 @@ from analysis.tables.comparisons import (
     compare_steps,
     summarise,
 )
-from dopt.calibration import HeldOutFit, held_out_fit
+from dopt.offline_fit import HeldOutFit, held_out_fit
 from dopt.types import Array
 from orchestrate.store import Reader
 
@@ -363,7 +363,7 @@ TABLES = {
 def measure_calibration(reader: Reader, selection: Selection) -> pd.DataFrame:
     """Return medians over the trials that are done, one row for each environment and variant.
 
-    Of each measure of :class:`dopt.calibration.HeldOutFit` on the grid and on the reachable set,
+    Of each measure of :class:`dopt.offline_fit.HeldOutFit` on the grid and on the reachable set,
     and of the mean of ‖u‖²/γ² over the steps, ``energy``. Of the share covered it is the mean: that
     of all states of all trials.
 

@@ -47,9 +47,9 @@ from analysis.tables.comparisons import (
     loss_of_random_inputs,
     paired,
 )
-from dopt.coverage import Plane
+from dopt.assessment import Plane
 from dopt.policies.titles import policy_title
-from dopt.spec.prequential import is_prequential, system_of
+from dopt.spec.trial import is_prequential, system_of
 from orchestrate.store import Assessments, Reader
 
 _SETTING = ("model", "learner", "limits")

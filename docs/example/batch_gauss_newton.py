@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.learning.base import Array, CustomLearner, Updater
 from dopt.systems import System
 from dopt.trial_view import TrialView

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.kernel.policies.prediction import input_columns, predicted_state
 from dopt.kernel.structs import Trial
 from dopt.policies.base import Array, CompiledPolicy, CustomPolicy, Planner

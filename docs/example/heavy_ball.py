@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.kernel.information.update import model_rows
 from dopt.kernel.learners.samples import sampled_point
 from dopt.kernel.structs import Trial

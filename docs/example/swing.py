@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.gymnasium import Environment
 from dopt.systems import Feature
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies.base import OpenLoop
 from dopt.systems import Feature, System
 from dopt.systems.elementary import magnitude

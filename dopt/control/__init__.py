@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dopt.control.task import Control
-from dopt.declare.registry import build
 from dopt.errors import SpecificationError
+from dopt.registry import build
 
 TASKS: dict[str, type[Control]] = {Control.name: Control}
 

@@ -12,8 +12,7 @@ import numpy as np
 from dopt.control.task import Control, Feedback, Goal
 from dopt.evaluation import evaluation_set
 from dopt.policies.base import on_sphere
-from dopt.systems.base import System
-from dopt.systems.integration import next_state
+from dopt.systems.base import System, next_state
 from dopt.types import Array
 
 # Prediction of many states over many steps, with true or modelled accelerations.

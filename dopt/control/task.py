@@ -6,8 +6,8 @@ import dataclasses
 import math
 from typing import Any, ClassVar, Protocol
 
-from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.fields import Validated, parameter
 from dopt.systems.base import System
 from dopt.types import Array
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from dopt.declare.registry import section_of
-from dopt.declare.validated_fields import LARGEST_WHOLE
 from dopt.errors import SpecificationError
+from dopt.fields import LARGEST_WHOLE
 from dopt.policies.base import ROUNDING
+from dopt.registry import section_of
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox

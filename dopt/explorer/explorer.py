@@ -33,8 +33,7 @@ from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
 from dopt.learning import Learner
 from dopt.models import Model
 from dopt.policies import Policy
-from dopt.spec.added_fields import completed
-from dopt.spec.config import LARGEST_HORIZON
+from dopt.spec.config import LARGEST_HORIZON, completed
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import Plant

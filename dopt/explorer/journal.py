@@ -24,9 +24,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from dopt.errors import ExplorationError, SpecificationError
+from dopt.errors import ExplorationError, SpecificationError, given_path
 from dopt.explorer.arguments import finite, seconds, within
-from dopt.given_path import given_path
 
 FORMAT = 2
 """Version of the lines."""

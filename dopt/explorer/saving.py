@@ -19,10 +19,9 @@ from dopt.explorer.arguments import reals, whole
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
-from dopt.spec.prequential import PrequentialTrial
-from dopt.spec.trial import TrialSpec
+from dopt.spec.trial import PrequentialTrial, TrialSpec
 from dopt.systems.base import System
-from dopt.systems.sensors import start_variances
+from dopt.systems.black_box import start_variances
 from dopt.types import Array
 
 if TYPE_CHECKING:

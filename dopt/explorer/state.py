@@ -29,7 +29,7 @@ import numpy as np
 from dopt.errors import ExplorationError
 from dopt.explorer.journal import Event, is_event
 from dopt.models import MLP
-from dopt.spec.scale_check import warn_of_sizes
+from dopt.spec.custom_system import warn_of_sizes
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 

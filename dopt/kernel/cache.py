@@ -25,12 +25,11 @@ from pathlib import Path
 
 import llvmlite.binding
 
-from dopt.errors import UnusableEnvironmentError
-from dopt.given_path import given_path
+from dopt.errors import UnusableEnvironmentError, given_path
 
 CACHE_VARIABLE = "DOPT_CACHE"
 _PACKAGE = Path(__file__).resolve().parent.parent
-COMPILED_SOURCES = ("algorithm.py", "kernel", "systems", "math")
+COMPILED_SOURCES = ("algorithm.py", "kernel", "systems", "sphere.py")
 
 OTHER_SETTINGS = tuple(
     f"NUMBA_{name}" for name in ("CACHE", "CPU", "CUDA", "NUM_THREADS", "THREAD")

@@ -17,8 +17,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from dopt.cores import usable_cores
 from dopt.kernel import cache
+from dopt.process import usable_cores
 
 ENDS = ("first", "last")
 """Ends of the list of parts, at which the two processes begin."""

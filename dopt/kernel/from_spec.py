@@ -34,11 +34,11 @@ from dopt.policies.held_candidates import HeldCandidates
 from dopt.policies.search import score_code
 from dopt.policies.task_states import box_states, domain_box, task_states
 from dopt.randomness import Draws
+from dopt.spec.compatibility import is_fresh
 from dopt.spec.config import TrialConfig
-from dopt.spec.information_form import is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.systems.sensors import delay, differentiated
+from dopt.systems.black_box import delay, differentiated
 
 MODULES = {Form.PRIMAL: primal_network, Form.DUAL: dual, Form.SKETCH: sketch}
 

@@ -1,6 +1,6 @@
 """Kernel and posterior mean of a Gaussian process in compiled code.
 
-The flat parameters θ of :mod:`dopt.models.gaussian_process` hold the features of the T states at
+The flat parameters θ of :mod:`dopt.models.linear` hold the features of the T states at
 which samples are taken, (T, p), and the weights α of the mean, (T, r). Rows of samples not yet
 taken are zero. Here n is the number of samples taken.
 """

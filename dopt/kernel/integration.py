@@ -1,7 +1,7 @@
 """One time step of the truth or of a model with a held input, in compiled code.
 
 Either is taken in stages: one for the Euler map, four for the method of Runge and Kutta. Twin of
-:mod:`dopt.systems.integration`.
+:mod:`dopt.systems.base`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Random Fourier features and their derivatives in compiled code (:mod:`dopt.models.rff`).
+"""Random Fourier features and their derivatives in compiled code (:mod:`dopt.models.linear`).
 
 ψ(x) = c cos(Ω φ(x) + b) with φ the features of the state. The parameters that are learned are those
 of W, row by row, so that row k of J has ψ at the places k D to (k + 1) D and zeros elsewhere.

@@ -1,6 +1,6 @@
 """States that are measured with noise, and estimates of them by a filter, in compiled code.
 
-The filter is that of :mod:`dopt.systems.sensors`, for learners that do not estimate states. What
+The filter is that of :mod:`dopt.systems.black_box`, for learners that do not estimate states. What
 every step of every trial calls is given the parts that it needs: a whole trial takes microseconds
 to pass on.
 """

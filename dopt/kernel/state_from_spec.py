@@ -13,8 +13,8 @@ from dopt.learning import GaussNewton, JointKalman, Learner
 from dopt.models import MLP, GaussianProcess
 from dopt.policies import ICEM, DOptimal, InformationPolicy
 from dopt.policies.d_optimal import count_sketch
+from dopt.spec.compatibility import Information, held_information, is_fresh
 from dopt.spec.config import TrialConfig
-from dopt.spec.information_form import Information, held_information, is_fresh
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox

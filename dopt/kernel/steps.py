@@ -9,7 +9,7 @@ from dopt.kernel.numpy_parts import NumpyParts
 from dopt.kernel.pointers import BETWEEN, compiled_step, compiled_steps
 from dopt.kernel.trial_state import KernelState
 from dopt.spec.trial import TrialSpec
-from dopt.systems.sensors import start_variances
+from dopt.systems.black_box import start_variances
 from dopt.types import Array, CompiledFunction
 
 

@@ -11,7 +11,6 @@ from functools import partial
 from types import ModuleType
 from typing import NamedTuple
 
-from dopt.garbage_collection import collect_rarely
 from dopt.kernel import absent_steps, cache
 from dopt.kernel.equations import compiled_equations, name_of_equations
 from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
@@ -32,6 +31,7 @@ from dopt.kernel.pointers import (
 from dopt.kernel.run import KernelTrial
 from dopt.learning import LEARNERS, Adam
 from dopt.policies import POLICIES, DOptimal
+from dopt.process import collect_rarely
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 

@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.declare.kernel_support import LEARN_IN_NUMPY, KernelPart
-from dopt.declare.returned_part import check_returned
 from dopt.errors import SpecificationError
+from dopt.fields import LEARN_IN_NUMPY, KernelPart, parameter
+from dopt.registry import check_returned
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 
@@ -135,3 +135,25 @@ def check_update(name: str, updated: Array, shape: tuple[int, ...]) -> None:
             f"learner '{name}' returned {given}, but parameters of shape {shape} are expected: "
             f"correct its update()."
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class InformationLearner(Learner):
+    """A learner that updates θ and the information matrix M together.
+
+    There is one information matrix. With a policy that plans by M the learner takes that of the
+    policy, with its λ; with any other it holds one of its own. M is held as a q × q matrix.
+
+    Parameters
+    ----------
+    regularization : float
+        λ of a learner with a matrix of its own; with ρ = 1 it is the ratio of the variance of the
+        observations to that of the initial parameters.
+    noise_variance : float
+        ρ, in the units in which the parameters have the variance 1/λ.
+    """
+
+    updates_information: ClassVar[bool] = True
+
+    regularization: float = parameter(1e-3, bound="positive")
+    noise_variance: float = parameter(1.0, bound="positive")

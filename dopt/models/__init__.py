@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from dopt.models.base import Model
-from dopt.models.ensemble import Ensemble
-from dopt.models.gaussian_process import GaussianProcess
 from dopt.models.grey_box import GreyBox
-from dopt.models.input_networks import AffineMLP, BlackBoxMLP
-from dopt.models.linear import Linear
+from dopt.models.linear import RFF, GaussianProcess, Linear
 from dopt.models.linear_state import LinearState
-from dopt.models.mlp import MLP
-from dopt.models.rff import RFF
+from dopt.models.networks import MLP, AffineMLP, BlackBoxMLP, Ensemble
 
 MODELS: dict[str, type[Model]] = {
     model.name: model

@@ -9,9 +9,8 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from dopt.declare.kernel_support import KernelSupport
-from dopt.systems.base import System, with_inputs
-from dopt.systems.features import Feature, feature_values
+from dopt.fields import KernelSupport
+from dopt.systems.base import Feature, System, feature_values, with_inputs
 
 Array = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.models.base import Array, Model
 from dopt.systems.base import System
 from dopt.types import Scalar

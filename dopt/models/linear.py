@@ -1,12 +1,15 @@
-"""Linear form in known regressors: what an oracle knows of the physics."""
+"""Models that are linear in their parameters, and the Gaussian process."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
+from dopt.fields import parameter
 from dopt.models.base import Array, Model
 from dopt.systems.base import System
 
@@ -40,3 +43,116 @@ class Linear(Model):
         regressors = np.stack([unit - offset for unit in units], axis=-1)
         predicted: Array = offset + regressors @ parameters
         return predicted
+
+
+@dataclass(frozen=True, kw_only=True)
+class RFF(Model):
+    """a_θ(x) = W ψ(x), ψ(x) = s √(2/D) cos(Ω φ(x) + b), with φ the system's features.
+
+    The rows of Ω are drawn from N(0, I/ℓ²) and the phases b uniformly from a circle, by the seed of
+    the trial; they stay. Then E ψ(x)·ψ(x') = s² exp(-‖φ - φ'‖²/2ℓ²): least squares for W with the
+    ridge λ is Bayesian linear regression, which tends to the Gaussian process of that kernel, noise
+    variance λ, as D grows. W starts at zero. References: A. Rahimi and B. Recht, "Random features
+    for large-scale kernel machines" (NIPS 2007); for exploration, the paper's [9].
+
+    The flat parameter vector is W, Ω, b, each row by row. Only W is learned.
+
+    Parameters
+    ----------
+    n_features : int
+        D.
+    lengthscale : float
+        ℓ, in units of the features, which are of order one on the grid.
+    amplitude : float
+        s, prior standard deviation of the accelerations where λ is the variance of the noise.
+    """
+
+    name: ClassVar[str] = "rff"
+    structure: ClassVar[str] = "least_squares"
+    compiled: ClassVar[bool] = True
+
+    n_features: int = parameter(100, "features", "positive")
+    lengthscale: float = parameter(1.0, bound="positive")
+    amplitude: float = parameter(10.0, bound="positive")
+
+    def n_parameters(self, system: System) -> int:
+        return self.n_features * system.n_learned + self.n_fixed_parameters(system)
+
+    def n_fixed_parameters(self, system: System) -> int:
+        return self.n_features * (len(system.features) + 1)
+
+    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
+        weights = np.zeros(self.n_features * system.n_learned)
+        frequencies = rng.standard_normal(self.n_features * len(system.features))
+        phases = rng.uniform(0.0, 2.0 * math.pi, self.n_features)
+        return np.concatenate([weights, frequencies / self.lengthscale, phases])
+
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
+        first = self.n_features * system.n_learned
+        last = len(parameters) - self.n_features
+        weights = parameters[:first].reshape(system.n_learned, self.n_features)
+        frequencies = parameters[first:last].reshape(self.n_features, len(system.features))
+        waves = np.cos(system.featurize(points) @ frequencies.T + parameters[last:])
+        predicted: Array = self.scale * waves @ weights.T
+        return predicted
+
+    @property
+    def scale(self) -> float:
+        """S √(2/D)."""
+        return self.amplitude * math.sqrt(2.0 / self.n_features)
+
+
+ROUNDING = 1e-10
+"""Least variance of the noise, by the prior variance: the factorisation needs some."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianProcess(Model):
+    """Independent processes with one kernel, k(x, x') = s² exp(-‖φ(x) - φ(x')‖²/2ℓ²), mean zero.
+
+    The noise is the trial's: an observed acceleration has the variance σ²/dt. The model is the
+    posterior mean a(x) = Σ_i k(x, x_i) α_i with α = (K + σ²/dt I)⁻¹ Y. References: C. Rasmussen and
+    C. Williams, "Gaussian processes for machine learning", chapter 2 (2006); for exploration, the
+    paper's [8].
+
+    The flat parameter vector holds what the mean is made of: the features of the T states at which
+    samples are taken, (T, p), then α, (T, r), both row by row. Rows of samples not yet taken are
+    zero and add nothing.
+
+    Parameters
+    ----------
+    lengthscale : float
+        ℓ, in units of the features, which are of order one on the grid.
+    amplitude : float
+        s, prior standard deviation of the accelerations.
+    """
+
+    name: ClassVar[str] = "gaussian_process"
+    structure: ClassVar[str] = "conditioning"
+    compiled: ClassVar[bool] = True
+
+    lengthscale: float = parameter(1.0, bound="positive")
+    amplitude: float = parameter(10.0, bound="positive")
+
+    def n_parameters(self, system: System) -> int:
+        return system.horizon * (len(system.features) + system.n_learned)
+
+    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:  # noqa: ARG002  # nothing is random here
+        return np.zeros(self.n_parameters(system))
+
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
+        first = system.horizon * len(system.features)
+        centers = parameters[:first].reshape(system.horizon, -1)
+        alpha = parameters[first:].reshape(system.horizon, -1)
+        predicted: Array = self.kernel(system.featurize(points), centers) @ alpha
+        return predicted
+
+    def kernel(self, phi: Array, other: Array) -> Array:
+        """Return k, (N, N'), between features (N, p) and (N', p)."""
+        squares = np.square(phi[:, None] - other[None]).sum(axis=-1)
+        values: npt.NDArray[np.float64] = np.exp(-0.5 * squares / self.lengthscale**2)
+        return self.amplitude**2 * values
+
+    def noise_variance(self, system: System) -> float:
+        """Return σ²/dt, or what rounding needs if that is more."""
+        return max(system.noise**2 / system.dt, ROUNDING * self.amplitude**2)

@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.control.task import Control, Feedback, Goal
-from dopt.declare.kernel_support import PLAN_IN_NUMPY, KernelPart
-from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.fields import PLAN_IN_NUMPY, KernelPart, parameter
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 

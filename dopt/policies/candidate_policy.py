@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies.base import Array, Policy
 from dopt.policies.sphere_directions import sphere_directions
 from dopt.systems.base import System

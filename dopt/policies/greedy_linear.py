@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
+from dopt.fields import parameter
 from dopt.policies.base import Array, ClosedLoop
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies.base import ClosedLoop, check_length
 from dopt.policies.candidate_policy import CandidatePolicy
 from dopt.systems.base import System

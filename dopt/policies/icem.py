@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.algorithm import Score
-from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
+from dopt.fields import parameter
 from dopt.policies.base import Array, InformationPolicy, check_length
 from dopt.systems.base import System
 

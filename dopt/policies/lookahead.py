@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
+from dopt.fields import parameter
 from dopt.policies.base import check_length
 from dopt.policies.search import Search
 from dopt.systems.base import System
-from dopt.systems.equilibrium import eigenmode
+from dopt.systems.properties import eigenmode
 
 PERIOD_SHARE = 0.6
 STEPS_WITHOUT_PERIOD = 10

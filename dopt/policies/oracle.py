@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
+from dopt.fields import parameter
 from dopt.policies.d_optimal import DOptimal
 from dopt.systems.base import System
 

@@ -8,11 +8,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError
+from dopt.fields import parameter
 from dopt.policies.base import Array, OpenLoop
 from dopt.systems.base import System
-from dopt.systems.equilibrium import eigenmode
+from dopt.systems.properties import eigenmode
 
 
 @dataclass(frozen=True, kw_only=True)

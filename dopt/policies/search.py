@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from dopt.algorithm import Score
-from dopt.declare.validated_fields import parameter
 from dopt.errors import unknown_name
+from dopt.fields import parameter
 from dopt.policies.base import InformationPolicy
 from dopt.policies.candidate_policy import CandidatePolicy
 from dopt.systems.base import System

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies.base import Array, CustomPolicy, Planner
 from dopt.policies.held_candidates import HeldCandidates
 from dopt.systems.base import System

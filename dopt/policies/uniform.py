@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies.base import ClosedLoop
 
 

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from dopt.reference.derivatives import rows as model_rows
 from dopt.reference.models import BatchModel, stack
-from dopt.systems.base import System
-from dopt.systems.integration import next_state
+from dopt.systems.base import System, next_state
 
 
 def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:

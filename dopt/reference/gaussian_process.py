@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dopt.models.gaussian_process import GaussianProcess
+from dopt.models.linear import GaussianProcess
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.reference.dynamics import flow
 from dopt.reference.models import features, kernel

@@ -19,8 +19,7 @@ from dopt.models import (
     LinearState,
     Model,
 )
-from dopt.systems.base import System
-from dopt.systems.features import feature_values
+from dopt.systems.base import System, feature_values
 from dopt.types import Scalar
 
 BatchModel = Callable[[Tensor, Tensor], Tensor]

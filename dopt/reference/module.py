@@ -13,10 +13,10 @@ import torch
 from torch import nn
 from torch.nn.utils import parameters_to_vector
 
-from dopt.declare.registry import SOURCE, TARGET, check_source, imported, source_digest
 from dopt.errors import SpecificationError
 from dopt.models.base import Array, Model
 from dopt.reference.models import network_function
+from dopt.registry import SOURCE, TARGET, check_source, imported, source_digest
 from dopt.systems.base import System
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dopt.reference.state import BatchState
-from dopt.systems.sensors import delay, differentiated
+from dopt.systems.black_box import delay, differentiated
 
 
 class BatchSensors:

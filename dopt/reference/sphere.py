@@ -1,4 +1,4 @@
-"""The quadratic problem on a sphere for a batch, in torch: see :mod:`dopt.math.sphere`.
+"""The quadratic problem on a sphere for a batch, in torch: see :mod:`dopt.sphere`.
 
 The same mathematics in another form: the root of the secular equation is enclosed for all problems
 at once, in intervals of which each is a part of the one before.

@@ -16,7 +16,7 @@ from dopt.randomness import draw
 from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.information import BatchInformation
 from dopt.reference.models import model_function, network_function
-from dopt.spec.information_form import held_information
+from dopt.spec.compatibility import held_information
 from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import BlackBox
 from dopt.types import Array

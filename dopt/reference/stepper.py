@@ -10,7 +10,7 @@ from dopt.errors import SpecificationError
 from dopt.reference.batch import Lockstep
 from dopt.reference.steps import BatchSteps
 from dopt.spec.trial import TrialSpec
-from dopt.systems.sensors import start_variances
+from dopt.systems.black_box import start_variances
 
 Array = npt.NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from dopt.reference.recorded import Recorded
 from dopt.reference.search import searched_inputs
 from dopt.reference.sensors import BatchSensors
 from dopt.reference.state import BatchState
-from dopt.spec.information_form import is_fresh
+from dopt.spec.compatibility import is_fresh
 
 
 class BatchSteps(BatchState):

@@ -1,4 +1,4 @@
-"""Configuration of a trial: everything but its seed, and checks that its parts fit together."""
+"""Configuration of a trial: everything except its seed, and the classes that its sections name."""
 
 from __future__ import annotations
 
@@ -6,27 +6,68 @@ import dataclasses
 import functools
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from dopt.control import Control
+from dopt.control import TASKS, Control
 from dopt.control.task import GOALS, Goal
-from dopt.declare.registry import identifying_section, section_of
-from dopt.declare.validated_fields import Validated
 from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.evaluation import LONGEST_RUN
+from dopt.fields import Validated
 from dopt.learning import LEARNERS, InformationLearner, JointKalman, Learner
 from dopt.learning.base import CompiledLearner, CustomLearner
-from dopt.limits import Limits
-from dopt.models import Model
+from dopt.limits import LIMITS, Limits
+from dopt.models import MODELS, Model
 from dopt.policies import POLICIES, DOptimal, GradientDOptimal, Policy, Search
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, TaskPolicy
-from dopt.spec.compatibility import check_together, mismatch
-from dopt.spec.custom_system_check import check_system
-from dopt.spec.memory_estimate import memory_by_setting
-from dopt.spec.scale_check import warn_of_prior, warn_of_scale
-from dopt.systems import SYSTEMS, System
+from dopt.registry import TARGET, added_defaults, identifying_section, section_of
+from dopt.spec.compatibility import check_together, memory_by_setting, mismatch
+from dopt.spec.custom_system import check_system, warn_of_prior, warn_of_scale
+from dopt.systems import NAMED_SYSTEMS, SYSTEMS, System
 from dopt.systems.black_box import BlackBox
+
+REGISTRIES: Mapping[str, Mapping[str, type[Validated]]] = {
+    "env": NAMED_SYSTEMS,
+    "policy": POLICIES,
+    "model": MODELS,
+    "learner": LEARNERS,
+    "task": TASKS,
+    "limits": LIMITS,
+}
+"""Registered classes of every section."""
+
+
+def section_name(config: Mapping[str, object], key: str) -> str:
+    """Return the name in a section, or the text that stands in its place; empty without one."""
+    section = config.get(key)
+    return str(section.get("name")) if isinstance(section, Mapping) else str(section or "")
+
+
+def section_class(config: Mapping[str, object], key: str) -> type[Validated] | None:
+    """Return the class of a section: a registered one, or a user's that is loaded already."""
+    section = config.get(key)
+    if not isinstance(section, Mapping) or TARGET not in section:
+        return REGISTRIES[key].get(section_name(config, key))
+    module, _, name = str(section[TARGET]).rpartition(".")
+    found = getattr(sys.modules.get(module), name, None)
+    return found if isinstance(found, type) and issubclass(found, Validated) else None
+
+
+def completed(config: Mapping[str, object]) -> dict[str, object]:
+    """Return a stored configuration with the defaults of the added fields that it lacks.
+
+    The stored text is what the key is made of, which has no added field with its default
+    (:func:`dopt.fields.parameter`). The fields of a user's class are known only
+    where that class is loaded.
+    """
+    whole = dict(config)
+    for key in REGISTRIES:
+        section, cls = config.get(key), section_class(config, key)
+        if isinstance(section, Mapping) and cls is not None:
+            whole[key] = {**added_defaults(cls), **section}
+    return whole
+
 
 CODE_VERSION = 1
 """Version of the numbers of trials, part of every key: increased by a change that alters them."""
@@ -198,7 +239,7 @@ class TrialConfig:
         """Sorted, compact JSON of what identifies the configuration: what the key is made of.
 
         It is :meth:`content` without added fields that have their default
-        (:func:`dopt.spec.added_fields.completed` puts them back).
+        (:func:`dopt.spec.config.completed` puts them back).
         """
         content = self._content(identifying_section)
         return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)

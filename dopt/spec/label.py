@@ -10,14 +10,11 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 from dopt.control import Control
-from dopt.declare.kernel_support import default_path
-from dopt.declare.registry import SOURCE, TARGET, section_of
-from dopt.declare.validated_fields import Validated
 from dopt.errors import SpecificationError
+from dopt.fields import Validated, default_path
 from dopt.policies.titles import policy_title
-from dopt.spec.added_fields import completed
-from dopt.spec.config import SECTIONS
-from dopt.spec.named_classes import REGISTRIES, section_class, section_name
+from dopt.registry import SOURCE, TARGET, section_of
+from dopt.spec.config import REGISTRIES, SECTIONS, completed, section_class, section_name
 from dopt.systems import System
 
 Flat = Mapping[str, object]

@@ -1,33 +1,31 @@
-"""Physical systems: one file each, and the registry that names them."""
+"""Physical systems, and the registry that names them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dopt.declare.registry import TARGET, build
+from dopt.registry import TARGET, build
 from dopt.systems import plant
-from dopt.systems.arm import Arm
-from dopt.systems.base import System
+from dopt.systems.arm import Arm, Chain
+from dopt.systems.base import Feature, System
 from dopt.systems.black_box import BlackBox
-from dopt.systems.car import Car
 from dopt.systems.cartpole import Cartpole, CartpoleUnknownGain
-from dopt.systems.chain import Chain
-from dopt.systems.coupled_pendulums import CoupledPendulums
-from dopt.systems.drifting_pendulum import DriftingPendulum
-from dopt.systems.drone import Drone
-from dopt.systems.features import Feature
-from dopt.systems.mass_spring import MassSpring
-from dopt.systems.moving_star import MovingStar
 from dopt.systems.mujoco import (
     MuJoCoAcrobot,
     MuJoCoCartpole,
     MuJoCoPendulum,
     MuJoCoReacher,
 )
-from dopt.systems.pendulum import Pendulum, PendulumUnknownGain
-from dopt.systems.quadrotor import Quadrotor
-from dopt.systems.unbalanced_disk import UnbalancedDisk
-from dopt.systems.van_der_pol import VanDerPol
+from dopt.systems.oscillators import MassSpring, VanDerPol
+from dopt.systems.pendulum import (
+    CoupledPendulums,
+    DriftingPendulum,
+    Pendulum,
+    PendulumUnknownGain,
+    UnbalancedDisk,
+)
+from dopt.systems.planar import Car, MovingStar
+from dopt.systems.quadrotor import Drone, Quadrotor
 
 SYSTEMS: dict[str, type[System]] = {
     system.name: system

@@ -1,14 +1,15 @@
-"""Damped two-link robot arm in a vertical plane, with point masses at the ends of the links."""
+"""Links that hang from a pivot in a vertical plane: the paper's arm, and a chain with n links."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.declare.validated_fields import parameter
-from dopt.systems.base import System
+from dopt.errors import SpecificationError
+from dopt.fields import Validated, parameter
+from dopt.systems.base import Feature, System
 from dopt.systems.elementary import cos, sin
-from dopt.systems.features import Feature
 from dopt.types import Scalar
 
 
@@ -101,3 +102,159 @@ class Arm(System):
         torque_1 = -friction * rate_1 - twist * rate_2**2 - weight_1
         torque_2 = -friction * rate_2 + twist * rate_1**2 - weight_2
         return _solved(state, parameters, torque_1, torque_2)
+
+
+def _solved_chain(state: Scalar, parameters: Scalar, right: list[Scalar]) -> list[Scalar]:
+    """Return H(φ)⁻¹ right with the mass matrix H of the chain, by elimination.
+
+    H is symmetric and positive definite: no pivots are sought, and its upper triangle is enough.
+    """
+    n, inertia = len(right), parameters[0] * parameters[1] ** 2
+    upper = []
+    solution = []
+    for i in range(n):
+        solution.append(right[i])
+        for j in range(n):
+            outer = max(i, j)
+            upper.append(inertia * (n - outer) * cos(state[2 * i] - state[2 * j]))
+    for j in range(n):
+        for i in range(j + 1, n):
+            ratio = upper[j * n + i] / upper[j * n + j]
+            solution[i] = solution[i] - ratio * solution[j]
+            for k in range(i, n):
+                upper[i * n + k] = upper[i * n + k] - ratio * upper[j * n + k]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            solution[i] = solution[i] - upper[i * n + j] * solution[j]
+        solution[i] = solution[i] / upper[i * n + i]
+    return solution
+
+
+def _learned_rows(n_links: int) -> tuple[int, ...]:
+    return tuple(range(1, 2 * n_links, 2))
+
+
+def _state_labels(n_links: int) -> tuple[str, ...]:
+    return tuple(label for i in range(1, n_links + 1) for label in (f"φ{i} [rad]", f"φ̇{i} [rad/s]"))
+
+
+def _features(n_links: int) -> tuple[Feature, ...]:
+    return tuple(
+        feature
+        for i in range(0, 2 * n_links, 2)
+        for feature in (Feature("cos", i), Feature("sin", i), Feature("identity", i + 1))
+    )
+
+
+LARGEST_CHAIN = 100
+"""Links of a chain; its mass matrix is solved without a thought for its structure."""
+
+_DEFAULT_LINKS = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chain(System):
+    """Chain of n massless links of length l with a mass m at the end of each, damped by its medium.
+
+    State: φ₁, φ̇₁, …, φₙ, φ̇ₙ, absolute angles from hanging [rad] and rates [rad/s]. Inputs: the
+    torques τ₁ … τₙ of the motors [N m]; the i-th turns link i against link i - 1.
+
+    With nᵢⱼ = n + 1 - max(i, j), the number of masses that both links carry:
+    Σⱼ nᵢⱼ m l² (cos(φᵢ - φⱼ) φ̈ⱼ + sin(φᵢ - φⱼ) φ̇ⱼ²) + nᵢᵢ m g l sin φᵢ
+    = τᵢ - τᵢ₊₁ - b φ̇ᵢ with τₙ₊₁ = 0.
+    Learned: all φ̈ᵢ at τ = 0. Known: H⁻¹ times the torques.
+
+    The evaluation box has 2n axes, too many for a full grid: its points are a low-discrepancy set
+    of ``grid_points`` states. The attributes of the class are those of the default number of links.
+
+    Parameters
+    ----------
+    n_links : int
+        Number n of links.
+    mass, length : float
+        Mass m [kg] and length l [m] of each link.
+    gravity : float
+        Gravitational acceleration g [m/s²].
+    friction : float
+        Viscous friction coefficient b of each link's rotation [N m s].
+    initial_state, grid_half_widths : tuple of float
+        Of all 2n components, or an angle and a rate, which then hold for every link.
+    """
+
+    name: ClassVar[str] = "chain"
+    physical: ClassVar[tuple[str, ...]] = ("mass", "length", "gravity", "friction")
+    linear_parameters: ClassVar[tuple[str, ...]] = ("gravity", "friction")
+    state_labels: ClassVar[tuple[str, ...]] = _state_labels(_DEFAULT_LINKS)
+    input_labels: ClassVar[tuple[str, ...]] = tuple(
+        f"τ{i} [N m]" for i in range(1, _DEFAULT_LINKS + 1)
+    )
+    learned_rows: ClassVar[tuple[int, ...]] = _learned_rows(_DEFAULT_LINKS)
+    features: ClassVar[tuple[Feature, ...]] = _features(_DEFAULT_LINKS)
+    angle_indices: ClassVar[tuple[int, ...]] = tuple(range(0, 2 * _DEFAULT_LINKS, 2))
+    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
+    grid_indices: ClassVar[tuple[int, ...]] = tuple(range(2 * _DEFAULT_LINKS))
+    low_discrepancy: ClassVar[bool] = True
+    equilibrium: ClassVar[tuple[float, ...] | None] = (0.0,) * (2 * _DEFAULT_LINKS)
+
+    n_links: int = parameter(_DEFAULT_LINKS, "links", "positive")
+    mass: float = parameter(0.2, "kg", "positive")
+    length: float = parameter(0.4, "m", "positive")
+    gravity: float = parameter(10.0, "m/s²", "nonnegative")
+    friction: float = parameter(0.2, "N m s", "nonnegative")
+    gamma: float = parameter(2.0, "N m", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((1.0, 6.0), bound="positive")
+    grid_points: tuple[int, ...] = parameter((1024,), bound="positive")
+
+    def __post_init__(self) -> None:
+        Validated.__post_init__(self)
+        if self.n_links > LARGEST_CHAIN:
+            raise SpecificationError(
+                f"env.n_links is {self.n_links}, but it has to be at most {LARGEST_CHAIN}: "
+                f"set env.n_links to a smaller number."
+            )
+        self._take_shape(self.n_links)
+        super().__post_init__()
+
+    def _take_shape(self, n: int) -> None:
+        """Set what follows from the number of links, and say for every link what is said once."""
+        shape = {
+            "state_labels": _state_labels(n),
+            "input_labels": tuple(f"τ{i} [N m]" for i in range(1, n + 1)),
+            "learned_rows": _learned_rows(n),
+            "features": _features(n),
+            "angle_indices": tuple(range(0, 2 * n, 2)),
+            "grid_indices": tuple(range(2 * n)),
+            "equilibrium": (0.0,) * (2 * n),
+        }
+        for field in ("initial_state", "grid_half_widths"):
+            given = getattr(self, field)
+            if len(given) % 2 == 0 and given == given[:2] * (len(given) // 2):
+                shape[field] = given[:2] * n
+        for attribute, value in shape.items():
+            object.__setattr__(self, attribute, value)
+
+    @staticmethod
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> Sequence[Scalar]:
+        n = len(inputs)
+        torques = [inputs[i] - inputs[i + 1] for i in range(n - 1)] + [inputs[n - 1]]
+        accelerations = _solved_chain(state, parameters, torques)
+        flow = []
+        for i in range(n):
+            flow.append(state[2 * i + 1])
+            flow.append(accelerations[i])
+        return flow
+
+    @staticmethod
+    def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:
+        mass, length, gravity, friction = parameters
+        n = len(state) // 2
+        torques = []
+        for i in range(n):
+            angle, rate = state[2 * i], state[2 * i + 1]
+            torque = -gravity * mass * length * (n - i) * sin(angle) - friction * rate
+            for j in range(n):
+                carried = mass * length**2 * (n - max(i, j))
+                torque = torque - carried * sin(angle - state[2 * j]) * state[2 * j + 1] ** 2
+            torques.append(torque)
+        return _solved_chain(state, parameters, torques)

@@ -24,18 +24,99 @@ import dataclasses
 import functools
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from dopt.declare.validated_fields import Validated, parameter
+from dopt.algorithm import RUNGE_KUTTA_SHARES, RUNGE_KUTTA_WEIGHTS, Integrator
 from dopt.errors import SpecificationError
-from dopt.systems.features import Feature, feature_values
-from dopt.systems.integration import INTEGRATORS
-from dopt.systems.points import check_number, sobol_midpoints
+from dopt.fields import Validated, parameter
+from dopt.systems.elementary import cos, sin
 from dopt.types import Scalar
+
+
+def check_number(n: int) -> None:
+    """Refuse a number of points of a low-discrepancy set.
+
+    Raises
+    ------
+    SpecificationError
+        If n is not a power of two: other numbers of points are spread less evenly.
+    """
+    if n & (n - 1):
+        raise SpecificationError(
+            f"env.grid_points is [{n}], but a power of two is expected for a low-discrepancy set: "
+            f"set it to {2 ** (n.bit_length() - 1)} or {2 ** n.bit_length()}."
+        )
+
+
+def sobol_midpoints(dimensions: int, n: int) -> npt.NDArray[np.float64]:
+    """Return the first n points of a Sobol sequence in the unit cube, (n, dimensions).
+
+    They are moved by half of 1/n, so that along every axis they are the n midpoints of a regular
+    partition, each once. Reference: I. Sobol, "On the distribution of points in a cube and the
+    approximate evaluation of integrals" (1967), with the direction numbers of S. Joe and F. Kuo,
+    "Constructing Sobol sequences with better two-dimensional projections" (2008).
+
+    Raises
+    ------
+    SpecificationError
+        If :func:`check_number` refuses n.
+    """
+    from scipy.stats import qmc  # its import takes longer than a short trial
+
+    check_number(n)
+    points: npt.NDArray[np.float64] = qmc.Sobol(dimensions, scramble=False).random(n)
+    return points + 0.5 / n
+
+
+INTEGRATORS = tuple(integrator.name.lower() for integrator in Integrator)
+
+
+def next_state(integrator: str, rate: Callable[[Scalar], Scalar], x: Scalar, dt: float) -> Scalar:
+    """Return the state dt seconds after x, for arrays and tensors alike.
+
+    ``rate`` is dx/dt. With "rk4" it is the classical method of Runge and Kutta of fourth order.
+    """
+    slope = rate(x)
+    if integrator == Integrator.EULER.name.lower():
+        return x + dt * slope
+    total = RUNGE_KUTTA_WEIGHTS[0] * slope
+    for share, weight in zip(RUNGE_KUTTA_SHARES, RUNGE_KUTTA_WEIGHTS[1:], strict=True):
+        slope = rate(x + share * dt * slope)
+        total = total + weight * slope
+    return x + dt * total
+
+
+Kind = Literal["identity", "cos", "sin"]
+KINDS: tuple[Kind, ...] = ("identity", "cos", "sin")
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One network input: ``kind`` of the state component ``index``.
+
+    An ``identity`` feature is divided by the half-width of the evaluation grid along that
+    component, so that every input of the network is of order one.
+    """
+
+    kind: Kind
+    index: int
+
+
+def feature_values(
+    features: tuple[Feature, ...], scales: tuple[float, ...], state: Scalar
+) -> list[Scalar]:
+    """Return the features of a state, given as a sequence of d scalars, arrays or tensors."""
+    maps = {"identity": lambda x: x, "cos": cos, "sin": sin}
+    return [
+        maps[feature.kind](state[feature.index]) / scale
+        for feature, scale in zip(features, scales, strict=True)
+    ]
+
 
 Array = npt.NDArray[np.float64]
 
@@ -53,7 +134,7 @@ class System(Validated):
     y = C x + v in the place of x, these states with noise of the standard deviations
     ``measurement_noise``, in their units. The states are then estimated: by a learner that does so
     (:class:`dopt.learning.JointKalman`), or else by a low-pass filter of ``velocity_cutoff`` [Hz]
-    and differences (:mod:`dopt.systems.sensors`). Outputs that mix states are given by
+    and differences (:mod:`dopt.systems.black_box`). Outputs that mix states are given by
     ``output_matrix``, the numbers of C row by row; then a learner has to estimate the states.
     """
 

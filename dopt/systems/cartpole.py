@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.declare.validated_fields import parameter
-from dopt.systems.base import System
+from dopt.fields import parameter
+from dopt.systems.base import Feature, System
 from dopt.systems.elementary import cos, sin
-from dopt.systems.features import Feature
 from dopt.types import Scalar
 
 

@@ -1,15 +1,19 @@
-"""Damped pendulum: a uniform rod that swings about one end."""
+"""Pendulums: one, one that wears out, a disk with a weight, and a row that springs couple."""
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from dopt.declare.validated_fields import parameter
-from dopt.systems.base import System
-from dopt.systems.elementary import sin
-from dopt.systems.features import Feature
+import numpy as np
+
+from dopt.errors import SpecificationError
+from dopt.fields import Validated, parameter
+from dopt.systems.base import Array, Feature, System
+from dopt.systems.elementary import sin, tanh
 from dopt.types import Scalar
 
 
@@ -105,3 +109,234 @@ class PendulumUnknownGain(Pendulum):
         mass, length, gravity, friction, gain = parameters
         (free,) = _free_accelerations((angle, rate), (mass, length, gravity, friction))
         return (free + 3.0 * gain * u / (mass * length**2),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriftingPendulum(Pendulum):
+    """The pendulum with a friction that tends to another value, b(t) = b∞ + (b₀ - b∞) exp(-t/τ).
+
+    The model is not told the time. The loss of step t is that against the accelerations at the time
+    t dt of the step.
+
+    Parameters
+    ----------
+    friction : float
+        Viscous friction coefficient b₀ of the pivot at t = 0 [N m s].
+    final_friction : float
+        Coefficient b∞ of the worn pivot [N m s].
+    time_constant : float
+        τ [s].
+    """
+
+    name: ClassVar[str] = "drifting_pendulum"
+
+    horizon: int = parameter(1000, "steps", "positive")
+    final_friction: float = parameter(0.5, "N m s", "nonnegative")
+    time_constant: float = parameter(5.0, "s", "positive")
+
+    @functools.cached_property
+    def history(self) -> Array:
+        """Physical parameters of each step, (T, number of them)."""
+        rows = np.tile(np.array(self.parameters), (self.horizon, 1))
+        worn = -np.expm1(-self.dt * np.arange(self.horizon) / self.time_constant)
+        growth = (self.final_friction - self.friction) * worn
+        rows[:, self.physical.index("friction")] += growth
+        return rows
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnbalancedDisk(System):
+    """Disk with a weight off its centre, turned by a voltage.
+
+    State: angle y from hanging [rad], rate ω [rad/s]. Input: voltage u [V].
+
+    dω/dt = -ω₀² sin y - b ω - c tanh(ω / ω_c) + k u. Learned: dω/dt at u = 0. Known: k u.
+
+    The numbers are those of the laboratory's disk that exercises of system identification simulate.
+    There ω_c is 0.001 rad/s, which asks for steps far below dt; at 0.1 rad/s the friction turns
+    sign as fast as the Euler map can follow.
+
+    Parameters
+    ----------
+    gravity : float
+        ω₀², angular acceleration of the weight when it is level [rad/s²].
+    friction : float
+        Viscous friction b [1/s].
+    dry_friction : float
+        Coulomb friction c [rad/s²].
+    dry_rate : float
+        Rate ω_c at which the dry friction has 76 % of its value [rad/s].
+    motor_gain : float
+        k [rad/(V s²)].
+    """
+
+    name: ClassVar[str] = "unbalanced_disk"
+    physical: ClassVar[tuple[str, ...]] = (
+        *("gravity", "friction", "dry_friction", "dry_rate", "motor_gain"),
+    )
+    linear_parameters: ClassVar[tuple[str, ...]] = ("gravity", "friction", "dry_friction")
+    state_labels: ClassVar[tuple[str, ...]] = ("y [rad]", "ω [rad/s]")
+    input_labels: ClassVar[tuple[str, ...]] = ("u [V]",)
+    learned_rows: ClassVar[tuple[int, ...]] = (1,)
+    features: ClassVar[tuple[Feature, ...]] = (
+        Feature("cos", 0),
+        Feature("sin", 0),
+        Feature("identity", 1),
+    )
+    angle_indices: ClassVar[tuple[int, ...]] = (0,)
+    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
+    grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
+
+    gravity: float = parameter(128.6, "rad/s²", "nonnegative")
+    friction: float = parameter(1.333, "1/s", "nonnegative")
+    dry_friction: float = parameter(6.063, "rad/s²", "nonnegative")
+    dry_rate: float = parameter(0.1, "rad/s", "positive")
+    motor_gain: float = parameter(28.14, "rad/(V s²)", "positive")
+    gamma: float = parameter(3.0, "V", "positive")
+    dt: float = parameter(0.01, "s", "positive")
+    initial_state: tuple[float, ...] = parameter((1e-3, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((math.pi, 20.0), bound="positive")
+    grid_points: tuple[int, ...] = parameter((32, 32), bound="positive")
+
+    @staticmethod
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
+        return state[1], parameters[4] * inputs[0]
+
+    @staticmethod
+    def accelerations(state: Scalar, parameters: Scalar) -> tuple[Scalar, ...]:
+        angle, rate = state
+        gravity, friction, dry_friction, dry_rate, _ = parameters
+        dry = dry_friction * tanh(rate / dry_rate)
+        return (-gravity * sin(angle) - friction * rate - dry,)
+
+
+LARGEST_ROW = 50
+"""Pendulums of a row; each has a friction of its own, and the compiled equations hold them all."""
+
+_DEFAULT_PENDULUMS = 5
+
+
+def _shape(n: int) -> dict[str, tuple[object, ...]]:
+    """Return what follows from the number of pendulums."""
+    frictions = tuple(f"friction_{i}" for i in range(1, n + 1))
+    rates = tuple(range(1, 2 * n, 2))
+    return {
+        "physical": ("gravity", "coupling", *frictions),
+        "linear_parameters": frictions,
+        "state_labels": tuple(
+            label for i in range(1, n + 1) for label in (f"φ{i} [rad]", f"φ̇{i} [rad/s]")
+        ),
+        "learned_rows": rates,
+        "features": tuple(Feature("identity", i) for i in rates),
+        "angle_indices": tuple(range(0, 2 * n, 2)),
+        "grid_indices": rates,
+        "equilibrium": (0.0,) * (2 * n),
+    }
+
+
+_DEFAULT = _shape(_DEFAULT_PENDULUMS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoupledPendulums(System):
+    """Row of n equal pendulums on one axis, each coupled to its neighbours by torsion springs.
+
+    State: φ₁, φ̇₁, …, φₙ, φ̇ₙ, angles from hanging [rad] and rates [rad/s]. Input: the torque of
+    the only motor, on the first pendulum, by its moment of inertia [rad/s²].
+
+    φ̈ᵢ = -ω₀² sin φᵢ - κ Σⱼ (φᵢ - φⱼ) - bᵢ φ̇ᵢ + δᵢ₁ u, with j over the one or two neighbours.
+    Learned: the accelerations of friction, -bᵢ φ̇ᵢ. Known: all other terms. The linear model has the
+    n frictions for its parameters.
+
+    Source: Table 3 of M. Blanke and M. Lelarge, "FLEX: an adaptive exploration algorithm for
+    nonlinear systems" (2023). It prints no equation and no constants: those here are this
+    project's.
+
+    The evaluation box has an axis for each rate, and its points are a low-discrepancy set, whose
+    projection on every axis is a regular partition: the loss of the linear model is the Euclidean
+    norm of the error of the frictions times the root mean square of that partition
+    (:mod:`dopt.assessment`). The attributes of the class are those of the default number of
+    pendulums.
+
+    Parameters
+    ----------
+    n_pendulums : int
+        Number n of pendulums.
+    gravity : float
+        ω₀², gravity by length [rad/s²].
+    coupling : float
+        κ, stiffness of a spring by the moment of inertia [1/s²].
+    friction : float
+        True viscous friction of every pendulum by the moment of inertia [1/s]; a model learns it
+        for each.
+    initial_state, grid_half_widths : tuple of float
+        Of all 2n states and n rates, or those of one pendulum, which then hold for all.
+    """
+
+    name: ClassVar[str] = "coupled_pendulums"
+    physical: ClassVar[tuple[str, ...]] = _DEFAULT["physical"]  # type: ignore[assignment]
+    linear_parameters: ClassVar[tuple[str, ...]] = _DEFAULT["linear_parameters"]  # type: ignore[assignment]
+    state_labels: ClassVar[tuple[str, ...]] = _DEFAULT["state_labels"]  # type: ignore[assignment]
+    input_labels: ClassVar[tuple[str, ...]] = ("u [rad/s²]",)
+    learned_rows: ClassVar[tuple[int, ...]] = _DEFAULT["learned_rows"]  # type: ignore[assignment]
+    features: ClassVar[tuple[Feature, ...]] = _DEFAULT["features"]  # type: ignore[assignment]
+    angle_indices: ClassVar[tuple[int, ...]] = _DEFAULT["angle_indices"]  # type: ignore[assignment]
+    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
+    grid_indices: ClassVar[tuple[int, ...]] = _DEFAULT["grid_indices"]  # type: ignore[assignment]
+    low_discrepancy: ClassVar[bool] = True
+    equilibrium: ClassVar[tuple[float, ...] | None] = _DEFAULT["equilibrium"]  # type: ignore[assignment]
+
+    n_pendulums: int = parameter(_DEFAULT_PENDULUMS, "pendulums", "positive")
+    gravity: float = parameter(1.0, "rad/s²", "nonnegative")
+    coupling: float = parameter(6.25, "1/s²", "nonnegative")
+    friction: float = parameter(0.6, "1/s", "nonnegative")
+    gamma: float = parameter(5.0, "rad/s²", "positive")
+    noise: float = parameter(1e-5, bound="nonnegative")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((3.0,), bound="positive")
+    grid_points: tuple[int, ...] = parameter((64,), bound="positive")
+
+    def __post_init__(self) -> None:
+        Validated.__post_init__(self)
+        n = self.n_pendulums
+        if n > LARGEST_ROW:
+            raise SpecificationError(
+                f"env.n_pendulums is {n}, but it has to be at most {LARGEST_ROW}: set "
+                f"env.n_pendulums to a smaller number."
+            )
+        for attribute, value in _shape(n).items():
+            object.__setattr__(self, attribute, value)
+        for field, size in (("initial_state", 2), ("grid_half_widths", 1)):
+            given = getattr(self, field)
+            if len(given) % size == 0 and given == given[:size] * (len(given) // size):
+                object.__setattr__(self, field, given[:size] * n)
+        super().__post_init__()
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Physical parameters in the order of ``physical``."""
+        return (self.gravity, self.coupling, *[self.friction] * self.n_pendulums)
+
+    @staticmethod
+    def known(state: Scalar, inputs: Scalar, parameters: Scalar) -> Sequence[Scalar]:
+        gravity, coupling, n = parameters[0], parameters[1], len(state) // 2
+        flow = []
+        for i in range(n):
+            angle = state[2 * i]
+            acceleration = -gravity * sin(angle)
+            if i > 0:
+                acceleration = acceleration - coupling * (angle - state[2 * i - 2])
+            if i < n - 1:
+                acceleration = acceleration - coupling * (angle - state[2 * i + 2])
+            if i == 0:
+                acceleration = acceleration + inputs[0]
+            flow.append(state[2 * i + 1])
+            flow.append(acceleration)
+        return flow
+
+    @staticmethod
+    def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:
+        rows = []
+        for i in range(len(state) // 2):
+            rows.append(-parameters[2 + i] * state[2 * i + 1])  # noqa: PERF401  # Numba's lists
+        return rows

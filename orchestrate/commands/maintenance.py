@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 
-from dopt.given_path import given_path
+from dopt.errors import given_path
 from orchestrate.cli_parser import UsageError, length_of_time, path
 from orchestrate.commands.command import (
     PROGRAM,

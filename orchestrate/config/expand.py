@@ -27,8 +27,8 @@ from hydra.errors import ConfigCompositionException
 from omegaconf import AnyNode, Container, DictConfig, ListConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
-from dopt.declare.registry import TARGET
 from dopt.errors import unknown_name
+from dopt.registry import TARGET
 from orchestrate.config.grid import TRIAL_SECTIONS, Combination
 from orchestrate.config.messages import KNOWN, unknown_field, unknown_setting
 from orchestrate.config.sweeps import Axis, parsed_overrides, read_axes

@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from dopt.declare.registry import name_of
 from dopt.errors import IncompatibleError, SpecificationError
+from dopt.registry import name_of
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 

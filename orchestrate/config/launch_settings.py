@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from dopt.errors import unknown_name
-from dopt.given_path import given_path, stripped
+from dopt.errors import given_path, stripped, unknown_name
 from orchestrate.config.share import Share, share
 from orchestrate.config.value_checks import (
     amount,

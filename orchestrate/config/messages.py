@@ -17,8 +17,8 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from dopt.declare.registry import TARGET, imported
 from dopt.errors import DoptError, SpecificationError, unknown_name
+from dopt.registry import TARGET, imported
 from orchestrate.cli_parser import removed_word
 from orchestrate.config.options import CONFIGURATION, option_names
 

@@ -18,8 +18,8 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from signal import SIGKILL
 
-from dopt.cores import usable_cores
 from dopt.errors import DoptError
+from dopt.process import usable_cores
 from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.factory import ExecutorFactory, limits_of

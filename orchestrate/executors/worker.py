@@ -17,7 +17,7 @@ import threading
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from dopt.garbage_collection import collect_rarely
+from dopt.process import collect_rarely
 from orchestrate.executors.base import Run, Task, run_task
 from orchestrate.executors.limits import (
     Limits,

@@ -17,13 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from dopt.cores import usable_cores
 from dopt.errors import DoptError
 from dopt.kernel import warm_up
+from dopt.process import usable_cores
 from dopt.run import run_trial
-from dopt.spec.added_fields import completed
-from dopt.spec.prequential import stored_trial
-from dopt.spec.trial import TrialSpec
+from dopt.spec.config import completed
+from dopt.spec.trial import TrialSpec, stored_trial
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.value_checks import factor
 from orchestrate.errors import ExitCode

@@ -10,7 +10,7 @@ from pathlib import Path
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
-from dopt.given_path import given_path, stripped
+from dopt.errors import given_path, stripped
 from orchestrate.store.errors import StoreError
 
 DEFAULT_URL = "sqlite:///results/results.db"
@@ -37,7 +37,7 @@ def default_url() -> str:
 def parse(url: str) -> URL:
     """Return the URL with its driver; raise ``StoreError`` if it names no supported database.
 
-    The path of a file is read as :func:`dopt.given_path.given_path` does. The message says whether
+    The path of a file is read as :func:`dopt.errors.given_path` does. The message says whether
     the URL came from ``DOPT_DB`` or ``DOPT_READ_DB``. It repeats no text other than a path, because
     a mistyped URL may hold a password.
     """

@@ -299,7 +299,7 @@ def _config_row(spec: Registrable) -> dict[str, Any]:
             f"expected {', '.join(CONFIG_COLUMNS)}."
         )
     if PREQUENTIAL.strip("%") not in spec.config_json:  # what was measured is not run again
-        from dopt.declare.registry import check_importable  # loaded with the specifications
+        from dopt.registry import check_importable  # loaded with the specifications
 
         for key, section in json.loads(spec.config_json).items():
             check_importable(key, section)

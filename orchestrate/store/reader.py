@@ -173,7 +173,7 @@ class Reader:
 
     def configs(self) -> list[ConfigRow]:
         """Return all configurations, sorted by name, with the counts of their trials."""
-        from dopt.spec.added_fields import completed  # loads every class that it may meet
+        from dopt.spec.config import completed  # loads every class that it may meet
 
         with self._snapshot() as connection:
             configs = [

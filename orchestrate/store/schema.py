@@ -74,7 +74,7 @@ RETRIED = {
 """Statuses that each argument of ``retry`` selects."""
 
 PREQUENTIAL = '%"loss":"prequential"%'
-"""Pattern of the JSON of an exploration's configuration (:mod:`dopt.spec.prequential`)."""
+"""Pattern of the JSON of an exploration's configuration (:mod:`dopt.spec.trial`)."""
 
 N_ROWS = (
     f"CASE WHEN c.config_json LIKE '{PREQUENTIAL}' AND r.status = 'done' "

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from dopt.control.planning import costs, within_ball
 from dopt.control.task import Goal
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies.base import (
     CustomPolicy,
     Planner,

@@ -14,8 +14,8 @@ from analysis.data.samples import learned_model, violation_shares
 from analysis.data.selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
+from dopt.assessment import model_forecast
 from dopt.control.planning import forecast_by_equations
-from dopt.forecasts import model_forecast
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System, UnbalancedDisk
 from dopt.types import Array

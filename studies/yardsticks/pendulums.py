@@ -14,8 +14,8 @@ from analysis.data.selection import Entry, policy_rank
 from analysis.formatting import steps_text, within
 from analysis.stats.scores import last_passage
 from analysis.tables.rendering import TextTable
-from dopt.parameter_error import loss_by_parameter_error
-from dopt.spec.prequential import system_of
+from dopt.assessment import loss_by_parameter_error
+from dopt.spec.trial import system_of
 from dopt.systems import CoupledPendulums
 from orchestrate.store import ConfigRow, Reader
 from studies.yardsticks.common import (

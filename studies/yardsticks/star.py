@@ -13,8 +13,8 @@ from analysis.data.samples import learned_model
 from analysis.data.selection import Entry, policy_rank
 from analysis.formatting import within
 from analysis.tables.rendering import TextTable
+from dopt.assessment import parameter_error
 from dopt.models import GreyBox
-from dopt.parameter_error import parameter_error
 from dopt.systems import MovingStar, System
 from dopt.types import Array
 from orchestrate.store import ConfigRow, Reader

@@ -16,7 +16,7 @@ from dopt.result import Assessment, TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System
-from dopt.systems.equilibrium import eigenmode
+from dopt.systems.properties import eigenmode
 from orchestrate.store import LaunchRecord, RunRecord, Store
 
 Array = npt.NDArray[np.float64]

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.gymnasium import Environment
 from dopt.systems import Feature
 

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.learning.base import CustomLearner, Updater
 from dopt.systems import System
 from dopt.trial_view import TrialView

@@ -12,9 +12,8 @@ from dopt import assessment
 from dopt.assessment import MEASURES, assess
 from dopt.kernel import run
 from dopt.limits import VIOLATIONS, WORST
-from dopt.rerun import rerun
 from dopt.result import TrialResult
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.executors.base import Task
 from orchestrate.executors.lockstep import run_batch

@@ -9,12 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from dopt.calibration import HeldOut, held_out_fit, jacobian, predicted_variances
 from dopt.evaluation import evaluation_set
+from dopt.offline_fit import (
+    HeldOut,
+    Samples,
+    held_out_fit,
+    jacobian,
+    predicted_variances,
+    recorded_samples,
+)
 from dopt.reference.models import mlp_function
 from dopt.run import run_trial
-from dopt.samples import Samples, recorded_samples
-from dopt.spec.information_form import Information
+from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import trial
 

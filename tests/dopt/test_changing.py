@@ -12,8 +12,7 @@ from scipy import stats
 
 from dopt.evaluation import evaluation_set, simulate
 from dopt.kernel.run import KernelTrial
-from dopt.rerun import rerun
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import DriftingPendulum, Pendulum
 from tests.dopt.trials import trial

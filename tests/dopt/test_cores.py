@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dopt import cores
+from dopt import process
 
 Group = Callable[..., None]
 
@@ -17,7 +17,7 @@ Group = Callable[..., None]
 def group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Group:
     """Return a function that puts this process, on eight cores, into a control group."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(8)})
-    monkeypatch.setattr(cores, "PROC", tmp_path)
+    monkeypatch.setattr(process, "PROC", tmp_path)
 
     def put(kind: str, groups: str, quotas: dict[str, str], root: str = "/") -> None:
         (tmp_path / "cgroup").write_text(groups)
@@ -35,13 +35,13 @@ def group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Group:
 
 
 def test_without_a_group_the_affinity_counts(group: Group, tmp_path: Path) -> None:
-    assert cores.usable_cores() == 8  # no file says anything
+    assert process.usable_cores() == 8  # no file says anything
     group("cgroup2", "0::/\n", {"cpu.max": "max 100000\n"})
-    assert cores.usable_cores() == 8
+    assert process.usable_cores() == 8
     group("cgroup", "4:cpu,cpuacct:/\n", {"cpu.cfs_quota_us": "-1", "cpu.cfs_period_us": "100000"})
-    assert cores.usable_cores() == 8
+    assert process.usable_cores() == 8
     (tmp_path / "mountinfo").write_text("of another kind\n")
-    assert cores.usable_cores() == 8
+    assert process.usable_cores() == 8
 
 
 @pytest.mark.parametrize(
@@ -56,23 +56,23 @@ def test_a_quota_counts_in_whole_cores(
     else:
         files = {"a/b/cpu.cfs_quota_us": quota, "a/b/cpu.cfs_period_us": "100000"}
         group("cgroup", "5:memory:/m\n4:cpu,cpuacct:/a/b\n", files)
-    assert cores.usable_cores() == expected
+    assert process.usable_cores() == expected
 
 
 def test_the_smallest_quota_up_the_hierarchy_counts(group: Group) -> None:
     quotas = {"a/cpu.max": "300000 100000", "a/b/cpu.max": "max 100000", "a/b/c/cpu.max": "5 1"}
     group("cgroup2", "0::/a/b/c\n", quotas)
-    assert cores.usable_cores() == 3
+    assert process.usable_cores() == 3
 
 
 def test_a_container_sees_its_own_group_as_the_top(group: Group) -> None:
     """What is mounted begins at it, while its path is that on the host."""
     files = {"cpu.cfs_quota_us": "250000", "cpu.cfs_period_us": "100000"}
     group("cgroup", "4:cpu,cpuacct:/docker/1f\n", files, root="/docker/1f")
-    assert cores.usable_cores() == 2
+    assert process.usable_cores() == 2
     files = {"job/cpu.cfs_quota_us": "100000", "job/cpu.cfs_period_us": "100000"}
     group("cgroup", "4:cpu,cpuacct:/docker/1f/job\n", files, root="/docker/1f")
-    assert cores.usable_cores() == 1
+    assert process.usable_cores() == 1
 
 
 def test_nothing_else_counts_cores() -> None:
@@ -85,4 +85,4 @@ def test_nothing_else_counts_cores() -> None:
         for path in (ROOT / package).rglob("*.py")
         if any(words in path.read_text() for words in counting)
     ]
-    assert found == ["dopt/cores.py"]
+    assert found == ["dopt/process.py"]

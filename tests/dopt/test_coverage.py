@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from dopt.coverage import Plane, coverage
+from dopt.assessment import Plane, coverage
 from dopt.evaluation import reachable_states
 from dopt.systems import Cartpole
 

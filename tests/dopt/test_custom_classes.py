@@ -14,12 +14,12 @@ import pytest
 from omegaconf import OmegaConf
 
 from dopt.control.task import GOAL_FIELDS
-from dopt.declare.registry import check_importable, source_digest
 from dopt.errors import SpecificationError
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
 from dopt.policies.base import ClosedLoop, CustomPolicy, Planner
+from dopt.registry import check_importable, source_digest
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, System
@@ -37,7 +37,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies.base import CustomPolicy, Planner
 
 

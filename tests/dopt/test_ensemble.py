@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dopt.assessment import model_forecast
 from dopt.control.planning import forecast_by
 from dopt.errors import IncompatibleError
 from dopt.evaluation import evaluation_set
-from dopt.forecasts import model_forecast
 from dopt.offline_fit import grid_loss
 from dopt.randomness import initial_weights
-from dopt.rerun import rerun
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES

@@ -20,7 +20,7 @@ from dopt.policies import PeriodicSquare
 from dopt.randomness import draw
 from dopt.spec.config import REACHABLE_VERSION
 from dopt.systems import SYSTEMS, Pendulum, Quadrotor
-from dopt.systems.equilibrium import eigenmode
+from dopt.systems.properties import eigenmode
 from tests.dopt.trials import trial
 
 NAMES = sorted(SYSTEMS)

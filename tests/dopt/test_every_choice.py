@@ -18,7 +18,7 @@ from dopt.models.base import Model
 from dopt.policies import POLICIES
 from dopt.policies.base import Policy
 from dopt.run import run_trial
-from dopt.spec.information_form import held_information
+from dopt.spec.compatibility import held_information
 from tests.dopt.every_choice import CASES, combined
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.newcomers import Alternating, Average

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dopt.assessment import model_forecast, true_forecast
 from dopt.control.planning import forecast_by, forecast_by_equations
 from dopt.evaluation import simulate
-from dopt.forecasts import model_forecast, true_forecast
 from dopt.models import MLP, Linear
 from dopt.models.base import Model
 from dopt.systems import SYSTEMS, Pendulum

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from dopt import Explorer
-from dopt.errors import SpecificationError
-from dopt.given_path import _say_once, given_path
+from dopt.errors import SpecificationError, _say_once, given_path
 from tests.dopt.explorer.plants import MOTOR
 
 PLAIN = ["r.db", "/a/b c.db", "price$", "a$-b", "./~x", "%7E/x", "./ x", "é", "a~b", "\udcff.db"]

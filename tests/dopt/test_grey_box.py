@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError
-from dopt.parameter_error import parameter_error
-from dopt.rerun import rerun
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import trial
 

@@ -11,8 +11,7 @@ import pytest
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.reference.batch import run_trials
-from dopt.rerun import rerun
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.paths import EXAMPLE

@@ -14,13 +14,12 @@ from torch.func import jacrev
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.models import MODELS
-from dopt.offline_fit import fit_offline
+from dopt.offline_fit import fit_offline, uniform_samples
 from dopt.randomness import PLANNED_DIMENSIONS, draw
 from dopt.reference.information import BatchInformation
 from dopt.reference.planning import planning_columns, predicted_states, quadratic_problem
 from dopt.reference.state import BatchState
 from dopt.run import run_trial
-from dopt.samples import uniform_samples
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS

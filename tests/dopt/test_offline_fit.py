@@ -11,10 +11,16 @@ from torch.func import jacrev, vmap
 
 import dopt
 from dopt.errors import SpecificationError
-from dopt.offline_fit import RIDGE, fit_offline, grid_loss
+from dopt.offline_fit import (
+    RIDGE,
+    Samples,
+    fit_offline,
+    grid_loss,
+    recorded_samples,
+    uniform_samples,
+)
 from dopt.randomness import draw, initial_weights
-from dopt.rerun import rerun
-from dopt.samples import Samples, recorded_samples, uniform_samples
+from dopt.run import rerun
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.close import assert_close

@@ -7,10 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from dopt.assessment import loss_by_parameter_error, parameter_error, true_parameters
 from dopt.errors import SpecificationError
-from dopt.parameter_error import loss_by_parameter_error, parameter_error, true_parameters
-from dopt.rerun import rerun
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.systems import SYSTEMS, CoupledPendulums
 from tests.dopt.trials import trial
 

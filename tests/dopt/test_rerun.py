@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from dopt.errors import SpecificationError
-from dopt.rerun import rerun
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import KNOWN_EFFECT

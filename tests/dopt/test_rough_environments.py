@@ -10,9 +10,9 @@ import pytest
 
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
+from dopt.offline_fit import recorded_samples
 from dopt.reference.batch import run_trials
 from dopt.run import run_trial
-from dopt.samples import recorded_samples
 from dopt.spec.trial import TrialSpec
 
 pytest.importorskip("gymnasium", reason="needs the extra gymnasium")

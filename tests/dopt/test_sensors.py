@@ -14,7 +14,7 @@ from dopt.reference.batch import Lockstep
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems.sensors import delay, differentiated
+from dopt.systems.black_box import delay, differentiated
 from dopt.types import Array
 from tests.dopt.trials import SMALL_GRIDS
 

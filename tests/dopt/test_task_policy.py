@@ -8,10 +8,10 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from dopt.assessment import true_forecast
 from dopt.control.planning import run_feedback
 from dopt.control.task import GOALS, Goal
 from dopt.errors import IncompatibleError
-from dopt.forecasts import true_forecast
 from dopt.policies.base import Array, Planner, TaskPolicy
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec

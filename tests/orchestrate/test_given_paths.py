@@ -1,4 +1,4 @@
-"""Paths that users give to the programs: every one is read by ``dopt.given_path``."""
+"""Paths that users give to the programs: every one is read by ``dopt.errors``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from analysis.cli import main as analysis
 from analysis.cli import parser as parser_of_analysis
-from dopt.given_path import _say_once
+from dopt.errors import _say_once
 from orchestrate.__main__ import main as orchestrate
 from orchestrate.commands import COMMANDS
 from orchestrate.store import Reader, StoreError

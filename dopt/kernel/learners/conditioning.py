@@ -1,4 +1,4 @@
-"""Conditioning of a Gaussian process in compiled code (:mod:`dopt.learning.conditioning`).
+"""Conditioning of a Gaussian process in compiled code (:mod:`dopt.learning.least_squares`).
 
 ======  =====================================================  =====
 symbol  meaning                                                shape

@@ -1,4 +1,4 @@
-"""Gauss-Newton steps on all samples in compiled code (:mod:`dopt.learning.gauss_newton`).
+"""Gauss-Newton steps on all samples in compiled code (:mod:`dopt.learning.least_squares`).
 
 Its numbers are λ, ρ, the steps from one fit to the next and the Gauss-Newton steps of a fit.
 """

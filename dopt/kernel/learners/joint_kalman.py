@@ -1,4 +1,4 @@
-"""Kalman filter over state and parameters in compiled code (:mod:`dopt.learning.joint_kalman`).
+"""Kalman filter over state and parameters in compiled code (:mod:`dopt.learning.least_squares`).
 
 Its numbers are λ, the ρ of the beginning, ζ, the steps from one fit to the next, the Gauss-Newton
 steps of a fit, and whether it estimates ρ.

@@ -1,4 +1,4 @@
-"""The extended Kalman filter in compiled code (:mod:`dopt.learning.extended_kalman`).
+"""The extended Kalman filter in compiled code (:mod:`dopt.learning.least_squares`).
 
 Its numbers are ρ, f, the count of diagonal entries of M renewed at a step, what each gets back,
 and ζ.

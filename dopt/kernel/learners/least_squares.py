@@ -1,4 +1,4 @@
-"""Recursive least squares in compiled code (:mod:`dopt.learning.recursive_least_squares`)."""
+"""Recursive least squares in compiled code (:mod:`dopt.learning.least_squares`)."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 The filter over the state alone, at parameters θ, leaves the innovations e, whose variances are s;
 their derivatives by θ, with the gains held, are -C Ψ. A fit takes damped Gauss-Newton steps to the
-minimum of Σ (e²/s + log s) + λ ‖θ - θ₀‖² (:mod:`dopt.learning.joint_kalman`).
+minimum of Σ (e²/s + log s) + λ ‖θ - θ₀‖² (:mod:`dopt.learning.least_squares`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Adam on minibatches of a replay buffer in compiled code (:mod:`dopt.learning.adam_replay`).
+"""Adam on minibatches of a replay buffer in compiled code (:mod:`dopt.learning.adam`).
 
 Its numbers are those of :mod:`dopt.kernel.learners.adam`.
 """

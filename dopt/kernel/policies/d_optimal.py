@@ -14,7 +14,7 @@ from dopt.kernel.information.primal import inner
 from dopt.kernel.points import model_point
 from dopt.kernel.policies.prediction import learned_columns, point_columns, predicted_state
 from dopt.kernel.structs import Trial
-from dopt.math.sphere import sphere_maximizer
+from dopt.sphere import sphere_maximizer
 from dopt.types import Vector
 
 compilable(sphere_maximizer)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
-from dopt.cores import usable_cores
+from dopt.process import usable_cores
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.executors.base import Executor, Prepare, Run
 from orchestrate.executors.factory import ExecutorFactory, limits_of

@@ -15,8 +15,8 @@ import ray
 from ray._private import services
 from ray.job_config import JobConfig
 
-from dopt.cores import usable_cores
 from dopt.errors import DoptError
+from dopt.process import usable_cores
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Run, Task
 from orchestrate.executors.limits import ONE_THREAD, Limits, module_path

@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dopt.errors import DoptError
-from dopt.given_path import given_path
+from dopt.errors import DoptError, given_path
 from orchestrate.cli_parser import length_of_time
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.value_checks import count, limit, section, text, wrong

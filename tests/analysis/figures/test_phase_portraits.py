@@ -10,7 +10,7 @@ from analysis.data.selection import select
 from analysis.errors import AnalysisError
 from analysis.figures.phase_portraits import measure_portraits, tabulate_portraits
 from analysis.stats.trajectories import median_seed
-from dopt.coverage import Plane
+from dopt.assessment import Plane
 from dopt.systems import SYSTEMS
 from orchestrate.store import Reader
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from analysis.stats.trajectories import average_spectrum, periodogram, wrapped_line
-from dopt.coverage import TURN, turns, wrap
+from dopt.assessment import TURN, turns, wrap
 
 
 @given(

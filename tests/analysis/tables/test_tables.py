@@ -22,7 +22,7 @@ from analysis.stats.curves import measure_curves, tabulate_curves
 from analysis.stats.scores import Measure
 from analysis.tables.comparisons import compare_policies, summarise
 from analysis.tables.rendering import comparison_table, control_table, summary_table
-from dopt.calibration import held_out_fit
+from dopt.offline_fit import held_out_fit
 from dopt.run import run_trial
 from orchestrate.store import Reader
 from tests.analysis.synthetic import fake_result, fill, make_spec, simulated

@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
+from dopt.assessment import true_forecast
 from dopt.control import Control
 from dopt.control.planning import Forecast, costs, run_episode, succeeds
 from dopt.control.task import GOALS
-from dopt.forecasts import true_forecast
 from dopt.systems import SYSTEMS, Pendulum, Quadrotor
 from dopt.systems.base import System
 

@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 
 import pytest
 
-from dopt.declare.registry import added_defaults, build, identifying_section, section_of
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.policies import POLICIES
 from dopt.policies.base import CompiledPolicy
-from dopt.spec.added_fields import completed
+from dopt.registry import added_defaults, build, identifying_section, section_of
+from dopt.spec.config import completed
 from dopt.spec.label import config_label, labels
 from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import trial

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Optional, Union
 
 import pytest
 
-from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError
+from dopt.fields import Validated, parameter
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import pytest
 
 from dopt.control.task import Control
-from dopt.declare.validated_fields import Validated, parameter
 from dopt.errors import SpecificationError
+from dopt.fields import Validated, parameter
 from dopt.learning import Adam
 from dopt.models import MLP
 from dopt.policies.random import RandomSphere

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.spec.prequential import stored_trial, system_of
-from dopt.spec.trial import TrialSpec
+from dopt.spec.trial import TrialSpec, stored_trial, system_of
 
 RAN = "import pathlib\npathlib.Path(__file__).with_suffix('.ran').touch()\n"
 PLUGIN = (

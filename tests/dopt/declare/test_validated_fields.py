@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dopt.declare.registry import build
 from dopt.errors import SpecificationError
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
+from dopt.registry import build
 from dopt.systems import SYSTEMS
 
 REGISTRIES: dict[str, dict[str, type[Any]]] = {

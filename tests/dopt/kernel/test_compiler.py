@@ -14,7 +14,7 @@ from pathlib import Path
 import llvmlite.binding
 import pytest
 
-from dopt.declare.kernel_support import LEARN_IN_NUMPY, PLAN_IN_NUMPY
+from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
 from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import compiled, contracted, squared, vectorized

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopt.forecasts import model_forecast
+from dopt.assessment import model_forecast
 from dopt.kernel.run import KernelTrial
 from dopt.models import GaussianProcess
 from dopt.run import run_trial

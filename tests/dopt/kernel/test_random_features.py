@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dopt.assessment import model_forecast
 from dopt.errors import IncompatibleError
-from dopt.forecasts import model_forecast
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
 from dopt.kernel.information.primal import dense

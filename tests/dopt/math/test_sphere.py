@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from dopt.errors import DoptError
-from dopt.math.sphere import maximize_on_sphere, sphere_maximizer
+from dopt.sphere import maximize_on_sphere, sphere_maximizer
 
 TINIEST = 5e-324
 

@@ -16,7 +16,7 @@ from dopt.randomness import draw
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import System
-from dopt.systems.equilibrium import eigenmode
+from dopt.systems.properties import eigenmode
 from tests.dopt.trials import ALL_PAIRS, covering, trial
 
 BOUNDED = [

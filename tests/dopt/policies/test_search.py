@@ -24,7 +24,7 @@ from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig
 from dopt.systems import SYSTEMS
-from dopt.systems.equilibrium import eigenmode
+from dopt.systems.properties import eigenmode
 from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from dopt.math.sphere import maximize_on_sphere
 from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.information import BatchInformation
 from dopt.reference.planning import d_optimal_inputs, planning_columns, quadratic_problem
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
+from dopt.sphere import maximize_on_sphere
 from tests.dopt.reference.batch import Situation, situation, sphere, step_from
 from tests.dopt.torch_models import for_one
 from tests.dopt.trials import PAIRS, trial

@@ -15,8 +15,7 @@ from dopt.errors import IncompatibleError, SpecificationError
 from dopt.models import MLP
 from dopt.policies import POLICIES
 from dopt.reference.batch import Lockstep, run_trials
-from dopt.rerun import rerun
-from dopt.run import run_trial
+from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.trials import SMALL_SEARCHES

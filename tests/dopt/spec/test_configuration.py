@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from dopt.declare.registry import build
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
+from dopt.registry import build
 from dopt.systems import NAMED_SYSTEMS, SYSTEMS, Quadrotor, System, system_from_mapping
-from dopt.systems.equilibrium import euler_spectral_radius, jacobians
+from dopt.systems.properties import euler_spectral_radius, jacobians
 from tests.paths import CONF
 
 ENVS = sorted((CONF / "env").rglob("*.yaml"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.spec.custom_system_check import check_system
+from dopt.spec.custom_system import check_system
 from dopt.systems.elementary import where
 from tests.dopt.spec.test_custom_system_check import broken
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from dopt.errors import SpecificationError
-from dopt.spec.custom_system_check import check_system
+from dopt.spec.custom_system import check_system
 from dopt.systems import SYSTEMS, Feature, Pendulum, System
 from tests.dopt.trials import trial
 

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import pytest
 
-from dopt.declare.validated_fields import parameter
 from dopt.errors import ScaleWarning
-from dopt.spec.scale_check import warn_of_scale
+from dopt.fields import parameter
+from dopt.spec.custom_system import warn_of_scale
 from dopt.systems import SYSTEMS, Feature, System
 from tests.dopt.trials import trial
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.spec.added_fields import completed
+from dopt.spec.config import completed
 from dopt.spec.trial import TrialSpec
 from tests.dopt.trials import ALL_PAIRS, covering, trial
 

@@ -10,7 +10,7 @@ import torch
 
 from dopt.errors import SpecificationError
 from dopt.systems import Arm, Chain, Feature
-from dopt.systems.equilibrium import jacobians
+from dopt.systems.properties import jacobians
 from tests.dopt.systems.compiled import assert_compiled_equations_agree
 from tests.dopt.systems.mechanics import ChainMechanics
 

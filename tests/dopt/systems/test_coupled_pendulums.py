@@ -10,8 +10,8 @@ import torch
 
 from dopt.errors import SpecificationError
 from dopt.systems import CoupledPendulums
-from dopt.systems.coupled_pendulums import LARGEST_ROW
-from dopt.systems.equilibrium import jacobians
+from dopt.systems.pendulum import LARGEST_ROW
+from dopt.systems.properties import jacobians
 from tests.dopt.systems.compiled import assert_compiled_equations_agree
 from tests.dopt.systems.mechanics import CoupledPendulumsMechanics
 

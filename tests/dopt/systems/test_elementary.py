@@ -12,7 +12,7 @@ import torch
 
 from dopt.errors import SpecificationError
 from dopt.kernel.equations import compiled_equations
-from dopt.spec.custom_system_check import check_system
+from dopt.spec.custom_system import check_system
 from dopt.systems.elementary import cos, magnitude, sign, sin, tanh, where
 from tests.dopt.spec.test_custom_system_check import broken
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dopt.systems import Arm, Cartpole, MassSpring, Pendulum, Quadrotor
-from dopt.systems.equilibrium import eigenmode, euler_spectral_radius, jacobians
+from dopt.systems.properties import eigenmode, euler_spectral_radius, jacobians
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems
 
 

@@ -9,19 +9,19 @@ import pytest
 import torch
 
 from dopt import Explorer, Plant
+from dopt.assessment import model_forecast, true_forecast
 from dopt.control.planning import forecast_by_equations
 from dopt.errors import SpecificationError
 from dopt.evaluation import simulate
-from dopt.forecasts import model_forecast, true_forecast
 from dopt.kernel.from_spec import plant_of
 from dopt.kernel.integration import next_true_state
 from dopt.models import MLP
+from dopt.offline_fit import recorded_samples
 from dopt.randomness import draw
 from dopt.run import run_trial
-from dopt.samples import recorded_samples
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, System
-from dopt.systems.integration import INTEGRATORS, next_state
+from dopt.systems.base import INTEGRATORS, next_state
 from tests.dopt.kernel.calls import call
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import LEARNERS, MODELS, SMALL_GRIDS, SMALL_SEARCHES

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopt.parameter_error import true_parameters
+from dopt.assessment import true_parameters
 from dopt.systems import SYSTEMS, System
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems, vectors
 

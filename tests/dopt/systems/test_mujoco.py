@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pytest
 
-from dopt.declare.validated_fields import parameter
 from dopt.errors import IncompatibleError, SpecificationError, install_command
 from dopt.evaluation import evaluation_set
+from dopt.fields import parameter
+from dopt.offline_fit import uniform_samples
 from dopt.run import run_trial
-from dopt.samples import uniform_samples
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SIMULATORS, Feature
 from dopt.systems.mujoco import MuJoCo, MuJoCoPendulum

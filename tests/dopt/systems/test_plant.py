@@ -14,7 +14,7 @@ from dopt import Plant
 from dopt.errors import SpecificationError
 from dopt.kernel.equations import compiled_equations
 from dopt.systems import system_from_mapping
-from dopt.systems.expressions import compiled_text
+from dopt.systems.plant import compiled_text
 from tests.dopt.explorer.plants import MOTOR
 
 CRANE = Plant(

@@ -11,10 +11,10 @@ import pytest
 from omegaconf import OmegaConf
 
 from dopt.control.task import Control
-from dopt.declare.registry import build
 from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
+from dopt.registry import build
 from dopt.systems import NAMED_SYSTEMS
 from orchestrate.config.launch_settings import LaunchSettings
 from tests.paths import ROOT

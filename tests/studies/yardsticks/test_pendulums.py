@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dopt.parameter_error import parameter_error
-from dopt.rerun import rerun
+from dopt.assessment import parameter_error
+from dopt.run import rerun
 from studies.yardsticks import pendulums as table_3
 from studies.yardsticks.__main__ import main
 from tests.analysis.synthetic import fill, simulated

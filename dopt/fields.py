@@ -1,19 +1,58 @@
-"""Dataclass fields that know their unit and bounds, and check what they are given."""
+"""Fields of specifications: validated dataclass fields, and what the compiled kernel runs."""
 
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
+import re
 import sys
 import types
 import typing
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from dopt.declare.own_fields import check_own_fields
 from dopt.errors import SpecificationError, unknown_name
+
+_CLASS_VARIABLE = re.compile(r"(\w+\.)*ClassVar\b")
+
+
+def check_own_fields(cls: type) -> None:
+    """Refuse a class whose values a base class would hide.
+
+    Raises
+    ------
+    SpecificationError
+        If it, or a base class of it, declares fields but is no dataclass itself, or sets a field
+        without a type.
+    """
+    for owner in cls.__mro__:
+        if dataclasses.is_dataclass(owner):
+            _check(owner)
+
+
+def _check(cls: type) -> None:
+    bases = [base for base in cls.__bases__ if dataclasses.is_dataclass(base)]
+    inherited = {field.name for base in bases for field in dataclasses.fields(base)}
+    annotations = inspect.get_annotations(cls)
+    if "__dataclass_fields__" not in vars(cls):
+        for key, annotation in annotations.items():
+            if _CLASS_VARIABLE.match(str(annotation)) or key.startswith("_"):
+                continue
+            if key in inherited or not any(hasattr(base, key) for base in cls.__bases__):
+                raise SpecificationError(
+                    f"class {cls.__name__} declares {key}, but is no dataclass itself: put "
+                    f"@dataclass(frozen=True, kw_only=True) above it."
+                )
+    for key in vars(cls):
+        if key in inherited and key not in annotations:
+            raise SpecificationError(
+                f"class {cls.__name__} sets {key} without a type, which leaves the value of its "
+                f"base class: declare it with its type, as {key}: float = parameter(...)."
+            )
+
 
 LARGEST_WHOLE = 2**31 - 1
 """Largest whole number of a specification, the largest of a database's integer column."""
@@ -251,3 +290,74 @@ def _wrong_type(path: str, value: object, expected: str) -> SpecificationError:
     return SpecificationError(
         f"{path} is {given}, but {expected} is expected: set {path} to {expected}."
     )
+
+
+PLAN_IN_NUMPY = "dopt.kernel.absent_steps.plan"
+LEARN_IN_NUMPY = "dopt.kernel.absent_steps.learn"
+IN_NUMPY = (PLAN_IN_NUMPY, LEARN_IN_NUMPY)
+"""Kernel functions of parts that the interpreter runs: they do nothing."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KernelSupport(Validated):
+    """A specification that the kernel may run; the reference path runs what it does not.
+
+    ``compiled`` says whether it does. A class with a ``name`` does not inherit it from another such
+    class, whose algorithm may be another one: it declares it itself or is not compiled. It does
+    inherit it from a class without a name, such as that of all open-loop policies, and from one
+    whose algorithm is in numpy: the kernel has nothing of it.
+    """
+
+    compiled: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "name" in cls.__dict__ and "compiled" not in cls.__dict__:
+            declaring = next(base for base in cls.__mro__ if "compiled" in base.__dict__)
+            inherited = "name" not in declaring.__dict__ or cls.is_in_numpy()
+            cls.compiled = declaring.__dict__["compiled"] and inherited
+
+    @classmethod
+    def is_in_numpy(cls) -> bool:
+        """Return whether the interpreter runs the algorithm between compiled steps."""
+        return False
+
+
+def default_path(parts: Iterable[object]) -> str:
+    """Return the path of a trial that names none, from its system, policy, model and learner.
+
+    It is the kernel if each of them, an object or its class, is compiled.
+    """
+    return "kernel" if all(getattr(part, "compiled", False) for part in parts) else "reference"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KernelPart(KernelSupport):
+    """A policy or a learner: what the kernel runs of it is one compiled function.
+
+    Attributes
+    ----------
+    kernel_function : str
+        Dotted path of the function, which takes the trial (:class:`dopt.kernel.structs.Trial`), the
+        step t, and the input to be written or the observed accelerations.
+    brings_function : bool
+        Whether the class itself has the function in place of a path.
+    """
+
+    kernel_function: ClassVar[str] = ""
+    brings_function: ClassVar[bool] = False
+
+    @classmethod
+    def is_in_numpy(cls) -> bool:
+        return cls.kernel_function in IN_NUMPY and not cls.brings_function
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of most parts, the fields are enough
+        """Return the numbers that the function takes, for q parameters and λ of M₀ = λI.
+
+        They are the numeric fields in the order of their declaration, base classes first; None is
+        NaN. Added fields (:func:`dopt.fields.parameter`) are left out: the
+        numbers of a class that is derived from theirs keep their places.
+        """
+        fields = [field for field in self.numeric_fields() if not field.metadata.get("added")]
+        values = [getattr(self, field.name) for field in fields]
+        return tuple(math.nan if value is None else float(value) for value in values)

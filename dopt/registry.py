@@ -1,6 +1,6 @@
 """Conversion of configuration sections to specification dataclasses and back.
 
-A section names a class of this package by ``name``, or one of the user's own by ``_target_``, the
+A section names a class of this package by ``name``, or a custom class by ``_target_``, the
 dotted path of a class that can be imported. Such a section also holds the digest of the file that
 defines the class: when the file changes, its trials are other trials.
 """
@@ -24,9 +24,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
-from dopt.declare.own_fields import check_own_fields
-from dopt.declare.validated_fields import Validated
 from dopt.errors import SpecificationError, unknown_name
+from dopt.fields import Validated, check_own_fields
 
 T = TypeVar("T", bound=Validated)
 
@@ -344,3 +343,37 @@ def _cell(cls: type) -> str:
 
 
 _digests: dict[type, str] = {}
+
+
+def check_returned(whose: str, method: str, found: object, base: type) -> None:
+    """Refuse what has not the methods of ``base``; ``whose`` names the class in a message.
+
+    Raises
+    ------
+    SpecificationError
+        If it is None, a class, or an object without one of the methods.
+    """
+    wanted = [key for key, value in vars(base).items() if callable(value) and key[0] != "_"]
+    missing = [key for key in wanted if not callable(getattr(found, key, None))]
+    if not missing and not isinstance(found, type):
+        return
+    raise SpecificationError(
+        f"{method}() of {whose} returned {_shown(found)}, but an object of a class derived from "
+        f"{base.__module__}.{base.__name__} is expected: {_remedy(found, method, missing)}."
+    )
+
+
+def _shown(found: object) -> str:
+    if found is None:
+        return "None"
+    if isinstance(found, type):
+        return f"the class {found.__name__} itself"
+    return f"an object of type {type(found).__name__}"
+
+
+def _remedy(found: object, method: str, missing: list[str]) -> str:
+    if found is None:
+        return f"add the return statement to {method}()"
+    if isinstance(found, type):
+        return f"return {found.__name__}(...), an object of it"
+    return f"return one that has {', '.join(missing)}"

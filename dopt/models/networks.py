@@ -1,4 +1,4 @@
-"""Multilayer perceptron with tanh units on the features of the state."""
+"""Networks: a perceptron with tanh units, forms of it that read inputs, and an ensemble."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from dopt.declare.validated_fields import parameter
+from dopt.fields import parameter
 from dopt.models.base import Array, Model
 from dopt.systems.base import System
 
@@ -85,3 +85,89 @@ class MLP(Model):
             if layer < self.depth:
                 values = np.tanh(values)
         return values
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlackBoxMLP(MLP):
+    """a_θ(x, u): a network (:class:`dopt.models.MLP`) of the features of x and of u/γ.
+
+    Nothing is assumed of the effect of the inputs.
+    """
+
+    name: ClassVar[str] = "black_box"
+    compiled: ClassVar[bool] = True
+    affine_in_inputs: ClassVar[bool] = False
+
+    def n_inputs_read(self, system: System) -> int:
+        return system.n_inputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class AffineMLP(BlackBoxMLP):
+    """a_θ(x) + B_θ(x) u, with a_θ and the columns of B_θ the outputs of one network of x.
+
+    With h the last hidden layer, the output layer is linear in (h, h u₁/γ, ..., h u_m/γ, u/γ): one
+    matrix W, (r, (1 + m) w + m), and a bias, (r,). In the flat parameter vector they come last, as
+    those of the last layer of :class:`dopt.models.MLP`.
+    """
+
+    name: ClassVar[str] = "affine"
+    compiled: ClassVar[bool] = True
+    affine_in_inputs: ClassVar[bool] = True
+
+    def n_first_inputs(self, system: System) -> int:
+        return len(system.features)
+
+    def n_output_inputs(self, system: System) -> int:
+        return (1 + system.n_inputs) * self.width + system.n_inputs
+
+    def output_inputs(self, system: System, hidden: Array, features: Array) -> Array:
+        m = system.n_inputs
+        u = features[:, -m:]
+        products = [hidden * u[:, j : j + 1] for j in range(m)]
+        inputs: Array = np.concatenate([hidden, *products, u], axis=1)
+        return inputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ensemble(MLP):
+    """The mean of E networks (:class:`dopt.models.MLP`) with initial parameters of their own.
+
+    The first member is the network of the same seed: it learns at each step and plans are made with
+    it, so that the trial explores as with one network. The others take turns, one learns at each
+    step, so that a step costs two learning steps whatever E is. Losses, predictions and control use
+    the mean of all members, whose errors partly cancel. It goes with a learner that fits all
+    samples anew at each step. The parameters are those of the members one after the other.
+    Reference: B. Lakshminarayanan et al., "Simple and scalable predictive uncertainty
+    estimation using deep ensembles" (2017).
+
+    Parameters
+    ----------
+    members : int
+        Number of networks E.
+    """
+
+    name: ClassVar[str] = "ensemble"
+    compiled: ClassVar[bool] = True
+    structure: ClassVar[str] = "ensemble"
+
+    members: int = parameter(5, "networks", "positive")
+
+    @property
+    def n_members(self) -> int:
+        return self.members
+
+    def n_parameters(self, system: System) -> int:
+        return self.members * super().n_parameters(system)
+
+    def initial_parameters(self, system: System, rng: np.random.Generator) -> Array:
+        """Draw the parameters of one member after the other, as :class:`dopt.models.MLP` does."""
+        drawn = [super(Ensemble, self).initial_parameters(system, rng) for _ in range(self.members)]
+        return np.concatenate(drawn)
+
+    def predict_at(self, system: System, parameters: Array, points: Array) -> Array:
+        """Return the mean of the members' accelerations, (N, r)."""
+        members = parameters.reshape(self.members, -1)
+        values = [super(Ensemble, self).predict_at(system, theta, points) for theta in members]
+        mean: Array = np.mean(values, axis=0)
+        return mean

@@ -1,1 +1,0 @@
-"""Declaration of specifications: validated dataclass fields and registries of named classes."""

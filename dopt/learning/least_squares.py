@@ -1,0 +1,250 @@
+"""Least squares: recursive, by Gauss-Newton steps, by Kalman filters; conditioning of a process.
+
+======  ==================================================================  =========
+symbol  meaning                                                             shape
+======  ==================================================================  =========
+θ, θ₀   parameters of the model, and the initial ones                       q
+J       ∂a_θ/∂θ at the newest state; in a fit at the N states of the        r × q
+        buffer, as N r rows
+e       y - a_θ(x), observed less modelled accelerations                    r
+M       information matrix, M₀ = λI; in a fit λI + JᵀJ/ρ                    q × q
+ρ       variance of the observed accelerations
+ζ, f    underweighting, forgetting factor
+x̂       estimate of the state, in the joint filter                          d
+A       ∂x_{t+1}/∂x_t of the model's step                                   d × d
+P       covariance of x̂, given θ                                            d × d
+Ψ       derivative of x̂ by θ                                                d × q
+C       row of one measured state; its noise has the variance R             1 × d
+s       variance C P Cᵀ + R of the innovation y - C x̂, given θ              1
+======  ==================================================================  =========
+
+References: A. Björck, "Numerical methods for least squares problems" (1996), for the damped
+Gauss-Newton method; L. Ljung and T. Söderström, "Theory and practice of recursive identification"
+(1983), for its recursive form, which is the step between two fits, and for forgetting; S. Singhal
+and L. Wu, "Training multilayer perceptrons with the extended Kalman algorithm" (1989); L. Ngia and
+J. Sjöberg, "Efficient training of neural nets for nonlinear adaptive filtering using a recursive
+Levenberg-Marquardt algorithm", IEEE Transactions on Signal Processing 48 (2000), for the renewal of
+the prior, some diagonal entries of M at a time; R. Zanetti, K. DeMars and R. Bishop,
+"Underweighting nonlinear measurements", Journal of Guidance, Control, and Dynamics 33 (2010), for
+the underweighting, which is due to W. Lear; B. Friedland, "Treatment of bias in recursive
+filtering", IEEE Transactions on Automatic Control 14 (1969), for the filter in two parts; L. Ljung,
+"Asymptotic behavior of the extended Kalman filter as a parameter estimator for linear systems",
+IEEE Transactions on Automatic Control 24 (1979), for why Ψ has to be in it; L. Ljung, "System
+identification: theory for the user" (1999), for the fit by errors of predictions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+from dopt.fields import parameter
+from dopt.learning.base import InformationLearner, Learner
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecursiveLeastSquares(Learner):
+    """θ += K (y - a_θ(x)), K = M⁻¹Jᵀ (I + J M⁻¹ Jᵀ)⁻¹, with the planner's own M.
+
+    Started from M₀ = λI it is at every t the minimiser of λ‖θ‖² + Σ ‖J θ + offset - y‖² over all
+    samples seen: ordinary least squares with a vanishing ridge λ.
+
+    Parameters
+    ----------
+    regularization : float
+        λ, unless the policy has one: a policy that plans by M shares it with the learner.
+    """
+
+    name: ClassVar[str] = "recursive_least_squares"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.least_squares.learn"
+    reads_inputs: ClassVar[bool] = True
+    updates_information: ClassVar[bool] = True
+    structure: ClassVar[str] = "least_squares"
+
+    regularization: float = parameter(1e-3, bound="positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Conditioning(Learner):
+    """The exact posterior given every sample seen, by a factor that grows by a row a step.
+
+    It costs t² at step t in time and memory, the drawback that the paper names.
+    """
+
+    name: ClassVar[str] = "conditioning"
+    structure: ClassVar[str] = "conditioning"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.conditioning.learn"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussNewton(InformationLearner):
+    """Fit all samples: minimise ‖e‖²/ρ + λ‖θ - θ₀‖² from the present θ on.
+
+    A fit takes damped Gauss-Newton steps θ += s M⁻¹ (Jᵀe/ρ + λ(θ₀ - θ)): s is 1, or the first of
+    1/2, 1/4, ... 1/64 at which the objective does not grow; where it grows at all of them, θ stays.
+    M is then that of the last step: the rows of all samples in the buffer at the parameters before
+    it. (With other learners M sums rows at the parameters of their own time.) Between two fits the
+    newest sample is filtered (:class:`dopt.learning.ExtendedKalman`). A λ so small that rounding
+    leaves M indefinite ends the trial as diverged.
+
+    Parameters
+    ----------
+    capacity : int
+        Number of newest samples that are fitted.
+    refit_every : int
+        Steps from one fit to the next.
+    steps : int
+        Gauss-Newton steps of a fit.
+    """
+
+    name: ClassVar[str] = "gauss_newton"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.gauss_newton.learn"
+    reads_inputs: ClassVar[bool] = True
+
+    capacity: int = parameter(10_000, "samples", "positive")
+    refit_every: int = parameter(1, "steps", "positive")
+    steps: int = parameter(1, "steps", "positive")
+
+    def samples_kept(self, horizon: int) -> int:
+        return min(self.capacity, horizon)
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
+        return regularization, self.noise_variance, float(self.refit_every), float(self.steps)
+
+
+class Renewal(NamedTuple):
+    """Part of the prior that is added back to M at each step while M fades.
+
+    Attributes
+    ----------
+    entries : int
+        Diagonal entries of M that are renewed at a step, k of them in turn: at step t those at
+        (k t, ..., k t + k - 1) mod q.
+    weight : float
+        Number that is added to each of them.
+    """
+
+    entries: int
+    weight: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExtendedKalman(InformationLearner):
+    """θ += K e with K = M⁻¹Jᵀ (ρI + J M⁻¹ Jᵀ)⁻¹, and M += JᵀJ/ρ.
+
+    A sample enters M with the J that its learning step was taken with, hence at the parameters
+    before that step, so that θ and M⁻¹ stay the mean and the covariance of one filter; for a model
+    that is linear in θ this is recursive least squares. (With other learners the planner adds J at
+    the parameters after the step, as the paper does.)
+
+    With f < 1 the past fades, M_{t+1} = f M_t + D_t + JᵀJ/ρ. The diagonal D_t gives back what the
+    prior loses, so that M never falls below λ/2 I: directions that nothing excites do not wind up,
+    and the variance of no parameter exceeds 2/λ.
+
+    With ζ > 0 a sample has the covariance R = ρI + ζ J M⁻¹ Jᵀ in place of ρI, M⁻¹ after what it
+    has forgotten: K = M⁻¹Jᵀ (ρI + (1 + ζ) J M⁻¹ Jᵀ)⁻¹, and M += Jᵀ R⁻¹ J. The additional part
+    stands for the error of the linearisation, which is large while the parameters are uncertain.
+    However small λ is, a step then removes at most the share 1/(1 + ζ) of an error, and a variance
+    along J falls by this share at most; once J M⁻¹ Jᵀ is far below ρ, it is the filter with ζ = 0.
+    Plans count a sample as JᵀJ/ρ.
+
+    Parameters
+    ----------
+    forgetting : float
+        f, above 0 and at most 1: samples of 1/(1 - f) steps ago count 1/e. 1 forgets nothing.
+    underweighting : float
+        ζ, at least 0, which is the plain filter. With 2, and ρ = 0.1, the final loss hardly depends
+        on λ.
+    """
+
+    name: ClassVar[str] = "ekf"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn"
+    reads_inputs: ClassVar[bool] = True
+
+    forgetting: float = parameter(1.0, bound="share")
+    underweighting: float = parameter(0.0, bound="nonnegative", added=True)
+
+    def renewal(self, n_parameters: int, regularization: float) -> Renewal:
+        """Return what is given back of λI for q parameters.
+
+        All entries have their turn within a period P with fᴾ ≥ 1/2, or at each step if f is less.
+        With an entry at λ or above after its turn it is at fᴾλ or above before the next, to which
+        λ(1 - fᴾ) is added.
+        """
+        if self.forgetting == 1.0:
+            return Renewal(0, 0.0)
+        longest = max(1, math.floor(math.log(0.5) / math.log(self.forgetting)))
+        entries = math.ceil(n_parameters / longest)
+        period = math.ceil(n_parameters / entries)
+        return Renewal(entries, regularization * (1.0 - self.forgetting**period))
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:
+        entries, weight = self.renewal(n_parameters, regularization)
+        return self.noise_variance, self.forgetting, float(entries), weight, self.underweighting
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointKalman(InformationLearner):
+    """Estimate x and θ together, from measured states with noise (``env.measured_states``).
+
+    The covariance of both is held in two parts: P, and ΨM⁻¹Ψᵀ, by which the error of θ adds to it.
+    A step predicts x̂ with the model,
+
+        P ← A P Aᵀ + dt² E (ρI + ζ J M⁻¹ Jᵀ) Eᵀ,    Ψ ← A Ψ + dt E J,
+
+    and takes each measured state in with the gain K = P Cᵀ/s: M ← M + (CΨ)ᵀ(CΨ)/s, hence the
+    information is that of the output's Jacobian CΨ; θ ← θ + Δ with Δ = M⁻¹(CΨ)ᵀ e/s;
+    Ψ ← Ψ - K CΨ; x̂ ← x̂ + K e + ΨΔ; P ← P - K Kᵀ s. The initial state is known.
+
+    Plans of searches count a sample as JᵀJ/ρ, which is more than outputs tell; D-optimal inputs do
+    not depend on such a factor.
+
+    ζ stands for what the linearisation leaves out (:class:`dopt.learning.ExtendedKalman`).
+
+    Every ``refit_every`` steps θ is fitted anew to all that was measured: with the filter over x̂
+    alone, damped Gauss-Newton steps lead to the minimum of Σ (e²/s + log s) + λ‖θ - θ₀‖², and x̂,
+    P, Ψ and M are those of the whole run at the θ that is found. The time of a fit grows with the
+    number of steps. With ``noise="fitted"`` it then moves ρ by factors of 10^(1/4), two decades at
+    most, as long as Σ (e²/s + log s) falls: to what is likeliest. One ρ stands for all
+    accelerations.
+
+    Units: 1/λ is the variance of an initial parameter; M has no other unit, as e has its variance.
+
+    Parameters
+    ----------
+    underweighting : float
+        ζ, at least 0.
+    refit_every : int
+        Steps from one fit to the next; with more than a trial has there is none.
+    steps : int
+        Gauss-Newton steps of a fit.
+    noise : str
+        Whether ρ stays as "given", or is "fitted" too, from ``noise_variance`` on.
+    """
+
+    name: ClassVar[str] = "joint_ekf"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.joint_kalman.learn"
+    reads_inputs: ClassVar[bool] = True
+    estimates_states: ClassVar[bool] = True
+
+    regularization: float = parameter(3.0, bound="positive")
+    noise_variance: float = parameter(0.1, bound="positive")
+    underweighting: float = parameter(2.0, bound="nonnegative")
+    refit_every: int = parameter(100, "steps", "positive")
+    steps: int = parameter(4, "steps", "positive")
+    noise: str = parameter("given", choices=("given", "fitted"), added=True)
+
+    @property
+    def fits_noise(self) -> bool:
+        """Whether a fit estimates ρ."""
+        return self.noise == "fitted"
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # none depends on how many parameters there are
+        fit = float(self.refit_every), float(self.steps), float(self.fits_noise)
+        return regularization, self.noise_variance, self.underweighting, *fit

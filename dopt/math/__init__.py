@@ -1,1 +1,0 @@
-"""Numerics that the reference and the kernel share: maximisation on a sphere, directions."""

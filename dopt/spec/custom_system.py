@@ -1,0 +1,369 @@
+"""Checks of a custom system: its names, its numbers, its equations and their size."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from dopt.errors import ScaleWarning, SpecificationError, suggestion
+from dopt.learning import Learner
+from dopt.models import MLP, Model
+from dopt.policies import Policy
+from dopt.systems.base import KINDS, Array, Feature, System
+from dopt.systems.black_box import BlackBox
+from dopt.systems.properties import input_effect
+
+LARGEST = 100.0
+"""Root mean square of the accelerations over the grid up to which a network learns them well.
+
+Those of the shipped systems are 2 to 60 in their units.
+"""
+
+SMALLEST = 0.05
+
+WEAKEST = 0.1
+"""λ below which a filter over state and parameters does not learn."""
+
+
+@functools.lru_cache(maxsize=64)
+def warn_of_scale(system: System, model: Model) -> None:
+    """Warn where the accelerations are of another size than the outputs of a network.
+
+    Weights begin at about 1 and move by the learning rate at each step, in whatever unit the
+    accelerations are: in one in which they are in thousands, most of the error is left at the end.
+    """
+    if isinstance(system, BlackBox) or not isinstance(model, MLP):
+        return
+    values = system.learned(system.grid())
+    warn_of_sizes(system, np.sqrt(np.mean(values**2, axis=0)), "over the evaluation grid")
+
+
+@functools.lru_cache(maxsize=64)
+def warn_of_prior(policy: Policy, model: Model, learner: Learner) -> None:
+    """Warn where a filter over state and parameters begins with weights that may be anything.
+
+    Its prediction is then as uncertain from the first step on, and its linearisation wrong.
+    """
+    regularization = getattr(policy, "regularization", None)
+    if not (learner.estimates_states and isinstance(model, MLP)) or regularization is None:
+        return
+    if regularization < WEAKEST:
+        warnings.warn(
+            f"policy.regularization is {regularization:g}, which gives each initial parameter the "
+            f"variance {1 / regularization:.3g}, but learner '{learner.name}' needs one of about "
+            f"1/3: set policy.regularization to 3.",
+            ScaleWarning,
+            stacklevel=2,
+        )
+
+
+def warn_of_sizes(system: System, sizes: Array, where: str, first: str = "") -> None:
+    """Warn of each learned acceleration whose size, (r,), a network does not learn well.
+
+    ``first`` is advice that goes before that on its unit.
+    """
+    for row, size in zip(system.learned_rows, sizes, strict=True):
+        if size > LARGEST or 0 < size < SMALLEST:
+            warnings.warn(
+                f"The learned acceleration of {system.state_labels[row]} in env '{system.name}' "
+                f"has a root mean square of {size:.3g} {where}, but a network learns one of "
+                f"{SMALLEST:g} to {LARGEST:g} well: {first}measure that state in a unit about "
+                f"{size:.1g} times as large.",
+                ScaleWarning,
+                stacklevel=2,
+            )
+
+
+FACTORS = (0.5, 1.0, 2.0)
+"""Multiples of the linear parameters at which the accelerations have to be affine in them."""
+
+AFFINE = 1e-6
+"""Largest departure from an affine function, relative to the largest of its terms."""
+
+
+def check_names(system: System) -> None:
+    """Refuse names of parameters that the system does not have.
+
+    Raises
+    ------
+    SpecificationError
+        If ``physical`` names no attribute, or ``linear_parameters`` none of ``physical``.
+    """
+    as_named = type(system).parameters is System.parameters
+    for name in system.physical:
+        if as_named and not hasattr(system, name):
+            raise SpecificationError(
+                f"physical of env '{system.name}' names '{name}', but {type(system).__name__} has "
+                f"no attribute of that name: declare it as a field, {name}: float = "
+                f"parameter(...), or correct the name."
+            )
+    for name in system.linear_parameters:
+        if name not in system.physical:
+            raise SpecificationError(
+                f"linear_parameters of env '{system.name}' names '{name}', but names of its "
+                f"physical parameters are expected: {_choice(name, system.physical)}"
+            )
+
+
+def _choice(name: str, physical: tuple[str, ...]) -> str:
+    return suggestion(name, physical) if physical else "it has none, so leave it out."
+
+
+def check_linear(system: System, points: Array) -> None:
+    """Refuse parameters in which the accelerations are not affine, at points, (d, n).
+
+    The oracle takes them as offset + Psi theta (:attr:`System.linear_form`).
+
+    Raises
+    ------
+    SpecificationError
+        If they are another function of these parameters, or not finite where one is 0 or 1.
+    """
+    names = system.linear_parameters
+    if not names:
+        return
+    with np.errstate(all="ignore"):
+        affine = all(_is_affine(system, points, factor) for factor in FACTORS)
+    if not affine:
+        raise SpecificationError(
+            f"linear_parameters of env '{system.name}' are {', '.join(names)}, but its "
+            f"accelerations are not affine in them, offset + Psi theta: name only parameters in "
+            f"which they are."
+        )
+
+
+def _is_affine(system: System, points: Array, factor: float) -> bool:
+    """Return whether the linear form gives the accelerations at a multiple of the parameters."""
+    names = system.linear_parameters
+    values = dict(zip(system.physical, system.parameters, strict=True))
+    theta = factor * np.array([values[name] or 1.0 for name in names])
+    offset, *ones = (_at(system, points, parameters) for parameters in system.linear_form)
+    terms = np.array([offset, *(theta[:, None, None] * (np.array(ones) - offset))])
+    moved = values | dict(zip(names, theta.tolist(), strict=True))
+    found = _at(system, points, tuple(moved[name] for name in system.physical))
+    apart = np.abs(found - terms.sum(axis=0)).max()
+    return bool(apart <= AFFINE * (1.0 + np.abs(terms).max()))
+
+
+def _at(system: System, points: Array, parameters: tuple[float, ...]) -> Array:
+    """Return the accelerations, (r, n); NaN where they cannot be computed."""
+    shape = (system.n_learned, points.shape[1])
+    try:
+        values = system.accelerations(tuple(points), parameters)
+        return np.array([np.broadcast_to(value, shape[1:]) for value in values], dtype=float)
+    except ArithmeticError:
+        return np.full(shape, np.nan)
+
+
+def check_finite(system: System) -> None:
+    """Refuse equations that are not finite at the initial state or on the evaluation grid.
+
+    Raises
+    ------
+    SpecificationError
+        If an acceleration is not at one of these states, or the known part at the first one.
+    """
+    start, rest = np.array([system.initial_state]), np.zeros(system.n_inputs)
+    with np.errstate(all="ignore"):
+        flow = system.known(tuple(start[0]), tuple(rest), system.parameters)
+        first, grid = system.learned(start), system.learned(system.grid())
+    learned = [system.state_labels[row] for row in system.learned_rows]
+    _refuse(system, "known", np.array([flow], float), start, system.state_labels, INITIAL)
+    _refuse(system, "accelerations", first, start, learned, INITIAL)
+    _refuse(system, "accelerations", grid, system.grid(), learned, GRID)
+
+
+INITIAL = "the initial state", "env.initial_state"
+GRID = "a state of the evaluation grid", "env.grid_half_widths"
+"""State at which an equation has to be finite, and the field that moves it."""
+
+
+def _refuse(
+    system: System,
+    what: str,
+    values: Array,
+    states: Array,
+    labels: tuple[str, ...] | list[str],
+    where: tuple[str, str],
+) -> None:
+    """Refuse values, (N, k), of an equation at states, (N, d), that are not finite."""
+    wrong = np.argwhere(~np.isfinite(values))
+    if not len(wrong):
+        return
+    i, k = wrong[0]
+    state = ", ".join(
+        f"{label} = {x:.4g}" for label, x in zip(system.state_labels, states[i], strict=True)
+    )
+    place, field = where
+    raise SpecificationError(
+        f"{what}() of env '{system.name}' gives {values[i, k]} for the derivative of {labels[k]} "
+        f"at {place}, {state}, but a finite number is expected: correct the equation, or {field}."
+    )
+
+
+STATES = 5
+"""States at once at which the equations are tried."""
+
+STEP = 1e-30
+"""Imaginary step, from which the derivative is exact to rounding."""
+
+DIFFERENCES = (1e-4, 1e-6)
+"""Steps of the central differences; one of them has to agree with the complex step."""
+
+AGREEMENT = 1e-3
+"""Largest departure of a derivative, relative to the largest of its equation."""
+
+_SEED = 20_240_601
+
+
+@functools.lru_cache(maxsize=1024)
+def check_system(system: System) -> None:
+    """Try a system's declarations and equations; try out a black box.
+
+    Raises
+    ------
+    SpecificationError
+        If a declared index is none of a state's, or the equations fail, return something else than
+        was declared, are not finite where a trial begins or is evaluated, depend on the inputs or
+        the linear parameters in another way than an affine one, or have a wrong derivative by a
+        complex step; if a black box says so.
+    """
+    check_names(system)
+    _check_indices(system)
+    if isinstance(system, BlackBox) and system.measured:
+        return  # nothing may run on it
+    if isinstance(system, BlackBox):
+        system.try_out()
+        return
+    rng = np.random.default_rng(_SEED)
+    states = rng.uniform(-1, 1, (system.n_states, STATES))
+    inputs = rng.uniform(-1, 1, (system.n_inputs, STATES))
+    points = np.concatenate([states, inputs]) if system.reads_inputs else states
+    _tried(system, "accelerations", system.n_learned, tuple(points))
+    _tried(system, "known", system.n_states, tuple(states), tuple(inputs))
+    check_finite(system)
+    check_linear(system, points)
+    if not input_effect(system).is_affine:
+        raise SpecificationError(
+            f"known() of env '{system.name}' is not affine in the inputs, but a derivative of the "
+            f"form f(x) + B(x) u is expected: make the input another quantity, in which it is."
+        )
+    if system.compiled:
+        for point in points.T:
+            _check_derivatives(system, point)
+
+
+def _check_derivatives(system: System, point: Array) -> None:
+    """Compare the derivatives of the accelerations by a complex step with differences."""
+    exact = _moved(system, point.astype(complex), 1j * STEP).imag / STEP
+    sides = ((_moved(system, point, step), _moved(system, point, -step)) for step in DIFFERENCES)
+    differences = np.array(
+        [(ahead - behind) / (2 * h) for h, (ahead, behind) in zip(DIFFERENCES, sides, strict=True)]
+    )
+    apart = np.abs(exact - differences).min(axis=0)
+    wrong = np.argwhere(apart > AGREEMENT * (1.0 + np.abs(exact).max()))
+    if len(wrong):
+        j, k = wrong[0]
+        labels = (*system.state_labels, *system.input_labels)
+        raise SpecificationError(
+            f"accelerations() of env '{system.name}' has in entry {k} the derivative "
+            f"{exact[j, k]:.4g} along {labels[j]} by a complex step, but "
+            f"{differences[-1, j, k]:.4g} by differences: use sign, where and magnitude of "
+            f"dopt.systems.elementary in place of other functions of that kind, such as numpy.sign "
+            f"and abs, or declare compiled = False in the class."
+        )
+
+
+def _moved(system: System, point: Any, step: complex) -> Any:
+    """Return the accelerations, (d, r), with each component of a point moved by a step in turn."""
+    moved = point + step * np.eye(len(point))
+    try:
+        with np.errstate(all="ignore"):
+            return np.array([system.accelerations(tuple(x), system.parameters) for x in moved])
+    except Exception as error:
+        kind = "complex numbers" if np.iscomplexobj(moved) else "numbers"
+        raise SpecificationError(
+            f"accelerations() of env '{system.name}' fails for {kind} "
+            f"({type(error).__name__}: {error}), by which its derivatives are taken: write it with "
+            f"the functions of dopt.systems.elementary, or declare compiled = False in the class."
+        ) from error
+
+
+def _check_indices(system: System) -> None:
+    d, name = system.n_states, system.name
+    for feature in system.features:
+        if not isinstance(feature, Feature):
+            raise SpecificationError(
+                f"features of env '{name}' hold {feature!r}, but entries like "
+                f"Feature('cos', 0) are expected: make it a dopt.systems.Feature."
+            )
+    declared = {
+        "learned_rows": system.learned_rows,
+        "grid_indices": system.grid_indices,
+        "angle_indices": system.angle_indices,
+        "phase_plane": system.phase_plane,
+        "features": tuple(feature.index for feature in system.features),
+    }
+    for what, indices in declared.items():
+        for index in indices:
+            if not 0 <= index < d:
+                raise SpecificationError(
+                    f"{what} of env '{name}' holds {index}, but its {d} states have the numbers 0 "
+                    f"to {d - 1}: correct it."
+                )
+    if len(set(system.learned_rows)) < len(system.learned_rows):
+        raise SpecificationError(
+            f"learned_rows of env '{name}' are {system.learned_rows}, but no row twice is "
+            f"expected: name each learned row of the state derivative once."
+        )
+    for feature in system.features:
+        if feature.kind not in KINDS:
+            raise SpecificationError(
+                f"features of env '{name}' hold one of kind '{feature.kind}', but the kinds are "
+                f"{', '.join(KINDS)}: take one of them."
+            )
+
+
+def _tried(system: System, what: str, size: int, *arguments: Sequence[Any]) -> Array:
+    """Return what an equation gives for many states at once, (size, STATES)."""
+    equation: Callable[..., Any] = getattr(system, what)
+    try:
+        with np.errstate(all="ignore"):
+            values = equation(*arguments, system.parameters)
+        single = _is_single(values, size)
+        entries = () if single else values
+        found = np.array([np.broadcast_to(value, (STATES,)) for value in entries], dtype=float)
+    except Exception as error:
+        raise SpecificationError(
+            f"{what}() of env '{system.name}' fails for arrays of {STATES} states "
+            f"({type(error).__name__}: {error}), but sums, products and the functions of "
+            f"dopt.systems.elementary are expected in it, which serve numbers, arrays and tensors "
+            f"alike: write it with these."
+        ) from error
+    if single:
+        raise SpecificationError(
+            f"{what}() of env '{system.name}' returns one number, but a tuple of {size} is "
+            f"expected, one for each {_entry(what)}: return {'a,' if size == 1 else 'a, b, ...'} "
+            f"with its comma{'' if size == 1 else 's'}."
+        )
+    if len(found) != size:
+        raise SpecificationError(
+            f"{what}() of env '{system.name}' returns {len(found)} numbers, but {size} are "
+            f"expected, one for each {_entry(what)}: correct it."
+        )
+    return found
+
+
+def _is_single(values: Any, size: int) -> bool:
+    """Return whether an equation gives one number, or one for each state, in place of a tuple."""
+    if isinstance(values, np.ndarray) and values.ndim:
+        return values.shape == (STATES,) and size != STATES
+    return isinstance(values, int | float | np.generic | np.ndarray)
+
+
+def _entry(what: str) -> str:
+    return "state" if what == "known" else "learned row"
