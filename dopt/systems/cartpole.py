@@ -105,6 +105,10 @@ class CartpoleUnknownGain(Cartpole):
     ----------
     gain : float
         k, force by input.
+
+    Notes
+    -----
+    It takes ``model=affine`` or ``model=black_box``.
     """
 
     name: ClassVar[str] = "cartpole_unknown_gain"

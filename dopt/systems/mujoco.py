@@ -211,6 +211,15 @@ class MuJoCoPendulum(SuiteModel):
     """Pendulum whose motor is too weak to lift it at once.
 
     State: angle θ from upright [rad], rate ω [rad/s]. Input: torque u [N m]. Learned: dω/dt.
+
+    Notes
+    -----
+    It takes ``model=affine`` or ``model=black_box``. Reasons for the default values:
+
+    - gamma: 1 N m, all that the motor has: a fifth of the torque that holds the weight level.
+    - grid: the full circle, and 8 rad/s: a fall from upright ends with 8.9 rad/s, less the
+      friction.
+    - horizon: 10 s.
     """
 
     name: ClassVar[str] = "mujoco_pendulum"
@@ -248,6 +257,15 @@ class MuJoCoCartpole(SuiteModel):
 
     State: place y [m], angle φ from upright [rad], ẏ [m/s], φ̇ [rad/s]. Input: force u [10 N].
     Learned: ÿ and φ̈.
+
+    Notes
+    -----
+    It takes ``model=affine`` or ``model=black_box``. Reasons for the default values:
+
+    - gamma: 3 N of the 10 N that the motor has: with all of it the cart is at a stop after
+      0.6 s.
+    - grid: within the stops at 1.8 m, the full circle.
+    - horizon: 10 s, an episode of the suite.
     """
 
     name: ClassVar[str] = "mujoco_cartpole"
@@ -282,6 +300,14 @@ class MuJoCoAcrobot(SuiteModel):
 
     State: shoulder θ₁ from upright, elbow θ₂ [rad], their rates [rad/s]. Input: torque u [2 N m].
     Learned: both accelerations.
+
+    Notes
+    -----
+    It takes ``model=affine`` or ``model=black_box``. Reasons for the default values:
+
+    - gamma: all that the motor has, 2 N m.
+    - grid: both full circles.
+    - horizon: 10 s, an episode of the suite.
     """
 
     name: ClassVar[str] = "mujoco_acrobot"
@@ -317,6 +343,14 @@ class MuJoCoReacher(SuiteModel):
 
     State: shoulder θ₁, wrist θ₂ [rad], their rates [10 rad/s]. Input: torques u [0.05 N m].
     Learned: both accelerations. The links are light: in a step damping takes most of a velocity.
+
+    Notes
+    -----
+    It takes ``model=affine`` or ``model=black_box``. Reasons for the default values:
+
+    - gamma: all that each motor has, 0.05 N m.
+    - grid: wrist within its stops at 2.8 rad; rates that the joints reach under full torque.
+    - horizon: 10 s.
     """
 
     name: ClassVar[str] = "mujoco_reacher"

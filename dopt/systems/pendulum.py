@@ -90,6 +90,10 @@ class PendulumUnknownGain(Pendulum):
     ----------
     gain : float
         k, torque by input.
+
+    Notes
+    -----
+    It takes ``model=affine`` or ``model=black_box``.
     """
 
     name: ClassVar[str] = "pendulum_unknown_gain"
@@ -126,6 +130,16 @@ class DriftingPendulum(Pendulum):
         Coefficient b∞ of the worn pivot [N m s].
     time_constant : float
         τ [s].
+
+    Notes
+    -----
+    Reasons for the default values beside those of env=pendulum:
+
+    - friction: b/I grows from 0.5 1/s to 1.5 1/s. A model of the first second is then wrong by
+      4.5 rad/s² (root mean square over the grid), 40 % of the accelerations themselves.
+    - time: constant of 5 s: the friction is where it tends to, to 2 %, at the end of the
+      horizon.
+    - horizon: 20 s, twice that of env=pendulum.
     """
 
     name: ClassVar[str] = "drifting_pendulum"
@@ -168,6 +182,18 @@ class UnbalancedDisk(System):
         Rate ω_c at which the dry friction has 76 % of its value [rad/s].
     motor_gain : float
         k [rad/(V s²)].
+
+    Notes
+    -----
+    Reasons for the default values:
+
+    - gravity, friction, dry_friction, motor_gain: those of the laboratory's disk.
+    - gamma: 3 V is 66 % of the voltage that holds the weight level: swinging up takes a few
+      swings.
+    - dt: 0.01 s: the Euler map follows the dry friction where it turns sign (dt c / ω_c = 0.6).
+    - grid: the full circle, and 20 rad/s: a fall from upright ends with 22 rad/s, less the
+      friction.
+    - horizon: 5 s, about nine periods.
     """
 
     name: ClassVar[str] = "unbalanced_disk"
@@ -271,6 +297,20 @@ class CoupledPendulums(System):
         for each.
     initial_state, grid_half_widths : tuple of float
         Of all 2n states and n rates, or those of one pendulum, which then hold for all.
+
+    Notes
+    -----
+    Reasons for the default values:
+
+    - coupling: 6.25 / s²: a wave passes about two pendulums in a second.
+    - friction: 0.6 / s: all modes die out, and the Euler map with dt = 0.02 s has a spectral
+      radius below 1 at rest for any number of pendulums, which takes dt (ω₀² + 4 κ) = 0.52 / s
+      at least.
+    - gamma: 5 rad/s², five times what holds a pendulum level.
+    - noise: so small that the wave's way along the row decides how many samples the last
+      friction takes.
+
+    One number of grid_half_widths and a pair of initial_state stand for all pendulums.
     """
 
     name: ClassVar[str] = "coupled_pendulums"

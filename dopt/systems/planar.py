@@ -54,6 +54,18 @@ class Car(System):
         δₘ, steering angle by its command [rad].
     steering_time : float
         τ [s].
+
+    Notes
+    -----
+    Reasons for the default values:
+
+    - mass, inertia, front, rear: a model car, 30 cm from axle to axle.
+    - grip: 8 N on each axle, half of the weight on it: a slippery floor.
+    - motor: 10 N against a drag that holds it at 4.5 m/s.
+    - gamma: commands of one: full drive, or full lock; both inputs share it.
+    - dt: 0.02 s: at rest the tyres take 0.29 of a yaw rate in a step.
+    - grid: what the car stays within for 95 % of the time under strong inputs of this energy,
+      and more of sliding. The last axis is the steering angle up to full lock.
     """
 
     name: ClassVar[str] = "car"
@@ -155,6 +167,17 @@ class MovingStar(System):
         R [m].
     period : float
         2π/ω [s].
+
+    Notes
+    -----
+    The default values are those of its released code, with α = 100 and dt = 0.01 there and dt/α the
+    same here:
+
+    - gamma: an input moves the mass by 5 mm in a step; the star moves by 5.7 mm, and its force
+      by 0.1 mm.
+    - period: 1,000 steps, the horizon.
+    - noise: that of a force of 1e-4 N.
+    - core: theirs is a barrier of this width.
     """
 
     name: ClassVar[str] = "moving_star"

@@ -120,6 +120,17 @@ class Drone(System):
         κ [kg m²].
     slow_speed, slow_rate : float
         v₀ [m/s] and ω₀ [rad/s].
+
+    Notes
+    -----
+    Reasons for the default values:
+
+    - mass, inertia, half_span: a drone of 1 kg and 40 cm.
+    - drag: 0.25 kg/m: its weight drives it to 6.3 m/s at most.
+    - turn_drag: turns at full thrust of two motors reach 4 rad/s.
+    - gamma: 1 N beside thrusts of 2.5 N each that carry the weight: no motor has to turn round.
+    - grid: speeds and rates up to these limits. Six axes: the points are a Sobol set.
+    - horizon: 10 s: the drone turns over several times.
     """
 
     name: ClassVar[str] = "drone"

@@ -22,7 +22,7 @@ SYSTEMS: dict[str, dict[str, object]] = {
     "cartpole": {},
     # It flies tens of kilometres.
     "drone": {"state_limit": 1e6},
-    # The chain of conf/env/beyond/chain.yaml as long and as heavy as it is there, of shorter links.
+    # The chain of env=beyond/chain as long and as heavy as it is there, of shorter links.
     # Its fastest modes take steps of Runge and Kutta.
     "chain": {
         "n_links": 20,

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
-from dopt.declare import registry
+from dopt import registry
 from omegaconf import DictConfig, OmegaConf
 
 import analysis

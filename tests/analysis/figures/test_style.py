@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -22,9 +21,12 @@ from analysis.figures.panels import (
 from analysis.line_styles import SEQUENCE, policy_style, sequence_style
 from analysis.stats.curves import log_limits
 from dopt.policies import POLICIES
+from orchestrate.config.options import option_names
 
 PAPER = ("oracle", "periodic", "d_optimal", "uniform", "random")
-BEYOND = {path.stem for path in Path("conf/policy/beyond").glob("*.yaml")}
+BEYOND = {
+    name.removeprefix("beyond/") for name in option_names("policy") if name.startswith("beyond/")
+}
 CLASSICAL = [policy for policy in POLICIES if policy not in BEYOND]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,12 @@ from dopt.learning import LEARNERS
 from dopt.models import MODELS
 from dopt.policies import POLICIES
 from dopt.registry import build
+from dopt.spec.trial import TrialSpec
 from dopt.systems import NAMED_SYSTEMS
+from orchestrate.config.command_line import read_command_line
+from orchestrate.config.grid import build_grid
 from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.config.options import option_names
 from tests.paths import ROOT
 
 CONF = ROOT / "conf"
@@ -47,12 +52,60 @@ def section(path: Path, group: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("path", FILES, ids=str)
 def test_a_file_builds_the_default_of_its_class(path: Path) -> None:
-    """Hydra accepts only overrides of existing keys, so that the files repeat all fields."""
+    """Hydra accepts only overrides of existing keys, so that these files repeat all fields."""
     group = path.parts[0]
     given = section(path, group)
     cls = CLASSES[group][given["name"]]
     assert build(group, CLASSES[group], given) == cls()
     assert set(given) == {"name", *(field.name for field in dataclasses.fields(cls))}
+
+
+OWN = """
+defaults:
+  - beyond/chain
+  - _self_
+n_links: 3
+"""
+"""A user's option that changes one number of a class without a file."""
+
+
+def keys(monkeypatch: pytest.MonkeyPatch, *words: str) -> list[str]:
+    """Return the keys of the trials that a command line asks for."""
+    monkeypatch.setattr(sys, "argv", ["launch.py", *words])
+    request = read_command_line()
+    assert request is not None
+    return [trial.trial_key for trial in build_grid(request.combinations).trials]
+
+
+def test_every_system_and_policy_is_an_option() -> None:
+    last = {group: {name.split("/")[-1] for name in option_names(group)} for group in CLASSES}
+    assert last["policy"] >= set(POLICIES)
+    assert last["env"] >= {name.removeprefix("mujoco_") for name in NAMED_SYSTEMS}
+    assert option_names("env")[:5] == ["arm", "cartpole", "pendulum", "quadrotor", "beyond/car"]
+
+
+def test_an_option_without_a_file_is_the_default_of_its_class(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    words = ("-m", "env=beyond/chain", "policy=glob([baseline/*,beyond/exact])", "seed=3")
+    names = ["chirp", "multisine", "periodic_square", "prbs", "random_held", "random_sphere"]
+    expected = [
+        TrialSpec.from_names("chain", policy, seed=3).trial_key for policy in (*names, "exact")
+    ]
+    assert keys(monkeypatch, *words) == expected
+
+
+def test_options_of_a_folder_of_the_user_build_on_those_of_classes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "short_chain.yaml").write_text(OWN)
+    given = ("-m", "--config-dir", str(tmp_path), "policy=d_optimal,random", "seed=range(2)")
+    ours = keys(monkeypatch, *given, "env=glob(short*)")
+    assert ours == keys(monkeypatch, *given, "env=beyond/chain", "env.n_links=3")
+    assert len(ours) == 4
+    both = keys(monkeypatch, *given, "env=glob([short*,p*])")
+    assert set(both) == {*ours, *keys(monkeypatch, *given, "env=pendulum")}
 
 
 def test_a_launch_has_the_default_settings() -> None:
