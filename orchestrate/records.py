@@ -8,6 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 
+URL_VARIABLE = "DOPT_DB"
+"""Environment variable that names another default database; an empty one counts as unset."""
+
 ENVIRONMENT = "environment"
 """Cause of a failure that is not the trial's: the launch ends, and the trial waits."""
 

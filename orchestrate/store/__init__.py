@@ -8,9 +8,9 @@ What a command does to a whole database is in modules of their own: ``merge``, `
 
 from __future__ import annotations
 
-from orchestrate.records import Failure, RunRecord
+from orchestrate.records import URL_VARIABLE, Failure, RunRecord
 from orchestrate.store.backends.open import LEASE_SECONDS
-from orchestrate.store.database_url import DEFAULT_URL, READ_VARIABLE, URL_VARIABLE, default_url
+from orchestrate.store.database_url import DEFAULT_URL, READ_VARIABLE, default_url
 from orchestrate.store.errors import (
     DatabaseMovedError,
     InvalidResultError,

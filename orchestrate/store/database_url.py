@@ -11,12 +11,10 @@ from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
 
 from dopt.errors import given_path, stripped
+from orchestrate.records import URL_VARIABLE
 from orchestrate.store.errors import StoreError
 
 DEFAULT_URL = "sqlite:///results/results.db"
-
-URL_VARIABLE = "DOPT_DB"
-"""Environment variable that names another default database; an empty one counts as unset."""
 
 READ_VARIABLE = "DOPT_READ_DB"
 """Environment variable with the URL of a user who can only read, as whom the page SQL asks."""

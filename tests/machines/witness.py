@@ -16,7 +16,7 @@ from dopt.kernel import warm_up
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from orchestrate.runner import launch
+from orchestrate.runner import launch, start
 from orchestrate.runner.run_grid import Work
 
 PAUSE = "WITNESS_PAUSE"
@@ -54,5 +54,5 @@ def read_notes(home: Path, kind: str) -> dict[int, float]:
 if __name__ == "__main__":
     from tests.machines.witness import witnessed as importable  # by a name that workers know
 
-    launch.WORK = Work(importable, warm_up)
+    start.WORK = Work(importable, warm_up)
     sys.exit(launch.main())

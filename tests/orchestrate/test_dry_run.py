@@ -32,7 +32,7 @@ def test_a_dry_run_counts_trials_that_run_again(
         def get(self, _key: str, _default: object = None) -> str:  # type: ignore[override]
             return "failed"
 
-    monkeypatch.setattr("orchestrate.runner.launch._statuses", lambda _: Failed())
+    monkeypatch.setattr("orchestrate.runner.start._statuses", lambda _: Failed())
     grid = ("-m", "policy=random", "seed=range(4)", "launch.dry_run=true", *SHORT)
     assert "4 trials, 0 done, 0 to run" in command_line(*grid)[1]
     assert "4 trials, 0 done, 4 to run" in command_line(*grid, "launch.retry=failed")[1]

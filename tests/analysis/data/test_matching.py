@@ -8,13 +8,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
-from dopt import registry
 from omegaconf import DictConfig, OmegaConf
 
 import analysis
 from analysis.data.matching import USUAL, Candidate, Filter, _argument, choose, difference, flatten
 from analysis.data.selection import select
 from analysis.errors import AnalysisError
+from dopt import registry
 from orchestrate.store import ConfigRow, Reader
 from tests.analysis.synthetic import fill, make_spec
 from tests.paths import EXAMPLE, ROOT

@@ -22,12 +22,12 @@ CommandLine = Callable[..., tuple[int, str, str]]
 
 LAUNCH = """
 import json, sys
-from orchestrate.runner import launch
+from orchestrate.runner import launch, start
 from orchestrate.runner.run_grid import Work
 from tests.orchestrate.standins import quick
 
 if __name__ == "__main__":
-    launch.WORK = Work(quick, prepare=lambda: None)
+    start.WORK = Work(quick, prepare=lambda: None)
     code = launch.main()
     print(json.dumps([code, sorted({"ray", "torch"} & set(sys.modules))]))
 """

@@ -23,7 +23,7 @@ import psycopg
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors import local
-from orchestrate.runner import launch, worker
+from orchestrate.runner import start, worker
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store, StoreUnavailableError
@@ -106,12 +106,12 @@ def _launch(order: Order) -> int:
     work = Work(run, prepare=lambda: None)
     if order.worker is not None:
         return _pull(order, work)
-    launch.WORK = work
+    start.WORK = work
     chosen = {"workers": 2, "chunk_seconds": 0.2, **order.settings}
     settings = LaunchSettings(order.executor, order.url, **chosen)
-    request = launch.Request((), {}, (), single=False)
+    request = start.Request((), {}, (), single=False)
     try:
-        return launch.run(request, grid_of(order.trials), settings)
+        return start.run(request, grid_of(order.trials), settings)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
 
@@ -135,7 +135,7 @@ def _pull(order: Order, work: Work) -> int:
         worker.time = worker.time = clock  # type: ignore[assignment]
     settings = WorkerSettings(order.url, **{"processes": 2, **dict(order.worker or {})})
     try:
-        return run_worker(settings, Output(launch.say, launch.say, sys.stderr), work)
+        return run_worker(settings, Output(start.say, start.say, sys.stderr), work)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
     except StoreUnavailableError as error:

@@ -12,7 +12,7 @@ import pytest
 
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
-from orchestrate.runner import launch
+from orchestrate.runner import launch, start
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.faults.gate import Gate, Gated
@@ -60,7 +60,7 @@ def started(url: str, folder: Path) -> subprocess.Popen[str]:
 
 
 def close_gate(folder: str) -> None:
-    launch.WORK = Work(Gated(launch.WORK.run, Gate(Path(folder))), launch.WORK.prepare)
+    start.WORK = Work(Gated(start.WORK.run, Gate(Path(folder))), start.WORK.prepare)
 
 
 def launched_here(url: str) -> int:
