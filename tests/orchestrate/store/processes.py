@@ -27,16 +27,7 @@ from tests.waiting import PATIENCE_SECONDS
 # Forked from a process that has imported everything and opened nothing: starts in milliseconds.
 CLEAN = multiprocessing.get_context("forkserver")
 _LATER = ("llvmlite.binding", "numpy.random")  # a launch imports them on its way
-CLEAN.set_forkserver_preload(
-    [
-        "pytest",
-        "psycopg",
-        "orchestrate.runner.launch",
-        "orchestrate.runner.start",
-        *_LATER,
-        __name__,
-    ]
-)
+CLEAN.set_forkserver_preload(["pytest", "psycopg", "orchestrate.runner.start", *_LATER, __name__])
 NOBODY = 65534
 
 
