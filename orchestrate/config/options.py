@@ -34,6 +34,8 @@ class Sweeps:
 def register() -> None:
     """Tell Hydra the options that are no files."""
     store = ConfigStore.instance()
+    # Hydra copies the store, which nothing changes, with every source of every composition.
+    setattr(store, "__deepcopy__", lambda _: store)  # noqa: B010  # mypy forbids the other way
     store.store(group="hydra/sweeper", name="grid", node=Sweeps)
     for path, section in _classes().items():
         group, _, name = path.rpartition("/")
