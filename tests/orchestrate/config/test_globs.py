@@ -22,7 +22,7 @@ NAMES = ("plain", "random", "far/exact", "far/random", "far/trace", "near/plain"
 @pytest.fixture
 def loader(tmp_path: Path) -> Iterator[ConfigLoader]:
     for name in NAMES:
-        path = tmp_path / f"policy/{name}.yaml"
+        path = tmp_path / f"choice_of/{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("value: 1\n")
     GlobalHydra.instance().clear()
@@ -31,7 +31,7 @@ def loader(tmp_path: Path) -> Iterator[ConfigLoader]:
 
 
 def found(loader: ConfigLoader, glob: str) -> tuple[str, ...]:
-    return read_axes(loader, [f"policy={glob}"])[0].texts
+    return read_axes(loader, [f"choice_of={glob}"])[0].texts
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def found(loader: ConfigLoader, glob: str) -> tuple[str, ...]:
 )
 def test_without_a_folder_it_is_that_of_hydra(loader: ConfigLoader, glob: str) -> None:
     parser = OverridesParser.create(config_loader=loader)
-    (override,) = parser.parse_overrides([f"policy={glob}"])
+    (override,) = parser.parse_overrides([f"choice_of={glob}"])
     assert isinstance(override.value(), Glob)
     assert found(loader, glob) == tuple(override.sweep_string_iterator())
 
@@ -62,4 +62,4 @@ def test_with_a_folder_it_is_what_is_in_there(
 def test_one_that_matches_nothing_names_what_is_near(loader: ConfigLoader) -> None:
     with pytest.raises(SpecificationError, match=r"did you mean 'far/exact'.* near/plain"):
         found(loader, "glob(far/exakt)")
-    assert loader.get_group_options("policy", ObjectType.GROUP) == ["far", "near"]
+    assert loader.get_group_options("choice_of", ObjectType.GROUP) == ["far", "near"]
