@@ -73,7 +73,7 @@ NONNEGATIVE = {
 }
 FRACTIONS = {"beta_1", "beta_2", "discount"}
 SHARES = {"forgetting", "band"}
-TEXTS = {"form", "criterion", "states", "information", "domain", "integrator", "energy"}
+TEXTS = {"form", "criterion", "states", "information", "domain", "integrator"}
 LISTED_TEXTS = {"unknown"}
 OF_ANY_SIZE = {"goal", "initial"}
 NOT_NUMBERS: tuple[Any, ...] = ("abc", True, {"a": 1}, float("nan"), float("inf"), 10**400)
