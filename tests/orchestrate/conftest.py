@@ -60,7 +60,7 @@ def command_line(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str, str]]:
     """Return a function that runs ``launch.py`` in this process: exit code, output and errors."""
-    from orchestrate.runner import launch
+    from orchestrate.runner import launch, start
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["launch.py", *arguments])
@@ -76,5 +76,5 @@ def command_line(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.delenv("DOPT_DB", raising=False)
-    monkeypatch.setattr(launch, "WORK", Work(quick, prepare=lambda: None))
+    monkeypatch.setattr(start, "WORK", Work(quick, prepare=lambda: None))
     return run
