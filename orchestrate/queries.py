@@ -84,20 +84,6 @@ class Status:
     def seconds_left(self) -> float | None:
         return self.left / self.rate if self.left and self.rate else None
 
-    @property
-    def rounded(self) -> int:
-        """Trials with a value of earlier ranges, which is not the nearest decimal."""
-        return sum(config.n for config in self.configs if _is_rounded(config.config))
-
-
-def _is_rounded(value: object) -> bool:
-    """Return whether a number in a configuration is a short decimal but for rounding."""
-    if isinstance(value, dict | list):
-        return any(map(_is_rounded, value.values() if isinstance(value, dict) else value))
-    if not isinstance(value, float) or not math.isfinite(value):
-        return False
-    return 0 < abs(value - float(f"{value:.12g}")) <= 8 * math.ulp(value)
-
 
 def counts(configs: Iterable[ConfigRow]) -> Counter[str]:
     """Return the number of trials in each state."""

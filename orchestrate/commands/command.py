@@ -34,18 +34,18 @@ class Command:
     ----------
     help
         One line for the list of commands.
-    add_arguments
-        Adds the arguments of the command, beside ``--db`` and ``--json``.
     run
         Runs the command and returns the exit code. With ``arguments.json`` it writes one JSON
         document to the standard output and nothing else. A ``DoptError`` is printed as one line,
         with exit code 75 for ``StoreUnavailableError`` and 2 for the others.
+    add_arguments
+        Adds the arguments of the command, beside ``--db`` and ``--json``.
     """
 
     name: str
     help: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], ExitCode]
+    add_arguments: Callable[[argparse.ArgumentParser], None] = lambda _: None
 
     def parser(self) -> Parser:
         """Return the parser of the arguments after the name of the command."""

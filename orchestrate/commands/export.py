@@ -120,5 +120,5 @@ def _format_of(path: Path) -> str:
 
 
 EXPORT_COMMAND = Command(
-    "export", "write results to a file or a bundle", _add_export_arguments, _run_export
+    "export", "write results to a file or a bundle", _run_export, _add_export_arguments
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
@@ -47,7 +46,7 @@ def _run_merge(arguments: argparse.Namespace) -> ExitCode:
     """Merge and print the counts; exit code 1 if trials that have an outcome were left out."""
     merged = _merge(arguments.db, arguments.other)
     if arguments.json:
-        say_json({**_plain(merged), "changed": merged.changed})
+        say_json({**asdict(merged), "changed": merged.changed})
     else:
         say("\n".join(_merge_lines(merged)))
     refused = merged.conflicts or merged.incomplete or merged.contradictory
@@ -68,10 +67,6 @@ def _merge(url: str, other: str) -> Merged:
     for merged in merge_collected(url, place, trial_key=trial_key):
         total.include(merged)
     return total
-
-
-def _plain(merged: Merged) -> dict[str, object]:
-    return dataclasses.asdict(merged)
 
 
 def _merge_lines(merged: Merged) -> list[str]:
@@ -99,19 +94,15 @@ def _listed(what: str, trials: Sequence[TrialName]) -> list[str]:
 
 
 MERGE_COMMAND = Command(
-    "merge", "copy the trials of another database", _add_merge_arguments, _run_merge
+    "merge", "copy the trials of another database", _run_merge, _add_merge_arguments
 )
-
-
-def _add_doctor_arguments(_: argparse.ArgumentParser) -> None:
-    """Add no arguments beside ``--db`` and ``--json``."""
 
 
 def _run_doctor(arguments: argparse.Namespace) -> ExitCode:
     """Print the findings; exit code 1 if results cannot be trusted."""
     findings = examine(arguments.db, trial_key)
     if arguments.json:
-        say_json([dataclasses.asdict(one) for one in findings])
+        say_json([asdict(one) for one in findings])
     else:
         show(*map(plain, _doctor_lines(findings)))
     errors = any(one.severity == "error" for one in findings)
@@ -135,7 +126,6 @@ def _doctor_lines(findings: list[Finding]) -> list[str]:
 DOCTOR_COMMAND = Command(
     "doctor",
     "check for damage, incomplete results, wrong keys and stale claims",
-    _add_doctor_arguments,
     _run_doctor,
 )
 
@@ -148,7 +138,7 @@ def _run_upgrade(arguments: argparse.Namespace) -> ExitCode:
     """Upgrade the database in one transaction, after a backup."""
     done = upgrade(arguments.db, backup=not arguments.no_backup)
     if arguments.json:
-        say_json({**dataclasses.asdict(done), "changed": done.changed})
+        say_json({**asdict(done), "changed": done.changed})
     else:
         say(_upgrade_sentence(done))
     return ExitCode.DONE
@@ -168,8 +158,8 @@ def _upgrade_sentence(done: Upgrade) -> str:
 UPGRADE_COMMAND = Command(
     "upgrade",
     "migrate an older database to the newest schema",
-    _add_upgrade_arguments,
     _run_upgrade,
+    _add_upgrade_arguments,
 )
 
 
@@ -193,7 +183,7 @@ def _run_backup(arguments: argparse.Namespace) -> ExitCode:
 
 
 BACKUP_COMMAND = Command(
-    "backup", "copy the database to a file", _add_backup_arguments, _run_backup
+    "backup", "copy the database to a file", _run_backup, _add_backup_arguments
 )
 
 
@@ -248,7 +238,7 @@ def _retry_sentence(arguments: argparse.Namespace, count: int, left: Counter[str
 
 
 RETRY_COMMAND = Command(
-    "retry", "let trials without a result run again", _add_retry_arguments, _run_retry
+    "retry", "let trials without a result run again", _run_retry, _add_retry_arguments
 )
 
 
@@ -328,23 +318,17 @@ def _prune_sentence(found: Prunable, deleted: int, *, dry: bool) -> str:
     return f"{deleted:,} trials were deleted ({kinds}): {size}; {space}.{rest}"
 
 
-PRUNE_COMMAND = Command("prune", "delete old or unwanted trials", _add_prune_arguments, _run_prune)
-
-
-def _add_vacuum_arguments(_: argparse.ArgumentParser) -> None:
-    """Add no arguments beside ``--db`` and ``--json``."""
+PRUNE_COMMAND = Command("prune", "delete old or unwanted trials", _run_prune, _add_prune_arguments)
 
 
 def _run_vacuum(arguments: argparse.Namespace) -> ExitCode:
     """Vacuum the database and print its size before and after."""
     done = vacuum(arguments.db)
     if arguments.json:
-        say_json(dataclasses.asdict(done))
+        say_json(asdict(done))
     else:
         say(f"{done.safe_url}: {done.before:,} bytes before, {done.after:,} bytes now")
     return ExitCode.DONE
 
 
-VACUUM_COMMAND = Command(
-    "vacuum", "give the space of deleted rows back", _add_vacuum_arguments, _run_vacuum
-)
+VACUUM_COMMAND = Command("vacuum", "give the space of deleted rows back", _run_vacuum)

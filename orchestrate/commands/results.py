@@ -105,7 +105,7 @@ def _text(value: object) -> str:
     return line if len(line) <= _MAX_TEXT else f"{line[: _MAX_TEXT - 1]}…"
 
 
-QUERY_COMMAND = Command("query", "run a read-only SQL query", _add_query_arguments, _run_query)
+QUERY_COMMAND = Command("query", "run a read-only SQL query", _run_query, _add_query_arguments)
 
 
 _BYTES_PER_MIB = 2**20
@@ -215,8 +215,8 @@ def _number(value: float | None) -> str | None:
 SHOW_COMMAND = Command(
     "show",
     "show one trial: configuration, launches, attempts, loss",
-    _add_show_arguments,
     _run_show,
+    _add_show_arguments,
 )
 
 

@@ -82,7 +82,7 @@ def _look(reader: Reader, arguments: argparse.Namespace) -> Status:
 
 
 STATUS_COMMAND = Command(
-    "status", "show progress, failures and running launches", _add_status_arguments, _run_status
+    "status", "show progress, failures and running launches", _run_status, _add_status_arguments
 )
 
 
@@ -118,11 +118,6 @@ def parts(status: Status, max_rows: int) -> Iterator[RenderableType]:
             f"{_plural(len(status.mixed), 'configuration')} with results of different code "
             f"(the first is {status.mixed[0][:12]}): python -m orchestrate doctor",
             style="yellow",
-        )
-    if status.rounded:
-        yield Text(
-            f"{_plural(status.rounded, 'trial')} of ranges of an earlier version, with values such "
-            f"as 0.30000000000000004: the same range now gives 0.3, and runs other trials"
         )
     if status.explorations:
         yield Text("\nExplorations", style="bold")
@@ -316,5 +311,5 @@ def _to_stderr(line: str) -> None:
 
 
 WORK_COMMAND = Command(
-    "work", "run registered trials on this machine", _add_work_arguments, _run_work
+    "work", "run registered trials on this machine", _run_work, _add_work_arguments
 )
