@@ -17,7 +17,6 @@ from orchestrate.commands.status import watch
 from orchestrate.queries import Status, gather
 from orchestrate.store import Claim, ConfigRow, Reader, Store, StoreUnavailableError
 from tests.orchestrate.commands.conftest import WAITING, Answer, failure, run_now
-from tests.orchestrate.standins import trial_of
 from tests.orchestrate.store.fakes import LAUNCH, Spec, result
 from tests.orchestrate.store.places import execute
 
@@ -125,14 +124,6 @@ def test_the_rate_is_that_of_the_living(store: Store, take: Take, reader: Reader
     assert 3 / 120 < status.rate <= 3
     store.end_launch(1, "done")
     assert gather(reader, reader.configs()).rate == 0
-
-
-def test_trials_with_the_digits_of_earlier_ranges_are_named(command: Run, store: Store) -> None:
-    old, new = trial_of("random", 0, gamma=0.1 + 0.2), trial_of("random", 0, gamma=0.3)
-    store.register(store.begin_launch(LAUNCH), [new])
-    assert "earlier version" not in command("status").out
-    store.register(store.begin_launch(LAUNCH), [old, old.with_seed(1)])
-    assert "2 trials of ranges of an earlier version" in " ".join(command("status").out.split())
 
 
 class TestTable:
