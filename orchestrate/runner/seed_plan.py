@@ -6,7 +6,7 @@ the spread is underestimated (Y. Chow and H. Robbins, "On the asymptotic theory 
 sequential confidence intervals for the mean", 1965): Student's interval of 95 %, with a first look
 after ten seeds, covers the mean of normal values in 93.4 % of simulated studies, and that of skewed
 ones in 92 %. The interval here is Student's of 98 %, with no stop before 20 seeds.
-``python -m benchmarks --only adaptive_seeds`` simulates its coverage.
+``python -m studies.adaptive_seeds.coverage`` simulates its coverage.
 """
 
 from __future__ import annotations
