@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import Connection, bindparam, select, update
 
+from dopt.spec.config import REGISTRIES, section_class
 from dopt.spec.label import config_label
 from orchestrate.store import database_url, launches, packed_curves, schema
 from orchestrate.store.backends import sqlite
@@ -105,12 +106,14 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
 
 
 def _write_labels(connection: Connection) -> None:
-    """Write the labels as this program makes them."""
+    """Write the labels as this program makes them, of configurations whose classes are known."""
     columns = select(config.c.config_id, config.c.config_json, config.c.label)
+    stored = [(row[0], json.loads(row[1]), row[2]) for row in connection.execute(columns)]
     rows = [
         {"id": config_id, "text": text}
-        for config_id, document, label in connection.execute(columns)
-        if (text := config_label(json.loads(document))) != label
+        for config_id, document, label in stored
+        if all(section_class(document, key) for key in REGISTRIES if document.get(key))
+        and (text := config_label(document)) != label
     ]
     if rows:
         statement = update(config).where(config.c.config_id == bindparam("id"))

@@ -133,6 +133,17 @@ def test_every_configuration_gets_its_label(old: str) -> None:
     assert shown == set(found)
 
 
+def test_the_label_of_a_class_that_is_not_known_stays(old: str) -> None:
+    execute(old, "UPDATE config SET label = 'stored'")
+    gone = "replace(config_json, '\"uniform\"', '\"gone\"')"
+    execute(old, f"UPDATE config SET config_json = {gone}")
+    upgrade(old)
+    with Reader.open(old) as reader:
+        found = [row[0] for row in reader.query("SELECT label FROM config ORDER BY config_id")]
+    assert found[0] == "random, adam, horizon 25, depth 1, width 2"
+    assert found[2] == "stored"
+
+
 def test_a_launch_goes_on_after_it(old: str) -> None:
     upgrade(old)
     with Store.open(old) as store:
