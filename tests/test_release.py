@@ -90,7 +90,16 @@ def test_no_command_for_pip_names_the_project_that_has_the_name_of_the_import() 
     by_pip = r"(pip|uv)[^\n]* (install|add|download)[^\n]*[ '\"]dopt\b(?!-)"
     foreign = re.compile(rf"\bdopt\[[a-z]|{by_pip}")
     files = [path for path in (*ROOT.glob("*"), ROOT / "docker/Dockerfile") if path.is_file()]
-    for folder in ("analysis", "benchmarks", "conf", "docker", "docs", "dopt", "orchestrate"):
+    for folder in (
+        "analysis",
+        "benchmarks",
+        "conf",
+        "docker",
+        "docs",
+        "dopt",
+        "orchestrate",
+        "studies",
+    ):
         files += [path for path in (ROOT / folder).rglob("*") if path.suffix in WRITTEN]
     assert len(files) > 500
     assert not [path for path in files if foreign.search(path.read_text(errors="replace"))]
