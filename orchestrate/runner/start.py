@@ -7,13 +7,14 @@ of ``launch.dry_run=true``, are here.
 from __future__ import annotations
 
 import dataclasses
+import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
 
-from dopt.control.task import GOAL_FIELDS
 from dopt.kernel import warm_up
 from dopt.run import run_trial
+from dopt.spec.label import labels
 from dopt.spec.trial import TrialSpec
 from orchestrate.cli_parser import tell
 from orchestrate.config.command_line import Request
@@ -190,13 +191,7 @@ def _traceback(reader: Reader, trial: TrialSpec) -> str:
     return str(rows[0][0]) if rows else ""
 
 
-SECTIONS = ("env", "policy", "model", "learner", "task", "limits")
-ABSENT = {"name": "none"}
-ALWAYS = ("env", "policy")
 COUNTS = ("trials", "done", "failed", "to run")
-
-Values = dict[str, object]
-"""Values of a configuration: the name of each section, and each field by its dotted path."""
 
 
 def preview(grid: Grid, url: str, retry: str | None = None) -> str:
@@ -207,19 +202,16 @@ def preview(grid: Grid, url: str, retry: str | None = None) -> str:
     again = RETRIED[retry] if retry else ()
     status = _statuses(url)
     rows: dict[str, Counter[str]] = {}
-    configs: dict[str, Values] = {}
     for trial in grid.trials:
-        if trial.config_key not in configs:
-            configs[trial.config_key] = _values(trial)
         row = rows.setdefault(trial.config_key, Counter())
         row["trials"] += 1
         found = status.get(trial.trial_key)
         row["to run" if found in again else _heading(found)] += 1
-    shown = _columns(list(configs.values()))
-    lines = [[*(_heading_of(column) for column in shown), *COUNTS]]
-    for key, row in rows.items():
-        lines.append([_cell(configs[key].get(column)) for column in shown])
-        lines[-1] += [f"{row[name]:,}" for name in COUNTS]
+    configs = list({trial.config_key: trial for trial in grid.trials}.values())
+    lines = [["env", "configuration", *COUNTS]]
+    for trial, label in zip(configs, _labels(configs), strict=True):
+        numbers = [f"{rows[trial.config_key][name]:,}" for name in COUNTS]
+        lines.append([trial.system.name, label, *numbers])
     left_out = [f"left out {count:,} trials: {why}" for why, count in grid.left_out.items()]
     total = sum(rows.values(), Counter[str]())
     plural = "" if total["trials"] == 1 else "s"
@@ -227,63 +219,25 @@ def preview(grid: Grid, url: str, retry: str | None = None) -> str:
     return "\n".join([*aligned(lines), *left_out, end])
 
 
+def _labels(configs: Sequence[TrialSpec]) -> list[str]:
+    """Return the stored labels, or others where these do not tell all configurations apart."""
+    stored = [str(trial.columns()["label"]) for trial in configs]
+    pairs = {(trial.system.name, label) for trial, label in zip(configs, stored, strict=True)}
+    if len(pairs) == len(configs):
+        return stored
+    return labels([json.loads(trial.config_json) for trial in configs])
+
+
 def _statuses(url: str) -> dict[str, str]:
     try:
         reader = Reader.open(url)
     except NoDatabaseError:
         return {}
-    try:
-        return {str(row[0]): str(row[1]) for row in _stored_rows(reader)}
-    finally:
-        reader.close()
-
-
-def _stored_rows(reader: Reader) -> list[tuple[object, ...]]:
-    return [tuple(row) for row in reader.rows("SELECT trial_key, status FROM trial")]
+    with reader:
+        return dict(map(tuple, reader.rows("SELECT trial_key, status FROM trial")))
 
 
 def _heading(status: str | None) -> str:
     if status in FINISHED:
         return "done"
     return "failed" if status in ("failed", "cancelled") else "to run"
-
-
-def _values(trial: TrialSpec) -> Values:
-    content = trial.to_mapping()
-    values: Values = {}
-    for section in SECTIONS:
-        fields = content.get(section, ABSENT)
-        assert isinstance(fields, dict)
-        # The goal belongs to the system, so that it distinguishes no configurations.
-        shown = {key: value for key, value in fields.items() if key not in GOAL_FIELDS}
-        values |= {f"{section}.{key}": value for key, value in shown.items()}
-        values[section] = values.pop(f"{section}.name")
-    return values
-
-
-def _columns(configs: Sequence[Values]) -> list[str]:
-    """Return the columns that distinguish the configurations.
-
-    A field is shown if it differs between configurations with the same option of its section; the
-    masses of two systems always differ.
-    """
-    names = [
-        one for one in SECTIONS if one in ALWAYS or len({config[one] for config in configs}) > 1
-    ]
-    seen: dict[tuple[str, object], str] = {}
-    fields: dict[str, None] = {}
-    for config in configs:
-        for path in config.keys() - set(SECTIONS):
-            text = _cell(config[path])
-            if seen.setdefault((path, config[path.split(".")[0]]), text) != text:
-                fields[path] = None
-    return [*names, *sorted(fields)]
-
-
-def _heading_of(column: str) -> str:
-    """Return the key that sets a column."""
-    return "width" if column == "model.width" else column
-
-
-def _cell(value: object) -> str:
-    return "-" if value is None else str(value)
