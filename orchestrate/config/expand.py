@@ -282,12 +282,10 @@ class _Composer:
         if path not in self._options:
             sources = self.loader.get_sources() if self._usual and "/" not in group else []
             found = next((one.load_config(path) for one in sources if one.is_config(path)), None)
-            alone = (
-                found is not None
-                and found.header["package"] in (None, "_group_", group)
-                and "defaults" not in found.config
-            )
-            self._options[path] = found.config if found is not None and alone else None
+            own = found is not None and found.header["package"] in (None, "_group_", group)
+            content = found.config if found is not None and own else None
+            plain = isinstance(content, DictConfig) and "defaults" not in content
+            self._options[path] = content if plain else None  # type: ignore[assignment]
         return self._options[path]
 
     def _is_choice(self, override: Override) -> bool:

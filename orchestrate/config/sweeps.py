@@ -143,7 +143,7 @@ def _unshuffled(shuffle: Callable[..., Any], *args: Any, **named: Any) -> Any:
     shuffled = shuffle(*args, **named)
     if not isinstance(shuffled, Sweep):
         raise ValueError("a shuffled list is another value each time: write it in its order")
-    shuffled.shuffle = False
+    shuffled.shuffle = False  # type: ignore[attr-defined]  # every sweep here has it
     return shuffled
 
 
