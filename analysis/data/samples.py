@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
+from analysis.formatting import of_finished
 from dopt.limits import VIOLATIONS, limits_from
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
@@ -55,10 +56,7 @@ class Sample:
 
     def describe(self) -> str:
         """Return the count to print, such as ``98/100, 2 diverged``."""
-        used = len(self.values)
-        if not self.n_diverged:
-            return str(used)
-        return f"{used}/{self.n_finished}, {self.n_diverged} diverged"
+        return of_finished(len(self.values), self.n_finished, self.n_diverged)
 
 
 def apply_rule(

@@ -22,7 +22,7 @@ from analysis.figures.panels import (
     log_ticks,
     sheet,
 )
-from analysis.formatting import count_text
+from analysis.formatting import but_diverged, count_text
 from analysis.line_styles import environment_title, policy_style
 from analysis.stats.trajectories import Spectrum, average_spectrum
 from dopt.spec.trial import system_of
@@ -169,8 +169,7 @@ def draw(spectra: InputSpectra) -> Figure:
 def _line(axes: Axes, one: PolicySpectrum) -> None:
     style, spectrum = policy_style(one.policy), one.spectrum
     colour = GREYS.get(one.policy, style.colour)
-    left_out = f", {one.n_diverged} diverged" if one.n_diverged else ""
-    label = f"{style.label}, mean (n = {spectrum.n}{left_out})"
+    label = f"{style.label}, mean (n = {but_diverged(spectrum.n, one.n_diverged)})"
     f = spectrum.frequency[INNER]
     if one.policy == REFERENCE:
         axes.fill_between(

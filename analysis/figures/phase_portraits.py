@@ -26,7 +26,7 @@ from analysis.figures.panels import (
     rows_and_columns,
     sheet,
 )
-from analysis.formatting import plus_minus
+from analysis.formatting import but_diverged, plus_minus
 from analysis.line_styles import BLACK, environment_title, policy_style
 from analysis.stats.intervals import mean, standard_error
 from analysis.stats.trajectories import DrawnPlane, median_seed
@@ -208,8 +208,7 @@ def _panel(axes: Axes, portrait: Portrait, plane: DrawnPlane) -> None:
 
 def count_text(portrait: Portrait) -> str:
     """Return the number of trials behind the coverage."""
-    left_out = f", {portrait.n_diverged} diverged" if portrait.n_diverged else ""
-    return f"n = {portrait.n}{left_out}"
+    return f"n = {but_diverged(portrait.n, portrait.n_diverged)}"
 
 
 def coverage_text(portrait: Portrait) -> str:

@@ -25,7 +25,7 @@ from analysis.data.selection import (
     labelled,
     policy_rank,
 )
-from analysis.formatting import but_lost
+from analysis.formatting import but_diverged, but_lost
 from analysis.stats.intervals import CONFIDENCE, band
 from analysis.stats.scores import Scores
 from orchestrate.store import Assessments, Reader
@@ -190,7 +190,6 @@ def _curve(reader: Reader, entry: Entry, truth: TrueModel) -> ControlCurve:
     reached = np.isfinite(successes.values)
     success, success_low, success_high = _by_step(_rate, successes.values)
     cost, cost_low, cost_high = _by_step(_mean_ratio, ratios)
-    diverged = int(np.sum(successes.diverged))
     return ControlCurve(
         entry.config.env,
         entry.config.policy,
@@ -204,7 +203,7 @@ def _curve(reader: Reader, entry: Entry, truth: TrueModel) -> ControlCurve:
         cost_high,
         np.sum(reached & ~_usable(ratios), axis=0),
         truth,
-        f"{len(successes.seeds)}, {diverged} diverged" if diverged else f"{len(successes.seeds)}",
+        but_diverged(len(successes.seeds), int(np.sum(successes.diverged))),
     )
 
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from analysis.data.samples import DivergenceRule, read_sample
 from analysis.data.selection import Entry
+from analysis.formatting import of_finished
 from analysis.stats.intervals import interval_of_mean
 from orchestrate.store import Reader
 
@@ -52,10 +53,7 @@ class Scores:
 
     def describe(self) -> str:
         """Return the count to print, such as ``98/100, 2 diverged``."""
-        used = len(self.by_seed)
-        if not self.n_diverged:
-            return str(used)
-        return f"{used}/{self.n_finished}, {self.n_diverged} diverged"
+        return of_finished(len(self.by_seed), self.n_finished, self.n_diverged)
 
 
 def final_losses(reader: Reader, entry: Entry, column: str, rule: DivergenceRule) -> Scores:
