@@ -137,11 +137,12 @@ def test_a_value_cannot_fill_the_memory(visit: Visit, sqlite_grid: str) -> None:
 def test_too_many_at_once_wait_or_are_told(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sql, "TIMEOUT_SECONDS", 0.05)
     for _ in range(sql.MAX_CONCURRENT):
         assert sql._slots.acquire(blocking=False)
     try:
-        assert post(client, "/api/sql", "SELECT 1").status_code == 429
+        with monkeypatch.context() as patch:
+            patch.setattr(sql, "TIMEOUT_SECONDS", 0.05)
+            assert post(client, "/api/sql", "SELECT 1").status_code == 429
     finally:
         for _ in range(sql.MAX_CONCURRENT):
             sql._slots.release()
