@@ -30,8 +30,7 @@ from orchestrate.files import whole
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]
-Move = Callable[[int, int], object]
-"""Puts a panel into the state of a frame, at a step."""
+Move = Callable[[int, int], object]  # puts a panel into the state of a frame, at a step
 
 FOLLOW = 4.0
 """Sizes of its body that a system travels before the view follows it."""
