@@ -1,4 +1,4 @@
-"""Questions about single trials: a step, its evaluation, a whole trial, and the torch reference."""
+"""Questions about single trials: a step, its evaluation, a whole trial, and the torch path."""
 
 from __future__ import annotations
 
@@ -114,10 +114,10 @@ def _seconds(spec: TrialSpec) -> tuple[float, float]:
 BATCH = 100
 GPU_BATCHES = (BATCH, 4_096)
 SKIPPED = 14
-"""First steps of a batch, in which torch allocates and operations are recorded."""
+"""First steps of a batch, in which torch allocates."""
 
 SETTLED = 160
-"""Steps of one trial: the window is full after 100, and its gradient recorded soon after."""
+"""Steps of one trial: the window is full after 100."""
 
 
 def reference(quick: bool) -> list[Row]:

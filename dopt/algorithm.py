@@ -12,6 +12,8 @@ class ModelKind(IntEnum):
     LINEAR = 1
     RANDOM_FEATURES = 2
     GAUSSIAN_PROCESS = 3
+    LINEAR_STATE = 4
+    GREY_BOX = 5
 
 
 class FeatureKind(IntEnum):

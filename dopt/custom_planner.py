@@ -8,7 +8,9 @@ import numpy as np
 
 from dopt.control.task import Feedback
 from dopt.errors import SpecificationError
-from dopt.policies import POLICIES
+from dopt.learning import Adam
+from dopt.models import MLP
+from dopt.policies import POLICIES, Disagreement
 from dopt.policies.base import Array, CustomPolicy, Planner, TaskPolicy
 from dopt.randomness import stream
 from dopt.registry import check_returned
@@ -30,6 +32,9 @@ def custom_planner(spec: TrialSpec) -> Planner | None:
     policy, system, rng = spec.policy, spec.system, stream(spec.seed, "planner")
     if not isinstance(policy, CustomPolicy):
         return None
+    if isinstance(policy, Disagreement) and isinstance(spec.model, MLP):
+        assert isinstance(spec.learner, Adam)
+        return policy.network_planner(system, spec.model, spec.learner, rng)
     if isinstance(policy, TaskPolicy):
         method, plan = "task_planner", policy.task_planner(system, spec.config.goal, rng)
     else:

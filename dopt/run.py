@@ -27,7 +27,7 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     spec : TrialSpec
         Trial to run.
     path : {"kernel", "reference"}, optional
-        Compiled kernel or torch reference, in place of what the specification says.
+        Compiled kernel or torch, in place of what the specification says.
 
     Returns
     -------

@@ -73,6 +73,15 @@ class TrialView(ABC):
         With the columns of :meth:`input_matrix` it is what Proposition 1 calls D B.
         """
 
+    @property
+    def covariance(self) -> Array:
+        """Inverse of the information matrix, (q, q), where policy or learner holds one.
+
+        A sample with the rows J adds JᵀJ to the inverse of it. It is M⁻¹, or M⁻¹/ρ with a learner
+        whose samples add JᵀJ/ρ to M.
+        """
+        raise NotImplementedError
+
     @abstractmethod
     def following(self, state: Array, inputs: Array) -> Array:
         """Return the predicted next states, (N, d), for inputs (N, m) at (d,)."""

@@ -43,7 +43,8 @@ def check_environment(disabled: object = None) -> None:
     if str(given or 0).strip() != "0":
         raise UnusableEnvironmentError(
             f"NUMBA_DISABLE_JIT is {given}, with which Numba compiles nothing, but trials run as "
-            f"compiled code: unset it, also in .numba_config.yaml, and run the same command again."
+            f"compiled code: unset it, also in .numba_config.yaml, and set DOPT_PLAIN=1 for "
+            f"breakpoints; then run the same command again."
         )
 
 

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dopt.kernel import cache
+from dopt.kernel.plain import PLAIN
 from dopt.process import usable_cores
 
 ENDS = ("first", "last")
@@ -41,7 +42,7 @@ def compile_missing(names: Sequence[str]) -> None:
     names : sequence of str
         Names of parts of the package: those of :func:`dopt.kernel.warming.kernel_parts`.
     """
-    needed = cache.missing(names)
+    needed = [] if PLAIN else cache.missing(names)
     if not needed or not cache.can_be_filled():
         return
     start, next_message, spoke, over = time.perf_counter(), 0.0, False, False

@@ -13,6 +13,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, register_jitable
 
+from dopt.kernel import plain
 from dopt.kernel.cache import check_environment
 from dopt.kernel.stored_code import stored
 from dopt.types import NumbaType, Vector
@@ -52,6 +53,8 @@ def _njit(function: F, *, fastmath: bool | set[str] = False, nogil: bool = False
     Numba compiles a function once, and hands it the liberties of the caller for which it does so
     unless ``fastmath`` is given, if only as False.
     """
+    if plain.PLAIN:
+        return function
     options = {"error_model": "numpy", "fastmath": fastmath, "nogil": nogil}
     return cast(F, stored(numba.njit(**options)(function)))
 
@@ -79,6 +82,7 @@ def copy_into(values: Vector, out: Vector) -> None:
         out[i] = values[i]
 
 
+@plain.or_plain(plain.power_of_two)
 @intrinsic
 def power_of_two(typing_context: NumbaType, shifted: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of Numba
     """Return 2^k for a float that holds the integer k in the lowest bits of its significand."""
@@ -98,6 +102,7 @@ def power_of_two(typing_context: NumbaType, shifted: NumbaType) -> NumbaType:  #
     return shifted(shifted), generate
 
 
+@plain.or_plain(plain.monotonic_microseconds)
 @intrinsic
 def monotonic_microseconds(typing_context: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of Numba
     """Read the system's monotonic clock [µs] (POSIX clock_gettime)."""

@@ -25,11 +25,14 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from dopt.errors import SpecificationError
 from dopt.kernel.cache import errors_of_the_system, one_compiler_at_a_time
 from dopt.kernel.compiler import compilable
+from dopt.kernel.plain import PLAIN
 from dopt.kernel.stored_code import stored
 from dopt.systems import elementary
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox, unknown_accelerations
 from dopt.types import Array, CompiledFunction, Equation, NumbaType, Scalar
+
+as_tuple = (lambda values, _: tuple(values)) if PLAIN else to_fixed_tuple
 
 KNOWN = types.void(float64[::1], float64[::1], float64[::1], float64[::1])
 ACCELERATIONS = types.void(float64[::1], float64[::1], float64[::1])
@@ -142,7 +145,8 @@ def _compiled_functions(
 ) -> Equations:
     name, n_read = _name(known, n_states), n_states + n_inputs_read
     known, accelerations = compilable(known), compilable(accelerations)
-    with one_compiler_at_a_time(name) if _shipped(known) else errors_of_the_system():
+    stored_once = _shipped(known) and not PLAIN
+    with one_compiler_at_a_time(name) if stored_once else errors_of_the_system():
         return Equations(
             _known_into(known, n_states, n_inputs, n_parameters),
             _accelerations_into(accelerations, n_read, n_parameters, ACCELERATIONS),
@@ -165,8 +169,8 @@ def _refused(function: Equation, sizes: tuple[int, ...], kind: NumbaType) -> Spe
     return SpecificationError(
         f"{function.__qualname__} of {file} does not compile{place} ({reason}), but sums, "
         f"products, comparisons and the functions of dopt.systems.elementary are expected: write "
-        f"it with these, or declare compiled = False in the class, whose trials then run on the "
-        f"reference."
+        f"it with these, or declare compiled = False in the class, whose trials then run in torch "
+        f"where it has the policy."
     )
 
 
@@ -175,9 +179,9 @@ def _known_into(
 ) -> CompiledFunction:
     def into(x: Array, u: Array, p: Array, out: Array) -> None:
         values = function(
-            to_fixed_tuple(x, n_states),
-            to_fixed_tuple(u, n_inputs),
-            to_fixed_tuple(p, n_parameters),
+            as_tuple(x, n_states),
+            as_tuple(u, n_inputs),
+            as_tuple(p, n_parameters),
         )
         for i in range(len(values)):
             out[i] = values[i]
@@ -189,7 +193,7 @@ def _accelerations_into(
     function: Equation, n_read: int, n_parameters: int, signature: NumbaType
 ) -> CompiledFunction:
     def into(x: Array, p: Array, out: Array) -> None:
-        values = function(to_fixed_tuple(x, n_read), to_fixed_tuple(p, n_parameters))
+        values = function(as_tuple(x, n_read), as_tuple(p, n_parameters))
         for i in range(len(values)):
             out[i] = values[i]
 
@@ -209,6 +213,8 @@ def _compiled_for(
     name = f"{function.__module__}.{function.__qualname__}.{sizes[0]}"
     into.__qualname__ = name if own else f"{name}.{next(_foreign)}"
     into.__name__ = into.__qualname__.replace(".", "_").replace("<", "_").replace(">", "_")
+    if PLAIN:
+        return into
     compiled = numba.njit(error_model="numpy", fastmath=False)(into)
     if own:  # the cache's folder is named after the package's sources: only they belong in it
         stored(compiled)

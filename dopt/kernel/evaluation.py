@@ -9,6 +9,7 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled, squared, vectorized
 from dopt.kernel.gaussian_process import kernel_value, mean_weights
+from dopt.kernel.grey_box import write_values
 from dopt.kernel.network import features_at, mean_forward
 from dopt.kernel.structs import Evaluation, Network, Plant
 from dopt.types import Matrix, Real, Singles, Vector
@@ -39,7 +40,13 @@ class Buffers(NamedTuple):
 
 @compiled
 def model_error(
-    network: Network, thetas: Matrix, points: Evaluation, start: int, stop: int, buffers: Buffers
+    plant: Plant,
+    network: Network,
+    thetas: Matrix,
+    points: Evaluation,
+    start: int,
+    stop: int,
+    buffers: Buffers,
 ) -> float:
     """Return sqrt(mean ‖a_θ(x) - a(x)‖²) over the points from ``start`` to ``stop``.
 
@@ -51,7 +58,9 @@ def model_error(
     if network.kind == ModelKind.LINEAR:
         return _linear_error(theta, points, start, stop)
     r = buffers.outputs.shape[0]
-    if network.kind == ModelKind.RANDOM_FEATURES:
+    if network.kind == ModelKind.GREY_BOX:
+        return _grey_box_error(plant, network, theta, points, start, stop, buffers.outputs)
+    if network.kind in (ModelKind.RANDOM_FEATURES, ModelKind.LINEAR_STATE):
         W = theta.reshape(r, points.basis.shape[1])
         return _combination_error(W, points, start, stop, buffers.outputs)
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
@@ -109,6 +118,25 @@ def _combination_error(
     for block in range(start, stop):
         np.dot(W, points.basis[block, : W.shape[1]], outputs)
         used = points.block_sizes[block]
+        total += _squared_errors(outputs, points.block_targets[block], used)
+        count += used
+    return float(np.sqrt(total / count)) if count else np.nan
+
+
+@compiled
+def _grey_box_error(
+    plant: Plant,
+    network: Network,
+    theta: Vector,
+    points: Evaluation,
+    start: int,
+    stop: int,
+    outputs: Matrix,
+) -> float:
+    total, count = 0.0, 0
+    for block in range(start, stop):
+        used = points.block_sizes[block]
+        write_values(plant, network, theta, points.features[block, :, :used], outputs[:, :used])
         total += _squared_errors(outputs, points.block_targets[block], used)
         count += used
     return float(np.sqrt(total / count)) if count else np.nan

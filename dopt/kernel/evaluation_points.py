@@ -68,6 +68,8 @@ def points_of_trial(
         np.cos(values, out=values)
         values *= network.waves.scale
         points = points._replace(basis=values, n_basis=np.array([values.shape[1]]))
+    elif network.kind == ModelKind.LINEAR_STATE:
+        points = points._replace(basis=points.features)
     elif network.kind == ModelKind.GAUSSIAN_PROCESS:
         room = np.zeros((points.bounds[2], horizon, BLOCK))
         points = points._replace(basis=room, n_basis=np.zeros(1, dtype=np.int64))

@@ -22,6 +22,7 @@ from dopt.kernel.state_from_spec import (
     regularization_of,
 )
 from dopt.limits import Limits
+from dopt.models import MLP
 from dopt.policies import (
     ICEM,
     EOptimal,
@@ -110,10 +111,10 @@ def information_of(config: TrialConfig) -> args.Information:
     """Return the functions for the form that holds M, which are compiled when a trial runs."""
     if not isinstance(config.policy, InformationPolicy):
         return args.Information(absent.add_rows, absent.planning_forms)
-    linear = config.model.structure == "least_squares"
-    module = primal_linear if linear else MODULES[Form(form_of(config))]
+    network = isinstance(config.model, MLP)
+    module = MODULES[Form(form_of(config))] if network else primal_linear
     if is_fresh(config.policy):
-        module = fresh  # which goes with a network and the primal form
+        module = fresh  # which goes with the primal form
     searches = isinstance(config.policy, (Search, ICEM))
     return args.Information(
         absent.add_rows if config.learner.updates_information else module.add_rows,

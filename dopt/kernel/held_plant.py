@@ -6,10 +6,13 @@ millisecond; here that is done once.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from numba import types
 from numba.experimental import structref
 
 from dopt.kernel.compiler import compiled
+from dopt.kernel.plain import or_plain
 from dopt.kernel.structs import Plant
 
 
@@ -24,9 +27,16 @@ class HeldPlant(structref.StructRefProxy):  # type: ignore[misc]
     plant: Plant
 
 
+class PlainPlant(NamedTuple):
+    """What stands for it in the interpreter (:mod:`dopt.kernel.plain`)."""
+
+    plant: Plant
+
+
 structref.define_proxy(HeldPlant, HeldPlantType, ("plant",))
 
 
+@or_plain(PlainPlant)
 @compiled
 def hold_plant(plant: Plant) -> HeldPlant:
     """Return a plant as one."""

@@ -12,6 +12,8 @@ from numba.experimental import structref
 from numba.extending import intrinsic
 
 from dopt.kernel.compiler import compiled
+from dopt.kernel.plain import Held, or_plain
+from dopt.kernel.plain import trial_in as plain_trial_in
 from dopt.kernel.struct_pointers import pointer_to
 from dopt.kernel.structs import Steps, Trial
 from dopt.types import NumbaType
@@ -34,12 +36,14 @@ FIELDS = ("trial", "steps")
 structref.define_proxy(HeldTrial, HeldTrialType, FIELDS)
 
 
+@or_plain(Held)
 @compiled
 def hold(trial: Trial, steps: Steps) -> HeldTrial:
     """Return a trial and its functions as one; it writes into the same arrays."""
     return HeldTrial(trial, steps)
 
 
+@or_plain(plain_trial_in)
 @intrinsic
 def trial_in(typing_context: NumbaType, held: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of Numba
     """Return a pointer to the trial that is held."""

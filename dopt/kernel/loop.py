@@ -180,8 +180,8 @@ def evaluate(trial: Trial, points: Evaluation, t: int, thetas: Matrix, buffers: 
         add_sample(network, points, sampled_state(plant, record.states, t))
     if plant.history.shape[0] > 1:
         follow_truth(plant, network, points, t)
-    loss = model_error(network, thetas, points, bounds[0], bounds[1], buffers)
-    reachable_loss = model_error(network, thetas, points, bounds[1], bounds[2], buffers)
+    loss = model_error(plant, network, thetas, points, bounds[0], bounds[1], buffers)
+    reachable_loss = model_error(plant, network, thetas, points, bounds[1], bounds[2], buffers)
     record.loss[t], record.reachable_loss[t] = loss, reachable_loss
     record.evaluate_us[t] = monotonic_microseconds() - start
     return bool(np.isfinite(loss))

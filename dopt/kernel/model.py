@@ -2,7 +2,8 @@
 
 Where a model is linear in its parameters the rows of J are the regressors Ψ(x). For the linear form
 of physics their change along a direction is taken by a complex step through the system's own
-equations, for random features by their derivative (:mod:`dopt.kernel.random_features`).
+equations, for random features by their derivative (:mod:`dopt.kernel.random_features`). Those of a
+grey box are in :mod:`dopt.kernel.grey_box`.
 """
 
 from __future__ import annotations
@@ -10,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel import gaussian_process, random_features
+from dopt.kernel import gaussian_process, grey_box, random_features
 from dopt.kernel import network as nn
 from dopt.kernel import network_backward as backward
 from dopt.kernel import network_tangents as tangents
-from dopt.kernel.compiler import compiled
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.state_structs import Linearization
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Stack, Vector
@@ -32,7 +33,7 @@ def regressors(plant: Plant, network: Network, x: Vector, rows: Matrix, offset: 
         rows[:] = np.nan
         offset[:] = np.nan
         return
-    if network.kind == ModelKind.RANDOM_FEATURES:
+    if network.kind in (ModelKind.RANDOM_FEATURES, ModelKind.LINEAR_STATE):
         random_features.write_rows(network, x, rows)
         offset[:] = 0.0
         return
@@ -45,11 +46,36 @@ def regressors(plant: Plant, network: Network, x: Vector, rows: Matrix, offset: 
 
 
 @compiled
-def regressors_along(
-    plant: Plant, network: Network, x: Vector, direction: Vector, component: int, out: Vector
+def parameter_rows(
+    plant: Plant, network: Network, theta: Vector, x: Vector, rows: Matrix, value: Vector
 ) -> None:
-    """Write the derivative of row ``component`` of Ψ, (q,), along a direction of the state."""
-    if network.kind == ModelKind.RANDOM_FEATURES:
+    """Write J, (r, q), and a_θ, (r,), at a point, for any model but a network."""
+    if network.kind == ModelKind.GREY_BOX:
+        constants = grey_box.constants_with(plant, network, theta)
+        plant.accelerations(x, constants, value)
+        grey_box.write_constant_rows(plant, x, constants, network.unknown, rows)
+        return
+    regressors(plant, network, x, rows, value)
+    add_linear(rows, theta, value)
+
+
+@compiled
+def row_along(
+    plant: Plant,
+    network: Network,
+    theta: Vector,
+    x: Vector,
+    direction: Vector,
+    component: int,
+    out: Vector,
+) -> None:
+    """Write the derivative of row ``component`` of J, (q,), along a direction of the state."""
+    if network.kind == ModelKind.GREY_BOX:
+        rows = np.empty((plant.learned_rows.shape[0], out.shape[0]))
+        grey_box.write_rows_along(plant, network, theta, x, direction, rows)
+        copy_into(rows[component], out)
+        return
+    if network.kind in (ModelKind.RANDOM_FEATURES, ModelKind.LINEAR_STATE):
         random_features.write_row_along(network, x, direction, component, out)
         return
     z = np.empty(x.shape[0], np.complex128)
@@ -84,6 +110,9 @@ def model_accelerations(
     """Write a_θ, (r,), at a point x."""
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
         gaussian_process.write_mean(network, theta, x, out)
+        return
+    if network.kind == ModelKind.GREY_BOX:
+        plant.accelerations(x, grey_box.constants_with(plant, network, theta), out)
         return
     if network.kind != ModelKind.MLP:
         rows = np.empty((out.shape[0], theta.shape[0]))
@@ -121,6 +150,9 @@ def accelerations_at(
 ) -> None:
     """Write a_θ, (r, N), at points, (N, ·)."""
     N, r = states.shape[0], outputs.shape[0]
+    if network.kind == ModelKind.GREY_BOX:
+        grey_box.write_values(plant, network, theta, states.T, outputs)
+        return
     if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)
         for n in range(N):
@@ -249,7 +281,7 @@ def rows_at(plant: Plant, network: Network, theta: Vector, states: Matrix) -> Ma
     rows, value = np.empty((n * r, theta.shape[0])), np.empty(r)
     for i in range(n):
         if network.kind != ModelKind.MLP:
-            regressors(plant, network, states[i], rows[r * i : r * (i + 1)], value)
+            parameter_rows(plant, network, theta, states[i], rows[r * i : r * (i + 1)], value)
         else:
             rows[r * i : r * (i + 1)] = network_jacobian(network, theta, states[i], value)
     return rows
@@ -266,20 +298,20 @@ def gradients_along_inputs(
 
 
 @compiled
-def linear_gradients(
+def parameter_gradients(
     plant: Plant,
     network: Network,
-    q: int,
+    theta: Vector,
     x: Vector,
     directions: Matrix,
     component: int,
 ) -> Matrix:
-    """Return g and the columns of D B of a linear model as rows, (1 + m, q)."""
-    m, r = directions.shape[0], plant.learned_rows.shape[0]
+    """Return g and the columns of D B of any model but a network as rows, (1 + m, q)."""
+    m, r, q = directions.shape[0], plant.learned_rows.shape[0], theta.shape[0]
     out, rows = np.empty((1 + m, q)), np.empty((r, q))
-    regressors(plant, network, x, rows, np.empty(r))
+    parameter_rows(plant, network, theta, x, rows, np.empty(r))
     for i in range(q):
         out[0, i] = rows[component, i]
     for j in range(m):
-        regressors_along(plant, network, x, directions[j], component, out[1 + j])
+        row_along(plant, network, theta, x, directions[j], component, out[1 + j])
     return out

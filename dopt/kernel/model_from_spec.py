@@ -8,42 +8,59 @@ from dopt.algorithm import FeatureKind, ModelKind
 from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
 from dopt.kernel.state_structs import Members
-from dopt.models import MLP, MODELS, RFF, AffineMLP, GaussianProcess, Linear
+from dopt.models import (
+    MLP,
+    MODELS,
+    RFF,
+    AffineMLP,
+    GaussianProcess,
+    GreyBox,
+    Linear,
+    LinearState,
+)
 from dopt.models.base import Model
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.types import Vector
+
+KINDS: dict[type[Model], ModelKind] = {
+    MLP: ModelKind.MLP,
+    Linear: ModelKind.LINEAR,
+    RFF: ModelKind.RANDOM_FEATURES,
+    GaussianProcess: ModelKind.GAUSSIAN_PROCESS,
+    LinearState: ModelKind.LINEAR_STATE,
+    GreyBox: ModelKind.GREY_BOX,
+}
+"""Models that the kernel evaluates, and classes derived from them."""
 
 FEATURE_KINDS = {"identity": FeatureKind.IDENTITY, "cos": FeatureKind.COS, "sin": FeatureKind.SIN}
 
 
 def network_of(system: System, model: Model) -> args.Network:
     """Return the architecture of a model on a system."""
-    if isinstance(model, MLP):
-        kind, sizes = ModelKind.MLP, model.layer_sizes(system)
-    elif isinstance(model, Linear):
-        kind, sizes = ModelKind.LINEAR, (len(system.features), 1, system.n_learned)
-    elif isinstance(model, RFF):
-        kind, sizes = ModelKind.RANDOM_FEATURES, (len(system.features), 1, system.n_learned)
-    elif isinstance(model, GaussianProcess):
-        kind, sizes = ModelKind.GAUSSIAN_PROCESS, (len(system.features), 1, system.n_learned)
-    else:
+    kinds = [kind for one, kind in KINDS.items() if isinstance(model, one)]
+    if not kinds:
         raise SpecificationError(
             f"model '{model.name}' says that it is compiled, but the kernel knows "
             f"{', '.join(name for name, one in MODELS.items() if one.compiled)} alone: set "
             f"compiled = False in its class."
         )
-    inputs = model.layer_inputs(system) if isinstance(model, MLP) else sizes[:-1]
+    features = model.features(system)
+    sizes: tuple[int, ...] = (len(features), 1, system.n_learned)
+    inputs = sizes[:-1]
+    if isinstance(model, MLP):
+        sizes, inputs = model.layer_sizes(system), model.layer_inputs(system)
     lengths = [(n_in + 1) * n_out for n_in, n_out in zip(inputs, sizes[1:], strict=True)]
     n_read = model.n_inputs_read(system)
-    features = model.features(system)
+    unknown = model.names(system) if isinstance(model, GreyBox) else ()
     return args.Network(
-        int(kind),
+        int(kinds[0]),
         np.array(sizes),
         np.array(inputs),
         np.cumsum([0, *lengths[:-1]]),
         n_read,
         n_read if isinstance(model, AffineMLP) else 0,
+        np.array([system.physical.index(name) for name in unknown], dtype=np.int64),
         np.array([FEATURE_KINDS[feature.kind] for feature in features]),
         np.array([feature.index for feature in features]),
         np.array(model.feature_scales(system)),

@@ -11,8 +11,8 @@ from dopt.kernel.held_trial import HeldTrial, trial_in
 from dopt.kernel.integration import next_model_state
 from dopt.kernel.model import (
     gradients_along_inputs,
-    linear_gradients,
     model_accelerations,
+    parameter_gradients,
     rows_at,
 )
 from dopt.kernel.policies.prediction import input_columns
@@ -45,7 +45,7 @@ def write_jacobian_change(held: HeldTrial, point: Vector, directions: Matrix, ou
         if network.kind == ModelKind.MLP:
             rows = gradients_along_inputs(plant, network, theta, point, directions, i)
         else:
-            rows = linear_gradients(plant, network, theta.shape[0], point, directions, i)
+            rows = parameter_gradients(plant, network, theta, point, directions, i)
         for j in range(directions.shape[0]):
             copy_into(rows[1 + j], out[j, i])
 

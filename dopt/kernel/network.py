@@ -1,6 +1,6 @@
 """The model in compiled code: values and gradients, for batches and single states.
 
-Twin of the ``torch.nn.Module`` of the reference. In the backward passes δ is the derivative of an
+In the backward passes δ is the derivative of an
 output with respect to the pre-activations of a layer, and h the activations. The output layer has
 the last hidden layer for its inputs, and with it the inputs of the system where they multiply it
 (:mod:`dopt.kernel.output_layer`).

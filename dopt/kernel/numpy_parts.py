@@ -13,6 +13,7 @@ from dopt.custom_planner import custom_planner
 from dopt.errors import SpecificationError
 from dopt.kernel import model_queries
 from dopt.kernel.held_trial import HeldTrial
+from dopt.kernel.information.primal import dense
 from dopt.kernel.pointers import compiled_step
 from dopt.kernel.structs import Trial
 from dopt.learning.base import CustomLearner, Updater, check_update
@@ -119,6 +120,7 @@ class KernelTrialView(TrialView):
         record, state = trial.record, trial.state
         self.system, self.t = system, t
         self._ask, self._size = ask, len(state.theta)
+        self._covariance, self._row_scale = state.covariance, trial.algorithm.search.row_scale
         self._point_size = system.n_states + trial.network.n_inputs_read
         self.states, self.inputs = _fixed(record.states[: t + 1]), _fixed(record.inputs[:t])
         self.sampled_inputs = _fixed(state.estimate.inputs[:t])
@@ -153,6 +155,15 @@ class KernelTrialView(TrialView):
         out = np.empty((len(along), self.system.n_learned, self._size))
         self._ask(model_queries.write_jacobian_change, point, along, out)
         return out
+
+    @property
+    def covariance(self) -> Array:
+        if not self._covariance.upper.shape[0]:
+            raise SpecificationError(
+                "a plan asked for the covariance of the parameters, but the trial holds no matrix "
+                "M of all of them: derive the policy from InformationPolicy with the form 'primal'."
+            )
+        return dense(self._covariance) * self._row_scale**2
 
     def following(self, state: Array, inputs: Array) -> Array:
         x = _given("a state", state, self.system.n_states)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numba
 from numba import float64, int64, types
@@ -23,6 +23,7 @@ from dopt.kernel.compilation import compile_missing
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
 from dopt.kernel.held_trial import HeldTrial
 from dopt.kernel.layout import layout_of
+from dopt.kernel.plain import PLAIN
 from dopt.kernel.state_structs import State
 from dopt.kernel.struct_pointers import pointer_to
 from dopt.kernel.structs import Evaluation, Information, Network, Plant, Steps, Trial
@@ -237,6 +238,8 @@ def _own(
     part: Policy | Learner, function: Callable[..., None], signature: NumbaType
 ) -> CompiledFunction:
     """Compile the function of a user's own policy or learner."""
+    if PLAIN:
+        return cast(Callable[..., Any], function)
     try:
         return compiled_own(function, signature)
     except NumbaError as error:
@@ -283,6 +286,8 @@ def compiled_for(
     name: str, function: CompiledFunction, kinds: tuple[NumbaType, ...]
 ) -> Callable[..., Any]:
     """Return the machine code of a function for types of arguments; compile it unless it is."""
+    if PLAIN:
+        return cast(Callable[..., Any], function)
     if (name, kinds) not in _done:
         with one_compiler_at_a_time(
             f"{name}-{hashlib.sha256(str(kinds).encode()).hexdigest()[:16]}"

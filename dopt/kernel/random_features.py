@@ -1,7 +1,9 @@
-"""Random Fourier features and their derivatives in compiled code (:mod:`dopt.models.linear`).
+"""Combinations W ψ(x) of D given functions of the state, and their derivatives, in compiled code.
 
-ψ(x) = c cos(Ω φ(x) + b) with φ the features of the state. The parameters that are learned are those
-of W, row by row, so that row k of J has ψ at the places k D to (k + 1) D and zeros elsewhere.
+Random Fourier features (:mod:`dopt.models.rff`) are ψ(x) = c cos(Ω φ(x) + b), with φ the features
+of the state; a linear map of the features (:mod:`dopt.models.linear_state`) has ψ = φ. The learned
+parameters are those of W, row by row: row k of J has ψ at the places k D to (k + 1) D and zeros
+elsewhere.
 """
 
 from __future__ import annotations
@@ -10,7 +12,8 @@ import math
 
 import numpy as np
 
-from dopt.kernel.compiler import compiled
+from dopt.algorithm import ModelKind
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.network import features_at
 from dopt.kernel.network_tangents import features_along
 from dopt.kernel.structs import Network
@@ -18,13 +21,24 @@ from dopt.types import Matrix, Vector
 
 
 @compiled
+def n_functions(network: Network) -> int:
+    """Return D."""
+    linear = network.kind == ModelKind.LINEAR_STATE
+    count: int = network.sizes[0] if linear else network.waves.phases.shape[0]
+    return count
+
+
+@compiled
 def write_rows(network: Network, x: Vector, rows: Matrix) -> None:
     """Write J, (r, r D), at a state."""
-    phi, D = np.empty(network.sizes[0]), network.waves.phases.shape[0]
+    phi, D = np.empty(network.sizes[0]), n_functions(network)
     features_at(network, x, phi)
     rows[:] = 0.0
     for i in range(D):
-        value = network.waves.scale * math.cos(_angle(network, phi, i))
+        if network.kind == ModelKind.LINEAR_STATE:
+            value = phi[i]
+        else:
+            value = network.waves.scale * math.cos(_angle(network, phi, i))
         for k in range(rows.shape[0]):
             rows[k, k * D + i] = value
 
@@ -38,7 +52,10 @@ def write_row_along(
     features_at(network, x, phi)
     features_along(network, x, direction, phi_dot)
     out[:] = 0.0
-    first = component * network.waves.phases.shape[0]
+    first = component * n_functions(network)
+    if network.kind == ModelKind.LINEAR_STATE:
+        copy_into(phi_dot, out[first : first + phi_dot.shape[0]])
+        return
     for i in range(network.waves.phases.shape[0]):
         slope = 0.0
         for j in range(phi_dot.shape[0]):

@@ -69,6 +69,7 @@ class Network(NamedTuple):
     offsets: Integers  # (L + 1,) where each layer's weights start in the parameter vector
     n_inputs_read: int  # m where the model depends on the inputs, 0 elsewhere
     n_factors: int  # m where they multiply the last hidden layer, 0 elsewhere
+    unknown: Integers  # (q,) which constants of the plant are θ; empty but in a grey box
     feature_kinds: Integers  # (p,) dopt.algorithm.FeatureKind
     feature_indices: Integers  # (p,)
     feature_scales: Vector  # (p,)

@@ -62,9 +62,7 @@ class Updater(ABC):
 class CustomLearner(Learner):
     """A learner whose update is written in numpy.
 
-    In the kernel the interpreter calls it between compiled steps. An update that is written in
-    torch (:class:`dopt.reference.batch_trial_view.BatchTrialView`) runs on the reference path
-    alone: its class declares ``compiled = False``.
+    In the kernel the interpreter calls it between compiled steps.
     """
 
     compiled: ClassVar[bool] = True

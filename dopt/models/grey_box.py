@@ -10,7 +10,7 @@ import numpy as np
 
 from dopt.fields import parameter
 from dopt.models.base import Array, Model
-from dopt.systems.base import System
+from dopt.systems.base import Feature, System
 from dopt.types import Scalar
 
 
@@ -34,7 +34,7 @@ class GreyBox(Model):
     """
 
     name: ClassVar[str] = "grey_box"
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
 
     unknown: tuple[str, ...] = parameter(())
     initial: tuple[float, ...] = parameter(())
@@ -53,6 +53,14 @@ class GreyBox(Model):
 
     def n_inputs_read(self, system: System) -> int:
         return system.n_inputs if system.reads_inputs else 0
+
+    def features(self, system: System) -> tuple[Feature, ...]:
+        """Return the point itself: the equations read states, and the inputs where they count."""
+        read = system.n_states + self.n_inputs_read(system)
+        return tuple(Feature("identity", index) for index in range(read))
+
+    def feature_scales(self, system: System) -> tuple[float, ...]:
+        return (1.0,) * len(self.features(system))
 
     def physical_values(self, system: System, theta: Sequence[Scalar]) -> list[Scalar]:
         """Return all physical parameters in their order, with q unknown ones, each of any kind."""

@@ -21,7 +21,7 @@ class LinearState(Model):
 
     name: ClassVar[str] = "linear_state"
     structure: ClassVar[str] = "least_squares"
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
 
     def n_parameters(self, system: System) -> int:
         return system.n_learned * len(system.features)

@@ -145,9 +145,7 @@ class Planner(ABC):
 class CustomPolicy(ClosedLoop):
     """A closed-loop policy whose plan is written in numpy.
 
-    In the kernel the interpreter calls it between compiled steps. A plan that is written in torch
-    (:class:`dopt.reference.batch_trial_view.BatchTrialView`) runs on the reference path alone: its
-    class declares ``compiled = False``.
+    In the kernel the interpreter calls it between compiled steps.
     """
 
     compiled: ClassVar[bool] = True

@@ -9,13 +9,15 @@ import numpy as np
 
 from dopt.errors import IncompatibleError
 from dopt.fields import parameter
-from dopt.policies.base import Array, ClosedLoop
+from dopt.policies.base import Array, CustomPolicy, Planner
+from dopt.sphere import sphere_maximizer
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
+from dopt.trial_view import TrialView
 
 
 @dataclass(frozen=True, kw_only=True)
-class GreedyLinear(ClosedLoop):
+class GreedyLinear(CustomPolicy):
     """Maximise x(u)ᵀ Γ⁻¹ x(u) on the sphere ‖u‖ = γ, with Γ = λI + Σ x_s x_sᵀ over the states seen.
 
     With x(u) = x̄ + B u and the least-squares estimate in x̄ this is uᵀQu - 2vᵀu with Q = BᵀΓ⁻¹B and
@@ -32,7 +34,7 @@ class GreedyLinear(ClosedLoop):
     """
 
     name: ClassVar[str] = "linear"
-    compiled: ClassVar[bool] = False
+    compiled: ClassVar[bool] = True
 
     regularization: float = parameter(1e-3, bound="positive")
 
@@ -42,6 +44,34 @@ class GreedyLinear(ClosedLoop):
                 f"policy 'linear' needs dynamics that are linear in state and input, and the state "
                 f"itself as features, but env '{system.name}' is not so: choose another policy."
             )
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002  # ties are broken by the trial's
+        return GreedyLinearPlan(self, system)
+
+
+class GreedyLinearPlan(Planner):
+    """The plan of one trial: uᵀQu - 2vᵀu with states in feature scales, and the Γ so far."""
+
+    def __init__(self, policy: GreedyLinear, system: System) -> None:
+        self._system, self._gram = system, policy.regularization * np.eye(system.n_states)
+
+    def choose(self, view: TrialView) -> Array:
+        system, still = self._system, np.zeros((1, self._system.n_inputs))
+        center = system.featurize(view.following(view.states[-1], still))[0]
+        B = system.featurize(view.input_matrix(view.states[0]).T).T
+        solved = np.linalg.solve(self._gram, B)
+        Q, v = B.T @ solved, -(solved.T @ center)
+        if not np.isfinite(v).all():
+            return np.full(system.n_inputs, np.nan)  # the model has overflowed
+        if len(v) == 1:
+            up = v[0] < 0.0 or (v[0] == 0.0 and view.tie[0] > 0.0)
+            return np.array([system.gamma if up else -system.gamma])
+        best: Array = sphere_maximizer(Q, v, system.gamma, view.tie)
+        return best
+
+    def observe(self, view: TrialView) -> None:
+        z = self._system.featurize(view.sampled[-1:])[0]
+        self._gram += np.outer(z, z)
 
 
 def is_linear(system: System) -> bool:

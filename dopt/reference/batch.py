@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Sequence
 
@@ -11,77 +10,436 @@ import torch
 from torch import Tensor, nn
 
 from dopt.control.task import Feedback
+from dopt.custom_planner import custom_planner
+from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set
-from dopt.reference.black_box import episodes_for, initial_states, stepped
-from dopt.reference.dynamics import true_accelerations, true_next_states
-from dopt.reference.gaussian_process import Posterior
-from dopt.reference.models import BatchModel
-from dopt.reference.recorded import Recorded
-from dopt.reference.steps import BatchSteps
+from dopt.learning import Adam
+from dopt.learning.base import CustomLearner, check_update
+from dopt.policies import DOptimal, InformationPolicy, Uniform
+from dopt.policies.base import OpenLoop, check_choice
+from dopt.policies.d_optimal import count_sketch
+from dopt.randomness import draw, episode_seed, stream
+from dopt.reference.models import (
+    BatchModel,
+    gradients_and_changes,
+    input_matrix,
+    jacobian,
+    known_flow,
+    model_function,
+    model_states,
+    network_function,
+    next_states,
+    true_accelerations,
+)
+from dopt.reference.planning import (
+    BatchInformation,
+    d_optimal_inputs,
+    planning_columns,
+    quadratic_problem,
+    uniform_inputs,
+)
 from dopt.result import TrialResult
+from dopt.spec.compatibility import held_information
 from dopt.spec.trial import TrialSpec
+from dopt.systems.black_box import BlackBox, new_start
+from dopt.trial_view import TrialView
 from dopt.types import Array
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us")
 
 
-class Lockstep(BatchSteps):
-    """A batch of n trials of one configuration that take each step together.
+class BatchState:
+    """n trials of one configuration in torch, before their first step.
 
-    Parameters and errors are those of :class:`dopt.reference.state.BatchState`.
+    Parameters
+    ----------
+    specs : sequence of TrialSpec
+        Trials that differ in the seed alone.
+    device : str
+        Torch device, ``"cpu"`` or ``"cuda"``.
+    module : torch.nn.Module, optional
+        Network from features to accelerations in place of the registered model; its parameters at
+        the time of the call are the initial ones of every trial.
+
+    Attributes
+    ----------
+    model : callable
+        a_θ of the batch (:data:`dopt.reference.models.BatchModel`).
+    theta : (n, q) tensor
+        Parameters.
+    states, inputs, targets : (n, T + 1, d), (n, T, m), (n, T, r) tensors
+        Visited states, applied inputs and observed accelerations; NaN where no trial has come yet.
+    sampled_states : (n, T, d) tensor
+        States at which the accelerations were observed.
+    information : BatchInformation or None
+        M in the space to which ``project`` maps gradients, (..., q).
+    diverged : (n, 1) tensor
+        Whether a trial has ended.
+    noise, open_loop, ties, components : tensors
+        Numbers of :class:`dopt.randomness.Draws` with the trials along the first axis.
+
+    Raises
+    ------
+    SpecificationError
+        If the trials belong to different configurations.
+    """
+
+    def __init__(
+        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
+    ) -> None:
+        if len({spec.config_key for spec in specs}) != 1:
+            raise SpecificationError(
+                f"{len(specs)} trials of different configurations were given, but those of a "
+                f"batch may differ in the seed alone: run one batch for each configuration."
+            )
+        self.specs, self.device = list(specs), device
+        self.system, self.config = specs[0].system, specs[0].config
+        draws = [draw(spec) for spec in specs]
+        self.noise = self.tensor(np.stack([d.noise for d in draws]))
+        self.open_loop = self.tensor(np.stack([d.inputs for d in draws]))
+        self.ties = self.tensor(np.stack([d.ties for d in draws]))
+        self.components = torch.tensor(np.stack([d.components for d in draws]), device=device)
+        if module is None:
+            self.model: BatchModel = model_function(self.system, self.config.model)
+            self.theta = self.tensor(np.stack([d.weights for d in draws]))
+        else:
+            self.model = network_function(self.system, module)
+            flat = nn.utils.parameters_to_vector(module.parameters()).detach().double()
+            self.theta = flat.to(device).repeat(len(specs), 1)
+        self._allocate()
+        self._hold_information()
+
+    def tensor(self, values: Array) -> Tensor:
+        """Return real numbers as a tensor where the trials are."""
+        return torch.tensor(values, dtype=torch.float64, device=self.device)
+
+    def _allocate(self) -> None:
+        n, T, system = len(self.specs), self.system.horizon, self.system
+        sizes = ((T + 1, system.n_states), (T, system.n_inputs), (T, system.n_learned))
+        self.states, self.inputs, self.targets = (
+            torch.full((n, *size), torch.nan, dtype=torch.float64, device=self.device)
+            for size in sizes
+        )
+        self.sampled_states = torch.full_like(self.states[:, 1:], torch.nan)
+        if not isinstance(system, BlackBox):  # which starts where its episodes do
+            self.states[:, 0] = self.tensor(np.array(system.initial_state))
+        self._rows = torch.tensor(system.learned_rows, device=self.device)
+        self.diverged = torch.zeros(n, 1, dtype=torch.bool, device=self.device)
+
+    def _hold_information(self) -> None:
+        policy, q = self.config.policy, self.theta.shape[1]
+        n_rows = self.system.n_learned * self.system.horizon
+        held = held_information(policy, self.config.learner, q, n_rows)
+        self._sketch: Tensor | None = None
+        self.information: BatchInformation | None = None
+        if held is None or not isinstance(policy, InformationPolicy):
+            return
+        if held.form == "sketch" and isinstance(policy, DOptimal):
+            buckets, signs = count_sketch(q, policy.sketch_size)
+            self._sketch = torch.zeros(q, policy.sketch_size).to(self.theta)
+            places = torch.tensor(buckets.astype(np.int64))
+            self._sketch[torch.arange(q), places] = torch.tensor(signs).to(self.theta)
+        self.information = BatchInformation(held.regularization, self.project(self.theta))
+
+    def project(self, rows: Tensor) -> Tensor:
+        """Return gradients, (..., q), in the space of M, (..., s): as they are, or their sketch."""
+        return rows if self._sketch is None else rows @ self._sketch
+
+    def observe(self, t: int, dt: float) -> None:
+        """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later.
+
+        With the integrator of Runge and Kutta, the accelerations are those of
+        :func:`dopt.kernel.loop.observe`.
+        """
+        system, x, u = self.system, self.states[:, t], self.inputs[:, t]
+        at = x if system.integrator == "euler" else 0.5 * (x + self.states[:, t + 1])
+        self.sampled_states[:, t] = at
+        known = known_flow(system, at, u)
+        observed = ((self.states[:, t + 1] - x) / dt - known).index_select(1, self._rows)
+        if system.integrator != "euler":
+            end = model_states(system, self.model, self.theta, x, u, dt)
+            step = ((end - x) / dt - known).index_select(1, self._rows)
+            observed = observed - (step - self.model(self.theta, at.unsqueeze(1)).squeeze(1))
+        self.targets[:, t] = observed
+
+    def alive(self) -> list[int]:
+        """Return the places of the trials that have not diverged."""
+        return [i for i, ended in enumerate(self.diverged[:, 0].tolist()) if not ended]
+
+
+class BatchTrialView(TrialView):
+    """Trial ``index`` of a batch after t steps, for a plan or an update in numpy."""
+
+    def __init__(self, batch: BatchState, index: int, t: int) -> None:
+        self.system, self.t = batch.system, t
+        self._model, self._theta = batch.model, batch.theta[index].clone()
+        self._batch, self._index = batch, index
+        self.states = _array(batch.states[index, : t + 1])
+        self.inputs = self.sampled_inputs = _array(batch.inputs[index, :t])
+        self.sampled = _array(batch.sampled_states[index, :t])
+        self.accelerations = _array(batch.targets[index, :t])
+        self.parameters = _array(self._theta)
+        last = t == self.system.horizon
+        self.tie = np.full(self.system.n_inputs, np.nan) if last else _array(batch.ties[index, t])
+
+    def points(self, states: Array, inputs: Array) -> Array:  # noqa: ARG002  # no model here reads inputs
+        return np.asarray(states, dtype=np.float64)
+
+    def predict(self, states: Array) -> Array:
+        return _array(self._model(self._theta[None], self._tensor(states)[None])[0])
+
+    def jacobian(self, state: Array) -> Array:
+        at = self._tensor(state)[None, None]
+        return _array(jacobian(self._model, self.system.n_learned, self._theta[None], at)[0, 0])
+
+    def jacobian_change(self, state: Array, directions: Array) -> Array:
+        along, r = self._tensor(directions), self.system.n_learned
+        items = len(along) * r
+        _, changes = gradients_and_changes(
+            self._model,
+            self._theta.expand(items, -1),
+            self._tensor(state).expand(items, -1),
+            torch.arange(r, device=along.device).repeat(len(along)),
+            along.repeat_interleave(r, dim=0),
+        )
+        return _array(changes.view(len(along), r, -1))
+
+    @property
+    def covariance(self) -> Array:
+        assert self._batch.information is not None
+        identity = (
+            torch.eye(len(self._theta)).to(self._batch.theta).repeat(len(self._batch.theta), 1, 1)
+        )
+        return _array(self._batch.information.solve(identity)[self._index])
+
+    def following(self, state: Array, inputs: Array) -> Array:
+        u = self._tensor(inputs)
+        x, theta = (one.expand(len(u), -1) for one in (self._tensor(state), self._theta))
+        return _array(model_states(self.system, self._model, theta, x, u, self.system.dt))
+
+    def input_matrix(self, state: Array) -> Array:
+        return _array(input_matrix(self.system, self._tensor(state)[None])[0])
+
+    def _tensor(self, values: Array) -> Tensor:
+        contiguous = np.ascontiguousarray(values)  # torch takes no negative strides
+        return torch.as_tensor(contiguous, dtype=self._theta.dtype, device=self._theta.device)
+
+
+def _array(values: Tensor) -> Array:
+    """Return a copy, so that nobody can change the trial."""
+    array: Array = values.detach().cpu().numpy().copy()
+    return array
+
+
+class AdamLearner:
+    """Adam on the newest samples, for the whole batch at once, as Adam is elementwise."""
+
+    def __init__(self, learner: Adam, batch: BatchState) -> None:
+        self._rule, self._batch = learner, batch
+        self._moments = torch.zeros_like(batch.theta), torch.zeros_like(batch.theta)
+
+    def learn(self, t: int) -> None:
+        """Take one step on the samples up to step t: what torch.optim.Adam computes."""
+        batch, rule, newest = (
+            self._batch,
+            self._rule,
+            slice(max(0, t + 1 - self._rule.window), t + 1),
+        )
+        gradient = loss_gradient(
+            batch.model, batch.theta, batch.sampled_states[:, newest], batch.targets[:, newest]
+        )
+        first, second = self._moments
+        first.lerp_(gradient, 1.0 - rule.beta_1)
+        second.mul_(rule.beta_2).addcmul_(gradient, gradient, value=1.0 - rule.beta_2)
+        unbiased = second.sqrt() / (1.0 - rule.beta_2 ** (t + 1)) ** 0.5
+        rate = rule.learning_rate / (1.0 - rule.beta_1 ** (t + 1))
+        batch.theta.addcdiv_(first, unbiased.add_(rule.epsilon), value=-rate)
+
+
+def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Tensor) -> Tensor:
+    """Return the gradient of mean_N ‖a_θ(x) - y‖² by θ, (n, q), at (n, N, d) and (n, N, r)."""
+    with torch.enable_grad():
+        at = theta.detach().requires_grad_()
+        squares = (model(at, states) - targets).square().sum(dim=-1)
+        # The gradient of a sum over trials holds that of each.
+        (gradient,) = torch.autograd.grad(squares.mean(dim=1).sum(), at)
+    return gradient
+
+
+class LeastSquaresLearner:
+    """Least squares over all samples with the ridge λ: θ = (λI + Σ JᵀJ)⁻¹ Σ Jᵀ(y - offset)."""
+
+    def __init__(self, regularization: float, batch: BatchState) -> None:
+        n, q = batch.theta.shape
+        self._batch, self._moment = batch, torch.zeros_like(batch.theta)
+        self._normal = regularization * torch.eye(q).to(batch.theta).repeat(n, 1, 1)
+
+    def learn(self, t: int) -> None:
+        """Absorb the sample of step t."""
+        batch, x = self._batch, self._batch.sampled_states[:, t : t + 1]
+        J = jacobian(batch.model, batch.system.n_learned, batch.theta, x)[:, 0]
+        offset = batch.model(torch.zeros_like(batch.theta), x).squeeze(1)
+        right = (batch.targets[:, t] - offset).unsqueeze(-1)
+        self._normal = self._normal + J.mT @ J
+        self._moment = self._moment + (J.mT @ right).squeeze(-1)
+        batch.theta.copy_(torch.linalg.solve(self._normal, self._moment))
+
+
+class NumpyLearner:
+    """The updates of a learner that is written in numpy, one trial after the other."""
+
+    def __init__(self, learner: CustomLearner, batch: BatchState) -> None:
+        self._batch = batch
+        self._updaters = [
+            learner.updater(spec.system, stream(spec.seed, "updater")) for spec in batch.specs
+        ]
+
+    def learn(self, t: int) -> None:
+        """Write the parameters that the updates return after step t.
+
+        Raises
+        ------
+        SpecificationError
+            If there are not as many parameters as before.
+        """
+        batch = self._batch
+        for i in batch.alive():
+            updated = self._updaters[i].update(BatchTrialView(batch, i, t + 1))
+            theta = np.asarray(updated, dtype=np.float64)
+            check_update(batch.config.learner.name, theta, tuple(batch.theta[i].shape))
+            batch.theta[i] = torch.as_tensor(theta).to(batch.theta)
+
+
+class BatchSteps(BatchState):
+    """The steps of a batch of trials, whatever comes between them: a simulation or a measurement.
+
+    Attributes
+    ----------
+    planners : list of Planner
+        The plan of each trial where the policy is written in numpy.
+    learner : object
+        What takes the learning step of the batch.
     """
 
     def __init__(
         self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
     ) -> None:
         super().__init__(specs, device, module)
-        self.episodes = episodes_for(self.specs)
-        if self.episodes:
-            self.states[:, 0] = initial_states(self.episodes)
-        self.columns = {
-            name: np.full((len(specs), self.system.horizon), np.nan) for name in COLUMNS
-        }
-        points = evaluation_set(self.system)
-        self.visited, self.applied = self.tensor(points.states), self.tensor(points.inputs)
-        self.truth, self.n_grid = self.tensor(points.accelerations), points.n_grid
-        self.evaluated = self.points(self.visited, self.applied)
-        self.prepare(self.evaluated)
-        constant = functools.partial(true_next_states, self.system, 0)
-        self._true_next_states = Recorded(constant)
-        known = self.model, self.evaluated.unsqueeze(0), self.n_grid
-        self._errors = Recorded(functools.partial(errors_of_model, *known))
+        plans = (custom_planner(spec) for spec in self.specs)
+        self.planners = [plan for plan in plans if plan is not None]
+        learner, policy = self.config.learner, self.config.policy
+        self.learner: AdamLearner | NumpyLearner | LeastSquaresLearner
+        if isinstance(learner, Adam):
+            self.learner = AdamLearner(learner, self)
+        elif isinstance(learner, CustomLearner):
+            self.learner = NumpyLearner(learner, self)
+        else:
+            ridge = getattr(policy, "regularization", getattr(learner, "regularization", 1.0))
+            self.learner = LeastSquaresLearner(float(ridge), self)
+
+    def plan(self, t: int) -> Tensor:
+        """Return the inputs u_t, (n, m); the first of a closed-loop policy is random."""
+        policy, system, x = self.config.policy, self.system, self.states[:, t]
+        if isinstance(policy, OpenLoop) or t == 0:
+            return self.open_loop[:, t]
+        if self.planners:
+            return self._planned_in_numpy(t)
+        if isinstance(policy, Uniform):
+            seen = self.states[:, : t + 1]
+            return uniform_inputs(system, self.model, self.theta, seen, policy.iterations)
+        assert self.information is not None
+        columns = planning_columns(system, self.model, self.theta, x, self.components[:, t])
+        problem = quadratic_problem(self.project(columns), self.information)
+        return d_optimal_inputs(problem, system.gamma, self.ties[:, t])
+
+    def _planned_in_numpy(self, t: int) -> Tensor:
+        """Return the inputs u_t, (n, m), of the trials' own plans; diverged ones get a random one.
+
+        Raises
+        ------
+        SpecificationError
+            If an input has the wrong shape or a norm above γ.
+        """
+        inputs = self.open_loop[:, t].clone()
+        for i in self.alive():
+            chosen = np.asarray(self.planners[i].choose(BatchTrialView(self, i, t)), np.float64)
+            check_choice(self.config.policy.name, chosen, t, self.system)
+            inputs[i] = torch.as_tensor(chosen).to(inputs)
+        return inputs
+
+    def learn(self, t: int) -> None:
+        """Update the parameters with the samples up to step t; diverged trials keep theirs."""
+        before = self.theta.clone()
+        self.learner.learn(t)
+        self.theta.copy_(torch.where(self.diverged, before, self.theta))
+
+    def inform(self, t: int) -> None:
+        """Add JᵀJ at x_t and the parameters after the learning step of time t (equation 5)."""
+        for i in self.alive() if self.planners else ():
+            self.planners[i].observe(BatchTrialView(self, i, t + 1))
+        if self.information is not None:
+            x = self.sampled_states[:, t : t + 1]
+            J = jacobian(self.model, self.system.n_learned, self.theta, x)
+            self.information.add(self.project(J[:, 0]))
+
+
+class Lockstep(BatchSteps):
+    """A batch of n trials of one configuration that take each step together.
+
+    Parameters and errors are those of :class:`BatchState`.
+    """
+
+    def __init__(
+        self, specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
+    ) -> None:
+        super().__init__(specs, device, module)
+        system = self.system
+        self._episodes = []
+        if isinstance(system, BlackBox):
+            self._episodes = [system.episode(episode_seed(spec.seed)) for spec in self.specs]
+            starts = np.stack([episode.state for episode in self._episodes])
+            self.states[:, 0] = self.tensor(starts)
+        self.columns = {name: np.full((len(specs), system.horizon), np.nan) for name in COLUMNS}
+        points = evaluation_set(system)
+        self._visited, self._applied = self.tensor(points.states), self.tensor(points.inputs)
+        self._truth, self._n_grid = self.tensor(points.accelerations), points.n_grid
         self.checkpoints: dict[int, Array] = {}
         self.feedbacks: dict[int, list[Feedback | None]] = {}
 
     def act(self, t: int, u: Tensor) -> None:
         """Apply u_t, store x_{t+1} (equation 2) and the observed accelerations."""
-        x = self.true_states[:, t]
-        if self.episodes:
-            u, following = stepped(self.episodes, x, u)
+        system, x = self.system, self.states[:, t]
+        if self._episodes:
+            u = self._step_episodes(t, u)
         else:
-            following = self._following(t, x, u) + self.noise[:, t]
+            following = next_states(
+                system, x, u, lambda z: true_accelerations(system, z, u, t), system.dt
+            )
+            self.states[:, t + 1] = following + self.noise[:, t]
         self.inputs[:, t] = u
-        self.true_states[:, t + 1] = following
-        if self.sensors:
-            self.sensors.measure(t)
-        self.observe(t, self.system.dt)
+        self.observe(t, system.dt)
 
-    def _following(self, t: int, x: Tensor, u: Tensor) -> Tensor:
-        """Return the states that follow (n, d) under inputs (n, m), without noise."""
-        if len(self.system.history) > 1:
-            return true_next_states(self.system, t, x, u)
-        following: Tensor = self._true_next_states(x, u)
-        return following
+    def _step_episodes(self, t: int, u: Tensor) -> Tensor:
+        """Let the runs of a black box go on; return what was applied, (n, m).
+
+        Where a run has begun anew, the state before the step becomes its start.
+        """
+        applied = u.clone()
+        for i, episode in enumerate(self._episodes):
+            applied[i] = self.tensor(episode.step(u[i].cpu().numpy()))
+            if (start := new_start(episode)) is not None:
+                self.states[i, t] = self.tensor(start)
+            self.states[i, t + 1] = self.tensor(episode.state)
+        return applied
 
     def evaluate(self, t: int) -> tuple[Tensor, Tensor]:
         """Return the RMS errors at step t over the grid and over the reachable set, (n,) each."""
         if len(self.system.history) > 1:
-            self.truth = true_accelerations(self.system, self.visited, self.applied, t)
-        if isinstance(self.learner, Posterior):
-            return errors(self.learner.predict_points(), self.truth, self.n_grid)
-        learned = self.theta if self.members is None else self.members
-        found: tuple[Tensor, Tensor] = self._errors(learned, self.truth)
-        return found
+            self._truth = true_accelerations(self.system, self._visited, self._applied, t)
+        predicted = self.model(self.theta, self._visited.unsqueeze(0))
+        squares = (predicted - self._truth).square().sum(dim=-1)
+        grid, reachable = squares[:, : self._n_grid], squares[:, self._n_grid :]
+        return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
 
     def step(self, t: int) -> None:
         """Take step t of every trial and record it."""
@@ -89,7 +447,7 @@ class Lockstep(BatchSteps):
         u = self.plan(t)
         clocks.append(self._clock())
         self.act(t, u)
-        inside = self.true_states[:, t + 1].abs() <= self.system.state_limit
+        inside = self.states[:, t + 1].abs() <= self.system.state_limit
         self.diverged |= ~inside.all(dim=1, keepdim=True)
         clocks.append(self._clock())
         self.learn(t)
@@ -108,7 +466,7 @@ class Lockstep(BatchSteps):
 
     def note_checkpoint(self, t: int) -> None:
         """Keep what has been learned after t steps, which is to be assessed."""
-        self.checkpoints[t] = self.parameters_of_model.cpu().numpy().copy()
+        self.checkpoints[t] = self.theta.cpu().numpy().copy()
         self.feedbacks[t] = [planner.feedback() for planner in self.planners]
 
     def _clock(self) -> float:
@@ -117,31 +475,14 @@ class Lockstep(BatchSteps):
         return time.perf_counter()
 
 
-def errors_of_model(
-    model: BatchModel, points: Tensor, n_grid: int, theta: Tensor, truth: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return :func:`errors` at points (1, N, ·) for θ (n, q), or (n, E, q) for networks' mean."""
-    if theta.ndim == 2:
-        return errors(model(theta, points), truth, n_grid)
-    each = [model(member, points) for member in theta.unbind(1)]
-    return errors(torch.stack(each).mean(dim=0), truth, n_grid)
-
-
-def errors(predicted: Tensor, truth: Tensor, n_grid: int) -> tuple[Tensor, Tensor]:
-    """Return the RMS errors of accelerations (n, N, r) at the first points and at the others."""
-    squares = (predicted - truth).square().sum(dim=-1)
-    grid, reachable = squares[:, :n_grid], squares[:, n_grid:]
-    return grid.mean(dim=1).sqrt(), reachable.mean(dim=1).sqrt()
-
-
 @torch.no_grad()
 def run_trials(
     specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
 ) -> list[TrialResult]:
     """Run trials of one configuration in lockstep; each result is that of the trial run alone.
 
-    Parameters and errors are those of :class:`dopt.reference.state.BatchState`. The seconds and
-    microseconds of a result are the batch's divided by its size.
+    Parameters and errors are those of :class:`BatchState`. The seconds and microseconds of a
+    result are the batch's divided by its size.
     """
     wall, cpu = time.perf_counter(), time.process_time()
     batch = Lockstep(specs, device, module)
@@ -157,26 +498,21 @@ def run_trials(
 
 def _result(batch: Lockstep, i: int, wall: float, cpu: float) -> TrialResult:
     """Cut trial i out of the batch; its rows end where it diverged."""
-    states, inputs = batch.true_states[i].cpu().numpy(), batch.inputs[i].cpu().numpy()
+    states, inputs = batch.states[i].cpu().numpy(), batch.inputs[i].cpu().numpy()
     columns = {name: rows[i].copy() for name, rows in batch.columns.items()}
     inside = np.all(np.abs(states[1:]) <= batch.system.state_limit, axis=1)
     wrong = np.flatnonzero(~(inside & np.isfinite(columns["loss"])))
     end = int(wrong[0]) if len(wrong) else None
     if end is not None:
-        for rows in (*columns.values(), inputs):
+        for rows in (*columns.values(), inputs, states):
             rows[end:] = np.nan
-        states[end:] = np.nan
     reached = [t for t in batch.checkpoints if end is None or t <= end]
     learned = {t: batch.feedbacks[t][i] for t in reached if batch.planners}
-    estimated = batch.states[i].cpu().numpy() if batch.sensors else None
-    if estimated is not None and end is not None:
-        estimated[end:] = np.nan
     return TrialResult(
         **columns,
         states=states,
         inputs=inputs,
-        parameters=batch.parameters_of_model[i].cpu().numpy().copy(),
-        estimated_states=estimated,
+        parameters=batch.theta[i].cpu().numpy().copy(),
         diverged_at=end,
         wall_seconds=wall,
         cpu_seconds=cpu,

@@ -1,4 +1,8 @@
-"""Models as functions of flat parameter vectors, for a batch of trials."""
+"""Models and dynamics over tensors, for a batch of trials, and their derivatives.
+
+All items of a derivative are taken together: each has parameters of its own, so that the gradient
+of a sum over the items holds the gradient of each.
+"""
 
 from __future__ import annotations
 
@@ -9,24 +13,14 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, vmap
 
-from dopt.models import (
-    MLP,
-    RFF,
-    AffineMLP,
-    GaussianProcess,
-    GreyBox,
-    Linear,
-    LinearState,
-    Model,
-)
-from dopt.systems.base import System, feature_values
+from dopt.models import MLP, Linear, Model
+from dopt.systems.base import System, feature_values, next_state
 from dopt.types import Scalar
 
 BatchModel = Callable[[Tensor, Tensor], Tensor]
-"""a_θ of n trials: parameters (n, q) and points (n, N, ·) to accelerations (n, N, r).
+"""a_θ of n trials: parameters (n, q) and states (n, N, d) to accelerations (n, N, r).
 
-A point is what the model depends on: a state, (d,), or a state and an input, (d + m,). Points that
-are the same for all trials may have 1 in the place of n.
+States that are the same for all trials may have 1 in the place of n.
 """
 
 
@@ -38,30 +32,20 @@ class Networked(Protocol):
 
 
 def model_function(system: System, model: Model) -> BatchModel:
-    """Return a_θ of a registered model."""
+    """Return a_θ of a model: a network, or the linear form of physics."""
     if isinstance(model, MLP):
         return mlp_function(system, model)
     if isinstance(model, Linear):
         return linear_function(system)
-    if isinstance(model, LinearState):
-        return linear_state_function(system)
-    if isinstance(model, RFF):
-        return rff_function(system, model)
-    if isinstance(model, GaussianProcess):
-        return process_function(system, model)
-    if isinstance(model, GreyBox):
-        return grey_box_function(system, model)
     if isinstance(model, Networked):
-        return network_function(system, model.module(system), model)
-    raise TypeError(f"model {model!r} is no Module and none of this package: give its module.")
+        return network_function(system, model.module(system))
+    raise TypeError(f"model {model!r} is no network and not linear: run it in the kernel.")
 
 
-def features(system: System, x: Tensor, model: Model | None = None) -> Tensor:
-    """Return the features, (..., p), of states (..., d), or of points of a model."""
-    kinds, scales = system.features, system.feature_scales
-    if model is not None:
-        kinds, scales = model.features(system), model.feature_scales(system)
-    return torch.stack(feature_values(kinds, scales, x.unbind(-1)), dim=-1)
+def features(system: System, x: Tensor) -> Tensor:
+    """Return the features, (..., p), of states (..., d)."""
+    values = feature_values(system.features, system.feature_scales, x.unbind(-1))
+    return torch.stack(values, dim=-1)
 
 
 class Layer(NamedTuple):
@@ -89,31 +73,21 @@ def layers(theta: Tensor, shapes: Sequence[tuple[int, int]]) -> list[Layer]:
 
 def mlp_function(system: System, model: MLP) -> BatchModel:
     """Return layers with tanh between them."""
-    sizes = model.layer_sizes(system)
-    shapes = list(zip(model.layer_inputs(system), sizes[1:], strict=True))
-    affine = isinstance(model, AffineMLP)
+    shapes = list(zip(model.layer_inputs(system), model.layer_sizes(system)[1:], strict=True))
 
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
         *hidden, output = layers(theta, shapes)
-        phi = features(system, x, model).expand(len(theta), -1, -1)
-        h = phi[..., : sizes[0]]
+        h = features(system, x).expand(len(theta), -1, -1)
         for layer in hidden:
             h = layer(h).tanh()
-        return output(_with_products(h, phi[..., sizes[0] :]) if affine else h)
+        return output(h)
 
     return accelerations
 
 
-def _with_products(h: Tensor, u: Tensor) -> Tensor:
-    """Return (h, h u₁, ..., h u_m, u) for hidden units (n, N, w) and inputs (n, N, m)."""
-    products = [h * column.unsqueeze(-1) for column in u.unbind(-1)]
-    return torch.cat([h, *products, u], dim=-1)
-
-
-def network_function(system: System, module: nn.Module, model: Model | None = None) -> BatchModel:
+def network_function(system: System, module: nn.Module) -> BatchModel:
     """Return a_θ for any module that maps the features, (p,), to accelerations, (r,).
 
-    The features are those of a state, or those of the points of a model.
     The flat vector holds the module's parameters in the order of ``module.named_parameters()``.
     """
     shapes = {name: parameter.shape for name, parameter in module.named_parameters()}
@@ -134,7 +108,7 @@ def network_function(system: System, module: nn.Module, model: Model | None = No
     over_trials, over_both = vmap(network), vmap(over_points)
 
     def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        phi = features(system, x, model).expand(len(theta), -1, -1)
+        phi = features(system, x).expand(len(theta), -1, -1)
         n, points = phi.shape[:2]
         if n > 1:
             many = over_both(theta, phi) if points > 1 else over_trials(theta, phi[:, 0])
@@ -157,62 +131,95 @@ def linear_function(system: System) -> BatchModel:
     return accelerations
 
 
-def grey_box_function(system: System, model: GreyBox) -> BatchModel:
-    """Return the system's own accelerations, with θ in the place of what is unknown."""
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        values = model.physical_values(system, theta.unsqueeze(-1).unbind(1))
-        rows = system.accelerations(x.unbind(-1), values)
-        return stack(rows).expand(len(theta), -1, -1)
-
-    return accelerations
-
-
-def linear_state_function(system: System) -> BatchModel:
-    """Return Θ φ(x), with θ the entries of Θ row by row."""
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        out: Tensor = features(system, x) @ theta.unflatten(1, (system.n_learned, -1)).mT
-        return out
-
-    return accelerations
-
-
-def rff_function(system: System, model: RFF) -> BatchModel:
-    """Return W ψ(x) of random Fourier features, with θ holding W, Ω and b."""
-    p, r, D = len(system.features), system.n_learned, model.n_features
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        weights, frequencies, phases = theta.split([r * D, D * p, D], dim=1)
-        projected = features(system, x) @ frequencies.unflatten(1, (D, p)).mT
-        waves = torch.cos(projected + phases.unsqueeze(1))
-        out: Tensor = model.scale * waves @ weights.unflatten(1, (r, D)).mT
-        return out
-
-    return accelerations
-
-
-def process_function(system: System, model: GaussianProcess) -> BatchModel:
-    """Return the posterior mean of a Gaussian process, with θ holding the samples and α."""
-    T, p, r = system.horizon, len(system.features), system.n_learned
-
-    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
-        centers, alpha = theta.split([T * p, T * r], dim=1)
-        values = kernel(model, features(system, x), centers.unflatten(1, (T, p)))
-        out: Tensor = values @ alpha.unflatten(1, (T, r))
-        return out
-
-    return accelerations
-
-
-def kernel(model: GaussianProcess, phi: Tensor, other: Tensor) -> Tensor:
-    """Return k, (..., N, N'), between features (..., N, p) and (..., N', p)."""
-    squares = (phi.unsqueeze(-2) - other.unsqueeze(-3)).square().sum(dim=-1)
-    return model.amplitude**2 * torch.exp(-0.5 / model.lengthscale**2 * squares)
-
-
 def stack(values: Sequence[Scalar]) -> Tensor:
     """Stack scalars, some of which may be plain numbers, along a new last axis."""
     like = next(value for value in values if isinstance(value, Tensor))
     tensors = [torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in values]
     return torch.stack(list(torch.broadcast_tensors(*tensors)), dim=-1)
+
+
+def known_flow(system: System, x: Tensor, u: Tensor) -> Tensor:
+    """Return the known part of dx/dt, (..., d), for states (..., d) and inputs (..., m)."""
+    return stack(system.known(x.unbind(-1), u.unbind(-1), system.parameters))
+
+
+def true_accelerations(system: System, x: Tensor, u: Tensor, step: int) -> Tensor:
+    """Return a at a step, (..., r), for states (..., d) and inputs (..., m)."""
+    parameters = system.history[min(step, len(system.history) - 1)].tolist()
+    point = torch.cat([x, u], dim=-1) if system.reads_inputs else x
+    return stack(system.accelerations(point.unbind(-1), parameters))
+
+
+def next_states(
+    system: System, x: Tensor, u: Tensor, accelerations: Callable[[Tensor], Tensor], dt: float
+) -> Tensor:
+    """Return the states, (..., d), dt seconds after (..., d) under held inputs, (..., m).
+
+    ``accelerations`` gives those, (..., r), of states.
+    """
+    rows = torch.tensor(system.learned_rows, device=x.device)
+
+    def rate(z: Tensor) -> Tensor:
+        return known_flow(system, z, u).index_add(-1, rows, accelerations(z))
+
+    following: Tensor = next_state(system.integrator, rate, x, dt)
+    return following
+
+
+def model_states(
+    system: System, model: BatchModel, theta: Tensor, x: Tensor, u: Tensor, dt: float
+) -> Tensor:
+    """Return what a model predicts dt seconds later, (n, d), for (n, q), (n, d) and (n, m)."""
+    return next_states(system, x, u, lambda z: model(theta, z.unsqueeze(1)).squeeze(1), dt)
+
+
+def input_matrix(system: System, x: Tensor) -> Tensor:
+    """Return B = dt ∂known/∂u, (n, d, m), at states (n, d)."""
+    n, d = x.shape
+    with torch.enable_grad():
+        u = x.new_zeros(n, d, system.n_inputs).requires_grad_()
+        known = known_flow(system, x.unsqueeze(1).expand(-1, d, -1), u)
+        # The i-th of d copies of the input is what the i-th state is differentiated by.
+        total = known.diagonal(dim1=1, dim2=2).sum()
+        if not total.requires_grad:
+            return torch.zeros_like(u)
+        (columns,) = torch.autograd.grad(total, u)
+    return system.dt * columns
+
+
+def jacobian(model: BatchModel, r: int, theta: Tensor, x: Tensor) -> Tensor:
+    """Return J = ∂a/∂θ, (n, N, r, q), of r accelerations for parameters (n, q) at (n, N, d)."""
+    (n, N), q = x.shape[:2], theta.shape[1]
+    with torch.enable_grad():
+        each = theta.detach()[:, None, None].expand(n, N, r, q).reshape(-1, q).requires_grad_()
+        values = model(each, x.unsqueeze(2).expand(n, N, r, -1).reshape(len(each), 1, -1))
+        total = values.view(-1, r, r).diagonal(dim1=1, dim2=2).sum()
+        (J,) = torch.autograd.grad(total, each, materialize_grads=True)
+    return J.view(n, N, r, q)
+
+
+def gradients_and_changes(
+    model: BatchModel, theta: Tensor, x: Tensor, components: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return g = ∂a_k/∂θ, and its derivative along a direction of the state, (n, q) each.
+
+    The derivative of g along b is the gradient, with respect to θ, of bᵀ ∂a_k/∂x.
+
+    Parameters
+    ----------
+    theta : (n, q)
+    x, directions : (n, d)
+    components : (n,)
+        The output k of each item.
+    """
+    with torch.enable_grad():
+        each, at = theta.detach().requires_grad_(), x.detach().requires_grad_()
+        chosen = model(each, at.unsqueeze(1)).squeeze(1).gather(1, components.unsqueeze(1))
+        g, slope = torch.autograd.grad(
+            chosen.sum(), (each, at), create_graph=True, materialize_grads=True
+        )
+        along = (slope * directions).sum()
+        if not along.requires_grad:  # the slope does not depend on θ
+            return g.detach(), torch.zeros_like(g)
+        (change,) = torch.autograd.grad(along, each, materialize_grads=True)
+    return g.detach(), change

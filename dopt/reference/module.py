@@ -26,8 +26,7 @@ class Module(Model):
 
     The class is called with the numbers p of features and r of learned accelerations and with the
     entries of its section by keyword. Its ``forward`` maps features, (p,), to accelerations, (r,),
-    in double precision, in evaluation mode, and differentiably by ``torch.func``; what it computes
-    outside of torch has to be constant (:mod:`dopt.reference.recorded`). θ holds all its
+    in double precision, in evaluation mode, and differentiably by ``torch.func``. θ holds all its
     parameters in the order of ``named_parameters()``. Its own initialisation, from a torch
     generator that the trial seeds, gives the initial ones.
 

@@ -1,28 +1,73 @@
-"""Closed-loop plans by automatic differentiation, for a batch of trials.
+"""Equations (5) to (7) for a batch of trials: the information matrix M and the inputs it asks for.
 
 ======  ==================================================  =========
 symbol  meaning (Proposition 1)                             shape
 ======  ==================================================  =========
 x̄       predicted state x_t + dt f_θ(x_t, 0)                d
-B       dt ∂f_θ/∂u at x̄                                     d × m
+B       dt ∂known/∂u at x̄                                   d × m
 g       ∂a_θ^k/∂θ at x̄                                      q
 D B     derivative of g along the columns of B              q × m
 M       information matrix                                  q × q
+J       rows that a sample adds: M grows by JᵀJ             r × q
 ======  ==================================================  =========
+
+The maximum on the sphere is found as in :mod:`dopt.math.sphere`, in another form: the root of the
+secular equation is enclosed for all problems at once, in intervals of which each is a part of the
+one before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dopt.algorithm import TIE_MARGIN
-from dopt.reference.derivatives import gradients_and_changes
-from dopt.reference.dynamics import LearnedDynamics
-from dopt.reference.sphere import maximize_on_spheres
+from dopt.reference.models import BatchModel, gradients_and_changes, input_matrix, model_states
+from dopt.systems.base import System
+
+SMALL = 100
+"""Largest size of an M that is factorised afresh after each step; of a larger one M⁻¹ is held."""
+
+PARTS = 64
+DIVISIONS = 11
+TINY = 1e-150
+ROUNDING = 4e-16
+
+
+class BatchInformation:
+    """M of n trials, (n, s, s), λI at the beginning, which grows by rows.
+
+    A trial for which rounding has left M indefinite has NaN in its solutions.
+    """
+
+    def __init__(self, regularization: float, like: Tensor) -> None:
+        n, s = like.shape
+        self._is_small, identity = s <= SMALL, torch.eye(s).to(like).repeat(n, 1, 1)
+        self._held = identity * (regularization if self._is_small else 1.0 / regularization)
+
+    def add(self, J: Tensor) -> None:
+        """Add JᵀJ for rows (n, r, s)."""
+        if self._is_small:
+            self._held = self._held + J.mT @ J
+            return
+        along = self._held @ J.mT
+        factor = cholesky_factor(torch.eye(J.shape[1]).to(J) + J @ along)
+        roots = torch.linalg.solve_triangular(factor, along.mT, upper=False)
+        self._held = torch.baddbmm(self._held, roots.mT, roots, alpha=-1)
+
+    def solve(self, columns: Tensor) -> Tensor:
+        """Return M⁻¹ C, (n, s, c), for columns C (n, s, c)."""
+        if not self._is_small:
+            return self._held @ columns
+        return torch.cholesky_solve(columns, cholesky_factor(self._held))
+
+
+def cholesky_factor(matrix: Tensor) -> Tensor:
+    """Return the lower Cholesky factors of matrices, (n, s, s); NaN where one is indefinite."""
+    factor, failed = torch.linalg.cholesky_ex(matrix)
+    return torch.where((failed > 0)[:, None, None], torch.nan, factor)
 
 
 class QuadraticProblem(NamedTuple):
@@ -32,95 +77,33 @@ class QuadraticProblem(NamedTuple):
     v: Tensor  # (n, m)
 
 
-def predicted_states(learned: LearnedDynamics, theta: Tensor, x: Tensor) -> Tensor:
+def predicted_states(system: System, model: BatchModel, theta: Tensor, x: Tensor) -> Tensor:
     """Return x̄ of every trial, (n, d), for parameters (n, q) and states (n, d)."""
-    system = learned.system
     zero = torch.zeros(len(x), system.n_inputs, dtype=x.dtype, device=x.device)
-    return learned.next_states(theta, x, zero, system.dt)
+    return model_states(system, model, theta, x, zero, system.dt)
 
 
 def planning_columns(
-    learned: LearnedDynamics,
-    project: Callable[[Tensor], Tensor],
-    theta: Tensor,
-    x: Tensor,
-    components: Tensor,
-    next_inputs: Tensor,
+    system: System, model: BatchModel, theta: Tensor, x: Tensor, components: Tensor
 ) -> Tensor:
-    """Return g and the columns of D B in the space of M, (n, c, 1 + m, s), for components (n, c).
-
-    Given are parameters (n, q) and states (n, d). ``next_inputs`` (n, m) are those of the next
-    sample, for a model that reads inputs. ``project`` maps gradients, (..., q), to the space of M,
-    (..., s): the identity, or a sketch.
-    """
-    g, DB = gradient_and_changes(learned, theta, x, components, next_inputs)
-    return project(torch.cat([g.unsqueeze(2), DB], dim=2))
-
-
-def drawn_columns(
-    learned: LearnedDynamics,
-    project: Callable[[Tensor], Tensor],
-    theta: Tensor,
-    x: Tensor,
-    components: Tensor,
-    directions: Tensor,
-    shares: Tensor,
-) -> Tensor:
-    """Return :func:`planning_columns` for next inputs of drawn directions, (n, m).
-
-    Their norms are drawn shares of γ, (n, 1).
-    """
-    lengths = torch.linalg.vector_norm(directions, dim=1, keepdim=True)
-    next_inputs = directions * (learned.system.gamma * shares / lengths)
-    return planning_columns(learned, project, theta, x, components, next_inputs)
-
-
-def quadratic_problem(columns: Tensor, solved: Tensor) -> QuadraticProblem:
-    """Return the sum of Q and of v over components k, from their :func:`planning_columns`.
-
-    ``solved`` (n, s, c (1 + m)) are M⁻¹ times these columns.
-    """
-    solved = solved.mT.view_as(columns)
-    Q = (columns[:, :, 1:] @ solved[:, :, 1:].mT).sum(dim=1)
-    v = -(columns[:, :, 1:] @ solved[:, :, :1].mT).sum(dim=1).squeeze(-1)
-    return QuadraticProblem(Q, v)
-
-
-def gradient_and_changes(
-    learned: LearnedDynamics, theta: Tensor, x: Tensor, components: Tensor, next_inputs: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Return g, (n, c, q), and D B, (n, c, m, q), for components (n, c).
-
-    They are those at the predicted state; a model that reads inputs is given the next one, which
-    does not change with the input that is planned.
-    """
-    bar = predicted_states(learned, theta, x)
-    B = learned.input_matrix(theta, bar)
-    n, c, m = len(x), components.shape[1], B.shape[2]
-    point = learned.points(bar, next_inputs)
-    columns = learned.points(B.mT, B.new_zeros(n, m, m))
-    shape = n, c, m
+    """Return g and the columns of D B as rows, (n, 1 + m, q), for components (n,)."""
+    bar = predicted_states(system, model, theta, x)
+    B = input_matrix(system, bar)
+    n, m = len(x), B.shape[2]
     g, DB = gradients_and_changes(
-        learned.model,
-        theta[:, None, None].expand(*shape, -1).flatten(0, 2),
-        point[:, None, None].expand(*shape, -1).flatten(0, 2),
-        components.unsqueeze(2).expand(shape).flatten(),
-        columns.unsqueeze(1).expand(*shape, -1).flatten(0, 2),
+        model,
+        theta.repeat_interleave(m, dim=0),
+        bar.repeat_interleave(m, dim=0),
+        components.repeat_interleave(m, dim=0),
+        B.mT.flatten(0, 1),
     )
-    return g.view(*shape, -1)[:, :, 0], DB.view(*shape, -1)
+    return torch.cat([g.view(n, m, -1)[:, :1], DB.view(n, m, -1)], dim=1)
 
 
-def best_inputs(
-    gamma: float, columns: Tensor, solved: Tensor, ties: Tensor, radii: Tensor
-) -> Tensor:
-    """Return the inputs, (n, m), from the :func:`planning_columns` and M⁻¹ times them.
-
-    Their norms are ``radii`` (n,) in γ.
-    """
-    Q, v = quadratic_problem(columns, solved)
-    scale = radii.unsqueeze(-1)  # on the sphere of radius γ, the problem in u / scale has scale Q
-    problem = QuadraticProblem(scale.unsqueeze(-1) * Q, v)
-    return scale * d_optimal_inputs(problem, gamma, ties)
+def quadratic_problem(columns: Tensor, information: BatchInformation) -> QuadraticProblem:
+    """Return Q and v from the :func:`planning_columns`, (n, 1 + m, s)."""
+    forms = columns @ information.solve(columns.mT)
+    return QuadraticProblem(forms[:, 1:, 1:], -forms[:, 1:, 0])
 
 
 def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> Tensor:
@@ -139,14 +122,16 @@ def d_optimal_inputs(problem: QuadraticProblem, gamma: float, ties: Tensor) -> T
     return torch.where(finite, chosen, torch.nan)
 
 
-def uniform_inputs(learned: LearnedDynamics, theta: Tensor, states: Tensor, steps: int) -> Tensor:
+def uniform_inputs(
+    system: System, model: BatchModel, theta: Tensor, states: Tensor, steps: int
+) -> Tensor:
     """Return the inputs, (n, m), that lead farthest from all states seen, (n, t + 1, d).
 
     Gradient ascent on the sphere from ±γ along every input axis, by automatic differentiation.
     """
-    system, x = learned.system, states[:, -1]
-    center = predicted_states(learned, theta, x).unsqueeze(1)
-    B = learned.input_matrix(theta, x)
+    x = states[:, -1]
+    center = predicted_states(system, model, theta, x).unsqueeze(1)
+    B = input_matrix(system, x)
     axes = torch.eye(system.n_inputs, dtype=x.dtype, device=x.device)
     starts = system.gamma * torch.stack([axes, -axes], dim=1).flatten(0, 1)
 
@@ -168,3 +153,76 @@ def uniform_inputs(learned: LearnedDynamics, theta: Tensor, states: Tensor, step
         best = torch.where(better.unsqueeze(-1), u[:, i], best)
         best_value = torch.where(better, value[:, i], best_value)
     return best
+
+
+def maximize_on_spheres(Q: Tensor, v: Tensor, radius: float, ties: Tensor) -> Tensor:
+    """Return maximisers, (n, m), of uᵀQu - 2vᵀu on ‖u‖ = radius.
+
+    Parameters
+    ----------
+    Q : (n, m, m)
+        Quadratic terms; the symmetric parts count.
+    v : (n, m)
+        Linear terms.
+    radius : float
+        γ > 0.
+    ties : (n, m)
+        Directions that decide between maximisers of equal value.
+    """
+    Q, v = _without_overflow(Q, v)
+    scale = torch.maximum(radius * Q.abs().amax((1, 2)), v.abs().amax(1))
+    flat, scale = (scale == 0)[:, None], scale.clamp_min(1e-300)
+    A = (Q + Q.mT) * (0.5 * radius / scale)[:, None, None]
+    values, axes = torch.linalg.eigh(A)
+    w = (axes.mT @ (v / scale[:, None]).unsqueeze(-1)).squeeze(-1)
+    preferred = (axes.mT @ ties.unsqueeze(-1)).squeeze(-1)
+    gaps = values[:, -1:] - values
+    top = gaps <= ROUNDING * values.shape[1] * values.abs().amax(1, keepdim=True)
+    gaps = torch.where(top, torch.zeros_like(gaps), gaps)
+
+    s = _secular_root(w, gaps, top)
+    unit = -w / (gaps + s).clamp_min(1e-300)
+    below = torch.where(top, torch.zeros_like(w), -w / torch.where(top, torch.ones_like(w), gaps))
+    missing = 1 - below.square().sum(1, keepdim=True)
+    along = torch.where(top, preferred, torch.zeros_like(preferred))
+    along = _direction(along, axis=-1)
+    hard = (torch.where(top, w, torch.zeros_like(w)).abs().amax(1, keepdim=True) < TINY) & (
+        missing >= 0
+    )
+    unit = torch.where(hard, below + along * missing.clamp_min(0).sqrt(), unit)
+    u = (axes @ unit.unsqueeze(-1)).squeeze(-1)
+    u = torch.where(flat, _direction(ties, axis=0), u)
+    scaled: Tensor = u * (radius / torch.linalg.vector_norm(u, dim=1, keepdim=True))
+    return scaled
+
+
+def _without_overflow(Q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """Return both divided by a power of two, which is exact: the largest entry is 1 to 2."""
+    largest = torch.maximum(Q.abs().amax((1, 2)), v.abs().amax(1))
+    unit = torch.ldexp(torch.ones_like(largest), torch.frexp(largest).exponent - 1)
+    unit = torch.where(largest > 0, unit, torch.ones_like(unit))
+    return Q / unit[:, None, None], v / unit[:, None]
+
+
+def _direction(vectors: Tensor, axis: int) -> Tensor:
+    """Return vectors, (n, m), of norm 1; along an axis where they are zero."""
+    length = torch.linalg.vector_norm(vectors, dim=1, keepdim=True)
+    along_axis = torch.zeros_like(vectors)
+    along_axis[:, axis] = 1.0
+    return torch.where(length > TINY, vectors / length.clamp_min(TINY), along_axis)
+
+
+def _secular_root(w: Tensor, gaps: Tensor, top: Tensor) -> Tensor:
+    """Return s ≥ 0 with ‖w / (gaps + s)‖ = 1, (n, 1), by division of its logarithm's range."""
+    low = torch.where(top, w, torch.zeros_like(w)).square().sum(1, keepdim=True).sqrt()
+    low = low.clamp_min(TINY).log()
+    high = torch.linalg.vector_norm(w, dim=1, keepdim=True).clamp_min(TINY).log()
+    high = torch.maximum(low, high)
+    shares = torch.linspace(0.0, 1.0, PARTS + 1).to(w)
+    for _ in range(DIVISIONS):
+        tried = low + (high - low) * shares
+        squares = (w.unsqueeze(2) / (gaps.unsqueeze(2) + tried.exp().unsqueeze(1))).square()
+        outside = (squares.sum(1) >= 1).sum(1, keepdim=True)
+        part = (outside - 1).clamp(0, PARTS - 1)
+        low, high = tried.gather(1, part), tried.gather(1, part + 1)
+    return (0.5 * (low + high)).exp()

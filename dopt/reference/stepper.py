@@ -7,10 +7,8 @@ import numpy.typing as npt
 import torch
 
 from dopt.errors import SpecificationError
-from dopt.reference.batch import Lockstep
-from dopt.reference.steps import BatchSteps
+from dopt.reference.batch import BatchSteps, Lockstep
 from dopt.spec.trial import TrialSpec
-from dopt.systems.black_box import start_variances
 
 Array = npt.NDArray[np.float64]
 
@@ -56,13 +54,13 @@ class ReferenceTrial:
     @property
     def parameters(self) -> Array:
         """Parameters of the model, (q,)."""
-        parameters: Array = self._batch.parameters_of_model[0].numpy()
+        parameters: Array = self._batch.theta[0].numpy()
         return parameters
 
     @property
     def states(self) -> Array:
-        """States x_0 ... x_T, (T + 1, d), the true ones; NaN where the trial has not come yet."""
-        states: Array = self._batch.true_states[0].numpy()
+        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet."""
+        states: Array = self._batch.states[0].numpy()
         return states
 
 
@@ -75,10 +73,6 @@ class ReferenceSteps:
     @torch.no_grad()
     def __init__(self, spec: TrialSpec) -> None:
         self._batch = BatchSteps([spec])
-        self._batch.prepare(self._batch.tensor(np.zeros((1, spec.system.n_states))))
-        if self._batch.sensors:
-            variances = start_variances(spec.system)
-            self._batch.sensors.start_variances = self._batch.tensor(variances)
         self.states: Array = self._batch.states[0].numpy()
         self.inputs: Array = self._batch.inputs[0].numpy()
         self.errors: Array = np.full(spec.system.horizon, np.nan)
@@ -86,21 +80,16 @@ class ReferenceSteps:
     @property
     def parameters(self) -> Array:
         """Parameters of the model, (q,)."""
-        parameters: Array = self._batch.parameters_of_model[0].numpy().copy()
+        parameters: Array = self._batch.theta[0].numpy().copy()
         return parameters
 
     def begin(self, t: int, state: Array) -> None:
         """Let step t begin at a state, (d,), whatever came before it."""
         self.states[t] = state
-        if self._batch.sensors:
-            self._batch.sensors.starts[:, t] = self._batch.tensor(state)
 
     def measure(self, t: int, measured: Array) -> None:
-        """Write what was measured after step t: x_{t+1}, (d,), or the outputs, (n,)."""
-        if self._batch.sensors:
-            self._batch.sensors.outputs[:, t] = self._batch.tensor(measured)
-        else:
-            self.states[t + 1] = measured
+        """Write what was measured after step t: x_{t+1}, (d,)."""
+        self.states[t + 1] = measured
 
     @torch.no_grad()
     def plan_input(self, t: int) -> None:
@@ -113,18 +102,14 @@ class ReferenceSteps:
 
         Returns whether the parameters are finite.
         """
-        if self._batch.sensors:
-            self.errors[t] = float(self._batch.sensors.output_errors(t, dt)[0])
         self._batch.observe(t, dt)
-        if not self._batch.sensors:
-            self.errors[t] = self._prediction_error(t)
+        self.errors[t] = self._prediction_error(t)
         self._batch.learn(t)
         self._batch.inform(t)
         return bool(self._batch.theta.isfinite().all())
 
     def _prediction_error(self, t: int) -> float:
-        """Return ‖y_t - a_θ(x_t, u_t)‖ before it is learned."""
+        """Return ‖y_t - a_θ(x_t)‖ before it is learned."""
         batch = self._batch
-        members = batch.theta if batch.members is None else batch.members[0]
-        predicted = batch.model(members, batch.sampled(t).expand(len(members), 1, -1))
-        return float(torch.linalg.vector_norm(batch.targets[0, t] - predicted.mean(dim=0)[0]))
+        predicted = batch.model(batch.theta, batch.sampled_states[:, t : t + 1])
+        return float(torch.linalg.vector_norm(batch.targets[0, t] - predicted[0, 0]))

@@ -25,6 +25,7 @@ from dopt.learning import (
     Learner,
     RecursiveLeastSquares,
 )
+from dopt.learning.base import CustomLearner
 from dopt.models import (
     MLP,
     MODELS,
@@ -38,7 +39,16 @@ from dopt.models import (
     LinearState,
     Model,
 )
-from dopt.policies import ICEM, DOptimal, InformationPolicy, Oracle, Policy, Search
+from dopt.policies import (
+    ICEM,
+    DOptimal,
+    InformationPolicy,
+    Oracle,
+    Policy,
+    Search,
+    Uniform,
+)
+from dopt.policies.base import CustomPolicy, OpenLoop
 from dopt.policies.disagreement import Disagreement
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.greedy_linear import GreedyLinear
@@ -79,7 +89,10 @@ def held_information(
     if isinstance(policy, InformationPolicy):
         form = "primal" if sharing else policy.chosen_form(n_parameters, n_rows)
         return Information(form, policy.regularization, noise_variance)
-    return Information("primal", sharing.regularization, noise_variance) if sharing else None
+    if sharing is None:
+        return None
+    ridge = float(getattr(policy, "regularization", sharing.regularization))
+    return Information("primal", ridge, noise_variance)
 
 
 def is_fresh(policy: Policy) -> TypeGuard[InformationPolicy]:
@@ -93,8 +106,8 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
     for kind, fitting in _MODELS_OF.items():
         if isinstance(policy, kind) and not isinstance(model, fitting):
             raise mismatch(f"policy '{policy.name}'", f"model '{fitting.name}'", given)
-    if isinstance(policy, Disagreement) and model.structure != "gradient":
-        raise mismatch(f"policy '{policy.name}'", _models("gradient"), given)
+    if isinstance(policy, Disagreement) and not (isinstance(model, MLP) and model.n_members == 1):
+        raise mismatch(f"policy '{policy.name}'", "model 'mlp'", given)
     if isinstance(policy, Disagreement) and not isinstance(learner, Adam):
         expected = "learner 'adam' or 'adam_window', which can learn for many networks"
         raise mismatch(f"policy '{policy.name}'", expected, f"learner '{learner.name}'")
@@ -112,6 +125,53 @@ def check_together(system: System, policy: Policy, model: Model, learner: Learne
         # a filter between two fits would keep the M of one network
         every = f"learner.refit_every {learner.refit_every}"
         raise mismatch(f"model '{model.name}'", "learner.refit_every 1", every)
+
+
+def check_reference(
+    parts: tuple[System, Policy, Model, Learner], *, enforced: bool = False
+) -> None:
+    """Raise IncompatibleError if the torch path does not run a trial with these parts.
+
+    ``enforced`` says whether limits replace inputs.
+    """
+    system, policy, model, learner = parts
+    least_squares = isinstance(learner, RecursiveLeastSquares) and isinstance(model, Linear)
+    network = (isinstance(model, MLP) and model.n_members == 1) or not model.compiled
+    plans = isinstance(policy, OpenLoop | CustomPolicy) or type(policy) in REFERENCE_POLICIES
+    for what, runs in (
+        (f"policy '{policy.name}'", plans),
+        (f"model '{model.name}'", network or isinstance(model, Linear)),
+        (f"model '{model.name}' with the inputs that it reads", not model.n_inputs_read(system)),
+        (
+            f"learner '{learner.name}'",
+            isinstance(learner, Adam | CustomLearner) or least_squares,
+        ),
+        ("policy.information 'fresh'", not is_fresh(policy)),
+        ("states that are measured with noise", not system.n_measured),
+        ("limits", not enforced),
+    ):
+        if not runs:
+            raise IncompatibleError(_kernel_alone(what, parts))
+
+
+REFERENCE_POLICIES = (DOptimal, Oracle, Uniform)
+"""Closed-loop policies that the torch path plans by; open-loop and numpy ones run there as well."""
+
+
+def _kernel_alone(what: str, parts: tuple[System, Policy, Model, Learner]) -> str:
+    """Return the sentence for what runs in the compiled kernel alone."""
+    in_torch = [f"{one.section} '{one.name}'" for one in parts if not one.compiled]
+    if not in_torch:
+        return (
+            f"{what} runs in the compiled kernel alone, but path is 'reference', as with "
+            f"executor=lockstep: leave path out, or set executor=local."
+        )
+    return (
+        f"{what} runs in the compiled kernel alone, but {in_torch[0]} runs in torch, which has the "
+        f"policies {', '.join(one.name for one in REFERENCE_POLICIES)}, open-loop ones and plans "
+        f"in numpy, with learner 'adam' or 'adam_window': choose among these, or a compiled "
+        f"{in_torch[0].partition(' ')[0]}."
+    )
 
 
 def _check_sensors(system: System, learner: Learner) -> None:
@@ -186,7 +246,8 @@ def _check_model(system: System, policy: Policy, model: Model, learner: Learner)
     if isinstance(model, GreyBox):
         _check_unknown(system, model)
     form = getattr(policy, "form", "auto")
-    if (sharing or model.structure == "least_squares") and form not in ("auto", "primal"):
+    primal = sharing or model.structure == "least_squares" or isinstance(model, GreyBox)
+    if primal and form not in ("auto", "primal"):
         what = f"learner '{learner.name}'" if sharing else f"model '{model.name}'"
         raise mismatch(what, "policy.form 'primal' or 'auto'", f"policy.form '{form}'")
     if isinstance(policy, InformationPolicy):

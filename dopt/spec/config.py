@@ -22,7 +22,12 @@ from dopt.models import MODELS, Model
 from dopt.policies import POLICIES, DOptimal, GradientDOptimal, Policy, Search
 from dopt.policies.base import CompiledPolicy, CustomPolicy, OpenLoop, TaskPolicy
 from dopt.registry import TARGET, added_defaults, identifying_section, section_of
-from dopt.spec.compatibility import check_together, memory_by_setting, mismatch
+from dopt.spec.compatibility import (
+    check_reference,
+    check_together,
+    memory_by_setting,
+    mismatch,
+)
 from dopt.spec.custom_system import check_system, warn_of_prior, warn_of_scale
 from dopt.systems import NAMED_SYSTEMS, SYSTEMS, System
 from dopt.systems.black_box import BlackBox
@@ -109,8 +114,9 @@ class TrialConfig:
     """A trial without its seed: one configuration of a grid.
 
     ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
-    agree to rounding only, which grows over a trial: so it is part of the trial's identity. What
-    the kernel does not know runs on the reference alone. ``task`` is what the trial is assessed by
+    agree to rounding only, which grows over a trial: so it is part of the trial's identity.
+    Networks in torch run on the reference alone, most other choices in the kernel alone
+    (:func:`dopt.spec.compatibility.check_reference`). ``task`` is what the trial is assessed by
     on the way, and ``limits`` what its states and inputs heed; each is no part of its identity
     where there is none.
     """
@@ -180,22 +186,15 @@ class TrialConfig:
                 f"path is 'kernel', but {foreign[0].section} '{foreign[0].name}' is not written "
                 f"for it: set path to 'reference', or leave it out."
             )
-
-        self._check_reference()
-
-    def _check_reference(self) -> None:
-        """Refuse on the reference path what brings a compiled function alone."""
-        for part, compiled, custom in (
-            (self.policy, CompiledPolicy, CustomPolicy),
-            (self.learner, CompiledLearner, CustomLearner),
-        ):
-            alone = isinstance(part, compiled) and not isinstance(part, custom)
-            if self.path == "reference" and alone:
+        for part in (self.policy, self.learner):
+            if isinstance(part, (CustomPolicy, CustomLearner)) and not part.compiled:
                 raise SpecificationError(
-                    f"path is 'reference', but {part.section} '{part.name}' brings a compiled "
-                    f"function alone: choose parts that the kernel runs too, or derive it from "
-                    f"{custom.__name__} as well."
+                    f"{part.section} '{part.name}' declares compiled = False, as one that is "
+                    f"written in torch did, but numpy is expected: leave that line out and write "
+                    f"it in numpy, or derive it from Compiled{part.section.capitalize()}."
                 )
+        if self.path == "reference":
+            check_reference(self._parts, enforced=bool(self.limits and self.limits.enforced))
 
     @functools.cached_property
     def goal(self) -> Goal:

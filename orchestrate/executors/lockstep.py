@@ -1,6 +1,7 @@
 """Executor that runs the trials of one configuration as torch batches, on a GPU or the CPU.
 
-The reference implementation (:mod:`dopt.reference`) takes each step for the whole batch at once.
+The torch path (:mod:`dopt.reference`) takes each step for the whole batch at once: of the paper's
+policies, open-loop ones and networks of a user's own. Other trials are refused with a sentence.
 The numbers equal those of the kernel up to rounding.
 """
 

@@ -69,8 +69,7 @@ class OwnAdam(CompiledLearner, AdamWindow):
         if t + 1 < features.shape[1]:
             features = features[:, : t + 1].copy()
             targets = targets[:, : t + 1].copy()
-        numbers, state = trial.algorithm.learner, trial.state
-        adam_step(trial.network, numbers, state, trial.scratch, t, features, targets)
+        adam_step(trial, t, features, targets)
 
 
 def measure(quick: bool) -> list[Row]:

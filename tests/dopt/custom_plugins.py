@@ -132,19 +132,10 @@ class MisaskingPlanner(Planner):
 
 @dataclass(frozen=True, kw_only=True)
 class InTorch(Coin):
-    """Asks for what a view has on the reference path alone."""
+    """Says that it is written in torch."""
 
     name: ClassVar[str] = "in_torch"
     compiled: ClassVar[bool] = False
-
-    def planner(self, system: System, rng: np.random.Generator) -> Planner:
-        return TorchPlanner(system.gamma, rng)
-
-
-class TorchPlanner(CoinPlanner):
-    def choose(self, view: TrialView) -> Array:
-        assert view.theta.isfinite().all()  # type: ignore[attr-defined]
-        return super().choose(view)
 
 
 ANSWERS: list[dict[str, Array]] = []
@@ -188,6 +179,14 @@ class Descent(CustomLearner):
 
     def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
         return DescentUpdater(self.extra)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaughtInTorch(Descent):
+    """Says that it is written in torch."""
+
+    name: ClassVar[str] = "taught_in_torch"
+    compiled: ClassVar[bool] = False
 
 
 class DescentUpdater(Updater):

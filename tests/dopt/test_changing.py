@@ -51,9 +51,15 @@ def test_the_observed_path_is_that_of_the_changing_system(path: Any) -> None:
     assert simulate(spec.system, result.inputs[:, None])[:, 0] == pytest.approx(result.states)
 
 
-@pytest.mark.parametrize("policy", ["random", "oracle"])
-def test_the_loss_of_a_step_is_that_against_the_truth_of_the_step(policy: str) -> None:
-    spec = trial("drifting_pendulum", policy, env=DRIFT | {"grid_points": (20, 20)})
+RFF = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+
+
+@pytest.mark.parametrize(
+    ("policy", "parts"),
+    [("random", {}), ("oracle", {}), ("gaussian_process", {}), ("random", RFF)],
+)
+def test_the_loss_of_a_step_is_that_against_the_truth_of_the_step(policy: str, parts: Any) -> None:
+    spec = trial("drifting_pendulum", policy, env=DRIFT | {"grid_points": (20, 20)}, **parts)
     seen, result = rerun(spec, range(1, 31)), run_trial(spec)
     points = evaluation_set(spec.system)
     for t, theta in enumerate(seen.parameters):

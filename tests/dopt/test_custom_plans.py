@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 from typing import Any
@@ -62,19 +61,9 @@ def test_a_plan_and_an_update_in_numpy_go_together(path: str) -> None:
     np.testing.assert_allclose(plain.parameters, shipped.parameters, rtol=1e-9)
 
 
-@pytest.mark.parametrize("model", ["mlp", "rff", "ensemble"])
-@pytest.mark.parametrize(
-    "env",
-    [
-        {"name": "pendulum"},
-        {"name": "arm", "integrator": "rk4"},
-        {"name": "pendulum", "measured_states": [0], "measurement_noise": [0.01]},
-    ],
-)
-def test_both_paths_answer_the_same(env: dict[str, Any], model: str) -> None:
-    learner = {"mlp": "adam", "ensemble": "gauss_newton"}.get(model, "recursive_least_squares")
-    parts = {"model": {"name": model}, "learner": {"name": learner}}
-    spec = specification(policy=own("Asking"), env={**env, "horizon": 12}, **parts)
+@pytest.mark.parametrize("env", [{"name": "pendulum"}, {"name": "arm", "integrator": "rk4"}])
+def test_both_paths_answer_the_same(env: dict[str, Any]) -> None:
+    spec = specification(policy=own("Asking"), env={**env, "horizon": 12})
     answered = []
     for path in ("kernel", "reference"):
         ANSWERS.clear()
@@ -111,9 +100,7 @@ def test_the_time_of_a_plan_and_an_update_in_numpy_is_measured() -> None:
 def test_limits_hold_for_a_plan_in_numpy() -> None:
     limits = {"bounds": {"u": [-0.5, 0.5]}}
     spec = specification(policy=own("Coin"), limits=limits)
-    for path in ("kernel", "reference"):
-        inputs = run_trial(spec, path).inputs
-        assert np.abs(inputs).max() == 0.5
+    assert np.abs(run_trial(spec).inputs).max() == 0.5
 
 
 def test_trials_in_lockstep_are_those_run_alone() -> None:
@@ -123,24 +110,6 @@ def test_trials_in_lockstep_are_those_run_alone() -> None:
         np.testing.assert_allclose(one.states, other.states, rtol=1e-9)
     assert not np.array_equal(alone[0].inputs, alone[1].inputs)
     np.testing.assert_array_equal(alone[0].inputs, run_trial(specs[0]).inputs)
-
-
-def test_what_the_kernel_lacks_runs_on_the_reference_by_itself() -> None:
-    assert specification(policy=own("Coin")).config.path == "kernel"
-    assert specification(learner=own("Descent")).config.path == "kernel"
-    spec = specification(policy=own("InTorch"))
-    assert spec.config.path == "reference"
-    assert TrialSpec.from_mapping(spec.to_mapping()).trial_key == spec.trial_key
-    assert np.isfinite(run_trial(spec).loss).all()
-
-
-def test_the_kernel_refuses_what_it_lacks() -> None:
-    config = specification(policy=own("InTorch")).config
-    with pytest.raises(SpecificationError, match="policy 'in_torch' is not written for it"):
-        dataclasses.replace(config, path="kernel")
-    mapping = specification(policy=own("InTorch")).to_mapping()
-    with pytest.raises(SpecificationError, match="policy 'in_torch' is not written for it"):
-        TrialSpec.from_mapping(mapping | {"path": "kernel"})
 
 
 @PATHS
@@ -186,10 +155,17 @@ def test_a_config_of_own_parts_is_a_value() -> None:
     assert hash(first) == hash(second)
 
 
+@pytest.mark.parametrize("part", ["policy", "learner"])
+def test_what_was_written_in_torch_is_told_where_to_go(part: str) -> None:
+    """The sentence names both doors, numpy and the compiled kernel."""
+    with pytest.raises(SpecificationError, match=rf"numpy .* Compiled{part.capitalize()}\.$"):
+        specification(**{part: own("InTorch" if part == "policy" else "TaughtInTorch")})
+
+
 def test_torch_is_loaded_where_a_trial_needs_it_and_no_sooner() -> None:
     """The driver of a grid only makes the specification, and sends it to its workers."""
     plain = specification(policy=own("Coin"), learner=own("Descent")).to_mapping()
-    in_torch = specification(policy=own("InTorch")).to_mapping()
+    in_torch = specification().to_mapping() | {"path": "reference"}
     program = (
         "import pickle, sys; from dopt.spec.trial import TrialSpec; "
         f"plain, in_torch = map(TrialSpec.from_mapping, ({plain!r}, {in_torch!r})); "

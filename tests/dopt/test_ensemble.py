@@ -15,7 +15,6 @@ from dopt.offline_fit import grid_loss
 from dopt.randomness import initial_weights
 from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
-from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES
 
 STEPS = 9
@@ -34,16 +33,6 @@ def make(
 
 def members_of(parameters: np.ndarray) -> np.ndarray:
     return parameters.reshape(ENSEMBLE["members"], -1)
-
-
-@pytest.mark.parametrize("policy", ["d_optimal", "icem", "uniform", "random"])
-def test_kernel_and_reference_agree(policy: str) -> None:
-    spec = make(ENSEMBLE, policy)
-    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
-    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
-    assert relative_gap(fast.parameters, plain.parameters) < 1e-8
-    assert relative_gap(fast.loss, plain.loss) < 1e-5
-    assert relative_gap(fast.reachable_loss, plain.reachable_loss) < 1e-5
 
 
 @pytest.mark.parametrize("policy", ["d_optimal", "icem"])
@@ -74,10 +63,9 @@ def test_the_others_take_turns() -> None:
     assert {k for k in range(len(two)) if not np.array_equal(four[k], two[k])} == {0, 1, 3}
 
 
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-def test_the_loss_is_that_of_the_mean_prediction(path: str) -> None:
+def test_the_loss_is_that_of_the_mean_prediction() -> None:
     spec = make(ENSEMBLE)
-    result = run_trial(spec, path)
+    result = run_trial(spec)
     assert result.loss[-1] == pytest.approx(grid_loss(spec, result.parameters), rel=1e-5)
     states = evaluation_set(spec.system).states[:5]
     members = [

@@ -1,8 +1,4 @@
-"""Every registered policy, learner and model, in every form of M, on both paths: none is left out.
-
-What says that it is compiled has to agree with the reference; what does not has to be refused by
-the kernel and to run on the reference.
-"""
+"""Every registered policy, learner and model, in every form of M, runs: none is left out."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import numpy as np
 import pytest
 
 from dopt.algorithm import Form
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError
 from dopt.learning import LEARNERS
 from dopt.learning.base import Learner
 from dopt.models import MODELS
@@ -25,21 +21,20 @@ from tests.dopt.newcomers import Alternating, Average
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_both_paths_agree_or_the_kernel_refuses(name: str) -> None:
+def test_every_choice_runs_and_agrees_where_both_paths_run_it(name: str) -> None:
     spec = CASES[name]
-    plain = run_trial(spec, "reference")
-    assert np.isfinite(plain.loss).all()
-    if spec.config.path == "reference":
-        with pytest.raises(SpecificationError, match="path is 'kernel', but"):
-            run_trial(spec, "kernel")
+    fast = run_trial(spec)
+    assert np.isfinite(fast.loss).all()
+    try:
+        plain = run_trial(spec, "reference")
+    except IncompatibleError as error:
+        assert "runs in the compiled kernel alone" in str(error)  # noqa: PT017  # the rest agrees
         return
-    fast = run_trial(spec, "kernel")
-    # Derivatives by a state are differences in the kernel.
-    expected = 1e-6 if spec.learner.estimates_states else 1e-8
+    # An ascent may end on a flat top, where inputs are known to the root of the rounding.
+    expected = 1e-6 if spec.policy.name == "gradient" else 1e-8
     assert relative_gap(fast.inputs, plain.inputs) < expected
     # Least squares of the reference squares the condition.
-    least_squares = spec.learner.structure == "least_squares"
-    expected = 1e-5 if least_squares else expected
+    expected = 1e-5 if spec.learner.structure == "least_squares" else expected
     assert relative_gap(fast.parameters, plain.parameters) < expected
 
 

@@ -6,62 +6,28 @@ import math
 from typing import Any
 
 import numpy as np
-import pytest
-import torch
 
 from dopt import run_trial
 from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
-from dopt.reference.batch import Lockstep
-from dopt.reference.joint_kalman import JointKalmanLearner
-from tests.dopt.test_sensors import ANGLE, JOINTS, sensed
+from dopt.kernel.learners.prediction_errors import run_filter
+from dopt.kernel.run import KernelTrial
+from tests.dopt.kernel.calls import call
+from tests.dopt.test_sensors import ANGLE, sensed
 
 FITTED: dict[str, Any] = {"noise": "fitted", "refit_every": 7, "horizon": 22}
-ONE_FIT = FITTED | {"refit_every": 60, "horizon": 60, "noise_variance": 30.0}
-
-
-def in_lockstep(
-    env: str, sensors: dict[str, Any], seeds: tuple[int, ...] = (0, 5), **fields: Any
-) -> Lockstep:
-    """Return a batch of trials after their last step, which ends with a fit."""
-    specs = [sensed(env, sensors, seed=seed, path="reference", **fields) for seed in seeds]
-    batch = Lockstep(specs)
-    for t in range(specs[0].system.horizon):
-        batch.step(t)
-    return batch
-
-
-def filter_of(batch: Lockstep) -> JointKalmanLearner:
-    (found,) = (one for one in vars(batch).values() if isinstance(one, JointKalmanLearner))
-    return found
-
-
-@pytest.mark.parametrize(
-    ("env", "sensors", "start"), [("pendulum", ANGLE, 1e2), ("arm", JOINTS, 1e4)]
-)
-def test_both_paths_fit_the_same(env: str, sensors: dict[str, Any], start: float) -> None:
-    fields = FITTED | {"noise_variance": start}
-    on_kernel = run_trial(sensed(env, sensors, **fields))
-    batch = in_lockstep(env, sensors, **fields)
-    np.testing.assert_allclose(on_kernel.parameters, batch.theta[0], rtol=1e-5, atol=1e-6)
-    given = run_trial(sensed(env, sensors, **fields | {"noise": "given"}))
-    assert np.abs(given.parameters - on_kernel.parameters).max() > 0.05
+ONE_FIT: dict[str, Any] = {"noise": "fitted", "refit_every": 60, "horizon": 60}
 
 
 def test_it_is_the_likeliest_of_its_neighbours() -> None:
-    learner = filter_of(in_lockstep("pendulum", ANGLE, **ONE_FIT))
-    fitted, lowest = learner._noise.clone(), learner._run(ONE_FIT["horizon"])[0]
-    moves = torch.log10(fitted / ONE_FIT["noise_variance"]).abs() / math.log10(NOISE_FACTORS[0])
-    assert ((moves > 0.5) & (moves < MOST_NOISE_FACTORS - 0.5)).all()
+    fast = KernelTrial(sensed("pendulum", ANGLE, **ONE_FIT, noise_variance=30.0))
+    fast.advance(60)
+    noise, none = fast.state.estimate.noise_variance, np.empty((0, len(fast.state.theta)))
+    fitted, lowest = float(noise[0]), call(run_filter, fast.trial, 60, none, np.empty(0))
+    moves = abs(math.log10(fitted / 30.0)) / math.log10(NOISE_FACTORS[0])
+    assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
     for factor in NOISE_FACTORS:
-        learner._noise = factor * fitted
-        assert (learner._run(ONE_FIT["horizon"])[0] >= lowest).all()
-
-
-def test_trials_of_a_batch_have_their_own() -> None:
-    both = filter_of(in_lockstep("pendulum", ANGLE, **ONE_FIT))._noise
-    alone = filter_of(in_lockstep("pendulum", ANGLE, seeds=(5,), **ONE_FIT))._noise
-    assert both[0] != pytest.approx(float(both[1]))
-    torch.testing.assert_close(both[1:], alone)
+        noise[0] = factor * fitted
+        assert call(run_filter, fast.trial, 60, none, np.empty(0)) >= lowest
 
 
 def test_it_forgets_where_it_began() -> None:

@@ -27,7 +27,7 @@ def test_with_linear_parameters_it_is_the_linear_model(env: str) -> None:
     linear = trial(env, "random", 0, model={"name": "linear"}, learner=filtered)
     q = linear.model.n_parameters(linear.system)
     box = grey(env, "random", {"initial": [0.0] * q, "spread": 0.0}, filtered)
-    one, other = (run_trial(spec, "reference") for spec in (linear, box))
+    one, other = (run_trial(spec) for spec in (linear, box))
     assert other.parameters == pytest.approx(one.parameters, rel=1e-6, abs=1e-9)
     assert other.loss == pytest.approx(one.loss, rel=1e-6, abs=1e-9)
 

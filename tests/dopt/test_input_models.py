@@ -7,25 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scipy.stats import kstest
-from torch.func import jacrev
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.models import MODELS
 from dopt.offline_fit import fit_offline, uniform_samples
 from dopt.randomness import PLANNED_DIMENSIONS, draw
-from dopt.reference.information import BatchInformation
-from dopt.reference.planning import planning_columns, predicted_states, quadratic_problem
-from dopt.reference.state import BatchState
 from dopt.run import run_trial
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from tests.dopt.kernel.calls import model_of_kernel
-from tests.dopt.kernel.twin import relative_gap
-from tests.dopt.torch_models import for_one, model_of_one
+from tests.dopt.oracles.traces import jacobian
 from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES
 
 READERS = ("affine", "black_box")
@@ -46,58 +40,21 @@ def small(
     return TrialSpec.from_mapping(merged | {"seed": seed})
 
 
-PATH_CASES = [
-    *[("arm", model, "d_optimal", "adam_window") for model in READERS],
-    *[("cartpole_unknown_gain", "affine", "d_optimal", name)
-      for name in ("adam", "adam_replay", "ekf", "gauss_newton")],
-    ("arm", "black_box", "d_optimal", "gauss_newton"),
-    ("cartpole_unknown_gain", "black_box", "d_optimal", "adam_window"),
-    ("cartpole_unknown_gain", "black_box", "trace_linearized", "ekf"),
-    ("arm", "affine", "d_optimal", "gauss_newton"),
-    *[("cartpole_unknown_gain", "affine", name, "adam_window")
-      for name in ("random", "uniform", "exact", "lookahead", "task", "trace_linearized")],
-    ("arm", "affine", "icem", "gauss_newton"),
-    ("cartpole_unknown_gain", "linear", "oracle", "recursive_least_squares"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("env", "model", "policy", "learner"), PATH_CASES)
-def test_both_paths_agree(env: str, model: str, policy: str, learner: str) -> None:
-    spec = small(env, model, policy, learner)
-    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
-    assert np.isfinite(plain.loss).all()
-    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
-    assert relative_gap(fast.parameters, plain.parameters) < 1e-6
-    # The loss is evaluated in single precision where that is enough.
-    assert relative_gap(fast.loss, plain.loss) < 1e-5
-    assert relative_gap(fast.reachable_loss, plain.reachable_loss) < 1e-5
-
-
-@pytest.mark.parametrize("policy", [{"information": "fresh", "refresh_every": 3},
-                                    {"form": "sketch", "sketch_size": 40}])  # fmt: skip
 @pytest.mark.parametrize("model", READERS)
-def test_forms_of_the_information_agree(model: str, policy: dict[str, Any]) -> None:
-    spec = small("cartpole_unknown_gain", model, policy=policy)
-    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
-    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
-    assert relative_gap(fast.parameters, plain.parameters) < 1e-8
-
-
-@pytest.mark.parametrize("model", READERS)
-def test_values_and_rows_are_those_of_automatic_differentiation(model: str) -> None:
+def test_values_and_rows_are_those_of_the_model(model: str) -> None:
     spec = small("arm", model)
-    function = model_of_one(spec.system, spec.model)
     rng = np.random.default_rng(1)
     theta = draw(spec).weights + 0.1 * rng.standard_normal(len(draw(spec).weights))
     x, u = rng.standard_normal((5, 4)), 3.0 * rng.standard_normal((5, 2))
     values, points = spec.model.predict(spec.system, theta, x, u), np.hstack([x, u])
     kernel = model_of_kernel(spec, theta)
     assert kernel.predict(points) == pytest.approx(values, rel=1e-12)
-    for point, value in zip(points, values, strict=True):
-        given = (torch.tensor(theta), torch.tensor(point))
-        rows = kernel.jacobian(point)
-        assert function(*given).numpy() == pytest.approx(value, rel=1e-12)
-        np.testing.assert_allclose(rows, jacrev(function)(*given).numpy(), rtol=1e-9, atol=1e-12)
+    for point, J in zip(points, jacobian(spec, theta, points), strict=True):
+        np.testing.assert_allclose(kernel.jacobian(point), J, rtol=1e-9, atol=1e-12)
+        along, step = rng.standard_normal((1, 6)), 1e-5
+        change = kernel.jacobian_change(point, along)[0]
+        ends = jacobian(spec, theta, point + step * along * np.array([[1.0], [-1.0]]))
+        np.testing.assert_allclose(change, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("model", READERS)
@@ -112,43 +69,6 @@ def test_only_one_is_affine_in_the_inputs(model: str) -> None:
     apart = np.abs(one + other - both - free).max()
     assert apart < 1e-12 if model == "affine" else apart > 1e-3
     assert np.array_equal(free, spec.model.predict(spec.system, theta, x))
-
-
-@pytest.mark.parametrize("model", READERS)
-def test_the_plan_is_for_the_change_of_the_gradient_with_the_state(model: str) -> None:
-    """D B by differences of the gradient at x̄ + B u, under the input that was drawn."""
-    spec = small("cartpole_unknown_gain", model)
-    batch, rng = BatchState([spec]), np.random.default_rng(3)
-    theta, x = batch.theta, torch.tensor(rng.standard_normal((1, 4)))
-    q, gamma = theta.shape[1], spec.system.gamma
-    root = torch.tensor(rng.standard_normal((q, q)))
-    M = (torch.eye(q) + root @ root.mT / q)[None]
-    information = BatchInformation(M)
-    v, learned = torch.tensor([[-gamma]], dtype=torch.float64), batch.learned
-    columns = planning_columns(learned, lambda rows: rows, theta, x, torch.tensor([[1]]), v)
-    problem = quadratic_problem(columns, information.solve(columns.flatten(1, 2).mT))
-    bar = predicted_states(learned, theta, x)[0]
-    B = learned.input_matrix(theta, bar[None])[0, :, 0]
-
-    def gradient(share: float) -> torch.Tensor:
-        point = torch.cat([bar + share * B, v[0]])
-        return jacrev(for_one(learned.model))(theta[0], point)[1]
-
-    change = (gradient(1e-5) - gradient(-1e-5)) / 2e-5
-    solved = torch.linalg.solve(M[0], change)
-    assert float(problem.Q) == pytest.approx(float(change @ solved), rel=1e-6)
-    assert float(problem.v) == pytest.approx(-float(gradient(0.0) @ solved), rel=1e-6)
-
-
-def test_the_effect_of_inputs_is_that_of_the_model_and_the_known_part() -> None:
-    """B by differences of the predicted next state."""
-    spec = small("cartpole_unknown_gain")
-    batch, rng = BatchState([spec]), np.random.default_rng(4)
-    theta, x = batch.theta, torch.tensor(rng.standard_normal((1, 4)))
-    both = torch.tensor([[0.5], [-0.5]], dtype=torch.float64)
-    ahead, behind = batch.learned.following(theta, x.expand(1, 2, -1), both[None])[0]
-    B = batch.learned.input_matrix(theta, x)[0]
-    np.testing.assert_allclose(B[:, 0], ahead - behind, rtol=1e-9, atol=1e-14)
 
 
 @pytest.mark.parametrize("name", UNKNOWN)

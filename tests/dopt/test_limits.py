@@ -14,7 +14,6 @@ from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.label import config_label
 from dopt.spec.trial import TrialSpec
-from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import LEARNERS, MODELS, SMALL_GRIDS, SMALL_SEARCHES
 
 RAIL: dict[str, Any] = {"bounds": {"y": [-2.0, 2.0]}}
@@ -38,32 +37,6 @@ def limited(
 
 def measures(result: TrialResult) -> dict[str, float]:
     return {row.measure: row.value for row in result.assessments}
-
-
-BOTH_PATHS = [
-    ("cartpole", TIGHT, "d_optimal", None, None),
-    ("cartpole", TIGHT, "random", None, None),
-    ("cartpole", TIGHT, "oracle", None, None),
-    ("cartpole", TIGHT | {"margin": 0.0}, "d_optimal", None, "gauss_newton"),
-    ("cartpole", TIGHT, "d_optimal", "affine", None),
-    ("cartpole", TIGHT, "d_optimal", None, "ekf"),
-    ("cartpole", TIGHT, "d_optimal", "ensemble", "gauss_newton"),
-    ("unbalanced_disk", {"bounds": {"y": [-0.5, None]}}, "lookahead", None, None),
-    ("arm", {"bounds": {"φ₁": [-0.2, 0.2]}}, "d_optimal", None, None),
-]
-
-
-@pytest.mark.parametrize(("env", "limits", "policy", "model", "learner"), BOTH_PATHS)
-def test_both_paths_choose_the_same_inputs(
-    env: str, limits: dict[str, Any], policy: str, model: str | None, learner: str | None
-) -> None:
-    spec = limited(env, limits | {"steps": 12}, policy, horizon=30, model=model, learner=learner)
-    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
-    free = run_trial(limited(env, None, policy, horizon=30, model=model, learner=learner))
-    assert not np.array_equal(fast.inputs, free.inputs)
-    assert relative_gap(fast.inputs, plain.inputs) < 1e-7
-    assert relative_gap(fast.parameters, plain.parameters) < 1e-6
-    assert measures(fast) == pytest.approx(measures(plain), abs=1e-9)
 
 
 @pytest.mark.parametrize("policy", ["d_optimal", "random", "uniform", "periodic"])
@@ -139,10 +112,9 @@ def test_an_explorer_fed_the_states_of_a_trial_chooses_its_inputs() -> None:
         explorer.tell(following)
 
 
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-def test_rates_are_counted_from_the_last_answer(path: str) -> None:
+def test_rates_are_counted_from_the_last_answer() -> None:
     """Also where nothing was learned after it, and from an input that was applied instead."""
-    explorer = Explorer(limited("cartpole", None).system, limits={"rates": {"u": 50.0}}, path=path)
+    explorer = Explorer(limited("cartpole", None).system, limits={"rates": {"u": 50.0}})
     x, before = np.array([0.0, 0.0, np.pi, 0.0]), 0.0
     for k in range(12):
         u = explorer.ask(x + 0.01 * k)[0]  # each state is a jump
@@ -152,10 +124,9 @@ def test_rates_are_counted_from_the_last_answer(path: str) -> None:
     assert abs(explorer.ask(x)[0] - 3.0) <= 50.0 * 0.02 + 1e-12
 
 
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-def test_an_input_of_others_beyond_the_bounds_widens_none(path: str) -> None:
+def test_an_input_of_others_beyond_the_bounds_widens_none() -> None:
     limits = {"bounds": {"u": [-1.0, 1.0]}, "rates": {"u": 1.0}}
-    explorer = Explorer(limited("cartpole", None).system, limits=limits, path=path)
+    explorer = Explorer(limited("cartpole", None).system, limits=limits)
     x = np.array([0.0, 0.0, np.pi, 0.0])
     explorer.ask(x)
     explorer.tell(x + 1e-3, applied=[500.0])

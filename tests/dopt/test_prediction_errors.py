@@ -2,71 +2,79 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from dopt.kernel.learners.prediction_errors import run_filter
+from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
-from dopt.reference.batch import Lockstep
+from dopt.spec.trial import TrialSpec
 from dopt.types import Array
+from tests.dopt.kernel.calls import call
+from tests.dopt.oracles.traces import model_step
 from tests.dopt.test_sensors import ANGLE, DEGREE, sensed
 
 
+def finished(spec: TrialSpec) -> KernelTrial:
+    fast = KernelTrial(spec)
+    fast.advance(spec.system.horizon)
+    return fast
+
+
+def objective(fast: KernelTrial) -> float:
+    """Return Σ (e²/s + log s) + λ‖θ - θ₀‖² at the present parameters, λ being the policy's."""
+    theta, prior, n = fast.state.theta, fast.state.prior, fast.done
+    total = call(run_filter, fast.trial, n, np.empty((0, len(theta))), np.empty(0))
+    return float(total + 3.0 * np.sum((theta - prior) ** 2))
+
+
 def test_a_fit_finds_parameters_at_which_all_that_was_measured_is_likelier() -> None:
-    """Its objective is that of the reference's pass over all steps."""
     objectives = {}
     for steps in (1, 8):
-        spec = sensed("pendulum", ANGLE, horizon=60, path="reference", refit_every=60, steps=steps)
-        batch = Lockstep([spec])
-        for t in range(60):
-            batch.step(t)
-        learner: Any = batch.learner
-        objectives[steps] = float(learner._run(60)[0])
+        fast = finished(sensed("pendulum", ANGLE, horizon=60, refit_every=60, steps=steps))
+        objectives[steps] = objective(fast)
         if steps == 1:
-            batch.theta.copy_(batch.tensor(draw(spec).weights)[None])
-            objectives[0] = float(learner._run(60)[0])
+            fast.state.theta[:] = draw(fast.spec).weights
+            objectives[0] = objective(fast)
     assert objectives[8] <= objectives[1] < objectives[0]
 
 
 def test_rows_of_a_fit_are_derivatives_of_the_innovations() -> None:
     """With the gains held, as in the step of Gauss and Newton."""
-    spec = sensed("pendulum", ANGLE, horizon=20, path="reference", refit_every=1000)
-    batch = Lockstep([spec])
-    for t in range(20):
-        batch.step(t)
-    learner: Any = batch.learner
-    _, rows, _ = learner._run(20)
-    theta, rng = batch.theta.clone(), np.random.default_rng(1)
-    direction = batch.tensor(rng.standard_normal(theta.shape[1]))[None]
-    gains = _gains(learner, batch)
-    ahead, behind = (_errors(batch, theta + sign * 1e-5 * direction, gains) for sign in (1.0, -1.0))
-    scale = np.array([float(s) for _, s in gains]) ** -0.5
+    fast = finished(sensed("pendulum", ANGLE, horizon=20, refit_every=1000))
+    theta = fast.state.theta.copy()
+    rows, found = np.empty((20, len(theta))), np.empty(20)
+    call(run_filter, fast.trial, 20, rows, found)
+    gains = _gains(fast, theta)
+    scale = np.array([s for _, s in gains]) ** -0.5
+    assert np.allclose(found, _errors(fast, theta, gains) * scale, rtol=1e-6, atol=1e-8)
+    direction = np.random.default_rng(1).standard_normal(len(theta))
+    ahead, behind = (_errors(fast, theta + sign * 1e-5 * direction, gains) for sign in (1.0, -1.0))
     expected = -(ahead - behind) / 2e-5 * scale
-    along = (rows @ direction.unsqueeze(-1)).squeeze().numpy()
-    np.testing.assert_allclose(along, expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(rows @ direction, expected, rtol=1e-4, atol=1e-6)
 
 
-def _gains(learner: Any, batch: Lockstep) -> list[tuple[Array, float]]:
-    """Return the gain and the variance of each step of the filter at the present parameters."""
-    x, P, found = batch.states[:, 0], np.zeros((2, 2)), []
-    for t in range(20):
-        u, dt = batch.inputs[:, t], batch.system.dt
-        A = learner._state_jacobian(batch.theta, x, u, dt)[0].numpy()
-        x = batch.learned.next_states(batch.theta, x, u, dt)
-        P = A @ P @ A.T + np.diag([0.0, dt**2 * 0.1])
+def _gains(fast: KernelTrial, theta: Array) -> list[tuple[Array, float]]:
+    """Return the gain and the variance of each step of the filter at some parameters."""
+    spec, x, P, found = fast.spec, fast.record.states[0], np.zeros((2, 2)), []
+    for t, u in enumerate(fast.record.inputs):
+        step = 1e-6 * np.eye(2)
+        ends = [[model_step(spec, theta, x + sign * e, u) for e in step] for sign in (1, -1)]
+        A = (np.array(ends[0]) - np.array(ends[1])).T / 2e-6
+        x = model_step(spec, theta, x, u)
+        P = A @ P @ A.T + np.diag([0.0, spec.system.dt**2 * 0.1])
         variance = P[0, 0] + DEGREE**2
         K = P[:, 0] / variance
         found.append((K, variance))
         P = P - np.outer(K, K) * variance
-        x = x + batch.tensor(K) * (batch.sensors.outputs[:, t] - x[:, :1])  # type: ignore[union-attr]
+        x = x + K * (fast.state.estimate.outputs[t, 0] - x[0])
     return found
 
 
-def _errors(batch: Lockstep, theta: Any, gains: list[tuple[Array, float]]) -> Array:
-    x, errors = batch.states[:, 0], []
+def _errors(fast: KernelTrial, theta: Array, gains: list[tuple[Array, float]]) -> Array:
+    x, errors = fast.record.states[0], []
     for t, (K, _) in enumerate(gains):
-        x = batch.learned.next_states(theta, x, batch.inputs[:, t], batch.system.dt)
-        error = batch.sensors.outputs[:, t] - x[:, :1]  # type: ignore[union-attr]
-        errors.append(float(error))
-        x = x + batch.tensor(K) * error
+        x = model_step(fast.spec, theta, x, fast.record.inputs[t])
+        error = fast.state.estimate.outputs[t, 0] - x[0]
+        errors.append(error)
+        x = x + K * error
     return np.array(errors)

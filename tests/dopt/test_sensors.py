@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from dopt.errors import IncompatibleError, ScaleWarning, SpecificationError
+from dopt.kernel.run import KernelTrial
+from dopt.kernel.state_structs import Record
+from dopt.kernel.stepped_trial import SteppedTrial
 from dopt.randomness import draw
-from dopt.reference.batch import Lockstep
-from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import delay, differentiated
@@ -47,40 +48,6 @@ TIP = {"output_matrix": [1, 0, 1, 0, 0, 0.05, 1, 0], "measurement_noise": [0.02,
 
 ABSOLUTE = {"output_matrix": [1, 0, 0, 0, 1, 0, 1, 0], "measurement_noise": [DEGREE, DEGREE]}
 """Of an arm the angles of both links against the base."""
-
-BOTH_PATHS = [
-    ("pendulum", ANGLE, "joint_ekf", "mlp"),
-    ("pendulum", ANGLE | {"integrator": "rk4"}, "joint_ekf", "mlp"),
-    ("pendulum_unknown_gain", ANGLE, "joint_ekf", "affine"),
-    ("cartpole", CART, "joint_ekf", "mlp"),
-    ("arm", JOINTS, "joint_ekf", "mlp"),
-    ("arm", ABSOLUTE, "joint_ekf", "mlp"),
-    ("cartpole", TIP, "joint_ekf", "mlp"),
-    ("mass_spring", {"measured_states": [1], "measurement_noise": [0.01]}, "joint_ekf", "linear"),
-    ("pendulum", ANGLE, "adam_window", "mlp"),
-    ("pendulum", ANGLE | {"integrator": "rk4"}, "gauss_newton", "mlp"),
-    ("cartpole", CART, "ekf", "mlp"),
-    ("pendulum_unknown_gain", ANGLE, "adam_window", "affine"),
-    ("pendulum", {"measured_states": [0, 1], "measurement_noise": [DEGREE, 0.1]}, "adam", "mlp"),
-]
-
-
-@pytest.mark.parametrize(("env", "sensors", "learner", "model"), BOTH_PATHS)
-def test_both_paths_estimate_and_learn_the_same(
-    env: str, sensors: dict[str, Any], learner: str, model: str
-) -> None:
-    policy = "oracle" if model == "linear" else "d_optimal"
-    on_kernel, on_reference = (
-        run_trial(sensed(env, sensors, learner, policy, horizon=16, model=model, path=path))
-        for path in ("kernel", "reference")
-    )
-    np.testing.assert_allclose(on_kernel.states, on_reference.states, atol=1e-8)
-    assert on_kernel.estimated_states is not None
-    assert on_reference.estimated_states is not None
-    np.testing.assert_allclose(
-        on_kernel.estimated_states, on_reference.estimated_states, rtol=1e-7, atol=1e-8
-    )
-    np.testing.assert_allclose(on_kernel.parameters, on_reference.parameters, rtol=1e-5, atol=1e-6)
 
 
 class Filtered(NamedTuple):
@@ -149,12 +116,19 @@ def test_what_is_measured_is_the_state_with_its_noise() -> None:
     noise = draw(spec).measurement_noise
     assert noise.shape == (400, 1)
     assert 0.9 * DEGREE < noise.std() < 1.1 * DEGREE
-    batch = Lockstep([sensed("pendulum", ANGLE, "adam", horizon=5, path="reference")])
-    for t in range(5):
-        batch.step(t)
-    assert batch.sensors is not None
-    seen = batch.sensors.outputs[0, :, 0] - batch.true_states[0, 1:, 0]
-    np.testing.assert_allclose(seen, draw(batch.specs[0]).measurement_noise[:5, 0], atol=1e-15)
+    fast = KernelTrial(sensed("pendulum", ANGLE, "adam", horizon=5))
+    fast.advance(5)
+    seen = fast.state.estimate.outputs[:, 0] - fast.record.true_states[1:, 0]
+    np.testing.assert_allclose(seen, draw(fast.spec).measurement_noise[:5, 0], atol=1e-15)
+
+
+def observed(spec: TrialSpec) -> tuple[Record, Array]:
+    """Return the record of a trial, and the accelerations that a learner in numpy observes."""
+    learner = {"learner": {"_target_": "tests.dopt.custom_plugins.Descent"}}
+    fast = SteppedTrial(TrialSpec.from_mapping(spec.to_mapping() | learner))
+    fast.advance(spec.system.horizon)
+    assert fast._parts is not None
+    return fast.record, fast._parts.targets
 
 
 EXACT = {"measurement_noise": [1e-13], "noise": 0.0}
@@ -163,15 +137,13 @@ EXACT = {"measurement_noise": [1e-13], "noise": 0.0}
 def test_filtered_differences_see_the_filtered_accelerations() -> None:
     """Without noise: what the filter gives for v̇ less the known part is what it gives for a(x)."""
     sensors = {"measured_states": [0], "initial_state": [1.0, 4.0], **EXACT}
-    batch = Lockstep([sensed("pendulum", sensors, "adam", "random", horizon=40, path="reference")])
-    for t in range(40):
-        batch.step(t)
-    system = batch.system
+    spec = sensed("pendulum", sensors, "adam", "random", horizon=40)
+    system, (record, targets) = spec.system, observed(spec)
     share, filtered, expected = -math.expm1(-2 * math.pi * 2.0 * system.dt), 0.0, []
-    for acceleration in system.learned(batch.true_states[0, :-1].numpy())[:, 0]:
+    for acceleration in system.learned(record.true_states[:-1])[:, 0]:
         expected.append(filtered)  # differences come one step late
         filtered += share * (acceleration - filtered)
-    np.testing.assert_allclose(batch.targets[0, :, 0], expected, atol=1e-8)
+    np.testing.assert_allclose(targets[:, 0], expected, atol=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -186,13 +158,11 @@ def test_filtered_differences_see_the_filtered_accelerations() -> None:
 def test_estimates_belong_together(env: str, sensors: dict[str, Any]) -> None:
     """Without noise and in small motions, what is learned at an estimate is a(x̂)."""
     sensors = EXACT | {"gamma": 0.05} | sensors  # small motions, of which a(x) is linear
-    batch = Lockstep([sensed(env, sensors, "adam", "periodic", horizon=300, path="reference")])
-    for t in range(300):
-        batch.step(t)
-    system, settled = batch.system, slice(100, None)
-    truth = system.learned(batch.sampled_states[0].numpy())[settled]
-    targets = batch.targets[0].numpy()[settled]
-    late = np.sqrt(np.mean((targets - truth) ** 2)) / np.sqrt(np.mean(truth**2))
+    spec = sensed(env, sensors, "adam", "periodic", horizon=300)
+    system, (record, targets) = spec.system, observed(spec)
+    truth = system.learned(system.sampled_states(record.states))
+    errors, sizes = (targets - truth)[100:], truth[100:]  # once the filters have settled
+    late = np.sqrt(np.mean(errors**2)) / np.sqrt(np.mean(sizes**2))
     assert late < 0.01
 
 
@@ -218,17 +188,12 @@ def test_without_measured_states_nothing_is_estimated() -> None:
 
 
 def test_a_trial_that_diverges_has_no_estimates_from_there_on() -> None:
-    results: list[TrialResult] = []
-    for path in ("kernel", "reference"):
-        sensors = ANGLE | {"state_limit": 0.05}
-        spec = sensed("pendulum", sensors, horizon=60, path=path, refit_every=1000)
-        results.append(run_trial(spec))
-    for result in results:
-        assert result.diverged_at is not None
-        assert result.estimated_states is not None
-        assert np.isnan(result.estimated_states[result.diverged_at :]).all()
-        assert np.isfinite(result.estimated_states[: result.diverged_at]).all()
-    assert results[0].diverged_at == results[1].diverged_at
+    sensors = ANGLE | {"state_limit": 0.05}
+    result = run_trial(sensed("pendulum", sensors, horizon=60, refit_every=1000))
+    assert result.diverged_at is not None
+    assert result.estimated_states is not None
+    assert np.isnan(result.estimated_states[result.diverged_at :]).all()
+    assert np.isfinite(result.estimated_states[: result.diverged_at]).all()
 
 
 REFUSED = [

@@ -7,7 +7,7 @@ import numpy as np
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled
 from dopt.kernel.information.primal import rank_update
-from dopt.kernel.model import add_linear, network_jacobian, regressors
+from dopt.kernel.model import network_jacobian, parameter_rows
 from dopt.kernel.state_structs import Covariance
 from dopt.kernel.structs import Network, Plant
 from dopt.types import Matrix, Vector
@@ -18,8 +18,7 @@ def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: 
     """Return J, (r, q), at a point, and write a_θ, (r,), there."""
     if network.kind != ModelKind.MLP:
         rows = np.empty((value.shape[0], theta.shape[0]))
-        regressors(plant, network, x, rows, value)
-        add_linear(rows, theta, value)
+        parameter_rows(plant, network, theta, x, rows, value)
         return rows
     return network_jacobian(network, theta, x, value)
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled, contracted
+from dopt.kernel.grey_box import write_normal_equations
 from dopt.kernel.learners.samples import sampled_point, store_sample
 from dopt.kernel.network import loss_gradient
-from dopt.kernel.state_structs import Scratch, State
-from dopt.kernel.structs import Network, Trial
+from dopt.kernel.structs import Trial
 from dopt.types import Matrix, Vector
 
 
@@ -23,25 +24,21 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     if t + 1 < features.shape[1]:
         features = features[:, : t + 1].copy()
         targets = targets[:, : t + 1].copy()
-    adam_step(
-        trial.network, trial.algorithm.learner, trial.state, trial.scratch, t, features, targets
-    )
+    adam_step(trial, t, features, targets)
 
 
 @compiled
-def adam_step(
-    network: Network,
-    numbers: Vector,
-    state: State,
-    scratch: Scratch,
-    step: int,
-    features: Matrix,
-    targets: Matrix,
-) -> None:
+def adam_step(trial: Trial, step: int, features: Matrix, targets: Matrix) -> None:
     """Take step ``step`` + 1 on a batch: features (p, n) and observed accelerations (r, n)."""
-    gradient = scratch.gradient
-    loss_gradient(network, state.theta, features, targets, scratch.hidden, scratch.deltas, gradient)
-    adam_update(numbers, step, state.theta, state.moment_1, state.moment_2, gradient)
+    network, state, scratch = trial.network, trial.state, trial.scratch
+    theta, gradient = state.theta, scratch.gradient
+    if network.kind == ModelKind.MLP:
+        loss_gradient(network, theta, features, targets, scratch.hidden, scratch.deltas, gradient)
+    else:
+        normal = np.empty((theta.shape[0], theta.shape[0]))
+        write_normal_equations(trial.plant, network, theta, features, targets, normal, gradient)
+        gradient *= -2.0 / features.shape[1]
+    adam_update(trial.algorithm.learner, step, theta, state.moment_1, state.moment_2, gradient)
 
 
 @contracted

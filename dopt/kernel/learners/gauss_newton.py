@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE
+from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE, ModelKind
+from dopt.kernel import grey_box
 from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.information.cholesky import factorize, solve, write_inverse
 from dopt.kernel.information.normal_equations import errors_of, normal_equations
 from dopt.kernel.learners.kalman import filter_sample
 from dopt.kernel.learners.samples import sampled_point, store_sample
 from dopt.kernel.state_structs import State
-from dopt.kernel.structs import Network, Trial
+from dopt.kernel.structs import Network, Plant, Trial
 from dopt.types import Matrix, Vector
 
 
@@ -34,7 +35,7 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
     definite = True
     for _ in range(steps):
         definite = definite and take_step(
-            trial.network, state.theta, state.prior, ridge, features, targets, factor
+            trial.plant, trial.network, state.theta, state.prior, ridge, features, targets, factor
         )
     if not (definite and _write_information(state, factor, noise_variance)):
         state.theta[:] = np.nan  # which ends the trial as diverged
@@ -58,6 +59,7 @@ def _write_information(state: State, factor: Matrix, noise_variance: float) -> b
 
 @compiled
 def take_step(
+    plant: Plant,
     network: Network,
     theta: Vector,
     prior: Vector,
@@ -73,7 +75,11 @@ def take_step(
     """
     q = theta.shape[0]
     step = np.empty(q)
-    squares = normal_equations(network, theta, features, targets, normal, step)
+    if network.kind == ModelKind.MLP:
+        squares = normal_equations(network, theta, features, targets, normal, step)
+    else:
+        grey_box.write_normal_equations(plant, network, theta, features, targets, normal, step)
+        squares = grey_box.squared_error(plant, network, theta, features, targets)
     squares += ridge * squared_distance(theta, prior)
     for i in range(q):
         normal[i, i] += ridge
@@ -85,7 +91,10 @@ def take_step(
     while share >= SMALLEST_SHARE:
         for i in range(q):
             theta[i] = before[i] + share * step[i]
-        after = errors_of(network, theta, features, targets)[0]
+        if network.kind == ModelKind.MLP:
+            after = errors_of(network, theta, features, targets)[0]
+        else:
+            after = grey_box.squared_error(plant, network, theta, features, targets)
         if after + ridge * squared_distance(theta, prior) <= squares * NO_GROWTH:
             return True
         share *= 0.5

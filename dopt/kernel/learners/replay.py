@@ -17,9 +17,9 @@ from dopt.types import Vector
 @compiled
 def learn(trial: Trial, t: int, target: Vector) -> None:
     """Take Adam's steps of time t, one for each row of places in the buffer, (steps, batch)."""
-    network, state, places = trial.network, trial.state, trial.randomness.replay[t]
+    state, places = trial.state, trial.randomness.replay[t]
     seen, observed = state.window_features, state.window_targets
-    store_sample(network, seen, observed, t, sampled_point(trial, t), target)
+    store_sample(trial.network, seen, observed, t, sampled_point(trial, t), target)
     steps, batch = places.shape
     features = np.empty((seen.shape[0], batch))
     targets = np.empty((observed.shape[0], batch))
@@ -31,4 +31,4 @@ def learn(trial: Trial, t: int, target: Vector) -> None:
             for k in range(targets.shape[0]):
                 targets[k, j] = observed[k, place]
         step = t * steps + s
-        adam_step(network, trial.algorithm.learner, state, trial.scratch, step, features, targets)
+        adam_step(trial, step, features, targets)

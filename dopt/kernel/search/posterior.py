@@ -21,7 +21,7 @@ from dopt.kernel.information.cholesky import (
     solve_columns,
     solve_transposed_columns,
 )
-from dopt.kernel.model import regressors, write_features
+from dopt.kernel.model import parameter_rows, write_features
 from dopt.kernel.network_backward import batch_back_signals
 from dopt.kernel.output_layer import output_inputs
 from dopt.kernel.state_structs import Covariance, State
@@ -116,7 +116,7 @@ def changes_along(
     if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)
         for n in range(N):
-            regressors(plant, network, states[n], rows, value)
+            parameter_rows(plant, network, theta, states[n], rows, value)
             for k in range(r):
                 out[k, :, n] = np.dot(along, rows[k])
         return

@@ -33,7 +33,15 @@ def test_a_number_keeps_its_place_where_one_before_it_is_not_given() -> None:
     assert Chirping(frequency=2.0, label="slow").kernel_numbers(1, 1.0) == (2.0, 0.5)
 
 
-@pytest.mark.parametrize(("policy", "path"), [("d_optimal", "kernel"), ("gradient", "reference")])
-def test_a_trial_without_a_path_is_on_the_one_that_knows_its_parts(policy: str, path: str) -> None:
-    mapping = trial("pendulum", policy, 0).to_mapping()
+@pytest.mark.parametrize(
+    ("model", "path"),
+    [
+        ({"name": "mlp"}, "kernel"),
+        ({"_target_": "tests.dopt.custom_networks.Stack"}, "reference"),
+    ],
+)
+def test_a_trial_without_a_path_is_on_the_one_that_knows_its_parts(
+    model: dict[str, Any], path: str
+) -> None:
+    mapping = trial("pendulum", "d_optimal", 0).to_mapping() | {"model": model}
     assert TrialSpec.from_mapping({**mapping, "path": None}).config.path == path

@@ -36,8 +36,11 @@ CHOICES: list[tuple[str | dict[str, object], str, str | dict[str, object]]] = [
 ]
 
 
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-@pytest.mark.parametrize(("policy", "model", "learner"), CHOICES)
+@pytest.mark.parametrize(("policy", "model", "learner", "path"), [
+    *[(*choice, "kernel") for choice in CHOICES],
+    ("d_optimal", "mlp", "adam_window", "reference"),
+    (COIN, "mlp", DESCENT, "reference"),
+])  # fmt: skip
 def test_fed_the_states_of_a_trial_it_chooses_its_inputs(
     policy: str | dict[str, object], model: str, learner: str | dict[str, object], path: str
 ) -> None:

@@ -13,8 +13,10 @@ import pytest
 from dopt import Explorer, Plant
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.explorer.saving import free_run_error
+from dopt.kernel.sensors import estimate_state
 from dopt.types import Array
 from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
+from tests.dopt.kernel.calls import call
 
 DEGREE = math.pi / 180
 ENCODER = dataclasses.replace(MOTOR, measured={"angle": DEGREE})
@@ -55,18 +57,6 @@ def test_it_learns_and_estimates_the_rate() -> None:
     assert np.abs(explorer.states[-1] - x)[1] < 0.5
     # once the model is good, what is predicted differs from what is measured by the noise
     assert 0.5 < float(np.sqrt(np.mean(explorer.errors[-100:] ** 2))) < 2.0
-
-
-def test_both_paths_explore_the_same() -> None:
-    paths = ("kernel", "reference")
-    explorers = [Explorer(ENCODER, steps=60, path=path, **JOINT) for path in paths]
-    for explorer in explorers:
-        driven(explorer, 45)
-    fast, plain = explorers
-    np.testing.assert_array_equal(fast.inputs, plain.inputs)
-    np.testing.assert_allclose(fast.states, plain.states, atol=1e-7)
-    np.testing.assert_allclose(fast.parameters, plain.parameters, atol=1e-5)
-    np.testing.assert_allclose(fast.errors, plain.errors, atol=1e-7)
 
 
 @pytest.mark.parametrize("learner", ["joint_ekf", "adam_window"])
@@ -119,19 +109,19 @@ def test_questions_about_other_measurements_are_warned_of(caplog: Any) -> None:
 def test_filters_begin_anew_after_a_reset(learner: str) -> None:
     """What comes after it is estimated as from the start of an exploration."""
     given = JOINT if learner == "joint_ekf" else {"learner": learner}
-    explorer, other = (Explorer(ENCODER, steps=60, path="reference", **given) for _ in range(2))
+    explorer, other = (Explorer(ENCODER, steps=60, **given) for _ in range(2))
     driven(explorer, 20)
     explorer.reset()
     steps, fresh = explorer._state.steps, other._state.steps
     for one, at in ((steps, 20), (fresh, 0)):
         state: Any = one
         state.begin(at, np.array([0.3, 0.0]))
-        state.inputs[at], state.states[at + 1, 0] = 1.0, 0.31
-        state._batch.sensors.estimate(at, 0.02)
+        state.inputs[at], state.state.estimate.outputs[at] = 1.0, 0.31
+        call(estimate_state, state.trial, at, 0.02)
     if learner == "adam_window":  # the filter over both predicts with what it has learned
         np.testing.assert_array_equal(steps.states[21], fresh.states[1])
-    sensors: Any = steps._batch.sensors  # type: ignore[attr-defined]
-    assert sensors.starts[0, 20, 0] == 0.3
+    estimate: Any = steps.state.estimate  # type: ignore[attr-defined]
+    assert estimate.starts[20, 0] == 0.3
 
 
 def test_states_are_measured_in_their_own_order() -> None:

@@ -1,4 +1,4 @@
-"""The compiled kernel against the torch reference that defines a trial."""
+"""The compiled kernel against the torch path, where both run a trial."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.kernel.run import KernelTrial
 from dopt.policies import POLICIES
 from dopt.policies.base import OpenLoop
 from dopt.result import TrialResult
 from dopt.run import run_trial
+from dopt.spec.compatibility import REFERENCE_POLICIES
 from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS
 from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.twin import relative_gap, transplant
 from tests.dopt.trials import LEARNERS, PAIRS, trial
@@ -38,10 +41,17 @@ def learners_of(env: str, policy: str) -> list[dict[str, Any]]:
     return [NEWEST, WINDOW] if env in PAPER else [WINDOW]
 
 
+def runs_on_both(env: str, policy: str) -> bool:
+    """Return whether the torch path plans by a policy, and the model reads no inputs."""
+    planned = POLICIES[policy] in REFERENCE_POLICIES or issubclass(POLICIES[policy], OpenLoop)
+    return planned and not SYSTEMS[env].reads_inputs
+
+
 PAPER = ("pendulum", "cartpole", "arm", "quadrotor")
 CASES = [
     pytest.param(env, policy, learner, id=f"{env}-{policy}-{learner.get('name', 'usual')}")
     for env, policy in PAIRS
+    if runs_on_both(env, policy)
     for learner in learners_of(env, policy)
 ]
 
@@ -100,7 +110,8 @@ def test_late_in_a_trial_equal_states_give_equal_steps(env: str, policy: str) ->
     fast = KernelTrial(trial(env, policy, 6, env={"horizon": late + 1}))
     plain = transplant(fast, run(fast, late))
     fast.advance(late + 1)
-    plain.step(late)
+    with torch.no_grad():
+        plain.step(late)
     gamma = fast.spec.system.gamma
     assert plain.inputs[0, late].numpy() == pytest.approx(
         fast.record.inputs[late], abs=1e-8 * gamma
@@ -127,7 +138,30 @@ def test_times_are_measured_and_add_up_to_less_than_the_whole() -> None:
         assert column.sum() < 1e6 * result.wall_seconds
 
 
-@pytest.mark.parametrize("policy", ["gradient", "max"])
-def test_the_kernel_does_not_pretend_to_run_what_it_lacks(policy: str) -> None:
-    with pytest.raises(SpecificationError, match=f"path is 'kernel', but policy '{policy}'"):
-        run_trial(trial("pendulum", policy), "kernel")
+def test_the_kernel_does_not_pretend_to_run_what_it_lacks() -> None:
+    mapping = trial("pendulum", "random").to_mapping()
+    own = {"_target_": "tests.dopt.custom_networks.Stack"}
+    with pytest.raises(SpecificationError, match="path is 'kernel', but model 'Stack'"):
+        TrialSpec.from_mapping(mapping | {"model": own, "path": "kernel"})
+
+
+@pytest.mark.parametrize(
+    ("what", "sections"),
+    [
+        ("policy 'exact'", {"policy": {"name": "exact"}}),
+        ("model 'affine'", {"model": {"name": "affine"}}),
+        ("model 'ensemble'", {"model": {"name": "ensemble"}, "learner": {"name": "gauss_newton"}}),
+        ("learner 'ekf'", {"learner": {"name": "ekf"}}),
+        ("policy.information 'fresh'", {"policy": {"name": "d_optimal", "information": "fresh"}}),
+        ("limits", {"limits": {"bounds": {"φ": [-1.0, 1.0]}}}),
+        (
+            "states that are measured with noise",
+            {"env": {"name": "pendulum", "measured_states": [0], "measurement_noise": [0.1]}},
+        ),
+    ],
+)
+def test_torch_refuses_what_the_kernel_runs_alone(what: str, sections: dict[str, Any]) -> None:
+    """The sentence names the executor that runs it."""
+    spec = TrialSpec.from_mapping(trial("pendulum", "d_optimal").to_mapping() | sections)
+    with pytest.raises(IncompatibleError, match=f"^{what} .* executor=local"):
+        run_trial(spec, "reference")

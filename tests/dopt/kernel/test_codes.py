@@ -17,10 +17,7 @@ from dopt.models import Model
 from dopt.policies import POLICIES, Search
 from dopt.policies.base import ClosedLoop
 from dopt.policies.search import SCORES, score_code
-from dopt.reference.batch import Lockstep
-from dopt.reference.learning import learner_for
 from dopt.systems import SYSTEMS
-from tests.dopt.trials import trial
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,18 +71,6 @@ def test_a_model_that_the_kernel_does_not_know_is_refused() -> None:
 def test_an_unknown_score_is_refused() -> None:
     with pytest.raises(SpecificationError, match=r"score of policy 'new'.*joint"):
         score_code(NewSearch())
-
-
-def test_the_reference_refuses_what_it_has_no_plan_or_update_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(POLICIES, "new", NewPolicy)
-    batch = Lockstep([trial("pendulum", "new")])
-    batch.step(0)
-    with pytest.raises(SpecificationError, match="no plan for policy 'new'"):
-        batch.plan(1)
-    with pytest.raises(SpecificationError, match="no update for learner 'new'"):
-        learner_for(NewLearner(), batch.model, batch.theta)
 
 
 def test_every_score_has_a_name_and_each_policy_that_searches_one_of_them() -> None:

@@ -1,4 +1,4 @@
-"""Information of all states at the present parameters: against dense sums, and on both paths."""
+"""Information of all states at the present parameters: against dense sums."""
 
 from __future__ import annotations
 
@@ -16,12 +16,10 @@ from dopt.kernel.run import KernelTrial
 from dopt.learning import LEARNERS
 from dopt.policies import POLICIES, InformationPolicy
 from dopt.policies.base import CompiledPolicy
-from dopt.reference.batch import Lockstep, run_trials
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from tests.close import assert_close
-from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.torch_models import model_of_one
 from tests.dopt.trials import trial
 
@@ -33,7 +31,6 @@ NETWORK_POLICIES = [
     for name, policy in POLICIES.items()
     if issubclass(policy, InformationPolicy) and name != "oracle"
 ]
-SEARCHES = [name for name in NETWORK_POLICIES if POLICIES[name].compiled]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,21 +111,6 @@ def test_a_trial_that_is_cut_gives_the_numbers_of_one_call(refresh_every: int) -
     assert np.array_equal(dense(cut.state.covariance), dense(whole.state.covariance))
 
 
-@pytest.mark.parametrize("refresh_every", [1, 3])
-@pytest.mark.parametrize("policy", SEARCHES)
-@pytest.mark.parametrize("env", ["pendulum", "arm"])
-def test_both_paths_plan_by_it(env: str, policy: str, refresh_every: int) -> None:
-    given = FRESH | {"refresh_every": refresh_every}
-    check_agreement(trial(env, policy, 3, env={"horizon": 9}, policy=given, learner=NEWEST))
-
-
-@pytest.mark.parametrize("learner", ["adam", "adam_window", "adam_replay"])
-@pytest.mark.parametrize("env", ["cartpole", "quadrotor", "drifting_pendulum", "chain"])
-def test_both_paths_plan_by_it_in_every_system(env: str, learner: str) -> None:
-    given = {"env": {"horizon": 9}, "policy": FRESH, "learner": {"name": learner}}
-    check_agreement(trial(env, "d_optimal", 3, **given))
-
-
 @pytest.mark.parametrize("policy", NETWORK_POLICIES)
 def test_every_policy_plans_by_another_matrix(policy: str) -> None:
     plain = trial("arm", policy, 1, learner=NEWEST)
@@ -136,44 +118,13 @@ def test_every_policy_plans_by_another_matrix(policy: str) -> None:
     assert not np.array_equal(run_trial(fresh).inputs, run_trial(plain).inputs)
 
 
-@pytest.mark.parametrize("refresh_every", [1, 3])
-def test_the_reference_holds_the_dense_sum_for_every_trial_of_a_batch(refresh_every: int) -> None:
-    policy = FRESH | {"refresh_every": refresh_every}
-    first = trial("arm", "gradient", 1, policy=policy, learner=NEWEST, model={"width": 4})
-    batch = Lockstep([first, first.with_seed(2)])
-    with torch.no_grad():
-        for t in range(9):
-            batch.step(t)
-    assert batch.information is not None
-    for M, theta, states in zip(batch.information.matrix(), batch.theta, batch.states, strict=True):
-        J = rows(first, theta.numpy(), states[:9].numpy())
-        assert M.numpy() == pytest.approx(1e-3 * np.eye(len(M)) + J.T @ J, rel=1e-9, abs=1e-12)
-
-
-@pytest.mark.parametrize("path", ["kernel", "reference"])
 @pytest.mark.parametrize("policy", ["d_optimal", "exact"])
-def test_a_prior_below_rounding_ends_the_trial_as_diverged(path: str, policy: str) -> None:
+def test_a_prior_below_rounding_ends_the_trial_as_diverged(policy: str) -> None:
     given = FRESH | {"regularization": 1e-300}
     spec = trial("arm", policy, 1, policy=given)
-    result = run_trial(spec, path)
+    result = run_trial(spec)
     assert result.diverged_at is not None
     assert np.isnan(result.loss[result.diverged_at :]).all()
-    assert run_trial(spec, "kernel").diverged_at == result.diverged_at
-
-
-def test_a_trial_that_diverges_leaves_the_others_of_its_batch_as_they_are() -> None:
-    """With a λ at the limit of rounding one trial may end before another."""
-    specs = [
-        trial("arm", "d_optimal", seed, policy=FRESH, env={"state_limit": 0.9, "noise": 0.2})
-        for seed in range(4)
-    ]
-    together = run_trials(specs)
-    ends = {result.diverged_at for result in together}
-    assert len(ends) > 1
-    for spec, result in zip(specs, together, strict=True):
-        alone = run_trial(spec, "kernel")
-        assert alone.diverged_at == result.diverged_at
-        assert alone.parameters == pytest.approx(result.parameters, rel=1e-7, abs=1e-10)
 
 
 def test_stored_trials_keep_their_keys() -> None:

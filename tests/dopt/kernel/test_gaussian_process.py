@@ -1,4 +1,4 @@
-"""Gaussian process in the compiled kernel: against the reference and dense algebra."""
+"""Gaussian process in the compiled kernel: against dense algebra."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from dopt.models import GaussianProcess
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close
-from tests.dopt.kernel.test_agreement import check_agreement
-from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
 
 
@@ -36,22 +34,6 @@ def covariance(spec: TrialSpec, states: np.ndarray) -> np.ndarray:
     phi = spec.system.featurize(states)
     noise = spec.model.noise_variance(spec.system)
     return spec.model.kernel(phi, phi) + noise * np.eye(len(states))
-
-
-@pytest.mark.parametrize("policy", ["gaussian_process", "uniform", "random_held"])
-@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
-def test_both_paths_run_the_same_trial(env: str, policy: str) -> None:
-    spec = process(env, policy)
-    assert spec.config.path == "kernel"
-    fast, plain = check_agreement(spec)
-    assert relative_gap(fast.parameters, plain.parameters) < 1e-6
-
-
-@pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
-def test_they_agree_on_paths_of_several_steps(env: str) -> None:
-    policy = {"lookahead": 4, "candidates": 7}
-    model = {"lengthscale": 0.8, "amplitude": 5.0}
-    check_agreement(process(env, policy=policy, model=model, env={"horizon": 20}))
 
 
 @settings(max_examples=20, deadline=None)
@@ -100,10 +82,6 @@ def test_stored_parameters_give_the_last_loss() -> None:
     result, grid = run_trial(spec), spec.system.grid()
     errors = spec.model.predict(spec.system, result.parameters, grid) - spec.system.learned(grid)
     assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(result.final_loss, rel=1e-9)
-
-
-def test_a_truth_that_changes_is_followed() -> None:
-    check_agreement(process("drifting_pendulum"))
 
 
 def test_where_a_trial_is_cut_makes_no_difference() -> None:

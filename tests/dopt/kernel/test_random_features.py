@@ -1,4 +1,4 @@
-"""Random Fourier features in the compiled kernel: against the reference and their definition."""
+"""Random Fourier features in the compiled kernel: against their definition."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 
 from dopt.assessment import model_forecast
-from dopt.errors import IncompatibleError
 from dopt.kernel.evaluation_points import points_of_trial
 from dopt.kernel.from_spec import shared_points
 from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
-from dopt.policies import POLICIES
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close
 from tests.dopt.kernel.calls import model_of_kernel
-from tests.dopt.kernel.test_agreement import check_agreement
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.trials import trial
 
@@ -34,36 +31,6 @@ def features(env: str, policy: str = "d_optimal", /, **fields: Any) -> TrialSpec
     }
     merged = {key: sections.get(key, {}) | entries for key, entries in fields.items()}
     return trial(env, policy, 3, **(sections | merged))
-
-
-def together(env: str) -> list[str]:
-    """Return the names of the compiled policies that go with random features."""
-    found = []
-    for name, policy in POLICIES.items():
-        try:
-            features(env, name)
-        except IncompatibleError:
-            continue
-        found += [name] * policy.compiled
-    return found
-
-
-CASES = [(env, policy) for env in ("arm", "pendulum") for policy in together(env)]
-
-
-@pytest.mark.parametrize(("env", "policy"), CASES)
-def test_both_paths_agree_with_every_policy(env: str, policy: str) -> None:
-    spec = features(env, policy)
-    assert spec.config.path == "kernel"
-    fast, plain = check_agreement(spec)
-    assert relative_gap(fast.parameters, plain.parameters) < 1e-5
-
-
-@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
-def test_both_paths_agree_over_many_steps(env: str) -> None:
-    spec = features(env, env={"horizon": 60}, policy={"regularization": 1e-2})
-    fast, plain = check_agreement(spec)
-    assert relative_gap(fast.parameters, plain.parameters) < 1e-5
 
 
 @pytest.mark.parametrize("policy", ["d_optimal", "random_held"])
@@ -105,10 +72,6 @@ def test_stored_parameters_give_the_last_loss_and_keep_what_was_drawn() -> None:
     assert np.all(result.parameters[:60] != 0.0)
     other = KernelTrial(spec.with_seed(4)).parameters
     assert np.all(other[60:] != before[60:])
-
-
-def test_a_truth_that_changes_is_followed() -> None:
-    check_agreement(features("drifting_pendulum", env={"horizon": 30}))
 
 
 def test_an_assessment_predicts_with_all_parameters() -> None:

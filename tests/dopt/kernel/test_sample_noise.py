@@ -7,25 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from torch.func import jacrev, vmap
 
 from dopt.kernel.information.primal import dense
 from dopt.kernel.run import KernelTrial
 from dopt.policies import Search
-from dopt.reference import search
-from dopt.reference.dynamics import LearnedDynamics
-from dopt.reference.exact_gain import ExactGain, Situation
-from dopt.reference.information import BatchInformation
-from dopt.reference.models import model_function
-from dopt.reference.search import paths
 from dopt.run import run_trial
 from dopt.spec.config import CRITERION_VERSION
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from tests.dopt.kernel.test_agreement import check_agreement
-from tests.dopt.kernel.twin import transplant
-from tests.dopt.torch_models import for_one
+from tests.dopt.oracles.traces import jacobian, model_step
 from tests.dopt.trials import trial
 
 SEARCHES = ["exact", "trace", "a_optimal", "e_optimal", "task", "lookahead"]
@@ -39,16 +29,12 @@ def noisy(
 
 
 def candidate_rows(fast: KernelTrial) -> Array:
-    """Return the rows J of each candidate of the next step, by automatic differentiation."""
+    """Return the rows J of each candidate of the next step."""
     policy, system = fast.spec.policy, fast.spec.system
     assert isinstance(policy, Search)
-    model = model_function(system, fast.spec.model)
-    theta, x = torch.tensor(fast.state.theta), torch.tensor(fast.record.states[fast.done])
-    inputs = torch.tensor(policy.compared_inputs(system))
-    held = torch.stack([inputs, inputs], 1)
-    states = paths(policy, LearnedDynamics(system, model), theta[None], x[None], held)[0, :, 0]
-    rows: Array = vmap(jacrev(for_one(model)), (None, 0))(theta, states).numpy()
-    return rows
+    theta, x = fast.state.theta, fast.record.states[fast.done]
+    states = [model_step(fast.spec, theta, x, u) for u in policy.compared_inputs(system)]
+    return jacobian(fast.spec, theta, np.array(states))
 
 
 def growth(J: Array, C: Array, noise_variance: float) -> Array:
@@ -97,55 +83,6 @@ def test_the_input_is_the_best_for_the_matrix_itself(policy: str, noise_variance
         judged_otherwise += unscaled[taken] < unscaled.max() * (1 - 1e-6)
     if policy != "exact":  # whose best candidate seldom depends on ρ
         assert judged_otherwise > 0
-
-
-def test_the_scores_of_the_reference_are_the_growth_of_the_determinant(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    spec = noisy("exact", 0.05)
-    fast = KernelTrial(spec)
-    fast.advance(12)
-    batch, values = transplant_of(spec, spec), []
-    monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
-    batch.plan(12)
-    C = batch.information.covariance()[0].numpy()
-    expected = growth(candidate_rows(fast), C, 0.05)
-    assert values[0][0].numpy() == pytest.approx(expected, rel=1e-5, abs=1e-7)
-
-
-@pytest.mark.parametrize("learner", ["ekf", "gauss_newton"])
-@pytest.mark.parametrize("policy", SEARCHES)
-def test_both_paths_judge_alike(policy: str, learner: str) -> None:
-    check_agreement(noisy(policy, 0.05, learner, horizon=9))
-
-
-def test_the_exact_gain_is_that_of_the_matrix() -> None:
-    spec = noisy("gradient", 0.05)
-    batch = transplant_of(noisy("exact", 0.05), spec)
-    assert batch.information is not None
-    covariance = batch.information.covariance()
-    now = Situation(batch.theta, covariance, batch.states[:, 12], batch.components[:, 12])
-    fast = KernelTrial(noisy("exact", 0.05))
-    fast.advance(12)
-    u = torch.tensor(fast.spec.policy.compared_inputs(spec.system))  # type: ignore[attr-defined]
-    C = batch.information.covariance()[0].numpy()
-    expected = growth(candidate_rows(fast), C, 0.05)
-    found = ExactGain(batch).values(u[None], now)[0].numpy()
-    assert found == pytest.approx(expected, rel=1e-5, abs=1e-7)
-
-
-def transplant_of(run: TrialSpec, other: TrialSpec) -> Any:
-    """Return a batch of another policy where a trial of the kernel stands after 12 steps."""
-    fast = KernelTrial(run)
-    fast.advance(12)
-    twin = transplant(fast)
-    batch = type(twin)([other])
-    batch.theta.copy_(twin.theta)
-    batch.states.copy_(twin.states)
-    batch.information = BatchInformation(
-        torch.linalg.inv(torch.tensor(dense(fast.state.covariance)))[None]
-    )
-    return batch
 
 
 @pytest.mark.parametrize("policy", [*SEARCHES, "gradient"])

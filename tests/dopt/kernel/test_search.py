@@ -1,4 +1,4 @@
-"""Policies that search: the kernel against its twin, and against dense linear algebra."""
+"""Policies that search, against dense linear algebra."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ from dopt.kernel.run import KernelTrial
 from dopt.policies import Search, TaskOptimal
 from dopt.policies.task_states import task_states
 from dopt.randomness import draw
-from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.models import model_function
-from dopt.reference.search import paths, plans, score_function
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
@@ -32,20 +29,6 @@ SEARCHES: list[tuple[str, dict[str, Any]]] = [
     ("lookahead", {"lookahead": 7, "criterion": "joint"}),
     ("lookahead", {"lookahead": 8, "criterion": "sum", "stride": 2}),
 ]
-"""An odd and an even length, whole and thinned paths."""
-
-
-@pytest.mark.parametrize(("policy", "fields"), SEARCHES)
-@pytest.mark.parametrize(("env", "candidates"), [("pendulum", 2), ("quadrotor", 5)])
-def test_kernel_and_reference_choose_the_same_plans_for_many_steps(
-    env: str, candidates: int, policy: str, fields: dict[str, Any]
-) -> None:
-    given = fields | {"candidates": candidates}
-    spec = trial(env, policy, 3, env={"horizon": 45}, policy=given, model={"width": 8})
-    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
-    assert np.array_equal(fast.inputs, plain.inputs)
-    assert relative_gap(fast.states, plain.states) < 1e-8
-    assert len(np.unique(fast.inputs[1:], axis=0)) > 1
 
 
 def before_planning(spec: TrialSpec, steps: int) -> KernelTrial:
@@ -137,21 +120,11 @@ def test_all_components_at_once_are_one_component_where_there_is_one() -> None:
     assert np.array_equal(found.inputs, run_trial(trial("pendulum", "d_optimal", 1)).inputs)
 
 
-@pytest.mark.parametrize("form", ["primal", "dual", "sketch"])
-def test_all_components_at_once_in_every_form(form: str) -> None:
-    policy = {"form": form, "sketch_size": 48}
-    spec = trial("arm", "trace_linearized", 2, env={"horizon": 14}, policy=policy)
-    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
-    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
-
-
 def test_plans_that_leave_the_bounds_of_a_state_do_not_count() -> None:
     limit = 0.5
     env = {"horizon": 60, "state_limit": limit, "gamma": 1.0}
     careful = trial("pendulum", "lookahead", 1, env=env, policy={"lookahead": 4})
-    fast, plain = run_trial(careful, "kernel"), run_trial(careful, "reference")
-    assert fast.diverged_at == plain.diverged_at
-    assert np.array_equal(fast.inputs, plain.inputs, equal_nan=True)
+    fast = run_trial(careful)
     reckless = run_trial(trial("pendulum", "lookahead", 1, env=env | {"state_limit": 1e4}))
     assert np.abs(reckless.states).max() > limit
     assert fast.diverged_at is None
@@ -160,11 +133,9 @@ def test_plans_that_leave_the_bounds_of_a_state_do_not_count() -> None:
 def test_where_every_plan_leaves_the_bounds_chance_decides() -> None:
     env = {"horizon": 40, "state_limit": 0.1, "gamma": 1.0}
     spec = trial("pendulum", "lookahead", 1, env=env, policy={"lookahead": 12})
-    fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
+    fast = run_trial(spec)
     end = fast.diverged_at
     assert end is not None
-    assert end == plain.diverged_at
-    assert np.array_equal(fast.inputs[:end], plain.inputs[:end])
     assert np.array_equal(np.sign(fast.inputs[1:end]), np.sign(draw(spec).ties[1:end]))
 
 
@@ -189,30 +160,3 @@ class TestBudget:
 
     def test_with_time_enough_all_plans_are_scored(self) -> None:
         assert np.array_equal(run_trial(self.spec(1e9)).inputs, run_trial(self.spec(0.0)).inputs)
-
-    def test_what_is_taken_is_no_worse_than_the_first_plan(self) -> None:
-        spec = self.spec(500.0)
-        fast, ties = before_planning(spec, 12), draw(spec).ties
-        for t in range(12, 20):
-            pairs, values = self.scores(fast)
-            fast.advance(t + 1)
-            candidates = spec.policy.compared_inputs(spec.system)  # type: ignore[attr-defined]  # a Search
-            taken = int(np.flatnonzero((candidates == fast.record.inputs[t]).all(axis=1))[0])
-            best = max(v for (c, _), v in zip(pairs, values, strict=True) if c == taken)
-            first = int(np.argmax(candidates @ ties[t]))
-            assert best >= values[pairs.index((first, first))] * (1 - 1e-9)
-
-    def scores(self, fast: KernelTrial) -> tuple[list[tuple[int, int]], list[float]]:
-        """Return all plans of the next step and their scores by the reference."""
-        policy, system = fast.spec.policy, fast.spec.system
-        assert isinstance(policy, Search)
-        model = model_function(system, fast.spec.model)
-        theta, x = torch.tensor(fast.state.theta), torch.tensor(fast.record.states[fast.done])
-        candidates = torch.tensor(policy.compared_inputs(system))
-        pairs = plans(policy, system, len(candidates))
-        learned = LearnedDynamics(system, model)
-        states = paths(policy, learned, theta[None], x[None], candidates[torch.tensor(pairs)])[0]
-        score = score_function(policy, system)
-        inverse = torch.tensor(dense(fast.state.covariance))
-        rows = vmap(vmap(jacrev(for_one(model)), (None, 0)), (None, 0))(theta, states)
-        return pairs, [float(score(J, theta[None], inverse)) for J in rows]

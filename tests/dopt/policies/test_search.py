@@ -3,29 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from torch.func import jacrev, vmap
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set, reachable_states
 from dopt.policies import Exact, Lookahead, TaskOptimal
 from dopt.policies.lookahead import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
 from dopt.policies.task_states import goal_weights, task_states
-from dopt.randomness import draw
-from dopt.reference import search
-from dopt.reference.dynamics import LearnedDynamics
-from dopt.reference.information import BatchInformation
-from dopt.reference.models import model_function
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig
 from dopt.systems import SYSTEMS
 from dopt.systems.properties import eigenmode
-from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
 
@@ -159,30 +150,3 @@ def test_random_features_are_searched_by_their_weights_alone(policy: str) -> Non
     result = run_trial(trial("pendulum", policy, **sections))
     assert np.isfinite(result.loss).all()
     assert np.abs(result.inputs) == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize(("criterion", "weight"), [("sum", 1.0), ("joint", 3.0)])
-def test_a_state_counts_stride_times_in_the_joint_determinant_alone(
-    criterion: str, weight: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spec = trial("pendulum", "lookahead", policy={"criterion": criterion, "stride": 3})
-    assert isinstance(spec.policy, Lookahead)
-    model = model_function(spec.system, spec.model)
-    theta = torch.tensor(draw(spec).weights)[None]
-    x = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
-    seen: list[torch.Tensor] = []
-
-    def scored(*_: object) -> Callable[..., torch.Tensor]:
-        return lambda rows, *_: seen.append(rows) or (rows**2).sum()  # type: ignore[func-returns-value]
-
-    monkeypatch.setattr(search, "score_function", scored)
-    learned = LearnedDynamics(spec.system, model)
-    information = BatchInformation(torch.eye(theta.shape[1], dtype=torch.float64)[None])
-    ties = torch.ones(1, 1, dtype=torch.float64)
-    values: list[torch.Tensor] = []
-    monkeypatch.setattr(search, "chosen", lambda value, first, _: values.append(value) or first[:1])
-    search.searched_inputs(spec.policy, learned, 1.0, theta, information.covariance(), x, ties)
-    inputs = torch.tensor(spec.policy.compared_inputs(spec.system))[[0, 0]][None]
-    path = search.paths(spec.policy, learned, theta[:1], x[:1], inputs)[0, 0, 2::3]
-    rows = vmap(jacrev(for_one(model)), (None, 0))(theta[0], path)
-    assert float(values[0][0, 0]) == pytest.approx(weight * float((rows**2).sum()))

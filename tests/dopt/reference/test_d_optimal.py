@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from dopt.reference.dynamics import LearnedDynamics
-from dopt.reference.information import BatchInformation
-from dopt.reference.planning import d_optimal_inputs, planning_columns, quadratic_problem
+from dopt.reference.planning import (
+    BatchInformation,
+    d_optimal_inputs,
+    planning_columns,
+    quadratic_problem,
+)
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.sphere import maximize_on_sphere
@@ -48,23 +51,21 @@ def _axes(like: Tensor) -> Tensor:
     return torch.eye(len(like), dtype=torch.float64)
 
 
-def whole(rows: Tensor) -> Tensor:
-    """Return gradients as they are: no sketch."""
-    return rows
+class Solved(BatchInformation):
+    """Matrices, (n, s, s), with which systems of equations are solved as they are."""
+
+    def __init__(self, matrices: Tensor) -> None:
+        self._matrices = matrices
+
+    def solve(self, columns: Tensor) -> Tensor:
+        return torch.linalg.solve(self._matrices, columns)
 
 
 def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return Q, v and the chosen input of the reference."""
-    columns = planning_columns(
-        LearnedDynamics(spec.system, now.model),
-        whole,
-        now.theta[None],
-        now.state[None],
-        torch.tensor([[component]]),
-        torch.zeros(1, spec.system.n_inputs, dtype=torch.float64),
-    )
-    information = BatchInformation(now.information[None])
-    problem = quadratic_problem(columns, information.solve(columns.flatten(1, 2).mT))
+    given = now.theta[None], now.state[None], torch.tensor([component])
+    columns = planning_columns(spec.system, now.model, *given)
+    problem = quadratic_problem(columns, Solved(now.information[None]))
     ties = torch.ones(1, spec.system.n_inputs, dtype=torch.float64)
     u = d_optimal_inputs(problem, spec.system.gamma, ties)
     return problem.Q[0], problem.v[0], u[0]
@@ -141,16 +142,10 @@ def _gap_and_effect(env: str, dt: float) -> tuple[float, float]:
 def test_each_trial_of_a_batch_has_its_own_problem() -> None:
     spec = trial("arm", "d_optimal")
     several = [situation(spec, seed) for seed in range(3)]
-    columns = planning_columns(
-        LearnedDynamics(spec.system, several[0].model),
-        whole,
-        torch.stack([now.theta for now in several]),
-        torch.stack([now.state for now in several]),
-        torch.tensor([[0], [1], [1]]),
-        torch.zeros(3, 2, dtype=torch.float64),
-    )
-    information = BatchInformation(torch.stack([now.information for now in several]))
-    problem = quadratic_problem(columns, information.solve(columns.flatten(1, 2).mT))
+    theta, x = (torch.stack([now[i] for now in several]) for i in (1, 2))
+    columns = planning_columns(spec.system, several[0].model, theta, x, torch.tensor([0, 1, 1]))
+    information = Solved(torch.stack([now.information for now in several]))
+    problem = quadratic_problem(columns, information)
     ties = torch.ones(3, 2, dtype=torch.float64)
     inputs = d_optimal_inputs(problem, spec.system.gamma, ties)
     for i, component in enumerate((0, 1, 1)):

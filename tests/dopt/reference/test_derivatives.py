@@ -7,31 +7,35 @@ import pytest
 import torch
 from torch.func import jacrev, jvp
 
-from dopt.reference.derivatives import gradients_and_changes, jacobian, rows
-from dopt.reference.models import BatchModel, model_function, network_function
+from dopt.reference.models import (
+    BatchModel,
+    gradients_and_changes,
+    jacobian,
+    model_function,
+    network_function,
+)
 from dopt.systems import SYSTEMS
 from tests.dopt.torch_models import for_one
 from tests.dopt.trials import trial
 
-MODELS = ["mlp", "affine", "black_box", "linear", "rff"]
+MODELS = ["mlp", "linear"]
 
 
 def items(model: str, n: int, points: int) -> tuple[BatchModel, int, torch.Tensor, torch.Tensor]:
     """Return a model of the arm, its number of outputs, parameters (n, q) and points (n, N, ·)."""
-    learner = "recursive_least_squares" if model in ("linear", "rff") else "adam_window"
+    learner = "recursive_least_squares" if model == "linear" else "adam_window"
     policy = "oracle" if model == "linear" else "random"
     spec = trial("arm", policy, model={"name": model}, learner={"name": learner})
     rng = np.random.default_rng(1)
     theta = torch.tensor(rng.normal(size=(n, spec.model.n_parameters(spec.system))))
-    read = spec.system.n_states + spec.model.n_inputs_read(spec.system)
-    x = torch.tensor(rng.normal(size=(n, points, read)))
+    x = torch.tensor(rng.normal(size=(n, points, spec.system.n_states)))
     return model_function(spec.system, spec.model), spec.system.n_learned, theta, x
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_rows_are_those_of_each_item(model: str) -> None:
     function, r, theta, points = items(model, 3, 4)
-    found = rows(function, r, theta, points)
+    found = jacobian(function, r, theta, points)
     for i in range(3):
         for j in range(4):
             one = jacrev(for_one(function))(theta[i], points[i, j])
@@ -82,16 +86,6 @@ def test_a_network_that_does_not_use_a_parameter_has_zeros_there() -> None:
 
     function = network_function(SYSTEMS["pendulum"](), Partly())
     theta, x = torch.ones(2, 6, dtype=torch.float64), torch.ones(2, 3, 2, dtype=torch.float64)
-    J = rows(function, 1, theta, x)
+    J = jacobian(function, 1, theta, x)
     assert torch.equal(J[..., 4:], torch.zeros_like(J[..., 4:]))
     assert bool((J[..., :4] != 0).all())
-
-
-def test_the_jacobian_takes_each_row_alone() -> None:
-    def function(x: torch.Tensor) -> torch.Tensor:
-        return torch.stack([x[:, 0] * x[:, 1], x[:, 1].sin(), torch.ones_like(x[:, 0])], dim=1)
-
-    x = torch.tensor(np.random.default_rng(3).normal(size=(4, 2)))
-    for row, J in zip(x, jacobian(function, x), strict=True):
-        expected = torch.tensor([[row[1], row[0]], [0.0, row[1].cos()], [0.0, 0.0]])
-        torch.testing.assert_close(J, expected.double())

@@ -8,8 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dopt.reference.planning import QuadraticProblem, d_optimal_inputs
-from dopt.reference.sphere import maximize_on_spheres
+from dopt.reference.planning import QuadraticProblem, d_optimal_inputs, maximize_on_spheres
 from dopt.sphere import maximize_on_sphere
 from tests.dopt.math.test_sphere import problems, size, value
 

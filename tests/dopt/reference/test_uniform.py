@@ -5,7 +5,6 @@ import torch
 from torch import Tensor
 from torch.func import vmap
 
-from dopt.reference.dynamics import LearnedDynamics
 from dopt.reference.planning import uniform_inputs
 from tests.dopt.reference.batch import situation, sphere, step_from
 from tests.dopt.trials import KNOWN_EFFECT, trial
@@ -27,7 +26,7 @@ def test_no_input_on_the_sphere_leads_farther(env: str, seed: int) -> None:
     path = now.state + torch.flip(
         torch.cat([torch.zeros(1, system.n_states), steps.cumsum(0)]), [0]
     )
-    chosen = uniform_inputs(LearnedDynamics(system, now.model), now.theta[None], path[None], 8)[0]
+    chosen = uniform_inputs(system, now.model, now.theta[None], path[None], 8)[0]
     inputs = torch.cat([chosen[None], sphere(system.gamma, system.n_inputs)[::10]])
     found, *scan = spread(path, vmap(lambda u: step_from(spec, now, u))(inputs)).tolist()
     best, worst = max(scan), min(scan)

@@ -78,22 +78,10 @@ def test_numpy_torch_and_the_kernel_take_the_same_step(name: str, integrator: st
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
 
 
-CASES = [
-    *[(env, "d_optimal", None, None) for env in sorted(SYSTEMS)],
-    *[("cartpole", policy, None, None) for policy in ("random", "uniform", "oracle", "lookahead")],
-    *[("pendulum", "d_optimal", None, learner)
-      for learner in ("adam", "adam_replay", "ekf", "gauss_newton")],
-    ("pendulum", "gaussian_process", None, None),
-    ("pendulum", "d_optimal", "ensemble", "gauss_newton"),
-    ("pendulum", "d_optimal", "rff", "recursive_least_squares"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("env", "policy", "model", "learner"), CASES)
-def test_both_paths_agree(env: str, policy: str, model: str | None, learner: str | None) -> None:
-    if policy == "gaussian_process":
-        model, learner = "gaussian_process", "conditioning"
-    spec = integrated(env, policy, model=model, learner=learner, horizon=15)
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random", "oracle"])
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "quadrotor", "drifting_pendulum"])
+def test_both_paths_agree(env: str, policy: str) -> None:
+    spec = integrated(env, policy, horizon=15)
     fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
     assert relative_gap(fast.states, plain.states) < 1e-8
     assert relative_gap(fast.parameters, plain.parameters) < 1e-6
@@ -154,7 +142,7 @@ def test_an_explorer_fed_the_states_of_a_trial_learns_what_it_learned() -> None:
     np.testing.assert_allclose(explorer.parameters, result.parameters, atol=1e-12)
 
 
-@pytest.mark.parametrize("learner", ["adam_window", "gauss_newton"])
+@pytest.mark.parametrize("learner", ["adam", "adam_window"])
 def test_a_reset_changes_no_sample_before_it(learner: str) -> None:
     """The state in which a plant starts anew takes the place of the one that was reached."""
     spec = integrated("pendulum", "random", horizon=40)

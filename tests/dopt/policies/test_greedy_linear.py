@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from dopt.errors import IncompatibleError
 from dopt.policies.greedy_linear import is_linear
-from dopt.reference.batch import Lockstep, run_trials
+from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
+from tests.dopt.oracles.traces import trace
 from tests.dopt.trials import trial
 
 
@@ -32,8 +32,7 @@ def linear_trial(policy: str, seed: int = 0, **env: Any) -> TrialSpec:
 def test_the_d_optimal_policy_recovers_the_linear_one_exactly(seed: int) -> None:
     """Section 2: "we recover the D-optimal exploration algorithm of [7]"."""
     general, closed = (
-        run_trials([linear_trial(policy, seed, horizon=80)])[0]
-        for policy in ("d_optimal", "linear")
+        run_trial(linear_trial(policy, seed, horizon=80)) for policy in ("d_optimal", "linear")
     )
     assert closed.inputs == pytest.approx(general.inputs, rel=0.0, abs=1e-7)
     assert closed.states == pytest.approx(general.states, rel=0.0, abs=1e-7)
@@ -43,20 +42,17 @@ def test_the_d_optimal_policy_recovers_the_linear_one_exactly(seed: int) -> None
 
 def test_no_input_on_the_circle_grows_the_determinant_more() -> None:
     spec = linear_trial("linear", 3)
-    system, batch = spec.system, Lockstep([spec])
+    system, run = spec.system, trace(spec)
     gram = 1e-3 * np.eye(4)
     angles = np.linspace(0.0, 2 * np.pi, 721)
     circle = system.gamma * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    with torch.no_grad():
-        for t in range(12):
-            x, theta = batch.states[0, t].numpy(), batch.theta[0].numpy().copy()
-            batch.step(t)
-            chosen = batch.inputs[0, t].numpy()
-            gains = [_log_det(spec, theta, gram, x, u) for u in (chosen, *circle)]
-            if t > 0:
-                assert gains[0] >= max(gains[1:]) - 1e-9
-            z = system.featurize(x[None])[0]
-            gram += np.outer(z, z)
+    for t in range(12):
+        x, theta = run.states[t], run.parameters[t]
+        gains = [_log_det(spec, theta, gram, x, u) for u in (run.inputs[t], *circle)]
+        if t > 0:
+            assert gains[0] >= max(gains[1:]) - 1e-9
+        z = system.featurize(x[None])[0]
+        gram += np.outer(z, z)
 
 
 def _log_det(
@@ -74,7 +70,7 @@ def test_the_estimate_tends_to_the_true_matrix() -> None:
     spec = linear_trial("linear", 1, horizon=200)
     system = spec.system
     assert system.name == "mass_spring"
-    found = run_trials([spec])[0].parameters.reshape(2, 4) / np.array(system.feature_scales)
+    found = run_trial(spec).parameters.reshape(2, 4) / np.array(system.feature_scales)
     k, c = system.parameters[1:]
     true = [[-2 * k, -2 * c, k, c], [k, c, -2 * k, -2 * c]]
     assert found == pytest.approx(np.array(true), abs=0.02)
