@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from dopt.policies.titles import policy_title
+from dopt.policies import policy_title
 
 Dashes = str | tuple[float, tuple[float, ...]]
 """``"-"``, or an offset and lengths of strokes and gaps in units of the line's width."""

@@ -24,8 +24,7 @@ from analysis.data.matching import (
 )
 from analysis.errors import AnalysisError
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.policies import POLICIES
-from dopt.policies.titles import TITLES
+from dopt.policies import POLICIES, TITLES
 from dopt.spec.label import labels, limits_label, value_label
 from dopt.spec.trial import is_prequential, stored_trial
 from dopt.systems import NAMED_SYSTEMS

@@ -33,7 +33,7 @@ from analysis.figures.panels import GUIDE, Plot, legend_below, mathematical, she
 from analysis.formatting import but_diverged, plus_minus
 from analysis.line_styles import BLUE, GREY, environment_title
 from analysis.stats.intervals import mean, standard_error
-from dopt.policies.titles import policy_title
+from dopt.policies import policy_title
 from dopt.spec.label import flatten
 from dopt.spec.trial import system_of
 from dopt.systems import System

@@ -29,7 +29,7 @@ from analysis.line_styles import GREY, LineStyle, environment_title
 from analysis.plot_options import Axis, PlotOptions, Spread
 from analysis.stats.curves import Limits, LossCurve, axis_parts, measure_curves, tabulate_curves
 from analysis.stats.intervals import FEWEST, BandKind
-from dopt.policies.titles import policy_title
+from dopt.policies import policy_title
 
 PANEL_HEIGHT = 2.3
 PLACES = {"loss": "grid", "reachable_loss": "reachable set"}

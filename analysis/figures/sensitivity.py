@@ -33,7 +33,7 @@ from analysis.line_styles import environment_title, policy_style, text_by_enviro
 from analysis.stats.curves import log_limits
 from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
 from analysis.stats.scores import Scores, final_losses
-from dopt.policies.titles import policy_title
+from dopt.policies import policy_title
 from dopt.spec.label import flatten, value_label
 from dopt.spec.trial import system_of
 from orchestrate.store import Reader

@@ -48,7 +48,7 @@ from analysis.tables.comparisons import (
     paired,
 )
 from dopt.assessment import Plane
-from dopt.policies.titles import policy_title
+from dopt.policies import policy_title
 from dopt.spec.trial import is_prequential, system_of
 from orchestrate.store import Assessments, Reader
 

@@ -1,31 +1,63 @@
-"""Policies that choose the next input, one file for each, and the registry that names them."""
+"""Policies that choose the next input, and the registry that names them and their titles."""
 
 from __future__ import annotations
 
-from dopt.policies.a_optimal import AOptimal
 from dopt.policies.base import InformationPolicy, Policy
-from dopt.policies.chirp import Chirp
-from dopt.policies.d_optimal import DOptimal
+from dopt.policies.d_optimal import DOptimal, Oracle, TraceLinearized
 from dopt.policies.disagreement import Disagreement
-from dopt.policies.e_optimal import EOptimal
 from dopt.policies.episodic import Episodic
-from dopt.policies.exact import Exact
 from dopt.policies.gaussian_process import GaussianProcessEntropy
 from dopt.policies.gradient import GradientDOptimal
 from dopt.policies.greedy_linear import GreedyLinear
 from dopt.policies.icem import ICEM
-from dopt.policies.lookahead import Lookahead
-from dopt.policies.multisine import Multisine
-from dopt.policies.oracle import Oracle
-from dopt.policies.periodic import Periodic, PeriodicSquare
-from dopt.policies.prbs import PRBS
-from dopt.policies.random import RandomGaussian, RandomHeld, RandomSphere
-from dopt.policies.search import Search
+from dopt.policies.open_loop import (
+    PRBS,
+    Chirp,
+    Multisine,
+    Periodic,
+    PeriodicSquare,
+    RandomGaussian,
+    RandomHeld,
+    RandomSphere,
+)
+from dopt.policies.search import AOptimal, EOptimal, Exact, Lookahead, Search, TaskOptimal, Trace
 from dopt.policies.space_filling import SpaceFilling
-from dopt.policies.task import TaskOptimal
-from dopt.policies.trace import Trace
-from dopt.policies.trace_linearized import TraceLinearized
 from dopt.policies.uniform import Uniform
+
+TITLES: dict[str, str] = {
+    "d_optimal": "D-optimal",
+    "oracle": "oracle",
+    "uniform": "uniform",
+    "periodic": "periodic",
+    "random": "random",
+    "random_held": "held random",
+    "random_sphere": "random on the sphere",
+    "prbs": "PRBS",
+    "multisine": "multisine",
+    "chirp": "chirp",
+    "periodic_square": "periodic, square wave",
+    "max": "ensemble disagreement",
+    "gaussian_process": "Gaussian process",
+    "gradient": "D-optimal, by gradient",
+    "linear": "D-optimal, linear",
+    "lookahead": "look-ahead",
+    "icem": "iCEM",
+    "episodic": "episodic plans",
+    "exact": "exact gain",
+    "trace": "trace",
+    "trace_linearized": "trace, linearised",
+    "a_optimal": "A-optimal",
+    "e_optimal": "E-optimal",
+    "task": "task-optimal",
+    "space_filling": "space filling",
+}
+"""The policies of the paper come first; a user's own policy follows by its name."""
+
+
+def policy_title(policy: str) -> str:
+    """Return the title of a policy; without an entry, its name with spaces."""
+    return TITLES.get(policy, policy.replace("_", " "))
+
 
 POLICIES: dict[str, type[Policy]] = {
     policy.name: policy

@@ -1,4 +1,4 @@
-"""D-optimal exploration (Algorithm 2)."""
+"""D-optimal exploration (Algorithm 2), for all learned components, and as an oracle."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from dopt.errors import IncompatibleError
 from dopt.fields import parameter
 from dopt.policies.base import InformationPolicy
+from dopt.systems.base import System
 from dopt.types import Buckets, Signs
 
 SMALL_PRIMAL = 600
@@ -68,3 +70,43 @@ def count_sketch(n_parameters: int, size: int) -> tuple[Buckets, Signs]:
     rng = np.random.default_rng(_SKETCH_SEED)
     buckets = rng.integers(size, size=n_parameters).astype(np.uint32)
     return buckets, rng.choice([-1.0, 1.0], size=n_parameters).astype(np.int8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TraceLinearized(DOptimal):
+    """Maximise the sum over all components k of equation 7's objective on the sphere.
+
+    The quadratic problems of the components add up to one of the same kind, so that nothing has to
+    be drawn and nothing but the linearisation is approximate.
+    """
+
+    name: ClassVar[str] = "trace_linearized"
+    compiled: ClassVar[bool] = True
+
+    def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:  # noqa: ARG002  # of all components
+        return (1.0,)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Oracle(DOptimal):
+    """D-optimal inputs for the physical parametrisation, learned by least squares (section 3).
+
+    It goes with ``model=linear`` and ``learner=recursive_least_squares``.
+
+    Parameters
+    ----------
+    regularization : float
+        λ, the ridge of the least squares as well.
+    """
+
+    name: ClassVar[str] = "oracle"
+    compiled: ClassVar[bool] = True
+
+    regularization: float = parameter(1e-6, bound="positive")
+
+    def check(self, system: System) -> None:
+        if not system.linear_parameters:
+            raise IncompatibleError(
+                f"policy 'oracle' needs dynamics that are linear in unknown parameters, but env "
+                f"'{system.name}' declares none: choose another policy."
+            )

@@ -11,7 +11,7 @@ import numpy as np
 
 from dopt.fields import parameter
 from dopt.policies.base import Array, CustomPolicy, InformationPolicy, Planner
-from dopt.policies.candidate_policy import CandidatePolicy
+from dopt.policies.search import CandidatePolicy
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
 
@@ -38,7 +38,7 @@ class GradientDOptimal(CandidatePolicy, InformationPolicy, CustomPolicy):
     Parameters
     ----------
     candidates : int
-        As of :class:`dopt.policies.candidate_policy.CandidatePolicy`.
+        As of :class:`dopt.policies.search.CandidatePolicy`.
     starts : int
         How many of them the ascent starts from.
     iterations : int

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from dopt.fields import parameter
 from dopt.policies.base import ClosedLoop, check_length
-from dopt.policies.candidate_policy import CandidatePolicy
+from dopt.policies.search import CandidatePolicy
 from dopt.systems.base import System
 
 
@@ -19,7 +19,7 @@ class HeldCandidates(CandidatePolicy, ClosedLoop):
     lookahead : int
         Steps for which a candidate is held in prediction.
     candidates : int
-        As of :class:`dopt.policies.candidate_policy.CandidatePolicy`.
+        As of :class:`dopt.policies.search.CandidatePolicy`.
     """
 
     lookahead: int = parameter(1, "steps", "positive")

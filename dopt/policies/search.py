@@ -1,17 +1,103 @@
-"""Base class of policies that search for the best plan among a finite set."""
+"""Search for the best of some candidate inputs or plans, by several criteria."""
 
 from __future__ import annotations
 
+import functools
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import ClassVar
 
+import numpy as np
+
 from dopt.algorithm import Score
-from dopt.errors import unknown_name
+from dopt.errors import IncompatibleError, SpecificationError, unknown_name
 from dopt.fields import parameter
-from dopt.policies.base import InformationPolicy
-from dopt.policies.candidate_policy import CandidatePolicy
+from dopt.policies.base import Array, InformationPolicy, Policy, check_length, on_sphere
 from dopt.systems.base import System
+from dopt.systems.black_box import BlackBox
+from dopt.systems.properties import eigenmode
+
+LARGEST_REPELLED = 256
+"""More points than these stay where the sequence has them: repulsion takes their number squared."""
+
+_REPULSIONS = 400
+
+
+@functools.lru_cache(maxsize=16)
+def sphere_directions(n_inputs: int, count: int) -> Array:
+    """Return unit vectors, (C, m), spread well over the sphere; the same at every call.
+
+    For m = 1 these are ±1, for m = 2 equal angles from the first axis. Otherwise points of a
+    low-discrepancy sequence (M. Roberts, "The unreasonable effectiveness of quasirandom sequences",
+    2018) repel each other as charges do.
+
+    Parameters
+    ----------
+    n_inputs : int
+        m.
+    count : int
+        C, odd or even. One input has two directions, whatever the count.
+
+    Raises
+    ------
+    SpecificationError
+        If either number is below 1.
+    """
+    if n_inputs < 1 or count < 1:
+        raise SpecificationError(
+            f"{count} directions of {n_inputs} inputs are asked for, but at least 1 direction of "
+            f"at least 1 input is expected: give two whole numbers above 0."
+        )
+    if n_inputs == 1:
+        return np.array([[1.0], [-1.0]])
+    if n_inputs == 2:
+        angles = 2 * np.pi * np.arange(count) / count
+        return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = _quasirandom(n_inputs, count)
+    return _repelled(points) if count <= LARGEST_REPELLED else points
+
+
+def _quasirandom(m: int, count: int) -> Array:
+    """Return points on the unit sphere, (count, m), from a Kronecker sequence in the cube."""
+    root = 2.0
+    for _ in range(50):  # the positive root of x^(m + 1) = x + 1
+        root = (1.0 + root) ** (1.0 / (m + 1))
+    cube = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, m + 1))) % 1.0
+    return on_sphere(np.vectorize(NormalDist().inv_cdf)(cube), 1.0)
+
+
+def _repelled(points: Array) -> Array:
+    """Return points on the unit sphere, (C, m), moved apart by forces of one over distance²."""
+    count, m = points.shape
+    for i in range(_REPULSIONS):
+        gaps = points[:, None] - points
+        distances = np.linalg.norm(gaps, axis=-1) + np.eye(count)
+        force = (gaps / distances[..., None] ** 3).sum(axis=1)
+        force -= (force * points).sum(axis=1, keepdims=True) * points
+        largest = np.linalg.norm(force, axis=1).max() + 1e-300
+        step = (1 - i / _REPULSIONS) * count ** (-1 / (m - 1))
+        points = on_sphere(points + step / (2 * largest) * force, 1.0)
+    return points
+
+
+@dataclass(frozen=True, kw_only=True)
+class CandidatePolicy(Policy):
+    """A policy that compares candidate inputs.
+
+    Parameters
+    ----------
+    candidates : int
+        Inputs spread over the sphere ‖u‖ = γ; with one input there are two, ±γ.
+    """
+
+    candidates: int = parameter(16, "inputs", "positive")
+
+    def compared_inputs(self, system: System) -> Array:
+        """Return the candidates, (C, m), with norm γ."""
+        return system.gamma * sphere_directions(system.n_inputs, self.candidates)
+
 
 SCORES = {score.name.lower(): score for score in Score}
 """Scores by which plans are compared."""
@@ -36,7 +122,7 @@ class Search(CandidatePolicy, InformationPolicy):
     Parameters
     ----------
     candidates : int
-        As of :class:`dopt.policies.candidate_policy.CandidatePolicy`.
+        As of :class:`dopt.policies.search.CandidatePolicy`.
     budget_us : float
         Time for the search of one step [µs]; 0 is no limit. The first plan is always scored.
     """
@@ -70,3 +156,197 @@ def score_code(policy: Search) -> Score:
     if policy.score not in SCORES:
         raise unknown_name(f"score of policy '{policy.name}'", policy.score, SCORES)
     return SCORES[policy.score]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exact(Search):
+    """Maximise log det(I + J M⁻¹ Jᵀ), the growth of log det M, with J at x_t + dt f_θ(x_t, u).
+
+    The objective of Definition 1 for one step, which D-optimal exploration linearises for one
+    component (Proposition 1), over candidate inputs. Reference: V. Fedorov, "Theory of optimal
+    experiments" (1972).
+    """
+
+    name: ClassVar[str] = "exact"
+    compiled: ClassVar[bool] = True
+
+    @property
+    def score(self) -> str:
+        return "joint"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trace(Search):
+    """Maximise tr(J M⁻¹ Jᵀ), the sum of all components' variances, at x_t + dt f_θ(x_t, u).
+
+    The first-order term of log det(I + J M⁻¹ Jᵀ). It also is the objective of Algorithm 2 summed
+    over the components, without linearisation in u; :mod:`dopt.policies.d_optimal` has that.
+    """
+
+    name: ClassVar[str] = "trace"
+    compiled: ClassVar[bool] = True
+
+    @property
+    def score(self) -> str:
+        return "trace"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AOptimal(Search):
+    """Maximise the decrease of tr M⁻¹ by the rows J at x_t + dt f_θ(x_t, u).
+
+    With V = J M⁻¹ it is tr((I + V Jᵀ)⁻¹ V Vᵀ) (Woodbury identity). Reference: F. Pukelsheim,
+    "Optimal design of experiments" (1993), chapter 6.
+    """
+
+    name: ClassVar[str] = "a_optimal"
+    compiled: ClassVar[bool] = True
+
+    @property
+    def score(self) -> str:
+        return "a"
+
+
+_START_SEED = 1_712
+
+
+@dataclass(frozen=True, kw_only=True)
+class EOptimal(Search):
+    """Maximise the smallest eigenvalue of M + JᵀJ, with J at x_t + dt f_θ(x_t, u).
+
+    Its inverse is the largest eigenvalue of (M + JᵀJ)⁻¹. It is taken by Rayleigh and Ritz in a
+    block Krylov space of M⁻¹, the same for all candidates, from r + 1 fixed vectors: a step adds r
+    rows, so that an eigenvalue of larger multiplicity is seen to stay. As long as fewer than q rows
+    are known that is 1/λ whatever the input: the criterion is blind, and chance decides.
+    Reference: Y. Saad, "Numerical methods for large eigenvalue problems", 2nd ed., chapter 6.
+
+    Parameters
+    ----------
+    subspace : int
+        Dimensions of the Krylov space; with q of them the eigenvalue is exact.
+    """
+
+    name: ClassVar[str] = "e_optimal"
+    compiled: ClassVar[bool] = True
+
+    subspace: int = parameter(32, "dimensions", "positive")
+
+    @property
+    def score(self) -> str:
+        return "e"
+
+    def starts(self, n_parameters: int, n_learned: int) -> Array:
+        """Return the vectors that span the Krylov space at first, (≤ r + 1, q)."""
+        count = min(n_learned + 1, self.subspace, n_parameters)
+        return np.random.default_rng(_START_SEED).standard_normal((count, n_parameters))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskOptimal(Search):
+    """Maximise the decrease of the predictive variance summed over states that matter to a task.
+
+    With G the rows of the Jacobian at these states and V = J M⁻¹, the decrease by the rows J at
+    x_t + dt f_θ(x_t, u) is tr((I + V Jᵀ)⁻¹ V GᵀG Vᵀ): V-optimal design. The states are drawn once
+    for all from the evaluation box or the reachable set, with weights exp(-δ²/2) that fall with
+    the distance δ to the goal (:func:`dopt.policies.task_states.task_states`). Reference:
+    A. Atkinson, A. Donev and R. Tobias, "Optimum experimental designs" (2007), chapter 10.
+
+    Parameters
+    ----------
+    states : {"grid", "reachable"}
+        Where the states are drawn from: the box of the evaluation grid, or the states that the true
+        system visits under strong inputs, which takes the true system to know.
+    count : int
+        Number of states.
+    goal : tuple of float
+        State of the task, in its d components; empty weighs all states alike.
+    radius : float
+        Distance to the goal at which the weight is e^(-1/2), in half-widths of the grid.
+    """
+
+    name: ClassVar[str] = "task"
+    compiled: ClassVar[bool] = True
+
+    states: str = parameter("grid", choices=("grid", "reachable"))
+    count: int = parameter(32, "states", "positive")
+    goal: tuple[float, ...] = parameter(())
+    radius: float = parameter(0.5, "half-widths", "positive")
+
+    @property
+    def score(self) -> str:
+        return "task"
+
+    def check(self, system: System) -> None:
+        if self.states == "reachable" and isinstance(system, BlackBox):
+            raise IncompatibleError(
+                f"policy.states is 'reachable', but where env '{system.name}' can be driven is not "
+                f"known without its equations: set it to grid."
+            )
+        if self.goal and len(self.goal) != system.n_states:
+            raise IncompatibleError(
+                f"policy.goal has {len(self.goal)} entries, but a state of env '{system.name}' has "
+                f"{system.n_states}: give one for each of them, or none."
+            )
+
+
+PERIOD_SHARE = 0.6
+STEPS_WITHOUT_PERIOD = 10
+STATES_OF_A_PATH = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lookahead(Search):
+    """Score "hold u" and "hold u for H/2 steps, then u'" over all candidates u and u'.
+
+    One step is blind where an input acts through an integrator: a rotation moves a quadrotor
+    sideways only later. The first input of the best of the C² plans is applied, and the plan is
+    made anew at the next step.
+
+    Parameters
+    ----------
+    lookahead : int or None
+        H; None takes 0.6 periods of the least damped oscillation about the stable equilibrium, and
+        10 steps where there is none. The period is the true system's, as that of the periodic
+        policy is: give H where it is unknown.
+    criterion : {"joint", "sum"}
+        ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` that of each state's
+        rows alone, summed over the path.
+    stride : int or None
+        Every how many steps a state's rows are taken; in ``joint`` each counts so many times. None
+        takes a fifth of the plan's steps: neighbouring rows are nearly the same.
+    """
+
+    name: ClassVar[str] = "lookahead"
+    compiled: ClassVar[bool] = True
+
+    candidates: int = parameter(8, "inputs", "positive")
+    lookahead: int | None = parameter(None, "steps", "positive")
+    criterion: str = parameter("sum", choices=("joint", "sum"))
+    stride: int | None = parameter(None, "steps", "positive")
+
+    def check(self, system: System) -> None:
+        if self.lookahead is not None:
+            check_length("policy.lookahead", self.lookahead, system)
+        if self.stride is not None and self.stride > self.steps(system):
+            raise IncompatibleError(
+                f"policy.stride is {self.stride} steps, but the plans have {self.steps(system)}: "
+                f"make it smaller, or policy.lookahead larger."
+            )
+
+    @property
+    def score(self) -> str:
+        return self.criterion
+
+    def steps(self, system: System) -> int:
+        if self.lookahead is not None:
+            return self.lookahead
+        mode = eigenmode(system)
+        if mode is None:
+            return STEPS_WITHOUT_PERIOD
+        return max(1, round(PERIOD_SHARE * 2 * math.pi / mode.frequency / system.dt))
+
+    def stride_of(self, system: System) -> int:
+        """Return every how many steps of a plan a state's rows are taken."""
+        if self.stride is not None:
+            return self.stride
+        return max(1, self.steps(system) // STATES_OF_A_PATH)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dopt.evaluation import reachable_states
 from dopt.policies.base import Array
-from dopt.policies.task import TaskOptimal
+from dopt.policies.search import TaskOptimal
 from dopt.systems.base import System
 
 DRAWN = 4096

@@ -11,7 +11,7 @@ M       information matrix                                  q × q
 J       rows that a sample adds: M grows by JᵀJ             r × q
 ======  ==================================================  =========
 
-The maximum on the sphere is found as in :mod:`dopt.math.sphere`, in another form: the root of the
+The maximum on the sphere is found as in :mod:`dopt.sphere`, in another form: the root of the
 secular equation is enclosed for all problems at once, in intervals of which each is a part of the
 one before.
 """

@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dopt.control import Control
 from dopt.errors import SpecificationError
 from dopt.fields import Validated, default_path
-from dopt.policies.titles import policy_title
+from dopt.policies import policy_title
 from dopt.registry import SOURCE, TARGET, section_of
 from dopt.spec.config import REGISTRIES, SECTIONS, completed, section_class, section_name
 from dopt.systems import System

@@ -12,7 +12,7 @@ from dopt.errors import SpecificationError
 from dopt.fields import Validated, parameter
 from dopt.learning import Adam
 from dopt.models import MLP
-from dopt.policies.random import RandomSphere
+from dopt.policies.open_loop import RandomSphere
 from dopt.spec.trial import TrialSpec
 from dopt.systems import Pendulum
 

@@ -11,7 +11,7 @@ import pytest
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set, reachable_states
 from dopt.policies import Exact, Lookahead, TaskOptimal
-from dopt.policies.lookahead import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
+from dopt.policies.search import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
 from dopt.policies.task_states import goal_weights, task_states
 from dopt.run import run_trial
 from dopt.spec.config import TrialConfig

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dopt.errors import SpecificationError
-from dopt.policies.sphere_directions import LARGEST_REPELLED, sphere_directions
+from dopt.policies.search import LARGEST_REPELLED, sphere_directions
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 4, 7])

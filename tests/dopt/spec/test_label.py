@@ -8,8 +8,7 @@ from itertools import combinations
 
 import pytest
 
-from dopt.policies import POLICIES
-from dopt.policies.titles import TITLES
+from dopt.policies import POLICIES, TITLES
 from dopt.spec.label import config_label, labels, value_label
 from dopt.spec.trial import TrialSpec
 
