@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.control.planning import (
-    Array,
     Forecast,
     forecast_by,
     forecast_by_equations,
@@ -30,6 +29,7 @@ from dopt.randomness import stream
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
+from dopt.types import Array
 
 
 def true_forecast(system: System) -> Forecast:
