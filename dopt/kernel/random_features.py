@@ -1,8 +1,8 @@
 """Combinations W ψ(x) of D given functions of the state, and their derivatives, in compiled code.
 
-Random Fourier features (:mod:`dopt.models.rff`) are ψ(x) = c cos(Ω φ(x) + b), with φ the features
-of the state; a linear map of the features (:mod:`dopt.models.linear_state`) has ψ = φ. The learned
-parameters are those of W, row by row: row k of J has ψ at the places k D to (k + 1) D and zeros
+Random Fourier features are ψ(x) = c cos(Ω φ(x) + b), with φ the features of the state; a linear map
+of the features has ψ = φ (:mod:`dopt.models.linear`). The learned parameters are the entries of W,
+row by row: row k of J has ψ at the places k D to (k + 1) D and zeros
 elsewhere.
 """
 

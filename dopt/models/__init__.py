@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dopt.models.base import Model
 from dopt.models.grey_box import GreyBox
-from dopt.models.linear import RFF, GaussianProcess, Linear
-from dopt.models.linear_state import LinearState
+from dopt.models.linear import RFF, GaussianProcess, Linear, LinearState
 from dopt.models.networks import MLP, AffineMLP, BlackBoxMLP, Ensemble
 
 MODELS: dict[str, type[Model]] = {

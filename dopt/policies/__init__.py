@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dopt.policies.base import InformationPolicy, Policy
-from dopt.policies.d_optimal import DOptimal, Oracle, TraceLinearized
-from dopt.policies.disagreement import Disagreement
-from dopt.policies.episodic import Episodic
-from dopt.policies.gaussian_process import GaussianProcessEntropy
-from dopt.policies.gradient import GradientDOptimal
-from dopt.policies.greedy_linear import GreedyLinear
-from dopt.policies.icem import ICEM
+from dopt.policies.d_optimal import (
+    DOptimal,
+    GradientDOptimal,
+    GreedyLinear,
+    Oracle,
+    TraceLinearized,
+    Uniform,
+)
+from dopt.policies.held_candidates import Disagreement, GaussianProcessEntropy, SpaceFilling
+from dopt.policies.icem import ICEM, Episodic
 from dopt.policies.open_loop import (
     PRBS,
     Chirp,
@@ -21,8 +24,6 @@ from dopt.policies.open_loop import (
     RandomSphere,
 )
 from dopt.policies.search import AOptimal, EOptimal, Exact, Lookahead, Search, TaskOptimal, Trace
-from dopt.policies.space_filling import SpaceFilling
-from dopt.policies.uniform import Uniform
 
 TITLES: dict[str, str] = {
     "d_optimal": "D-optimal",

@@ -49,9 +49,8 @@ from dopt.policies import (
     Uniform,
 )
 from dopt.policies.base import CustomPolicy, OpenLoop
-from dopt.policies.disagreement import Disagreement
-from dopt.policies.gaussian_process import GaussianProcessEntropy
-from dopt.policies.greedy_linear import GreedyLinear
+from dopt.policies.d_optimal import GreedyLinear
+from dopt.policies.held_candidates import Disagreement, GaussianProcessEntropy
 from dopt.systems import System
 from dopt.systems.black_box import BlackBox, differentiated
 from dopt.systems.plant import ExploredPlant

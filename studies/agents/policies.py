@@ -184,7 +184,7 @@ class ActiveExploration(CustomPolicy):
     The agent is the one of Stable-Baselines3. Reference: P. Shyam, W. Jaśkowski
     and F. Gomez, "Model-based active exploration" (ICML 2019), algorithm 1. There networks and
     agent are new at each plan and learn far longer; here they go on from the plan before, with the
-    transitions imagined anew. :class:`dopt.policies.disagreement.Disagreement` compares held
+    transitions imagined anew. :class:`dopt.policies.held_candidates.Disagreement` compares held
     inputs instead.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Predictive entropy in compiled code (:mod:`dopt.policies.gaussian_process`).
+"""Predictive entropy in compiled code (:mod:`dopt.policies.held_candidates`).
 
 Legend beside :mod:`dopt.kernel.structs`: C candidates, H steps for which one is held, n samples
 taken, L their Cholesky factor (:mod:`dopt.kernel.learners.conditioning`).

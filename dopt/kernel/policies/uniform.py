@@ -1,4 +1,4 @@
-"""Uniform exploration in compiled code (:mod:`dopt.policies.uniform`).
+"""Uniform exploration in compiled code (:mod:`dopt.policies.d_optimal`).
 
 Its number is the count of ascent steps.
 """

@@ -1,4 +1,4 @@
-"""Episodic planner in compiled code (:mod:`dopt.policies.episodic`).
+"""Episodic planner in compiled code (:mod:`dopt.policies.icem`).
 
 Its numbers are those of the sampling planner and the steps k from one search to the next.
 """

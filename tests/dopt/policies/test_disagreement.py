@@ -7,7 +7,7 @@ import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.kernel.stepped_trial import SteppedTrial
-from dopt.policies.disagreement import DisagreementPlan
+from dopt.policies.held_candidates import DisagreementPlan
 from dopt.run import run_trial
 from tests.dopt.trials import trial
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dopt.policies.gradient import ascend
+from dopt.policies.d_optimal import ascend
 from dopt.types import Array
 from tests.dopt.oracles.traces import Trace, information, jacobian, model_step, trace
 from tests.dopt.trials import trial

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import IncompatibleError
-from dopt.policies.greedy_linear import is_linear
+from dopt.policies.d_optimal import is_linear
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS

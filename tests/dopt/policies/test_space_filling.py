@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt.policies.space_filling import SpaceFilling, SpaceFillingPlan
+from dopt.policies.held_candidates import SpaceFilling, SpaceFillingPlan
 from dopt.run import run_trial
 from dopt.systems import SYSTEMS
 from dopt.trial_view import Array, TrialView
