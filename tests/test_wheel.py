@@ -127,7 +127,6 @@ class Plan(Planner):
 @dataclass(frozen=True, kw_only=True)
 class Held(CustomPolicy):
     name: ClassVar[str] = "held"
-    compiled: ClassVar[bool] = False  # nothing is compiled for this test
 
     def planner(self, system, rng):
         return Plan()

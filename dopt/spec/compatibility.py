@@ -148,6 +148,7 @@ def check_reference(
         ("policy.information 'fresh'", not is_fresh(policy)),
         ("states that are measured with noise", not system.n_measured),
         ("limits", not enforced),
+        ("env.restarts", not getattr(system, "restarts", False)),
     ):
         if not runs:
             raise IncompatibleError(_kernel_alone(what, parts))

@@ -124,7 +124,7 @@ def test_the_examples_of_the_tutorial_mean_the_same_on_both_paths(
 def test_copies_of_shipped_classes_give_their_very_numbers() -> None:
     shipped = trial("cartpole", "d_optimal", 2, env={"horizon": 120})
     for section, name in (("policy", "OwnDOptimal"), ("learner", "OwnAdam")):
-        given = {"_target_": f"benchmarks.compiled_plugins.{name}"}
+        given = {"_target_": f"studies.speed.compiled_plugins.{name}"}
         copy = run_trial(TrialSpec.from_mapping({**shipped.to_mapping(), section: given}))
         assert np.array_equal(copy.inputs, run_trial(shipped).inputs)
         assert np.array_equal(copy.parameters, run_trial(shipped).parameters)
@@ -161,7 +161,7 @@ def test_a_function_that_does_not_compile_is_one_sentence() -> None:
 
 
 def test_what_brings_a_compiled_function_alone_is_refused_on_the_reference_path() -> None:
-    with pytest.raises(SpecificationError, match="'large' brings a compiled function alone"):
+    with pytest.raises(SpecificationError, match="'large' runs in the compiled kernel alone"):
         changed("policy", own("Large"), path="reference")
 
 

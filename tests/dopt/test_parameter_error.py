@@ -37,7 +37,7 @@ def test_systems_whose_loss_is_no_parameter_error_are_refused() -> None:
     with pytest.raises(SpecificationError, match=r"'pendulum' weighs its parameters differently"):
         loss_by_parameter_error(SYSTEMS["pendulum"]())
     uneven = CoupledPendulums(n_pendulums=2, grid_half_widths=(1.0, 1.1))
-    with pytest.raises(SpecificationError, match=r"dopt\.rerun"):
+    with pytest.raises(SpecificationError, match=r"dopt\.run"):
         loss_by_parameter_error(uneven)
     even = dataclasses.replace(uneven, grid_half_widths=(1.0,))
     assert loss_by_parameter_error(even) == pytest.approx(1 / 3**0.5, rel=1e-3)

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.offline_fit import recorded_samples
-from dopt.reference.batch import run_trials
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 
@@ -43,12 +42,11 @@ def specification(
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.5, 2.0])
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-def test_what_was_applied_is_recorded_and_learned_from(gamma: float, path: str) -> None:
+def test_what_was_applied_is_recorded_and_learned_from(gamma: float) -> None:
     """Actions are cut to whole numbers towards 0, so that none is larger than γ."""
     spec = specification("Whole", "uniform", gamma=gamma)
     TAKEN.clear()
-    result = run_trial(spec, path)
+    result = run_trial(spec)
     # Other runs are those of the evaluation, where it is not known yet.
     assert any(np.array_equal(result.inputs, np.array(taken, float)) for taken in TAKEN)
     assert set(result.inputs.ravel()) <= {-2.0, -1.0, 0.0, 1.0, 2.0}
@@ -114,11 +112,10 @@ def test_restarts_are_no_part_of_the_key_unless_they_are_asked_for() -> None:
 
 
 @pytest.mark.parametrize("identity", ["Truncating", "Restarting"])
-@pytest.mark.parametrize("path", ["kernel", "reference"])
-def test_nothing_is_taught_across_a_restart(identity: str, path: str) -> None:
+def test_nothing_is_taught_across_a_restart(identity: str) -> None:
     noting = {"_target_": "tests.dopt.rough_environments.Noting"}
     spec = specification(identity, "random", noting, restarts=True)
-    result = run_trial(spec, path)
+    result = run_trial(spec)
     states, inputs, accelerations = SEEN
     assert len(states) == 30
     np.testing.assert_allclose(accelerations, -DRAG * states[:, 1:], atol=1e-4)
@@ -130,20 +127,10 @@ def test_nothing_is_taught_across_a_restart(identity: str, path: str) -> None:
         recorded_samples(spec.system, result.states, result.inputs)
 
 
-@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
-def test_pieces_are_learned_as_the_reference_learns_them(policy: str) -> None:
-    """The reference is another implementation, which takes the steps of all seeds together."""
-    specs = [
-        specification("Near", policy, seed=seed, restarts=True, grid_half_widths=[2.0])
-        for seed in range(2)
-    ]
-    for together, spec in zip(run_trials(specs), specs, strict=True):
-        alone = run_trial(spec)
-        np.testing.assert_allclose(together.states, alone.states, rtol=1e-7)
-        np.testing.assert_allclose(together.inputs, alone.inputs, atol=1e-6)
-        np.testing.assert_allclose(together.parameters, alone.parameters, rtol=1e-4, atol=1e-6)
-        np.testing.assert_array_equal(run_trial(spec).states, alone.states)
-    assert not np.array_equal(*(run_trial(spec).states for spec in specs))
+def test_the_torch_path_does_not_explore_in_pieces() -> None:
+    spec = specification("Near", "random", {"name": "adam_window"}, restarts=True)
+    with pytest.raises(IncompatibleError, match=r"env\.restarts runs in the compiled kernel alone"):
+        run_trial(spec, "reference")
 
 
 def test_the_loss_of_pieces_is_taken_within_them() -> None:

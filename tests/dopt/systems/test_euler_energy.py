@@ -21,9 +21,8 @@ LEAST = 0.01
 
 
 def shipped(name: str) -> System:
-    files = (CONF / "env").rglob(f"{name}.yaml")
-    (path,) = (file for file in files if file.parent.name != "mujoco")
-    section = OmegaConf.to_container(OmegaConf.load(path))
+    file = CONF / "env" / f"{name}.yaml"
+    section = OmegaConf.to_container(OmegaConf.load(file)) if file.exists() else {"name": name}
     assert isinstance(section, dict)
     return system_from_mapping(section)
 

@@ -174,13 +174,6 @@ def test_planned_inputs_teach_the_pendulum_where_random_ones_do_not() -> None:
         assert planned.loss[-1] < 0.3 * random.loss[-1]
 
 
-def test_both_paths_run_the_same_trial() -> None:
-    spec = specification("mujoco_reacher", "d_optimal", horizon=30)
-    kernel, reference = run_trial(spec), run_trial(spec, "reference")
-    np.testing.assert_allclose(kernel.states, reference.states, rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(kernel.loss, reference.loss, rtol=1e-5)
-
-
 def test_the_seed_decides_about_the_start_and_policies_share_it() -> None:
     first, second, other = (
         run_trial(specification(policy=policy, seed=seed, horizon=5)).states

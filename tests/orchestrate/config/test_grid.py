@@ -66,14 +66,14 @@ def test_a_seed_is_a_whole_number_of_at_least_zero(seeds: Any) -> None:
         build_grid([combination(seeds)])
 
 
-OWN = {"_target_": "tests.dopt.custom_plugins.InTorch"}
+OWN = {"_target_": "tests.dopt.custom_networks.Stack"}
 
 
 def test_a_grid_holds_trials_of_both_paths() -> None:
-    grid = build_grid([combination(), combination(policy=OWN)])
-    paths = {(trial.policy.name, trial.config.path) for trial in grid.trials}
-    assert paths == {("random", "kernel"), ("in_torch", "reference")}
+    grid = build_grid([combination(), combination(model=OWN)])
+    paths = {(trial.model.name, trial.config.path) for trial in grid.trials}
+    assert paths == {("mlp", "kernel"), ("Stack", "reference")}
     together = grid.on_path("reference")
     assert {trial.config.path for trial in together.trials} == {"reference"}
-    same = [trial.trial_key for trial in together.trials if trial.policy.name == "in_torch"]
-    assert same == [trial.trial_key for trial in grid.trials if trial.policy.name == "in_torch"]
+    same = [trial.trial_key for trial in together.trials if trial.model.name == "Stack"]
+    assert same == [trial.trial_key for trial in grid.trials if trial.model.name == "Stack"]

@@ -173,21 +173,19 @@ def test_nothing_is_made_for_a_wrong_grid(launches: Launches) -> None:
         Reader.open(launches.url)
 
 
-@pytest.mark.parametrize(
-    ("policies", "prepared"), [(("in_torch",), 0), (("in_torch", "random"), 1)]
-)
+@pytest.mark.parametrize(("models", "prepared"), [(("in_torch",), 0), (("in_torch", "mlp"), 1)])
 def test_the_kernel_is_made_ready_where_a_trial_needs_it(
-    tmp_path: Path, policies: tuple[str, ...], prepared: int
+    tmp_path: Path, models: tuple[str, ...], prepared: int
 ) -> None:
     calls: list[None] = []
     sections = {
-        "in_torch": {"_target_": "tests.dopt.custom_plugins.InTorch"},
-        "random": {"name": "random"},
+        "in_torch": {"_target_": "tests.dopt.custom_networks.Stack"},
+        "mlp": {"name": "mlp"},
     }
     usual = specification().to_mapping()
     trials = [
-        TrialSpec.from_mapping({k: v for k, v in usual.items() if k != "path"} | {"policy": chosen})
-        for chosen in (sections[name] for name in policies)
+        TrialSpec.from_mapping({k: v for k, v in usual.items() if k != "path"} | {"model": chosen})
+        for chosen in (sections[name] for name in models)
     ]
     grid = Grid(trials, n_jobs=len(trials), left_out={})
     settings = LaunchSettings("inprocess", f"sqlite:///{tmp_path / 'results.db'}")
