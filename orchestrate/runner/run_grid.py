@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 import threading
 import time
 from collections import Counter
@@ -70,7 +69,7 @@ def launch_grid(
     record: LaunchRecord,
     work: Work,
     say: Say,
-    stream: TextIO | None = sys.stderr,
+    stream: TextIO | None = None,
     warn: Say | None = None,
 ) -> ExitCode:
     """Bring every trial of the grid to an outcome, or leave that to workers.

@@ -107,7 +107,7 @@ def run(request: Request, grid: Grid, settings: LaunchSettings) -> int:
         return ExitCode.DONE
     record = launch_record(sys.argv, request.overrides, ROOT)
     if not request.single:
-        return launch_grid(grid, settings, record, WORK, say=say)
+        return launch_grid(grid, settings, record, WORK, say=say, stream=sys.stderr)
     code, line = launch_trial(grid.trials[0], settings, record, WORK)
     say(line)
     return code
