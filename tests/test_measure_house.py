@@ -1,4 +1,4 @@
-"""What counts as a line of code."""
+"""Lines of code as the measurement counts them."""
 
 from __future__ import annotations
 

@@ -224,7 +224,8 @@ def _launches(reader: Reader) -> Content:
         outcomes = {int(row[0]): row[1:] for row in moment.rows(_OUTCOMES)}
     return {
         "launches": [
-            _launch(one) | dict(zip(("finished", "failed"), outcomes.get(one.launch_id, (0, 0))))  # noqa: B905
+            _launch(one)
+            | dict(zip(("finished", "failed"), outcomes.get(one.launch_id, (0, 0)), strict=True))
             for one in found[:MOST_LAUNCHES]
         ],
         "n_launches": len(found),

@@ -1,4 +1,4 @@
-"""What stands in a trial before each of its steps, and the model of a trial in plain numpy."""
+"""Contents of a trial before each of its steps, and its model in plain numpy."""
 
 from __future__ import annotations
 
