@@ -127,6 +127,18 @@ def test_nothing_is_taught_across_a_restart(identity: str) -> None:
         recorded_samples(spec.system, result.states, result.inputs)
 
 
+@pytest.mark.parametrize("learner", ["gauss_newton", "adam_replay"])
+def test_learners_fit_the_pieces(learner: str) -> None:
+    """The jumps between them, taken for accelerations, are beyond ten times the true ones."""
+    for seed in range(2):
+        result = run_trial(specification("Near", "random", learner, seed=seed, restarts=True))
+        assert result.loss[-1] < 0.5 * result.loss[0]
+        assert np.array_equal(
+            run_trial(specification("Near", "random", learner, seed=seed, restarts=True)).states,
+            result.states,
+        )
+
+
 def test_the_torch_path_does_not_explore_in_pieces() -> None:
     spec = specification("Near", "random", {"name": "adam_window"}, restarts=True)
     with pytest.raises(IncompatibleError, match=r"env\.restarts runs in the compiled kernel alone"):
