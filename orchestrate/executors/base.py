@@ -151,16 +151,21 @@ def run_task(run: Run, task: Task, limits: Limits = NO_LIMITS) -> TaskDone:
             outcome = _checked(run(task.spec))
     except (Exception, SystemExit, TrialTimeoutError) as error:
         outcome = failure_of(error)
-    run_record = RunRecord(
+    run_record = record_of(started, time.perf_counter() - wall, time.process_time() - cpu)
+    return TaskDone(task.key, run_record, outcome)
+
+
+def record_of(started: datetime, wall_seconds: float, cpu_seconds: float) -> RunRecord:
+    """Return the record of a run in this process, which ends now."""
+    return RunRecord(
         node=socket.gethostname(),
         pid=os.getpid(),
-        wall_seconds=time.perf_counter() - wall,
-        cpu_seconds=time.process_time() - cpu,
+        wall_seconds=wall_seconds,
+        cpu_seconds=cpu_seconds,
         peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_KIB,
         started=started,
         ended=datetime.now(UTC),
     )
-    return TaskDone(task.key, run_record, outcome)
 
 
 def failure_of(error: BaseException) -> Failure:

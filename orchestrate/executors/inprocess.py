@@ -6,20 +6,14 @@ from collections import deque
 from collections.abc import Sequence
 
 from orchestrate.executors.base import Event, Executor, Run, Task, run_task
-from orchestrate.executors.factory import ExecutorFactory, limits_of
 from orchestrate.executors.limits import NO_LIMITS, Limits
+from orchestrate.executors.registry import ExecutorFactory, limits_of
 
 
-class InProcessExecutor(Executor):
-    """Runs one task at each call of ``wait``.
+class QueueExecutor(Executor):
+    """Queue of chunks that run in this process, in calls of ``wait``."""
 
-    A time limit cannot stop native code that does not return to the interpreter. The memory limit
-    is not set, because it would hold for the whole launch.
-    """
-
-    def __init__(self, run: Run, limits: Limits = NO_LIMITS) -> None:
-        self._run = run
-        self._limits = limits
+    def __init__(self) -> None:
         self._chunks: deque[deque[Task]] = deque()
 
     def start(self) -> None:
@@ -29,6 +23,26 @@ class InProcessExecutor(Executor):
         if chunk:
             self._chunks.append(deque(chunk))
 
+    @property
+    def pending(self) -> int:
+        return len(self._chunks)
+
+    def stop(self) -> None:
+        self._chunks.clear()
+
+
+class InProcessExecutor(QueueExecutor):
+    """Runs one task at each call of ``wait``.
+
+    A time limit cannot stop native code that does not return to the interpreter. The memory limit
+    is not set, because it would hold for the whole launch.
+    """
+
+    def __init__(self, run: Run, limits: Limits = NO_LIMITS) -> None:
+        super().__init__()
+        self._run = run
+        self._limits = limits
+
     def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a running trial is not left
         if not self._chunks:
             return []
@@ -36,13 +50,6 @@ class InProcessExecutor(Executor):
         if not self._chunks[0]:
             self._chunks.popleft()
         return [event]
-
-    @property
-    def pending(self) -> int:
-        return len(self._chunks)
-
-    def stop(self) -> None:
-        self._chunks.clear()
 
 
 FACTORY = ExecutorFactory(

@@ -1,18 +1,13 @@
 """Executor that runs the trials of one configuration as torch batches, on a GPU or the CPU.
 
 The torch path (:mod:`dopt.reference`) takes each step for the whole batch at once: of the paper's
-policies, open-loop ones and networks of a user's own. Other trials are refused with a sentence.
-The numbers equal those of the kernel up to rounding.
+policies, open-loop ones and custom networks. Other trials are refused with a sentence. The numbers
+equal those of the kernel up to rounding.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import os
-import resource
-import socket
 import time
-from collections import deque
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
@@ -20,15 +15,16 @@ from dopt.result import TrialResult
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.value_checks import count, text
 from orchestrate.errors import LaunchError
-from orchestrate.executors.base import BYTES_PER_KIB, Event, Executor, Task, TaskDone, failure_of
-from orchestrate.executors.factory import ExecutorFactory
-from orchestrate.records import Failure, RunRecord
+from orchestrate.executors.base import Event, Task, TaskDone, failure_of, record_of
+from orchestrate.executors.inprocess import QueueExecutor
+from orchestrate.executors.registry import ExecutorFactory
+from orchestrate.records import Failure
 
 DEVICE = "cpu"
 BATCH_SIZE = 100
 
 
-class LockstepExecutor(Executor):
+class LockstepExecutor(QueueExecutor):
     """Runs each chunk of trials of one configuration as one batch in this process.
 
     A batch has no time limit: its trials advance together, so that none can be stopped alone.
@@ -42,27 +38,16 @@ class LockstepExecutor(Executor):
     """
 
     def __init__(self, device: str, batch: int) -> None:
+        super().__init__()
         self._device = device
         self.batch = batch
-        self._chunks: deque[list[Task]] = deque()
 
     def start(self) -> None:
         check_device(self._device)
-        self.slots = 1
-
-    def submit(self, chunk: Sequence[Task]) -> None:
-        if chunk:
-            self._chunks.append(list(chunk))
+        super().start()
 
     def wait(self, timeout: float) -> list[Event]:  # noqa: ARG002  # a running batch is not left
         return run_batch(self._chunks.popleft(), self._device) if self._chunks else []
-
-    @property
-    def pending(self) -> int:
-        return len(self._chunks)
-
-    def stop(self) -> None:
-        self._chunks.clear()
 
 
 def check_device(device: str) -> None:
@@ -91,18 +76,10 @@ def run_batch(tasks: Sequence[Task], device: str) -> list[Event]:
         outcomes = [assessed(spec, result) for spec, result in zip(specs, results, strict=True)]
     except Exception as error:
         outcomes = [failure_of(error)] * len(tasks)
-    share = RunRecord(
-        node=socket.gethostname(),
-        pid=os.getpid(),
-        wall_seconds=(time.perf_counter() - wall) / len(tasks),
-        cpu_seconds=(time.process_time() - cpu) / len(tasks),
-        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_KIB,
-        started=started,
-        ended=datetime.now(UTC),
-    )
+    wall_seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
+    share = record_of(started, wall_seconds / len(tasks), cpu_seconds / len(tasks))
     return [
-        TaskDone(task.key, dataclasses.replace(share), outcome)
-        for task, outcome in zip(tasks, outcomes, strict=True)
+        TaskDone(task.key, share, outcome) for task, outcome in zip(tasks, outcomes, strict=True)
     ]
 
 

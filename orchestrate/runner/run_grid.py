@@ -16,14 +16,12 @@ from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Prepare, Run
-from orchestrate.executors.factory import Job
-from orchestrate.executors.registry import executor_factory, make_executor, make_job
+from orchestrate.executors.registry import Job, executor_factory, make_executor, make_job
 from orchestrate.program import exit_code
-from orchestrate.runner.chunks import Chunks
+from orchestrate.runner.chunks import Chunks, SeedPlan
 from orchestrate.runner.progress import Interrupt, Progress, Tally, duration
-from orchestrate.runner.retrying_store import Heartbeat, RetryingStore
+from orchestrate.runner.saving import Heartbeat, RetryingStore
 from orchestrate.runner.scheduler import Scheduler
-from orchestrate.runner.seed_plan import SeedPlan
 from orchestrate.store import (
     URL_VARIABLE,
     DatabaseMovedError,

@@ -1,4 +1,4 @@
-"""Records of a launch or an exploration: its provenance, and an exploration as trials."""
+"""Writes of a launch or an exploration: operations that are retried, the heartbeat, provenance."""
 
 from __future__ import annotations
 
@@ -6,36 +6,201 @@ import hashlib
 import logging
 import os
 import platform
-import resource
 import socket
 import sys
 import threading
-from collections.abc import Sequence
-from contextlib import ExitStack
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from importlib import metadata
 from pathlib import Path
+from typing import Any, Self, TypeVar
 
 from dopt import __version__
 from dopt.result import TrialResult
-from orchestrate.executors.base import BYTES_PER_KIB
+from orchestrate.executors.base import record_of
 from orchestrate.fingerprint import fingerprint
-from orchestrate.program import COMMIT_VARIABLE, commit_of, git
+from orchestrate.program import COMMIT_VARIABLE, ROOT, commit_of, git
+from orchestrate.records import Failure, RunRecord
 from orchestrate.redaction import without_password_in_word
-from orchestrate.runner.retrying_store import Heartbeat
+from orchestrate.runner.progress import undisturbed
 from orchestrate.store import (
     LEASE_SECONDS,
+    Claim,
     DatabaseMovedError,
     LaunchRecord,
     Registrable,
-    RunRecord,
+    Result,
     Saved,
     Store,
     StoreError,
+    StoreUnavailableError,
     default_url,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
+FIRST_PAUSE_SECONDS = 0.1
+MAX_PAUSE_SECONDS = 3.0
+"""Pauses between two tries; each is twice the one before, up to the maximum."""
+
+IDEMPOTENT = {
+    "recover": False,
+    "retry": False,
+    "final_losses": False,
+    "register": True,
+    "open_configs": True,
+    "others": True,
+    "open_trials": True,
+    "suspects": True,
+    "release": True,
+    "end_launch": True,
+}
+"""Operations of :class:`Store` that may be executed twice, and whether they take the launch."""
+
+T = TypeVar("T")
+Say = Callable[[str], None]
+
+
+class RetryingStore:
+    """Operations of one launch, each retried for ``seconds`` after its first failure.
+
+    A failed operation may have been executed, with only its answer lost. The operations of
+    :data:`IDEMPOTENT` are repeated as they are, without the number of the launch as argument;
+    ``claim``, ``commit`` and ``fail`` are repeated in a form that is harmless after that.
+
+    Raises
+    ------
+    StoreUnavailableError
+        From every method, if the database stays unreachable, or at once if waiting cannot help.
+
+    Attributes
+    ----------
+    alike : bool
+        Whether only trials are claimed that code with the fingerprint of this launch registered.
+    safe_url : str
+        The URL without a password.
+    """
+
+    alike = False
+
+    def __init__(self, store: Store, launch: int, seconds: float, say: Say) -> None:
+        self._store = store
+        self._launch = launch
+        self._seconds = seconds
+        self._say = say
+        self.safe_url = store.safe_url
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name not in IDEMPOTENT:
+            raise AttributeError(name)
+        launch = (self._launch,) if IDEMPOTENT[name] else ()
+        operation = partial(getattr(self._store, name), *launch)
+        return lambda *words: self._persist(lambda: operation(*words))
+
+    def hurry(self) -> None:
+        """Wait no longer for a database that does not answer; a signal handler may call it."""
+        self._seconds = 0.0
+
+    def check(self) -> None:
+        """Raise ``DatabaseMovedError`` if the file was removed, renamed or replaced."""
+        self._store.check()
+
+    def claim(self, trial_keys: Sequence[str]) -> list[Claim]:
+        """Claim the pending ones of the trials, none of which the launch holds."""
+        only = {"alike": True} if self.alike else {}
+
+        def claim() -> list[Claim]:
+            return self._store.claim(self._launch, trial_keys, **only)
+
+        def again() -> list[Claim]:
+            self._store.release(self._launch, trial_keys)
+            return claim()
+
+        return self._persist(claim, again)
+
+    def commit(self, items: Sequence[tuple[Claim, Result, RunRecord]]) -> list[bool]:
+        """Write finished trials; False for each whose claim is lost."""
+        claims = [claim for claim, _, _ in items]
+
+        def again() -> list[bool]:
+            written = self._store.commit_many(items)
+            return written if all(written) else self._store.written(claims)
+
+        return self._persist(lambda: self._store.commit_many(items), again)
+
+    def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
+        """Write a failed trial; False where the claim is lost."""
+
+        def again() -> bool:
+            return self._store.fail(claim, failure, run) or self._store.written([claim])[0]
+
+        return self._persist(lambda: self._store.fail(claim, failure, run), again)
+
+    def _persist(self, operation: Callable[[], T], again: Callable[[], T] | None = None) -> T:
+        try:
+            return _whole(operation)
+        except StoreUnavailableError as error:
+            if not error.transient:
+                raise
+            self._say(f"waiting for up to {self._seconds:g} s: {error}")
+        return self._repeat(again or operation)
+
+    def _repeat(self, operation: Callable[[], T]) -> T:
+        start, pause = time.monotonic(), FIRST_PAUSE_SECONDS
+        while True:
+            left = start + self._seconds - time.monotonic()
+            time.sleep(max(0.0, min(pause, left)))
+            pause = min(2 * pause, MAX_PAUSE_SECONDS)
+            try:
+                result = _whole(operation)
+            except StoreUnavailableError as error:
+                if not error.transient or time.monotonic() - start >= self._seconds:
+                    raise
+            else:
+                self._say(f"the database is back after {time.monotonic() - start:.1f} s")
+                return result
+
+
+def _whole(operation: Callable[[], T]) -> T:
+    with undisturbed():
+        return operation()
+
+
+HEARTBEATS_PER_LEASE = 6
+"""Heartbeats in one lease, so that a few may fail."""
+
+JOIN_TIMEOUT_SECONDS = 2.0
+"""Time for the last heartbeat to finish."""
+
+
+class Heartbeat:
+    """Context manager that renews the lease of a launch from a thread.
+
+    It ignores a lost database, which the main thread notices too. A lease that has run out is
+    renewed all the same: what others claimed meanwhile is refused when it is committed.
+    """
+
+    def __init__(self, store: Store, launch: int, lease_seconds: float) -> None:
+        self._store = store
+        self._launch = launch
+        self._interval = lease_seconds / HEARTBEATS_PER_LEASE
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join(JOIN_TIMEOUT_SECONDS)
+
+    def _beat(self) -> None:
+        while not self._ended.wait(self._interval):
+            with suppress(Exception):  # a failed heartbeat must not be the last one
+                self._store.heartbeat(self._launch)
+
 
 _log = logging.getLogger("dopt.explorer")
 
@@ -71,7 +236,7 @@ class ExplorationSaver:
         ------
         StoreError
             If nothing was written: the database fails, or holds another exploration. If its file
-            was removed, renamed or replaced, the next save opens the URL anew.
+            was removed, renamed or replaced, the next save opens the URL again.
         """
         with self._lock:
             self._store = self._store or _opened(self._url)
@@ -88,7 +253,9 @@ class ExplorationSaver:
             self._launch = store.begin_launch(self._record)
             self._alive.enter_context(Heartbeat(store, self._launch, LEASE_SECONDS))
         last, self._last = self._last, None  # whether a save that fails has written is unknown
-        self._last = store.save(self._launch, spec, result, _run_record(result), last)
+        started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
+        run = record_of(started, result.wall_seconds, result.cpu_seconds)
+        self._last = store.save(self._launch, spec, result, run, last)
         return self._last is not None
 
     def close(self) -> None:
@@ -123,19 +290,6 @@ def _opened(url: str) -> Store:
         store.close()
         raise
     return store
-
-
-def _run_record(result: TrialResult) -> RunRecord:
-    now = datetime.now(UTC)
-    return RunRecord(
-        node=socket.gethostname(),
-        pid=os.getpid(),
-        wall_seconds=result.wall_seconds,
-        cpu_seconds=result.cpu_seconds,
-        peak_memory_bytes=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_KIB,
-        started=now - timedelta(seconds=result.wall_seconds),
-        ended=now,
-    )
 
 
 LIBRARIES = (

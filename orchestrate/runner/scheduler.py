@@ -16,7 +16,7 @@ from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost
 from orchestrate.records import ENVIRONMENT, Failure, RunRecord
 from orchestrate.runner.chunks import Chunks
 from orchestrate.runner.progress import Tally
-from orchestrate.runner.retrying_store import RetryingStore
+from orchestrate.runner.saving import RetryingStore
 from orchestrate.store import Claim, InvalidResultError
 
 POLL_SECONDS = 0.2

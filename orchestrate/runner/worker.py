@@ -36,9 +36,8 @@ from orchestrate.runner.chunks import (
     memory_of_this_machine,
 )
 from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally
-from orchestrate.runner.retrying_store import RetryingStore
 from orchestrate.runner.run_grid import Output, Work, prepare_workers, recorded_launch, worked
-from orchestrate.runner.saving import launch_record
+from orchestrate.runner.saving import RetryingStore, launch_record
 from orchestrate.runner.scheduler import SUSPECT_LOSSES, Scheduler
 from orchestrate.store import OpenConfig
 

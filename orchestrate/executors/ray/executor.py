@@ -15,9 +15,7 @@ from ray import exceptions
 from orchestrate.errors import InfrastructureError
 from orchestrate.executors.base import Event, Executor, Prepare, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.limits import NO_LIMITS, Limits
-from orchestrate.executors.ray.cluster import Cluster
-from orchestrate.executors.ray.connection import Connection, first_line
-from orchestrate.executors.ray.local import OwnRay
+from orchestrate.executors.ray.connection import Cluster, Connection, OwnRay, first_line
 
 _WORKER_LOST = (exceptions.WorkerCrashedError, exceptions.OutOfMemoryError)
 _NODE_LOST = (exceptions.NodeDiedError, exceptions.ObjectLostError)

@@ -20,8 +20,8 @@ from orchestrate.cli_parser import length_of_time
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.config.value_checks import count, limit, section, text, wrong
 from orchestrate.errors import InfrastructureError, LaunchError
-from orchestrate.executors.factory import ExecutorFactory
 from orchestrate.executors.limits import module_path
+from orchestrate.executors.registry import ExecutorFactory
 from orchestrate.redaction import without_password
 
 LEAVE_SECONDS = 120

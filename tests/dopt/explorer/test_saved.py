@@ -46,7 +46,7 @@ def test_an_exploration_lives_between_two_saves(
     postgresql_url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A launch whose lease has run out is taken for lost, and its session ended in a save."""
-    monkeypatch.setattr("orchestrate.runner.retrying_store.HEARTBEATS_PER_LEASE", 600)
+    monkeypatch.setattr("orchestrate.runner.saving.HEARTBEATS_PER_LEASE", 600)
     assert run.save(postgresql_url)
     wait_for_renewals(postgresql_url)
     with Store.open(postgresql_url) as others, Reader.open(postgresql_url) as reader:

@@ -19,7 +19,7 @@ def shared_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     """
     import ray
 
-    from orchestrate.executors.ray.local import OwnRay
+    from orchestrate.executors.ray.connection import OwnRay
 
     start = OwnRay._init
 

@@ -17,8 +17,7 @@ from typing import Any
 import pytest
 
 from orchestrate.errors import InfrastructureError, LaunchError
-from orchestrate.executors.ray.cluster import SETTINGS_FILE
-from orchestrate.executors.ray.connection import first_line
+from orchestrate.executors.ray.connection import SETTINGS_FILE, first_line
 from orchestrate.executors.ray.executor import RayExecutor
 from orchestrate.store import Reader
 from tests.orchestrate.clustered_launches import ADDRESSES, LONG_SEED, LOSSES, ROOT

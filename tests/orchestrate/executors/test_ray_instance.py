@@ -17,10 +17,9 @@ from ray._private import services
 
 from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import WorkerLost
-from orchestrate.executors.ray import local as ray_start
-from orchestrate.executors.ray.connection import unreachable
+from orchestrate.executors.ray import connection as ray_start
+from orchestrate.executors.ray.connection import start, unreachable
 from orchestrate.executors.ray.executor import RayExecutor
-from orchestrate.executors.ray.local import start
 from tests.orchestrate.executors.names import ON_RAY, WORKERS
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.lean_ray import leave_services_out

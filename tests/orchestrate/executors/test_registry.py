@@ -11,10 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.executors.base import Executor, Prepare, Run
-from orchestrate.executors.factory import ExecutorFactory
-from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.executors.registry import EXECUTORS
 from tests.paths import ROOT
 
@@ -54,23 +50,33 @@ def test_an_executor_is_named_in_its_own_files_and_the_registry_only(name: str) 
                 assert name not in values or (name == "local" and "ray" in file), file
 
 
+MINE = """
+from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.executors.registry import ExecutorFactory
+
+given = []
+
+def make(settings, run, _):
+    given.append(settings.executor_options["nice"])
+    return InProcessExecutor(run)
+
+FACTORY = ExecutorFactory(make, lambda _: 1)
+"""
+
+
 def test_a_new_executor_needs_a_module_a_file_and_an_entry(
     command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    given: list[object] = []
-
-    def make(settings: LaunchSettings, run: Run, _: Prepare | None) -> Executor:
-        given.append(settings.executor_options["nice"])
-        return InProcessExecutor(run)
-
-    monkeypatch.setitem(EXECUTORS, "mine", ExecutorFactory(make, lambda _: 1))  # type: ignore[arg-type]
+    (tmp_path / "my_executor.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(EXECUTORS, "mine", "my_executor")  # type: ignore[arg-type]
     (tmp_path / "conf" / "executor").mkdir(parents=True)
     (tmp_path / "conf" / "executor" / "mine.yaml").write_text("name: mine\nnice: 5\n")
     code, output, errors = command_line(
         *("-m", "env.horizon=5", "policy=random", "seed=0,1", "executor=mine", "executor.nice=7"),
         f"hydra.searchpath=[file://{tmp_path / 'conf'}]",
     )
-    assert (code, given) == (0, [7]), errors
+    assert (code, sys.modules.pop("my_executor").given) == (0, [7]), errors
     assert "2 to run with executor=mine" in output
 
 

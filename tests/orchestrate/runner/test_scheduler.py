@@ -258,7 +258,7 @@ def test_a_database_that_stays_away_ends_the_launch_and_a_rerun_completes(
 def test_lost_questions_and_answers_cost_a_launch_nothing(
     launches: Launches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrate.runner.retrying_store.FIRST_PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr("orchestrate.runner.saving.FIRST_PAUSE_SECONDS", 0.01)
     lose(monkeypatch, 8 * ["answer", "", "question", "answer", "", ""])
     assert launches(raising, seeds=20) == ExitCode.SOME_FAILED
     statuses = launches.statuses()

@@ -18,8 +18,7 @@ from orchestrate.config.grid import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run
-from orchestrate.runner.run_grid import Work, launch_grid
-from orchestrate.runner.seed_plan import (
+from orchestrate.runner.chunks import (
     FEWEST_SEEDS,
     FEWEST_VALUES,
     MOST_LOOKS,
@@ -27,6 +26,7 @@ from orchestrate.runner.seed_plan import (
     is_narrow,
     looks,
 )
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import Reader
 from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.standins import diverged, grid_of, quick

@@ -12,7 +12,7 @@ import pytest
 from dopt.errors import DoptError
 from dopt.spec.trial import TrialSpec
 from orchestrate.records import RunRecord
-from orchestrate.runner.retrying_store import RetryingStore
+from orchestrate.runner.saving import RetryingStore
 from orchestrate.runner.worker import StoredChunks, trial_of
 from orchestrate.store import LaunchRecord, OpenConfig, Store
 from tests.orchestrate.faults.trials import outcome

@@ -14,7 +14,7 @@ from dopt.run import run_trial
 from orchestrate.executors.base import Task, run_task
 from orchestrate.executors.limits import Limits
 from orchestrate.records import Failure
-from orchestrate.runner.retrying_store import Heartbeat
+from orchestrate.runner.saving import Heartbeat
 from orchestrate.store import Store
 from orchestrate.store.backends.open import LEASE_SECONDS
 from tests.dopt.trials import trial
@@ -30,7 +30,7 @@ LEASE = 4.0
 @pytest.fixture
 def many_beats(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let ten heartbeats come in a second, and a lease last as long as ever."""
-    monkeypatch.setattr("orchestrate.runner.retrying_store.HEARTBEATS_PER_LEASE", 600)
+    monkeypatch.setattr("orchestrate.runner.saving.HEARTBEATS_PER_LEASE", 600)
 
 
 def wait_for_renewals(url: str, count: int = 3) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from orchestrate.runner.retrying_store import IDEMPOTENT, RetryingStore
+from orchestrate.runner.saving import IDEMPOTENT, RetryingStore
 from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
 from orchestrate.store import StoreUnavailableError as UnavailableError
 from tests.orchestrate.losses import lose
@@ -31,7 +31,7 @@ losses = pytest.mark.parametrize("lost", LOSSES, ids="-".join)
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("orchestrate.runner.retrying_store.FIRST_PAUSE_SECONDS", 0.01)
+    monkeypatch.setattr("orchestrate.runner.saving.FIRST_PAUSE_SECONDS", 0.01)
 
 
 @pytest.fixture
