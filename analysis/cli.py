@@ -32,8 +32,7 @@ from analysis.tables.rendering import (
     comparison,
     gaps_table,
 )
-from orchestrate.cli_parser import Parser, path, positive, tell
-from orchestrate.program import answered
+from orchestrate.program import Parser, answered, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
 COLUMNS = ("loss", "reachable_loss")

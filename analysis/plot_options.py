@@ -9,7 +9,7 @@ from enum import StrEnum
 from analysis.data.samples import DivergenceRule
 from analysis.stats.intervals import BandKind, Statistic
 from dopt.process import usable_cores
-from orchestrate.cli_parser import UsageError
+from orchestrate.program import UsageError
 
 
 class Axis(StrEnum):

@@ -42,8 +42,8 @@ from analysis.tables.variants import (
     verdict,
 )
 from dopt.policies import POLICIES
-from orchestrate.cli_parser import path
 from orchestrate.files import make_folder
+from orchestrate.program import path
 from orchestrate.store import Reader
 
 HELP = "compare every policy, model and learner with the reference, on one page"

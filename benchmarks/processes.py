@@ -15,7 +15,7 @@ from pathlib import Path
 from dopt.kernel import warm_up
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.grid import Grid
+from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.runner.run_grid import Work, launch_grid

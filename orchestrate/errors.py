@@ -1,8 +1,18 @@
-"""Errors of a launch, and exit codes."""
+"""Errors of a launch, exit codes, and redaction of passwords in stored and printed text.
+
+A password may be part of a URL, of its query, or of a variable such as ``PGPASSWORD``. It is
+recognised by its position; passwords of the command line and the environment are also replaced
+wherever they occur, such as in the message of an exception.
+"""
 
 from __future__ import annotations
 
 import enum
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from urllib.parse import unquote, unquote_plus
 
 from dopt.errors import DoptError
 
@@ -25,3 +35,53 @@ class LaunchError(DoptError, ValueError):
 
 class InfrastructureError(DoptError):
     """Loss of a service such as Ray; the same command continues later."""
+
+
+HIDDEN = "***"
+
+MIN_SECRET_LENGTH = 4
+"""Shorter words are not replaced, because they occur in ordinary text."""
+
+_NAMES = r"(?:password|passwd|passfile|secret|token)"
+_SECRET_VARIABLE = re.compile(r"PASSW(OR)?D|SECRET|TOKEN$", re.IGNORECASE)
+
+# In one argument the password extends to the last @, spaces included.
+_WORD_QUERY = re.compile(rf"({_NAMES}=)([^&]*)", re.IGNORECASE)
+_WORD_URL = re.compile(r"(://[^:/@]*:)(.*)@", re.DOTALL)
+_TEXT_QUERY = re.compile(rf"({_NAMES}=)([^&\s'\"]+)", re.IGNORECASE)
+_TEXT_URL = re.compile(r"(://[^:/@\s]*:)(\S*)@")
+
+
+def without_password(text: str) -> str:
+    """Return a text with all passwords replaced."""
+    for secret in known_secrets([*sys.argv, *_environment()]):
+        text = text.replace(secret, HIDDEN)
+    return _TEXT_URL.sub(rf"\1{HIDDEN}@", _TEXT_QUERY.sub(rf"\1{HIDDEN}", text))
+
+
+def without_password_in_word(word: str) -> str:
+    """Return a command-line argument with the passwords of URLs replaced."""
+    return _WORD_URL.sub(rf"\1{HIDDEN}@", _WORD_QUERY.sub(rf"\1{HIDDEN}", word))
+
+
+def known_secrets(words: Iterable[str]) -> list[str]:
+    """Return the passwords in the words, as written and URL-decoded, the longest first."""
+    written = {match[2] for word in words for match in _matches(word)}
+    meant = {form(secret) for secret in written for form in (str, unquote, unquote_plus)}
+    return sorted(
+        (secret for secret in meant if len(secret) >= MIN_SECRET_LENGTH), key=len, reverse=True
+    )
+
+
+def _matches(word: str) -> Iterator[re.Match[str]]:
+    yield from _WORD_QUERY.finditer(word)
+    yield from _WORD_URL.finditer(_WORD_QUERY.sub(r"\1", word))
+
+
+def _environment() -> Iterator[str]:
+    """Yield the variables that are secret by their name, and those that hold a URL."""
+    for name, value in os.environ.items():
+        if _SECRET_VARIABLE.search(name):
+            yield f"password={value}"
+        elif "://" in value:
+            yield value

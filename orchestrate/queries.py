@@ -12,7 +12,7 @@ from typing import Any
 from dopt.limits import VIOLATIONS, WORST
 from dopt.spec.config import completed
 from dopt.spec.label import limits_label
-from orchestrate.redaction import without_password
+from orchestrate.errors import without_password
 from orchestrate.store import (
     ConfigRow,
     ExplorationRow,

@@ -49,18 +49,16 @@ NUMBERS = (
 )
 """Parts of the analysis that compute or select numbers and draw nothing."""
 
-BASE = {"errors", "records", "redaction", "files", "cli_parser", "program"}
+BASE = {"errors", "records", "files", "program"}
 ORCHESTRATE_IMPORTS = {
     "errors": set(),
     "records": set(),
     "fingerprint": set(),
-    "redaction": set(),
     "files": set(),
-    "cli_parser": set(),
-    "program": {"cli_parser", "errors", "redaction"},
+    "program": {"errors"},
     "config": BASE,
     "executors": BASE | {"config", "fingerprint"},
-    "store": {"errors", "records", "redaction", "files"},
+    "store": {"errors", "records", "files"},
     "queries": BASE | {"store"},
     "runner": BASE | {"config", "executors", "fingerprint", "store"},
     "export": BASE | {"queries", "store"},
@@ -174,7 +172,7 @@ def test_what_saves_an_exploration_is_loaded_by_the_first_save() -> None:
 
 
 def test_the_analysis_reads_through_the_store_alone() -> None:
-    parts = ("store", "cli_parser", "files", "program")
+    parts = ("store", "files", "program")
     shared = tuple(f"orchestrate.{part}" for part in parts)
     for path in sources("analysis"):
         names = imports(path)

@@ -19,8 +19,8 @@ from rich.table import Table
 from rich.text import Text
 
 from dopt.errors import unknown_name
-from orchestrate.cli_parser import Parser, UsageError, as_started, tell, visible
 from orchestrate.errors import ExitCode
+from orchestrate.program import Parser, UsageError, as_started, tell, visible
 from orchestrate.store import DEFAULT_URL, URL_VARIABLE, ConfigRow, Reader, default_url
 
 PROGRAM = as_started("python -m orchestrate")

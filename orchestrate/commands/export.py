@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from orchestrate.cli_parser import UsageError, path
 from orchestrate.commands.command import Command, add_filters, chosen, say, say_json
 from orchestrate.errors import ExitCode
 from orchestrate.export.exporting import FORMATS, KINDS, BundleExport, Export, export
+from orchestrate.program import UsageError, path
 from orchestrate.store import Reader
 
 _NO_LICENSE = "unknown"

@@ -10,7 +10,6 @@ from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 
 from dopt.errors import given_path
-from orchestrate.cli_parser import UsageError, length_of_time, path
 from orchestrate.commands.command import (
     PROGRAM,
     Command,
@@ -23,12 +22,13 @@ from orchestrate.commands.command import (
 )
 from orchestrate.commands.results import ListedTrial, listed, the_one
 from orchestrate.errors import ExitCode
+from orchestrate.program import UsageError, length_of_time, path
 from orchestrate.store import RETRIED, Reader, Store
 from orchestrate.store.doctor import Finding, examine
 from orchestrate.store.maintenance import Prunable, back_up, merge_collected, prunable, vacuum
 from orchestrate.store.merge import Merged, TrialName, merge
-from orchestrate.store.migrations.upgrade import Upgrade, upgrade
 from orchestrate.store.records import utc_text
+from orchestrate.store.upgrade import Upgrade, upgrade
 
 MAX_LISTED = 10
 """Trials of a kind that are listed; the JSON has all of them."""

@@ -18,7 +18,6 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from orchestrate.cli_parser import UsageError, integer, positive, tell
 from orchestrate.commands.command import (
     Command,
     add_filters,
@@ -30,6 +29,7 @@ from orchestrate.commands.command import (
     table,
 )
 from orchestrate.errors import ExitCode
+from orchestrate.program import UsageError, integer, positive, tell
 from orchestrate.queries import COLUMNS, TrialReport, column_text, counts, differing, report
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store import Table as Rows

@@ -15,7 +15,6 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from orchestrate.cli_parser import as_started, length_of_time, positive, tell
 from orchestrate.commands.command import (
     Command,
     add_filters,
@@ -27,10 +26,10 @@ from orchestrate.commands.command import (
     show,
 )
 from orchestrate.commands.results import grid_table
-from orchestrate.errors import ExitCode
+from orchestrate.errors import ExitCode, without_password
+from orchestrate.program import as_started, length_of_time, positive, tell
 from orchestrate.program import say as say_still
 from orchestrate.queries import STATES, Status, gather, seconds_since
-from orchestrate.redaction import without_password
 from orchestrate.runner.progress import duration
 from orchestrate.store import ExplorationRow, FailureKind, LaunchRow, Reader, StoreUnavailableError
 

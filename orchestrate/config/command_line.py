@@ -23,11 +23,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from dopt.errors import SpecificationError
-from orchestrate.cli_parser import Parser, UsageError, as_started, check_removed
+from orchestrate.config import TRIAL_SECTIONS, Combination
 from orchestrate.config.expand import expand, reject_unknown
-from orchestrate.config.grid import TRIAL_SECTIONS, Combination
 from orchestrate.config.options import CONFIGURATION, option_names, register
 from orchestrate.config.sweeps import parsed_overrides
+from orchestrate.program import Parser, UsageError, as_started, check_removed
 
 PROGRAM = "python orchestrate/launch.py"
 LAUNCH_SECTIONS = ("launch", "store", "executor")

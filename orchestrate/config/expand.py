@@ -29,8 +29,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from dopt.errors import unknown_name
 from dopt.registry import TARGET
-from orchestrate.config.grid import TRIAL_SECTIONS, Combination
-from orchestrate.config.messages import KNOWN, unknown_field, unknown_setting
+from orchestrate.config import TRIAL_SECTIONS, Combination
+from orchestrate.config.options import KNOWN, unknown_field, unknown_setting
 from orchestrate.config.sweeps import Axis, parsed_overrides, read_axes
 
 Settings = dict[str, Any]

@@ -21,9 +21,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
+from orchestrate.errors import without_password
 from orchestrate.export.exporting import BundleExport, ExportError, provenance
 from orchestrate.files import whole_folder
-from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store.bundle import (
     ARRAY_AXES,

@@ -12,9 +12,9 @@ from typing import Any
 
 from dopt import __version__
 from dopt.errors import DoptError
+from orchestrate.errors import without_password
 from orchestrate.files import whole
 from orchestrate.queries import counts
-from orchestrate.redaction import without_password
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store.records import now
 

@@ -24,7 +24,7 @@ import numpy as np
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
-from orchestrate.config.grid import Grid
+from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import Task

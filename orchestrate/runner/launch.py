@@ -8,11 +8,10 @@ from __future__ import annotations
 import os
 import sys
 
-from orchestrate.cli_parser import UsageError
 from orchestrate.config.command_line import read_command_line
-from orchestrate.config.messages import format_error
+from orchestrate.config.options import format_error
 from orchestrate.errors import ExitCode, LaunchError
-from orchestrate.program import answered
+from orchestrate.program import UsageError, answered
 from orchestrate.records import URL_VARIABLE
 
 

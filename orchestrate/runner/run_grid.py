@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TextIO
 
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.grid import Grid
+from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Prepare, Run

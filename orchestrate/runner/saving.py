@@ -20,11 +20,11 @@ from typing import Any, Self, TypeVar
 
 from dopt import __version__
 from dopt.result import TrialResult
+from orchestrate.errors import without_password_in_word
 from orchestrate.executors.base import record_of
 from orchestrate.fingerprint import fingerprint
 from orchestrate.program import COMMIT_VARIABLE, ROOT, commit_of, git
 from orchestrate.records import Failure, RunRecord
-from orchestrate.redaction import without_password_in_word
 from orchestrate.runner.progress import undisturbed
 from orchestrate.store import (
     LEASE_SECONDS,

@@ -16,14 +16,13 @@ from dopt.kernel import warm_up
 from dopt.run import run_trial
 from dopt.spec.label import labels
 from dopt.spec.trial import TrialSpec
-from orchestrate.cli_parser import tell
+from orchestrate.config import Grid, build_grid
 from orchestrate.config.command_line import Request
-from orchestrate.config.grid import Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.config.messages import check_launch
+from orchestrate.config.options import check_launch
 from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.registry import executor_factory, make_job
-from orchestrate.program import ROOT, answered, say
+from orchestrate.program import ROOT, answered, say, tell
 from orchestrate.runner.chunks import check_memory
 from orchestrate.runner.progress import aligned
 from orchestrate.runner.run_grid import Work, launch_grid

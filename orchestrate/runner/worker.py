@@ -23,8 +23,7 @@ from dopt.process import usable_cores
 from dopt.run import run_trial
 from dopt.spec.config import completed
 from dopt.spec.trial import TrialSpec, stored_trial
-from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.config.value_checks import factor
+from orchestrate.config.launch_settings import LaunchSettings, factor
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Task
 from orchestrate.executors.registry import make_executor

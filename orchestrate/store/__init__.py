@@ -21,7 +21,6 @@ from orchestrate.store.errors import (
     StoreError,
     StoreUnavailableError,
 )
-from orchestrate.store.exploration import Saved
 from orchestrate.store.launches import OpenConfig, OpenTrial
 from orchestrate.store.reader import (
     ExplorationRow,
@@ -44,6 +43,7 @@ from orchestrate.store.records import (
     Trajectory,
     TrialRow,
 )
+from orchestrate.store.results import Saved
 from orchestrate.store.schema import CONFIG_COLUMNS, FINISHED, RETRIED
 from orchestrate.store.store import Store
 

@@ -25,10 +25,9 @@ from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.doctor import TrialKey
 from orchestrate.store.errors import StoreError
-from orchestrate.store.exploration import steps_ahead, unpacked
 from orchestrate.store.reader import Reader
 from orchestrate.store.records import DTYPE, Array, stored_json, unpack
-from orchestrate.store.results import insert_error
+from orchestrate.store.results import insert_error, steps_ahead, unpacked
 from orchestrate.store.schema import (
     FINISHED,
     N_ROWS,

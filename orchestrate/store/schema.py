@@ -156,7 +156,7 @@ def _trial_key(**options: Any) -> Column[int]:
     return Column("trial_id", _Long, ForeignKey("trial.trial_id"), **options)
 
 
-# As Alembic creates it, but STRICT, which has no VARCHAR.
+# The table and its name are of Alembic, which upgraded earlier schemas.
 alembic_version = _table("alembic_version", Column("version_num", Text, primary_key=True))
 
 launch = _table(

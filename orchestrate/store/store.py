@@ -6,12 +6,12 @@ from collections.abc import Iterable, Sequence
 from typing import Self
 
 from orchestrate.records import Failure, RunRecord
-from orchestrate.store import database_url, exploration, launches, results, schema
+from orchestrate.store import database_url, launches, results, schema
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import LEASE_SECONDS, PATIENCE_SECONDS, make_backend
-from orchestrate.store.exploration import Saved
 from orchestrate.store.launches import OpenConfig, OpenTrial, final_losses
 from orchestrate.store.records import Claim, LaunchRecord, Registrable, Registration, Result
+from orchestrate.store.results import Saved
 
 
 class Store:
@@ -161,7 +161,7 @@ class Store:
     def holds_more(self, spec: Registrable, result: Result) -> bool:
         """Return whether more steps of an exploration are stored; raises as :meth:`save`."""
         with self._backend.transaction() as connection:
-            return exploration.is_longer(connection, self._backend, spec, result)
+            return results.is_longer(connection, self._backend, spec, result)
 
     def save(
         self,
@@ -179,7 +179,7 @@ class Store:
         """
         self.check()
         with self._backend.transaction() as connection:
-            return exploration.save(connection, self._backend, launch, spec, result, run, last)
+            return results.save(connection, self._backend, launch, spec, result, run, last)
 
     def fail(self, claim: Claim, failure: Failure, run: RunRecord) -> bool:
         """Write a failed trial with its error; return False if the claim is lost."""

@@ -16,8 +16,7 @@ from analysis.data.matching import Filter
 from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.tables.rendering import TextTable
-from orchestrate.cli_parser import Parser, path, tell
-from orchestrate.program import answered, run
+from orchestrate.program import Parser, answered, path, run, tell
 from orchestrate.store import Reader
 from studies.yardsticks import disk, pendulums, star, swing_up
 

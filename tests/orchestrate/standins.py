@@ -12,7 +12,7 @@ import numpy as np
 from dopt.errors import UnusableEnvironmentError
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.grid import Grid
+from orchestrate.config import Grid
 
 BROKEN_SEED = 2
 

@@ -10,7 +10,7 @@ from dopt.errors import SpecificationError
 from dopt.run import run_trial
 from dopt.spec.config import without_versions
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.grid import Combination, Grid, build_grid
+from orchestrate.config import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.runner.run_grid import Work, launch_grid

@@ -17,8 +17,8 @@ import pytest
 import dopt
 from dopt.errors import DoptError
 from orchestrate import program
-from orchestrate.cli_parser import as_started
 from orchestrate.errors import ExitCode, InfrastructureError
+from orchestrate.program import as_started
 from orchestrate.store import StoreUnavailableError
 from tests.paths import ROOT, without_coverage
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.redaction import without_password, without_password_in_word
+from orchestrate.errors import without_password, without_password_in_word
 from orchestrate.runner.saving import launch_record
 from tests.orchestrate.conftest import Launches
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from orchestrate.__main__ import main
-from orchestrate.cli_parser import SUCCESSORS
+from orchestrate.program import SUCCESSORS
 
 
 @pytest.mark.parametrize("word", [name for name in SUCCESSORS if name.startswith("launch.")])

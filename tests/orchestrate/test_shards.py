@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from orchestrate.__main__ import main
-from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.config.share import Share, share
+from orchestrate.config.launch_settings import LaunchSettings, Share, share
 from orchestrate.errors import LaunchError
 from orchestrate.runner.run_grid import collected
 from orchestrate.store import NoDatabaseError, Reader, Store, StoreError

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrate.config.grid import Grid
-from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.config.share import Share
+from orchestrate.config import Grid
+from orchestrate.config.launch_settings import LaunchSettings, Share
 from orchestrate.errors import ExitCode
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store.maintenance import merge_collected

@@ -16,13 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from dopt.errors import DoptError, given_path
-from orchestrate.cli_parser import length_of_time
-from orchestrate.config.launch_settings import LaunchSettings
-from orchestrate.config.value_checks import count, limit, section, text, wrong
-from orchestrate.errors import InfrastructureError, LaunchError
+from orchestrate.config.launch_settings import LaunchSettings, count, limit, section, text, wrong
+from orchestrate.errors import InfrastructureError, LaunchError, without_password
 from orchestrate.executors.limits import module_path
 from orchestrate.executors.registry import ExecutorFactory
-from orchestrate.redaction import without_password
+from orchestrate.program import length_of_time
 
 LEAVE_SECONDS = 120
 """Time before the end of a task at which its workers hold nothing any more.

@@ -24,7 +24,7 @@ from dopt.systems import System
 from dopt.types import Array
 from orchestrate.commands.maintenance import trial_key
 from orchestrate.store import Reader, Store, StoreError, StoreUnavailableError, default_url
-from orchestrate.store import exploration as writing
+from orchestrate.store import results as writing
 from orchestrate.store.doctor import examine
 from tests.dopt.explorer.saves import STEPS, content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH

@@ -15,9 +15,9 @@ import pytest
 import yaml
 
 from orchestrate.__main__ import main
+from orchestrate.errors import without_password
 from orchestrate.export import bundle as writing
 from orchestrate.export.bundle import COLUMNS, TABLE_TITLES
-from orchestrate.redaction import without_password
 from orchestrate.store import Claim, Reader, Store
 from orchestrate.store.bundle import TABLES, arrow_schema, fill, primary_key
 from tests.orchestrate.commands.conftest import BAD, BUNDLE_FILES, DONE, ODD, SECRET, Answer

@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from orchestrate.__main__ import main
-from orchestrate.cli_parser import Parser
 from orchestrate.commands import COMMANDS
 from orchestrate.commands.command import Command
 from orchestrate.errors import ExitCode
+from orchestrate.program import Parser
 from orchestrate.store import Store
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.paths import ROOT

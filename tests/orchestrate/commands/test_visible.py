@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from analysis.cli import main as analysis
-from orchestrate.cli_parser import visible
+from orchestrate.program import visible
 from orchestrate.store import Failure, Store
 from tests.orchestrate.commands.conftest import Answer, run_now
 from tests.orchestrate.store.fakes import LAUNCH, Spec, result

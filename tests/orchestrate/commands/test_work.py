@@ -9,10 +9,10 @@ import pytest
 
 from dopt.spec.trial import TrialSpec
 from orchestrate.__main__ import main
-from orchestrate.cli_parser import UsageError, length_of_time
 from orchestrate.executors.base import Event, Task
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.fingerprint import fingerprint
+from orchestrate.program import UsageError, length_of_time
 from orchestrate.runner import worker
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import Claim, LaunchRecord, Store

@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 
 from dopt.errors import SpecificationError
+from orchestrate.config import Combination
 from orchestrate.config import expand as expansion
-from orchestrate.config.grid import Combination
 
 SAMPLE = Path(__file__).parent / "sample"
 SECTIONS = (

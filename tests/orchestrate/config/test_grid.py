@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
-from orchestrate.config.grid import Combination, build_grid
+from orchestrate.config import Combination, build_grid
 
 SETTINGS: dict[str, Any] = {
     "env": {"name": "pendulum"},

@@ -11,7 +11,7 @@ import numpy as np
 
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.grid import Grid
+from orchestrate.config import Grid
 from tests.orchestrate.faults.gate import rest
 from tests.orchestrate.standins import diverged, quick, specification
 

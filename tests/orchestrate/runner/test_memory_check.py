@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from orchestrate.config.grid import Combination, Grid, build_grid
+from orchestrate.config import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import LaunchError
 from orchestrate.runner.chunks import BYTES_PER_GIB, check_memory, memory_of_this_machine

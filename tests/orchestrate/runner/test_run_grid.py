@@ -8,7 +8,7 @@ import pytest
 
 from dopt.errors import SpecificationError, UnusableEnvironmentError
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.grid import Grid
+from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.runner.run_grid import Work, launch_grid

@@ -14,7 +14,7 @@ from scipy import stats
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
-from orchestrate.config.grid import Grid
+from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Run

@@ -18,9 +18,9 @@ import sqlalchemy
 from orchestrate.store import Claim, Store
 from orchestrate.store import merge as merge_source
 from orchestrate.store import merge as merging
+from orchestrate.store import upgrade as migration
 from orchestrate.store.merge import merge
-from orchestrate.store.migrations import upgrade as migration
-from orchestrate.store.migrations.upgrade import upgrade
+from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Array, Spec, result
 from tests.waiting import PATIENCE_SECONDS
 

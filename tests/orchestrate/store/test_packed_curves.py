@@ -10,8 +10,8 @@ import pytest
 
 from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
 from orchestrate.store.doctor import examine
-from orchestrate.store.migrations.upgrade import upgrade
 from orchestrate.store.schema import STEP_VALUES
+from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.fakes import LAUNCH, RUN, FakeResult, Spec, diverged, result
 from tests.orchestrate.store.places import execute
 

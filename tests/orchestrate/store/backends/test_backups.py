@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import StoreError, StoreUnavailableError
-from orchestrate.store.migrations.upgrade import upgrade
+from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.migrations.released import VERSIONS, restore
 from tests.orchestrate.store.places import backups, file_of, restored, schema_of
 from tests.orchestrate.store.structure import columns, contents, structure

@@ -15,7 +15,7 @@ from orchestrate.store import Claim, DatabaseMovedError, Failure, Reader, Store
 from orchestrate.store.backends import sqlite
 from orchestrate.store.maintenance import vacuum
 from orchestrate.store.merge import merge
-from orchestrate.store.migrations.upgrade import upgrade
+from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.orchestrate.store.places import file_of
 

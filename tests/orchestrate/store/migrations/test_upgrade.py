@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -20,31 +18,15 @@ from orchestrate.store import (
     Store,
     StoreUnavailableError,
 )
+from orchestrate.store import upgrade as migration
 from orchestrate.store.backends.file_locks import LaunchLocks
-from orchestrate.store.migrations import upgrade as migration
-from orchestrate.store.migrations.upgrade import upgrade
 from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
+from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.fakes import LAUNCH, Spec
 from tests.orchestrate.store.migrations.released import VERSIONS
 from tests.orchestrate.store.places import backups, execute, file_of
 from tests.orchestrate.store.processes import CLEAN, hear, kill, running, upgrade_and_tell
 from tests.orchestrate.store.structure import columns, contents, structure
-
-FAILING = '''
-"""A change that fails half-way."""
-
-import sqlalchemy
-from alembic import op
-
-revision = "99"
-down_revision = "{head}"
-
-
-def upgrade():
-    op.add_column("trial", sqlalchemy.Column("more", sqlalchemy.Integer))
-    op.execute("DELETE FROM step")
-    op.execute("SELECT nonsense FROM nowhere")
-'''
 
 
 @pytest.fixture
@@ -55,35 +37,9 @@ def other_url(tmp_path: Path, url: str, request: pytest.FixtureRequest) -> str:
     return str(request.getfixturevalue("another_postgresql_url"))
 
 
-@pytest.fixture
-def with_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Return a function that adds a script after the newest one."""
-
-    def add(script: str) -> None:
-        location = tmp_path / "50% migrations"
-        shutil.copytree(migration.LOCATION, location)
-        script = script.format(head=SCHEMA_VERSION)
-        (location / "versions" / "version_99.py").write_text(script)
-        monkeypatch.setattr(migration, "LOCATION", location)
-
-    return add
-
-
-def test_there_is_a_script_for_each_version_and_one_database() -> None:
-    scripts = {path.stem for path in (migration.LOCATION / "versions").glob("version_*.py")}
-    assert scripts == {f"version_{n}" for n in range(OLDEST, SCHEMA_VERSION + 1)}
+def test_there_are_statements_for_each_version_and_one_database() -> None:
+    assert list(migration.STATEMENTS) == list(range(OLDEST + 1, SCHEMA_VERSION + 1))
     assert list(range(OLDEST, SCHEMA_VERSION)) == VERSIONS
-
-
-def test_a_script_uses_no_code_that_may_change() -> None:
-    for path in (migration.LOCATION / "versions").glob("version_*.py"):
-        imported = {
-            alias.name if isinstance(node, ast.Import) else str(node.module)
-            for node in ast.walk(ast.parse(path.read_text()))
-            if isinstance(node, ast.Import | ast.ImportFrom)
-            for alias in node.names
-        }
-        assert not {name for name in imported if name.split(".")[0] in ("dopt", "orchestrate")}
 
 
 @pytest.mark.parametrize("side", [Store, Reader])
@@ -165,10 +121,10 @@ def test_again_there_is_nothing_to_do(old: str) -> None:
     assert structure(old) == before
 
 
-def test_a_failure_in_the_middle_changes_nothing(
-    old: str, with_script: Callable[[str], None]
-) -> None:
-    with_script(FAILING)
+def test_a_failure_in_the_middle_changes_nothing(old: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    failing = ("DELETE FROM step", "SELECT nonsense FROM nowhere")
+    last = (*migration.STATEMENTS[SCHEMA_VERSION], *failing)
+    monkeypatch.setitem(migration.STATEMENTS, SCHEMA_VERSION, last)
     before, kept = structure(old), columns(old)
     rows = contents(old, kept)
     with pytest.raises((StoreUnavailableError, ProgrammingError), match="nowhere"):

@@ -1,8 +1,8 @@
 """Upgrade of an older database to the newest schema, atomic and with a backup.
 
 The check for running launches, the backup, the migration and the labels of configurations are one
-exclusive transaction. A migration script uses no code of the program that may change; what the
-current program computes, the labels, is written after the scripts.
+exclusive transaction. The statements of a schema never change; what the current program computes,
+the labels, is written after them.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from sqlalchemy import Connection, bindparam, select, update
+from sqlalchemy import Connection, bindparam, select, text, update
 
 from dopt.spec.config import REGISTRIES, section_class
 from dopt.spec.label import config_label
@@ -20,12 +19,23 @@ from orchestrate.store import database_url, launches, packed_curves, schema
 from orchestrate.store.backends import sqlite
 from orchestrate.store.backends.base import Backend
 from orchestrate.store.backends.open import make_backend
-from orchestrate.store.schema import SCHEMA_VERSION, config, create_views, curve, drop_views
+from orchestrate.store.schema import (
+    SCHEMA_VERSION,
+    alembic_version,
+    config,
+    create_views,
+    curve,
+    drop_views,
+)
 
-if TYPE_CHECKING:
-    from alembic.config import Config
-
-LOCATION = Path(__file__).parent
+STATEMENTS = {
+    6: (
+        "ALTER TABLE launch ADD COLUMN fingerprint TEXT",
+        "ALTER TABLE trial ADD COLUMN registered_by {whole}",
+    ),
+    7: ("DROP TABLE live_step",),
+}
+"""Statements that make each schema of the one before it; ``{whole}`` is a 64-bit integer."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +103,7 @@ def _upgrade(backend: Backend, backup: bool) -> Upgrade:
             if before < SCHEMA_VERSION:
                 launches.refuse_living(connection, backend)
                 name = backend.back_up(connection, before) if backup else None
-                migrate(connection)
+                migrate(connection, before)
                 curve.create(connection, checkfirst=True)
                 _write_labels(connection)
             else:
@@ -110,33 +120,25 @@ def _write_labels(connection: Connection) -> None:
     columns = select(config.c.config_id, config.c.config_json, config.c.label)
     stored = [(row[0], json.loads(row[1]), row[2]) for row in connection.execute(columns)]
     rows = [
-        {"id": config_id, "text": text}
+        {"id": config_id, "text": made}
         for config_id, document, label in stored
         if all(section_class(document, key) for key in REGISTRIES if document.get(key))
-        and (text := config_label(document)) != label
+        and (made := config_label(document)) != label
     ]
     if rows:
         statement = update(config).where(config.c.config_id == bindparam("id"))
         connection.execute(statement.values(label=bindparam("text")), rows)
 
 
-def migrate(connection: Connection) -> None:
-    """Migrate a database to the newest schema, in the transaction of the caller.
+def migrate(connection: Connection, version: int) -> None:
+    """Bring a database of a version to the newest schema, in the transaction of the caller.
 
     The views are dropped and created again: not every database can change a table below a view.
     """
-    from alembic import command  # a sixth of the start of every program, and used by none but this
-
     drop_views(connection)
-    command.upgrade(_configuration(connection), "head")
+    whole = "INTEGER" if connection.dialect.name == "sqlite" else "BIGINT"
+    for number in range(version + 1, SCHEMA_VERSION + 1):
+        for statement in STATEMENTS[number]:
+            connection.execute(text(statement.format(whole=whole)))
+    connection.execute(update(alembic_version).values(version_num=str(SCHEMA_VERSION)))
     create_views(connection)
-
-
-def _configuration(connection: Connection) -> Config:
-    from alembic.config import Config
-
-    configuration = Config()
-    # The configuration parser interpolates %.
-    configuration.set_main_option("script_location", str(LOCATION).replace("%", "%%"))
-    configuration.attributes["connection"] = connection
-    return configuration
