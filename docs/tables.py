@@ -1,56 +1,39 @@
 """``python docs/tables.py``: write the tables of the pages from CSV files and from the code.
 
-Numbers come from the CSV files of the studies; options, settings and columns of the database come
-from ``conf/``, the classes and the schema. A table stands in a page between
-``<!-- table: NAME -->`` and ``<!-- end -->``. ``--check`` writes nothing and fails where a page
-differs from its sources.
+Numbers come from the CSV files of the studies, the rest from :mod:`docs.code_tables`. A table
+stands in a page between ``<!-- table: NAME -->`` and ``<!-- end -->``. ``--check`` writes nothing
+and fails where a page differs from its sources.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import importlib
-import inspect
 import re
-import sqlite3
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from analysis.formatting import number, plus_minus, share, within
-from analysis.stats.intervals import band
-from dopt.control import TASKS
-from dopt.policies import POLICIES
-from dopt.systems import NAMED_SYSTEMS
-from dopt.systems.base import System
-from orchestrate.config.options import CONFIGURATION, option_names
-from orchestrate.export.bundle import COLUMNS
-from orchestrate.store.schema import VIEWS, metadata
+from analysis.stats.intervals import band, standard_error
+from analysis.stats.scores import compare
+from docs import code_tables
+from docs.code_tables import markdown
 
 DOCS = Path(__file__).parent
 PAGES = (
-    "database.md", "findings.md", "method.md", "options.md", "yardsticks.md", "../README.md"
+    "database.md", "findings.md", "method.md", "options.md", "structure.md", "wide_networks.md",
+    "yardsticks.md", "../README.md",
 )  # fmt: skip
 ALL = ("pendulum", "cartpole", "arm", "quadrotor")
 LEARNERS = ("adam_window", "adam_replay", "gauss_newton")
 TITLES = {"d_optimal": "D-optimal", "random_held": "held random", "periodic_square": "square wave"}
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-
-Rows = Iterable[Sequence[str]]
-
-
-def markdown(head: Sequence[str], rows: Rows) -> str:
-    first, *others = (f"| {' | '.join(line)} |" for line in (head, *rows))
-    return "\n".join([first, "|---" * len(head) + "|", *others]) + "\n"
 
 
 def read(name: str) -> pd.DataFrame:
@@ -492,125 +475,17 @@ def mujoco() -> str:
     return markdown(["inputs", *envs], rows)
 
 
-CLASSES: dict[str, Mapping[str, type]] = {
-    "env": NAMED_SYSTEMS,
-    "policy": POLICIES,
-    "task": TASKS,
-}
-"""Classes of the options that have no file."""
-
-COMMENTED = re.compile(r"^ *([\w.]+):(?: +([^#\n]*?))? *(?:# (.*))?$", re.MULTILINE)
-"""A setting of a file of options: key, value and comment."""
-
-
-def first_sentence(text: str) -> str:
-    """Return the first sentence of a docstring or comment, as one cell of a table."""
-    plain = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", " ".join(text.split())).replace("``", "`")
-    return re.split(r"(?<=\.) (?=[A-Z`])", plain)[0].rstrip(".:").replace("|", r"\|")
-
-
-def comment(path: Path) -> str:
-    """Return what a file of options says of itself in its first lines."""
-    lines = re.sub(r"# @package \S+\n", "", path.read_text()).splitlines()
-    end = next(i for i, line in enumerate(lines) if not line.startswith("#"))
-    return " ".join(line.lstrip("# ") for line in lines[:end])
-
-
-def settings(values: Mapping[str, Any]) -> str:
-    """Return settings with their defaults, as one cell of a table."""
-
-    def text(value: object) -> str:
-        if value is None or isinstance(value, bool):
-            return "null" if value is None else str(value).lower()
-        return str(value).replace(" ", "").replace("'", "")
-
-    return " ".join(f"`{key}={text(value)}`" for key, value in values.items() if key != "name")
-
-
-def fields(cls: type) -> dict[str, object]:
-    found = {one.name: one.default for one in dataclasses.fields(cls)}
-    return {key: list(one) if isinstance(one, tuple) else one for key, one in found.items()}
-
-
-def option(group: str, name: str) -> list[str]:
-    """Return the row of an option: name, what it is, its settings with their defaults."""
-    path = CONFIGURATION / group / f"{name}.yaml"
-    if path.exists():
-        said, found = comment(path), yaml.safe_load(path.read_text())
-        own = {key: one for key, one in found.get(group, found).items() if key != "defaults"}
-    else:
-        folder, _, short = name.rpartition("/")
-        cls = CLASSES[group][f"mujoco_{short}" if folder == "mujoco" else short]
-        said, own = inspect.getdoc(cls) or "", fields(cls)
-    shared = fields(System) if group == "env" else {}
-    own = {key: one for key, one in own.items() if key not in shared}
-    return [f"`{name}`", first_sentence(said), settings(own)]
-
-
-def of_group(group: str) -> str:
-    """Return the options of a group; the complete grids of an experiment are no settings."""
-    rows = [option(group, name) for name in option_names(group)]
-    if group == "experiment":
-        return markdown(["experiment", "grid"], [row[:2] for row in rows])
-    return markdown([group, "is", "settings"], rows)
-
-
-def explained(section: str, keys: Callable[[str], bool] = bool) -> str:
-    """Return settings with their defaults and the comments behind them."""
-    rows = [
-        [f"`{key}`", f"`{value}`", said] for key, value, said in COMMENTED.findall(section)
-        if keys(key)
-    ]  # fmt: skip
-    return markdown(["key", "default", "meaning"], rows)
-
-
-def system_settings() -> str:
-    """Return the settings that all systems have, with the values of the pendulum."""
-    text = (CONFIGURATION / "env/pendulum.yaml").read_text()
-    return explained(text, fields(System).__contains__)
-
-
-def launch_settings() -> str:
-    text = (CONFIGURATION / "config.yaml").read_text()
-    section = text.split("\nlaunch:\n")[1].split("\n\n")[0]
-    return explained(section.replace("  ray:\n    address", "  ray.address"))
-
-
-def columns() -> str:
-    """Return the columns of every table of the database, with unit and meaning."""
-    rows = [
-        [f"`{table}`", f"`{name}`", unit, said]
-        for table, found in COLUMNS.items()
-        for name, (unit, said) in found.items()
-    ]
-    return markdown(["table", "column", "unit", "meaning"], rows)
-
-
-ROW_OF = {
-    "v_trial": "trial", "v_curve": "trial and step", "v_curve_stats": "configuration and step",
-    "v_progress": "configuration", "v_failures": "failed attempt",
-    "v_assessment": "trial, step and measure",
-}  # fmt: skip
-
-
-def views() -> str:
-    """Return the columns of every view of the database that it has beside the shared ones."""
-    with sqlite3.connect(":memory:") as database:
-        for table in metadata.sorted_tables:
-            names = ", ".join(column.name for column in table.columns)
-            database.execute(f"CREATE TABLE {table.name} ({names})")
-        for name, query in VIEWS.items():
-            database.execute(f"CREATE VIEW {name} AS {query}")
-        found = {
-            name: [one[0] for one in database.execute(f"SELECT * FROM {name}").description]
-            for name in VIEWS
-        }
-    shared = [name for name in found["v_trial"] if all(name in names for names in found.values())]
-    rows = [
-        [f"`{view}`", ROW_OF[view], ", ".join(f"`{one}`" for one in names if one not in shared)]
-        for view, names in found.items()
-    ]
-    return markdown(["view", "one row per", "columns"], rows)
+def sketch() -> str:
+    """Return losses with the sketch beside exact ones, compared as in all other tables."""
+    losses = read("sketch_losses").set_index(["env", "width", "form", "seed"])
+    rows = []
+    for (env, width), part in losses.groupby(["env", "width"]):
+        pairs = part.final_loss.droplevel(["env", "width"]).unstack("form")
+        exact, approximate = pairs["dual"].to_numpy(), pairs["sketch"].to_numpy()
+        found = compare(approximate, exact, np.random.default_rng(0))
+        means = [f"{x.mean():.2f} ± {2 * standard_error(x):.2f}" for x in (exact, approximate)]
+        rows.append([str(env), str(width), *means, f"{found.ratio:.2f}", f"{found.p_value:.2f}"])
+    return markdown(["system", "width", "exact", "sketch", "ratio", "p"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -621,24 +496,10 @@ TABLES: dict[str, Callable[[], str]] = {
         periodic, models,
         unknown_gain, integrators, integrators_gauss_newton, calibration, limits, noisy_angle,
         noisy_angle_expected, flex_table1, flex_table1_agents, flex_table3, flex_star,
-        active_sysid, flex_example, mujoco, launch_settings, system_settings,
-        columns, views,
+        active_sysid, flex_example, mujoco, sketch,
     )
 }  # fmt: skip
-TABLES |= {
-    f"{group}_options": functools.partial(of_group, group)
-    for group in (
-        "env",
-        "policy",
-        "model",
-        "learner",
-        "limits",
-        "task",
-        "executor",
-        "store",
-        "experiment",
-    )
-}
+TABLES |= code_tables.TABLES
 
 
 def with_tables(text: str) -> str:
@@ -652,7 +513,7 @@ def main(check: bool) -> int:
         old = page.read_text()
         new = with_tables(old)
         if old != new and check:
-            sys.stderr.write(f"{page.name} differs from its CSV files: run python docs/tables.py\n")
+            sys.stderr.write(f"{page.name} differs from its sources: run python docs/tables.py\n")
             status = 1
         elif old != new:
             page.write_text(new)

@@ -54,7 +54,7 @@ def test_a_changed_number_is_noticed_and_written(
     first = summary.read_text().splitlines()[1].split(",")[3]
     summary.write_text(summary.read_text().replace(first, "7.5"))
     assert tables(copied).main(check=True) == 1
-    assert "README.md differs from its CSV files" in capsys.readouterr().err
+    assert "README.md differs from its sources" in capsys.readouterr().err
     assert tables(copied).main(check=False) == 0
     assert "7.50" in (copied / "../README.md").read_text()
     assert tables(copied).main(check=True) == 0

@@ -1,0 +1,182 @@
+"""Tables of the pages that are made from the code: options, settings, columns, source map."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import re
+import sqlite3
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dopt.control import TASKS
+from dopt.policies import POLICIES
+from dopt.systems import NAMED_SYSTEMS
+from dopt.systems.base import System
+from orchestrate.config.options import CONFIGURATION, option_names
+from orchestrate.export.bundle import COLUMNS
+from orchestrate.store.schema import VIEWS, metadata
+
+ROOT = Path(__file__).parents[1]
+
+Rows = Iterable[Sequence[str]]
+
+CLASSES: dict[str, Mapping[str, type]] = {
+    "env": NAMED_SYSTEMS,
+    "policy": POLICIES,
+    "task": TASKS,
+}
+"""Classes of the options that have no file."""
+
+COMMENTED = re.compile(r"^ *([\w.]+):(?: +([^#\n]*?))? *(?:# (.*))?$", re.MULTILINE)
+"""A setting of a file of options: key, value and comment."""
+
+
+def markdown(head: Sequence[str], rows: Rows) -> str:
+    first, *others = (f"| {' | '.join(line)} |" for line in (head, *rows))
+    return "\n".join([first, "|---" * len(head) + "|", *others]) + "\n"
+
+
+def first_sentence(text: str) -> str:
+    """Return the first sentence of a docstring or comment, as one cell of a table."""
+    plain = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", " ".join(text.split())).replace("``", "`")
+    return re.split(r"(?<=\.) (?=[A-Z`])", plain)[0].rstrip(".:").replace("|", r"\|")
+
+
+def comment(path: Path) -> str:
+    """Return what a file of options says of itself in its first lines."""
+    lines = re.sub(r"# @package \S+\n", "", path.read_text()).splitlines()
+    end = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    return " ".join(line.lstrip("# ") for line in lines[:end])
+
+
+def settings(values: Mapping[str, Any]) -> str:
+    """Return settings with their defaults, as one cell of a table."""
+
+    def text(value: object) -> str:
+        if value is None or isinstance(value, bool):
+            return "null" if value is None else str(value).lower()
+        return str(value).replace(" ", "").replace("'", "")
+
+    return " ".join(f"`{key}={text(value)}`" for key, value in values.items() if key != "name")
+
+
+def fields(cls: type) -> dict[str, object]:
+    found = {one.name: one.default for one in dataclasses.fields(cls)}
+    return {key: list(one) if isinstance(one, tuple) else one for key, one in found.items()}
+
+
+def option(group: str, name: str) -> list[str]:
+    """Return the row of an option: name, what it is, its settings with their defaults."""
+    path = CONFIGURATION / group / f"{name}.yaml"
+    if path.exists():
+        said, found = comment(path), yaml.safe_load(path.read_text())
+        own = {key: one for key, one in found.get(group, found).items() if key != "defaults"}
+    else:
+        folder, _, short = name.rpartition("/")
+        cls = CLASSES[group][f"mujoco_{short}" if folder == "mujoco" else short]
+        said, own = inspect.getdoc(cls) or "", fields(cls)
+    shared = fields(System) if group == "env" else {}
+    own = {key: one for key, one in own.items() if key not in shared}
+    return [f"`{name}`", first_sentence(said), settings(own)]
+
+
+def of_group(group: str) -> str:
+    """Return the options of a group; the complete grids of an experiment are no settings."""
+    rows = [option(group, name) for name in option_names(group)]
+    if group == "experiment":
+        return markdown(["experiment", "grid"], [row[:2] for row in rows])
+    return markdown([group, "is", "settings"], rows)
+
+
+def explained(section: str, keys: Callable[[str], bool] = bool) -> str:
+    """Return settings with their defaults and the comments behind them."""
+    rows = [
+        [f"`{key}`", f"`{value}`", said] for key, value, said in COMMENTED.findall(section)
+        if keys(key)
+    ]  # fmt: skip
+    return markdown(["key", "default", "meaning"], rows)
+
+
+def system_settings() -> str:
+    """Return the settings that all systems have, with the values of the pendulum."""
+    text = (CONFIGURATION / "env/pendulum.yaml").read_text()
+    return explained(text, fields(System).__contains__)
+
+
+def launch_settings() -> str:
+    text = (CONFIGURATION / "config.yaml").read_text()
+    section = text.split("\nlaunch:\n")[1].split("\n\n")[0]
+    return explained(section.replace("  ray:\n    address", "  ray.address"))
+
+
+def columns() -> str:
+    """Return the columns of every table of the database, with unit and meaning."""
+    rows = [
+        [f"`{table}`", f"`{name}`", unit, said]
+        for table, found in COLUMNS.items()
+        for name, (unit, said) in found.items()
+    ]
+    return markdown(["table", "column", "unit", "meaning"], rows)
+
+
+ROW_OF = {
+    "v_trial": "trial", "v_curve": "trial and step", "v_curve_stats": "configuration and step",
+    "v_progress": "configuration", "v_failures": "failed attempt",
+    "v_assessment": "trial, step and measure",
+}  # fmt: skip
+
+
+def views() -> str:
+    """Return the columns of every view of the database that it has beside the shared ones."""
+    with sqlite3.connect(":memory:") as database:
+        for table in metadata.sorted_tables:
+            names = ", ".join(column.name for column in table.columns)
+            database.execute(f"CREATE TABLE {table.name} ({names})")
+        for name, query in VIEWS.items():
+            database.execute(f"CREATE VIEW {name} AS {query}")
+        found = {
+            name: [one[0] for one in database.execute(f"SELECT * FROM {name}").description]
+            for name in VIEWS
+        }
+    shared = [name for name in found["v_trial"] if all(name in names for names in found.values())]
+    rows = [
+        [f"`{view}`", ROW_OF[view], ", ".join(f"`{one}`" for one in names if one not in shared)]
+        for view, names in found.items()
+    ]
+    return markdown(["view", "one row per", "columns"], rows)
+
+
+def source_map() -> str:
+    """Return the modules and folders of the packages with the first lines of their docstrings."""
+
+    def said(path: Path) -> str:
+        text = ast.get_docstring(ast.parse(path.read_text())) or ""
+        return text.partition("\n")[0].replace("``", "").replace(":mod:", "").replace("`", "")
+
+    lines = []
+    for package in ("dopt", "orchestrate", "orchestrate/store", "analysis"):
+        folder = ROOT / package
+        lines.append(f"{package + '/':<22}{said(folder / '__init__.py')}")
+        files = [one for one in sorted(folder.glob("*.py")) if not one.name.startswith("__")]
+        lines += [f"  {one.name:<20}{said(one)}" for one in files]
+        for one in sorted(folder.glob("*/__init__.py")):
+            if (name := one.parent.name) not in {"store", "backends", "migrations"}:
+                lines.append(f"  {name + '/':<20}{said(one)}")
+    return "```text\n" + "\n".join(lines) + "\n```\n"
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    made.__name__: made for made in (launch_settings, system_settings, columns, views, source_map)
+}
+TABLES |= {
+    f"{group}_options": functools.partial(of_group, group)
+    for group in (
+        "env", "policy", "model", "learner", "limits", "task", "executor", "store", "experiment"
+    )
+}  # fmt: skip
