@@ -83,7 +83,7 @@ def sqlite_url(tmp_path: Path) -> str:
 @pytest.fixture(scope="session")
 def server_url() -> Iterator[str]:
     """URL of the server that is named, or of one of our own, which does not wait for the disk."""
-    from tests.orchestrate.faults.servers import Server, binaries
+    from tests.orchestrate.faults.laboratory import Server, binaries
 
     named = os.environ.get("DOPT_TEST_POSTGRES")
     try:

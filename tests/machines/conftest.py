@@ -10,11 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.machines import servers
-from tests.machines.hosts import Network
-from tests.machines.lab import GRID, SEEDS, Lab, environment
-from tests.machines.outcome import Outcome
-from tests.machines.requirements import unavailable
+from tests.machines.hosts import Network, unavailable
+from tests.machines.lab import GRID, SEEDS, Lab, Outcome, environment
+from tests.paths import ROOT
 
 HERE = Path(__file__).parent
 SECONDS = 600
@@ -71,12 +69,12 @@ def undisturbed(namespaces: None, tmp_path_factory: pytest.TempPathFactory) -> O
     url = f"sqlite:///{tmp_path_factory.mktemp('undisturbed') / 'results.db'}"
     words = [*GRID, f"seed=range({SEEDS})", "executor=inprocess", f"store.url={url}"]
     process = subprocess.run(
-        [sys.executable, str(servers.ROOT / "orchestrate/launch.py"), "-m", *words],
+        [sys.executable, str(ROOT / "orchestrate/launch.py"), "-m", *words],
         capture_output=True, text=True, timeout=SECONDS, env={**os.environ, **environment()},
     )  # fmt: skip
     assert process.returncode == 0, process.stdout + process.stderr
     text = subprocess.run(
-        [sys.executable, "-m", "tests.machines.outcome", url],
-        capture_output=True, text=True, timeout=SECONDS, check=True, cwd=servers.ROOT,
+        [sys.executable, "-m", "tests.machines.lab", url],
+        capture_output=True, text=True, timeout=SECONDS, check=True, cwd=ROOT,
     ).stdout  # fmt: skip
     return Outcome.from_json(text)

@@ -17,7 +17,17 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import pytest
+
 from tests.paths import ROOT
+
+
+def unavailable(message: str) -> None:
+    """Skip the test, or fail it where DOPT_REQUIRE_MACHINES=1."""
+    if os.environ.get("DOPT_REQUIRE_MACHINES") == "1":
+        pytest.fail(message)
+    pytest.skip(message)
+
 
 _FIRST_PROCESS = (
     "import os, signal, socket; signal.signal(signal.SIGCHLD, signal.SIG_IGN); "

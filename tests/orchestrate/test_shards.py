@@ -14,7 +14,7 @@ from orchestrate.errors import LaunchError
 from orchestrate.runner.run_grid import collected
 from orchestrate.store import NoDatabaseError, Reader, Store, StoreError
 from orchestrate.store.maintenance import collect, merge_collected
-from tests.orchestrate.faults.outcome import flaws, results
+from tests.orchestrate.faults.laboratory import flaws, results
 from tests.orchestrate.standins import grid_of
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.waiting import until

@@ -1,21 +1,40 @@
-"""Ten thousand trials with a fault every few seconds end as if nothing had happened."""
+"""Thousands of trials with a fault every few seconds, or in many shares, end as if undisturbed."""
 
 from __future__ import annotations
 
 import os
 import random
+import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from tabulate import tabulate
 
-from tests.orchestrate.faults.laboratory import Laboratory
-from tests.orchestrate.faults.servers import Server
-from tests.soak.disturbances import ON_POSTGRESQL, ON_SQLITE
-from tests.soak.supervisor import Supervisor
+from orchestrate.config import Grid
+from orchestrate.config.launch_settings import LaunchSettings, Share
+from orchestrate.errors import ExitCode
+from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.store.maintenance import merge_collected
+from tests.orchestrate.conftest import RECORD
+from tests.orchestrate.faults.conftest import (  # noqa: F401  fixtures, which pytest finds here
+    laboratory_at,
+    postgresql_url,
+    server,
+    sqlite_url,
+    undisturbed,
+    url,
+)
+from tests.orchestrate.faults.laboratory import Laboratory, Server, flaws, preempt, results
+from tests.orchestrate.faults.test_workers import register
+from tests.orchestrate.faults.trials import outcome
+from tests.orchestrate.standins import specification
+from tests.soak.disturbances import ON_POSTGRESQL, ON_SQLITE, Supervisor
 
-TRIALS = 10_000
-"""Trials on each database, unless DOPT_SOAK_TRIALS says how many."""
+At = Callable[..., Laboratory]
+
+TRIALS = int(os.environ.get("DOPT_SOAK_TRIALS", "10000"))
+"""Trials on each database; workers that pull run half of them."""
 
 SETTINGS = {"lease": 6, "patience": 5, "chunk_seconds": 0.5}
 FEWEST_FAULTS = 10
@@ -23,36 +42,82 @@ FEWEST_FAULTS = 10
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1800)]
 
 
+@pytest.fixture
+def tell(request: pytest.FixtureRequest) -> Callable[[str], None]:
+    return lambda text: request.config.get_terminal_writer().line(f"\n{text}")
+
+
 @pytest.mark.parametrize("database", ["sqlite", "postgresql"])
 def test_a_grid_survives_everything(
-    request: pytest.FixtureRequest, laboratory_at: Callable[..., Laboratory], database: str
+    request: pytest.FixtureRequest,
+    laboratory_at: At,  # noqa: F811
+    tell: Callable[[str], None],
+    database: str,
 ) -> None:
-    trials = int(os.environ.get("DOPT_SOAK_TRIALS", TRIALS))
-    url = request.getfixturevalue(f"{database}_url")
-    server: Server | None = None
+    server: Server | None = None  # noqa: F811
     disturbances = ON_SQLITE
     if database == "postgresql":
         server, disturbances = request.getfixturevalue("server"), ON_POSTGRESQL
-    laboratory = laboratory_at(url, trials, seconds=0.005, settings=SETTINGS)
+    url = request.getfixturevalue(f"{database}_url")  # noqa: F811
+    laboratory = laboratory_at(url, TRIALS, seconds=0.005, settings=SETTINGS)
     supervisor = Supervisor(laboratory, server, disturbances, random.Random(1))
     try:
         supervisor.run()
         laboratory.check()
     finally:
-        _tell(request, database, supervisor)
+        tell(f"{TRIALS:,} trials on {database}, {supervisor.starts} launches")
+        tell(supervisor.table())
+        headers = ["outcome of an attempt", "times"]
+        tell(tabulate(attempts(laboratory), headers=headers, tablefmt="github"))
     faults = sum(seen.total() for seen in supervisor.seen.values())
-    assert faults >= min(FEWEST_FAULTS, trials // 500)
+    assert faults >= min(FEWEST_FAULTS, TRIALS // 500)
     assert laboratory.count("status = 'failed'") == 0
 
 
-def _tell(request: pytest.FixtureRequest, database: str, supervisor: Supervisor) -> None:
-    attempts = supervisor.laboratory.query(
-        "SELECT coalesce(outcome, 'running'), count(*) FROM attempt GROUP BY 1 ORDER BY 1"
-    )
-    terminal = request.config.get_terminal_writer()
-    terminal.line()
-    terminal.line(
-        f"{supervisor.laboratory.order.trials:,} trials on {database}, {supervisor.starts} launches"
-    )
-    terminal.line(supervisor.table())
-    terminal.line(tabulate(attempts, headers=["outcome of an attempt", "times"], tablefmt="github"))
+def test_workers_survive_a_preemption_every_second_or_two(
+    url: str,  # noqa: F811
+    laboratory_at: At,  # noqa: F811
+    tell: Callable[[str], None],
+) -> None:
+    laboratory = laboratory_at(url, TRIALS // 2, seconds=0.05)
+    register(laboratory)
+    sent = preempt(laboratory, workers=3, every=50, chance=random.Random(2), lease=2.0)
+    laboratory.check()
+    assert laboratory.count("status = 'failed'") == 0
+    tell(f"{TRIALS // 2:,} trials, signals {dict(sent)}, attempts {dict(attempts(laboratory))}")
+    assert sent.total() >= min(10, TRIALS // 200)
+
+
+def attempts(laboratory: Laboratory) -> list[tuple[str, int]]:
+    sql = "SELECT coalesce(outcome, 'running'), count(*) FROM attempt GROUP BY 1 ORDER BY 1"
+    return [(str(row[0]), int(row[1])) for row in laboratory.query(sql)]
+
+
+SHARED_TRIALS, SHARES, HORIZON = 10_000, 20, 50
+
+
+def run(grid: Grid, settings: LaunchSettings) -> None:
+    work = Work(outcome, prepare=lambda: None)
+    assert launch_grid(grid, settings, RECORD, work, lambda _: None, None) == ExitCode.DONE
+
+
+def test_twenty_shares_become_one_database(tmp_path: Path, tell: Callable[[str], None]) -> None:
+    first = specification(0, horizon=HORIZON)
+    trials = [first.with_seed(seed) for seed in range(SHARED_TRIALS)]
+    grid = Grid(trials, n_jobs=SHARED_TRIALS, left_out={})
+    one, merged = f"sqlite:///{tmp_path}/one.db", f"sqlite:///{tmp_path}/merged.db"
+    run(grid, LaunchSettings("inprocess", one))
+    shared = tmp_path / "shared"
+    for number in range(1, SHARES + 1):
+        part = Share(number, SHARES)
+        place = f"sqlite:///{tmp_path}/disk/s.{part}.here.db"
+        run(
+            grid.only(part.holds),
+            LaunchSettings("inprocess", place, share=part, collect_in=shared),
+        )
+    start = time.monotonic()
+    added = sum(sum(one.added.values()) for one in merge_collected(merged, shared))
+    tell(f"{added:,} trials merged in {time.monotonic() - start:.1f} s")
+    assert added == SHARED_TRIALS
+    assert results(merged) == results(one)
+    assert flaws(merged) == []

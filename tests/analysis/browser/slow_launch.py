@@ -11,7 +11,7 @@ from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import LaunchRecord
 from tests.analysis.browser.grids import SHORT
 from tests.analysis.synthetic import fake_result, make_grid
-from tests.orchestrate.faults.gate import Gate, Gated
+from tests.orchestrate.faults.trials import Gate, Gated
 
 
 def main(url: str, seeds: int, folder: Path) -> int:

@@ -14,7 +14,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.analysis.browser import chromium, grids
-from tests.orchestrate.faults.gate import Gate
+from tests.orchestrate.faults.trials import Gate
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docker.running.conftest import PASSWORD, TOKEN
-from tests.docker.running.engine import Ended, Machine
+from tests.docker.running.conftest import PASSWORD, TOKEN, Ended, Machine
 
 pytestmark = [pytest.mark.image, pytest.mark.timeout(900)]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docker.running.engine import Ended, Machine
+from tests.docker.running.conftest import Ended, Machine
 from tests.pages import PAGES, blocks
 
 pytestmark = [pytest.mark.image, pytest.mark.timeout(900)]

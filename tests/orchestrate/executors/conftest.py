@@ -6,8 +6,17 @@ from typing import Any
 
 import pytest
 
-from tests.orchestrate.executors.names import WORKERS
 from tests.orchestrate.lean_ray import leave_services_out
+
+WORKERS = 2
+"""Number of workers of an executor, where the number does not matter."""
+
+ON_RAY = pytest.mark.xdist_group("executors")
+"""Mark of the tests that share one Ray."""
+
+RAY = pytest.param("ray", marks=ON_RAY)
+WITH_PROCESSES = ("local", RAY)
+ALL = ("inprocess", *WITH_PROCESSES)
 
 
 @pytest.fixture

@@ -1,30 +1,40 @@
-"""One contract, run over every executor."""
+"""One contract, run over every executor; the pool, lockstep and the registry."""
 
 from __future__ import annotations
 
+import ast
 import errno
 import importlib
+import json
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from dopt.result import TrialResult
+from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.errors import ExitCode, InfrastructureError, LaunchError
 from orchestrate.executors.base import Event, Executor, Run, Task, TaskDone, WorkerLost
 from orchestrate.executors.inprocess import InProcessExecutor
 from orchestrate.executors.local import LocalExecutor
+from orchestrate.executors.lockstep import LockstepExecutor
+from orchestrate.executors.registry import EXECUTORS
 from orchestrate.program import exit_code
 from orchestrate.records import Failure
-from tests.orchestrate.executors.names import ALL, WITH_PROCESSES, WORKERS
+from orchestrate.store import Reader
+from tests.dopt.trials import trial
+from tests.orchestrate.executors.conftest import ALL, WITH_PROCESSES, WORKERS
 from tests.orchestrate.loaded_modules import report_modules
 from tests.orchestrate.standins import BROKEN_SEED, deadly, quick, raising, slow, specification
+from tests.paths import ROOT
 from tests.waiting import until
 
 Make = Callable[[Run], Executor]
@@ -225,3 +235,177 @@ def test_a_worker_of_the_local_executor_loads_no_heavy_library() -> None:
     loaded = set(done.outcome.message.split())
     assert loaded >= {"numba", "numpy"}
     assert not loaded & {"torch", "pandas", "sqlalchemy", "hydra", "omegaconf", "matplotlib", "ray"}
+
+
+TRIALS = [trial("pendulum", "d_optimal", seed, env={"horizon": 8}) for seed in range(3)]
+
+
+def test_a_chunk_is_run_as_one_batch() -> None:
+    with LockstepExecutor("cpu", batch=3) as executor:
+        executor.submit([Task(spec.trial_key, spec) for spec in TRIALS])
+        events = executor.wait(0.1)
+        assert executor.pending == 0
+    assert [event.key for event in events if isinstance(event, TaskDone)] == [
+        spec.trial_key for spec in TRIALS
+    ]
+    for event, spec in zip(events, TRIALS, strict=True):
+        assert isinstance(event, TaskDone)
+        assert isinstance(event.outcome, TrialResult)
+        alone = run_trial(spec, "reference")
+        assert event.outcome.loss == pytest.approx(alone.loss, rel=1e-9)
+        assert event.outcome.inputs == pytest.approx(alone.inputs, rel=1e-9)
+
+
+def test_what_cannot_run_together_is_every_trials_trouble() -> None:
+    mixed = [TRIALS[0], trial("pendulum", "random", 1, env={"horizon": 8})]
+    with LockstepExecutor("cpu", batch=2) as executor:
+        executor.submit([Task(spec.trial_key, spec) for spec in mixed])
+        outcomes = [event.outcome for event in executor.wait(0.1) if isinstance(event, TaskDone)]
+    assert [isinstance(outcome, Failure) for outcome in outcomes] == [True, True]
+
+
+@pytest.mark.parametrize("device", ["cuda:99", "banana", "meta"])
+def test_a_device_that_is_not_there_is_a_sentence(device: str) -> None:
+    with pytest.raises(LaunchError, match=f"executor.device is '{device}'.*executor.device=cpu"):
+        LockstepExecutor(device, batch=2).start()
+
+
+@pytest.mark.parametrize("grid", [["-m"], []])
+def test_a_launch_on_a_device_that_is_not_there_is_refused_and_leaves_nothing(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path, grid: list[str]
+) -> None:
+    code, _, errors = command_line(
+        "env.horizon=5", *grid, "seed=0", "executor=lockstep", "executor.device=cuda:99"
+    )
+    assert (code, errors.count("\n")) == (2, 1)
+    assert errors.startswith("error: executor.device is 'cuda:99'")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_grid_runs_in_lockstep(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    grid = ("-m", "env=pendulum", "policy=random,oracle", "seed=range(4)", "env.horizon=6")
+    code, _, errors = command_line(
+        *grid, "executor=lockstep", "executor.batch=3", f"store.url={url}"
+    )
+    assert code == 0, errors
+    with Reader.open(url) as reader:
+        assert [config.n_done for config in reader.configs()] == [4, 4]
+
+
+def test_lockstep_and_the_kernel_keep_their_trials_apart(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    """Their numbers agree to rounding only: one must not be taken for the other."""
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    one = ("env=pendulum", "policy=oracle", "seed=1", "env.horizon=6", f"store.url={url}")
+    assert command_line(*one, "executor=lockstep")[0] == 0
+    assert command_line(*one, "executor=inprocess")[0] == 0
+    with Reader.open(url) as reader:
+        assert sorted(str(config.config["path"]) for config in reader.configs()) == [
+            "kernel",
+            "reference",
+        ]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
+def test_a_grid_runs_on_a_gpu(
+    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+) -> None:
+    url = f"sqlite:///{tmp_path / 'results.db'}"
+    grid = ("-m", "env=pendulum", "policy=random,d_optimal", "seed=range(4)", "env.horizon=6")
+    device = ("executor=lockstep", "executor.device=cuda:0")
+    code, _, errors = command_line(*grid, *device, f"store.url={url}")
+    assert code == 0, errors
+    with Reader.open(url) as reader:
+        assert [config.n_done for config in reader.configs()] == [4, 4]
+
+
+CommandLine = Callable[..., tuple[int, str, str]]
+
+LAUNCH = """
+import json, sys
+from orchestrate.runner import launch, start
+from orchestrate.runner.run_grid import Work
+from tests.orchestrate.standins import quick
+
+if __name__ == "__main__":
+    start.WORK = Work(quick, prepare=lambda: None)
+    code = launch.main()
+    print(json.dumps([code, sorted({"ray", "torch"} & set(sys.modules))]))
+"""
+
+
+def test_each_executor_has_a_configuration_file() -> None:
+    files = {path.stem for path in (ROOT / "conf" / "executor").glob("*.yaml")}
+    assert files == set(EXECUTORS)
+
+
+@pytest.mark.parametrize("name", ["local", "lockstep", "ray", "slurm"])
+def test_an_executor_is_named_in_its_own_files_and_the_registry_only(name: str) -> None:
+    module = f"orchestrate.executors.{name}"
+    own = {f"orchestrate/executors/{name}.py", "orchestrate/executors/registry.py"}
+    for path in (ROOT / "orchestrate").rglob("*.py"):
+        file = str(path.relative_to(ROOT))
+        if file in own or file.startswith(f"orchestrate/executors/{name}/"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                assert not str(node.module).startswith(module), file
+            if isinstance(node, ast.Compare):
+                values = [one.value for one in node.comparators if isinstance(one, ast.Constant)]
+                assert name not in values or (name == "local" and "ray" in file), file
+
+
+MINE = """
+from orchestrate.executors.inprocess import InProcessExecutor
+from orchestrate.executors.registry import ExecutorFactory
+
+given = []
+
+def make(settings, run, _):
+    given.append(settings.executor_options["nice"])
+    return InProcessExecutor(run)
+
+FACTORY = ExecutorFactory(make, lambda _: 1)
+"""
+
+
+def test_a_new_executor_needs_a_module_a_file_and_an_entry(
+    command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "my_executor.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(EXECUTORS, "mine", "my_executor")  # type: ignore[arg-type]
+    (tmp_path / "conf" / "executor").mkdir(parents=True)
+    (tmp_path / "conf" / "executor" / "mine.yaml").write_text("name: mine\nnice: 5\n")
+    code, output, errors = command_line(
+        *("-m", "env.horizon=5", "policy=random", "seed=0,1", "executor=mine", "executor.nice=7"),
+        f"hydra.searchpath=[file://{tmp_path / 'conf'}]",
+    )
+    assert (code, sys.modules.pop("my_executor").given) == (0, [7]), errors
+    assert "2 to run with executor=mine" in output
+
+
+def test_an_unknown_executor_is_refused_with_the_nearest_name(command_line: CommandLine) -> None:
+    code, _, errors = command_line("env.horizon=5", "executor.name=locla")
+    assert code == 2
+    assert "executor.name 'locla' is unknown" in errors
+    assert "'local'" in errors
+
+
+def test_local_processes_load_neither_ray_nor_torch(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(LAUNCH)
+    words = ["-m", "env.horizon=5", "policy=random", "seed=0,1", "executor=local"]
+    done = subprocess.run(
+        [sys.executable, str(program), *words, "launch.workers=1"],
+        cwd=tmp_path,
+        env={"PATH": "", "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert json.loads(done.stdout.splitlines()[-1]) == [0, []], done.stderr

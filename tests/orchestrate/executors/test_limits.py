@@ -24,7 +24,7 @@ from orchestrate.executors.local import CrashReport, LocalExecutor
 from orchestrate.records import Failure
 from tests.dopt.trials import trial
 from tests.orchestrate.conftest import Launches
-from tests.orchestrate.executors.names import ALL, WITH_PROCESSES
+from tests.orchestrate.executors.conftest import ALL, WITH_PROCESSES
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.faults.laboratory import alive
 from tests.orchestrate.standins import BROKEN_SEED, quick

@@ -10,10 +10,8 @@ from typing import Any
 
 import pytest
 
-from tests.orchestrate.faults.laboratory import Laboratory
-from tests.orchestrate.faults.outcome import Rows, results
+from tests.orchestrate.faults.laboratory import Laboratory, Rows, Server, binaries, results
 from tests.orchestrate.faults.program import Order
-from tests.orchestrate.faults.servers import Server, binaries
 
 TRIALS = Order.trials
 
@@ -56,8 +54,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Row
             folder = tmp_path_factory.mktemp("undisturbed")
             url = f"sqlite:///{folder}/results.db"
             order = Order(url, executor="inprocess", trials=trials, seconds=0.0)
-            with Laboratory(folder, order, dict).launched() as launched:
-                assert launched.end() == 0, launched.errors
+            Laboratory(folder, order, dict).run()
             known[trials] = results(url)
         return known[trials]
 

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import faulthandler
+import itertools
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,15 +26,15 @@ import psycopg
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors import local
-from orchestrate.runner import start, worker
+from orchestrate.executors import worker as worker_process
+from orchestrate.runner import scheduler, start, worker
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store, StoreUnavailableError
 from orchestrate.store.backends.postgresql import PostgreSQLBackend
 from orchestrate.store.backends.sqlite import SQLiteBackend
 from tests.orchestrate import lean_ray
-from tests.orchestrate.faults.gate import Gate, Gated, rest
-from tests.orchestrate.faults.trials import Standin, grid_of
+from tests.orchestrate.faults.trials import Gate, Gated, Standin, grid_of, rest
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,8 @@ class Order:
         Seconds by which each trial at the gate sets the clock of a worker on; 0 for a real clock.
     worker
         Settings of a worker, which runs trials that are registered, in place of a launch.
+    lone_losses
+        Losses of a machine that ran only one trial after which the trial fails; 0 for the usual.
     environment
         Variables of the environment that must be there before the program starts.
     """
@@ -69,6 +74,7 @@ class Order:
     settings: Mapping[str, Any] = field(default_factory=dict)
     tick: float = 0.0
     worker: Mapping[str, Any] | None = None
+    lone_losses: int = 0
     environment: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -80,7 +86,7 @@ def carry_out(order: Order, output: Path) -> None:
     # As from a terminal: a test run in the background of a shell leaves Ctrl-C ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if order.environment:
-        _start_anew(order, output)
+        _start_again(order, output)
     if order.pause:
         _PAUSES[order.pause](lambda: _stop_for_ever(output.with_suffix(".paused")))
     sys.exit(_launch(order))
@@ -90,7 +96,7 @@ def errors_beside(output: Path) -> Path:
     return output.with_suffix(".err")
 
 
-def _start_anew(order: Order, output: Path) -> None:
+def _start_again(order: Order, output: Path) -> None:
     """Become a new program with the environment, which is no part of what it is told."""
     told = json.dumps({**dataclasses.asdict(order), "environment": {}})
     words = [sys.executable, "-m", __name__, told, str(output)]
@@ -100,8 +106,10 @@ def _start_anew(order: Order, output: Path) -> None:
 def _launch(order: Order) -> int:
     if order.executor == "ray":
         lean_ray.leave_services_out()
-    # Those of the whole machine, to which another test may add one at any moment.
+    # The counter is of the whole machine: another test may add a kill at any moment.
     local._kills_for_memory = lambda: 0
+    local._start = ForkedWorker  # type: ignore[assignment]
+    scheduler.MAX_LONE_LOSSES = order.lone_losses or scheduler.MAX_LONE_LOSSES
     run = Gated(Standin(order.seconds, order.trouble), Gate(Path(order.gate)))
     work = Work(run, prepare=lambda: None)
     if order.worker is not None:
@@ -114,6 +122,52 @@ def _launch(order: Order) -> int:
         return start.run(request, grid_of(order.trials), settings)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
+
+
+class ForkedWorker:
+    """Worker process of the pool, forked from its driver, which has imported everything.
+
+    It has what a process of its own would have: three descriptors, and its own group.
+    """
+
+    def __init__(self, *descriptors: int) -> None:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        self.returncode: int | None = None
+        self.pid = os.fork()
+        if self.pid == 0:
+            try:
+                self._work(*descriptors)
+                os._exit(0)
+            finally:
+                os._exit(1)
+
+    @staticmethod
+    def _work(connection: int, crash_report: int, errors: int) -> None:
+        os.setpgid(0, 0)
+        for stream in (1, 2):
+            os.dup2(crash_report, stream)
+        kept = sorted({connection, crash_report, errors})
+        for low, high in itertools.pairwise([2, *kept, os.sysconf("SC_OPEN_MAX")]):
+            os.closerange(low + 1, high)
+        with suppress(EOFError, ConnectionError):  # as when it is a program
+            worker_process.main(connection, crash_report, errors)
+
+    def wait(self, seconds: float | None = None) -> int:
+        end = None if seconds is None else time.monotonic() + seconds
+        while self.returncode is None:
+            pid, status = os.waitpid(self.pid, 0 if end is None else os.WNOHANG)
+            if pid:
+                self.returncode = os.waitstatus_to_exitcode(status)
+            elif end is not None and time.monotonic() > end:
+                raise subprocess.TimeoutExpired("worker", seconds or 0.0)
+            else:
+                rest(0.005)
+        return self.returncode
+
+    def kill(self) -> None:
+        if self.returncode is None:
+            os.kill(self.pid, signal.SIGKILL)
 
 
 @dataclass(frozen=True)

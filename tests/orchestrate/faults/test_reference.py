@@ -15,8 +15,8 @@ from dopt.spec.trial import TrialSpec
 from orchestrate.runner import launch, start
 from orchestrate.runner.run_grid import Work
 from orchestrate.store import NoDatabaseError, Reader, StoreError
-from tests.orchestrate.faults.gate import Gate, Gated
-from tests.orchestrate.faults.outcome import Rows, flaws, results
+from tests.orchestrate.faults.laboratory import Rows, flaws, results
+from tests.orchestrate.faults.trials import Gate, Gated
 from tests.paths import ROOT
 from tests.waiting import until
 
@@ -46,11 +46,11 @@ def words(url: str) -> list[str]:
 
 
 def started(url: str, folder: Path) -> subprocess.Popen[str]:
-    """Start a launch with a worker, whose trials pass the gate of a folder."""
+    """Start a launch whose trials pass the gate of a folder."""
     path = os.pathsep.join([str(ROOT), str(EXAMPLE)])
     program = [sys.executable, "-c", PROGRAM, str(folder), *words(url)]
     return subprocess.Popen(
-        [*program, "executor=local", "launch.workers=1", "launch.chunk_seconds=0.1"],
+        [*program, "executor=inprocess"],
         env={**os.environ, "PYTHONPATH": path},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

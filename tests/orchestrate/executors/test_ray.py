@@ -1,13 +1,12 @@
-"""Launches on a Ray cluster that loses nodes, gets new ones, and loses its head.
-
-The cluster is one of this machine's own processes, in a network namespace of its own; hosts that
-are apart are tested in ``tests/machines``.
-"""
+"""Ray: an instance of the launch, and a cluster whose nodes and head are lost."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -15,14 +14,148 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import ray
+from ray._private import services
 
 from orchestrate.errors import InfrastructureError, LaunchError
-from orchestrate.executors.ray.connection import SETTINGS_FILE, first_line
+from orchestrate.executors.base import WorkerLost
+from orchestrate.executors.ray import connection as ray_start
+from orchestrate.executors.ray.connection import SETTINGS_FILE, first_line, start, unreachable
 from orchestrate.executors.ray.executor import RayExecutor
 from orchestrate.store import Reader
 from tests.orchestrate.clustered_launches import ADDRESSES, LONG_SEED, LOSSES, ROOT
 from tests.orchestrate.conftest import Launches
-from tests.orchestrate.standins import quick
+from tests.orchestrate.executors.conftest import ON_RAY, WORKERS
+from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
+from tests.orchestrate.lean_ray import leave_services_out
+from tests.orchestrate.standins import BROKEN_SEED, quick, slow
+from tests.orchestrate.unruly import hanging
+from tests.waiting import PATIENCE_SECONDS
+
+pytestmark = ON_RAY  # after the tests that share the instance which this ends
+
+
+@pytest.mark.usefixtures("shared_ray")
+def test_the_end_of_ray_itself_is_no_fault_of_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    executor = RayExecutor(slow, workers=WORKERS)
+    executor.start()
+    node: Any = ray._private.worker._global_node
+    executor.submit(tasks(range(20)))
+    os.kill(node.all_processes["raylet"][0].process.pid, signal.SIGKILL)
+    with pytest.raises(InfrastructureError, match="Ray's raylet has ended"):
+        drain(executor)
+    monkeypatch.undo()
+    executor.stop()
+    assert not ray.is_initialized()
+
+
+def test_a_launch_without_a_parent_outlives_its_raylet() -> None:
+    command = f"{sys.executable} -m tests.orchestrate.orphaned_driver $$ &"
+    # The driver holds the pipe too: this returns when both have ended.
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
+    assert done.stdout.splitlines()[1:] == [
+        "Ray's raylet has ended: run the same command again to continue.",
+        "processes of Ray: 0",
+        "exit",
+    ], done.stderr
+
+
+def test_a_slow_start_of_ray_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = iter([RuntimeError("not yet"), RuntimeError("not yet"), {"node": 1}])
+
+    def slow_query() -> dict[str, int]:
+        answer = next(answers)
+        if isinstance(answer, RuntimeError):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(services, "get_node", slow_query)
+    monkeypatch.setattr(ray_start, "_raylet_lives", lambda: True)
+    found = []
+    start(lambda: found.append(services.get_node()))
+    assert found == [{"node": 1}]
+    assert services.get_node.__name__ == "slow_query"
+
+
+def test_a_raylet_that_has_ended_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    raylet = tmp_path / "raylet"
+    shutil.copy("/bin/sleep", raylet)
+    with subprocess.Popen([raylet, "600"]) as process:
+        monkeypatch.setattr(ray_start, "_children", lambda: {process.pid})
+        try:
+            while not ray_start._raylet_lives():  # until the process has its name
+                assert process.poll() is None
+        finally:
+            process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert not ray_start._raylet_lives()  # although nobody has asked for its status
+
+        def no_node() -> None:
+            raise RuntimeError("no node")
+
+        monkeypatch.setattr(services, "get_node", no_node)
+        with pytest.raises(RuntimeError, match="no node"):
+            start(services.get_node)
+
+
+def test_a_failed_start_of_ray_is_ended_and_tried_once_more() -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    def fail() -> None:
+        started.append(subprocess.Popen(["sleep", "600"]))
+        raise InfrastructureError("Ray timed out.")
+
+    with pytest.raises(
+        InfrastructureError, match=r"Ray timed out\. It was tried 2 times; the load"
+    ):
+        start(fail)
+    assert [process.wait(PATIENCE_SECONDS) for process in started] == [
+        -signal.SIGKILL,
+        -signal.SIGKILL,
+    ]
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.ENOSPC, None])
+def test_a_folder_that_ray_cannot_use_is_named_and_not_tried_again(code: int | None) -> None:
+    """TMPDIR of a job may be too long for the name of a socket."""
+    tries: list[int] = []
+    reason = "AF_UNIX path length cannot exceed 107 bytes"
+
+    def fail() -> None:
+        tries.append(1)
+        raise unreachable("local", OSError(code, reason) if code else OSError(reason))
+
+    with pytest.raises(LaunchError, match=f"{reason}.*set RAY_TMPDIR, or TMPDIR"):
+        start(fail)
+    assert len(tries) == 1
+    for error in (TimeoutError("late"), BlockingIOError(errno.EAGAIN, "no process"), ValueError()):
+        assert isinstance(unreachable("local", error), InfrastructureError)
+
+
+def test_a_worker_is_given_the_number_of_its_raylet() -> None:
+    leave_services_out()
+    with RayExecutor(slow, 1):
+        node: Any = ray._private.worker._global_node
+        raylet = node.all_processes["raylet"][0].process.pid
+        ask = ray.remote(num_cpus=1)(lambda: os.environ["RAY_RAYLET_PID"])
+        assert ray.get(ask.remote()) == str(raylet)
+
+
+def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("RAY_memory_usage_threshold", "0.0001")
+    monkeypatch.setenv("RAY_memory_monitor_refresh_ms", "100")
+    leave_services_out()
+    with RayExecutor(hanging, 1) as executor:
+        executor.submit(tasks([BROKEN_SEED, 3]))
+        [lost] = drain(executor)
+    assert isinstance(lost, WorkerLost)
+    assert (lost.cause, lost.node_lost) == ("out of memory", False)
+    assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED, 3]
+
 
 pytestmark = pytest.mark.xdist_group("ray")
 

@@ -1,4 +1,4 @@
-"""Chunks of pending trials: the longest first, in time, and only what this machine can run."""
+"""Chunks of trials, of a launch and of the database; the memory that they need."""
 
 from __future__ import annotations
 
@@ -6,18 +6,99 @@ import itertools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dopt.errors import DoptError
 from dopt.spec.trial import TrialSpec
+from orchestrate.config import Combination, Grid, build_grid
+from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.errors import LaunchError
 from orchestrate.records import RunRecord
+from orchestrate.runner.chunks import (
+    BYTES_PER_GIB,
+    MAX_CHUNK_TRIALS,
+    Chunks,
+    check_memory,
+    memory_of_this_machine,
+)
 from orchestrate.runner.saving import RetryingStore
 from orchestrate.runner.worker import StoredChunks, trial_of
 from orchestrate.store import LaunchRecord, OpenConfig, Store
 from tests.orchestrate.faults.trials import outcome
+from tests.orchestrate.standins import specification
 from tests.orchestrate.standins import trial_of as short_trial
 from tests.orchestrate.store.fakes import RUN
+
+TRIALS = [specification(seed) for seed in range(1000)]
+
+
+def sizes(chunks: Chunks) -> list[int]:
+    result = []
+    while len(chunks):
+        result.append(len(chunks.next()))
+    return result
+
+
+def chunks(trials: list[TrialSpec] = TRIALS, slots: int = 2) -> Chunks:
+    return Chunks(trials, seconds=1.0, slots=slots)
+
+
+def test_a_trial_of_unknown_cost_goes_alone() -> None:
+    assert len(chunks().next()) == 1
+
+
+def test_a_chunk_holds_the_wanted_seconds() -> None:
+    known = chunks()
+    known.observe(TRIALS[0].config_key, 0.1)
+    assert len(known.next()) == 10
+
+
+def test_a_trial_longer_than_a_chunk_goes_alone() -> None:
+    known = chunks()
+    known.observe(TRIALS[0].config_key, 30.0)
+    assert len(known.next()) == 1
+
+
+def test_cheap_trials_are_bounded_and_get_fewer_towards_the_end() -> None:
+    known = chunks()
+    known.observe(TRIALS[0].config_key, 1e-6)
+    given = sizes(known)
+    assert sum(given) == len(TRIALS)
+    assert max(given) == MAX_CHUNK_TRIALS
+    assert given == sorted(given, reverse=True)
+    assert given[-1] == 1
+
+
+def test_the_order_is_kept_and_nothing_is_given_twice() -> None:
+    known = chunks(TRIALS[:50])
+    known.observe(TRIALS[0].config_key, 0.2)
+    seeds = []
+    while len(known):
+        seeds += [task.spec.seed for task in known.next()]
+    assert seeds == [*range(50)]
+
+
+def test_a_lost_trial_comes_first_and_alone() -> None:
+    known = chunks(TRIALS[:50])
+    known.observe(TRIALS[0].config_key, 1e-3)
+    known.add(TRIALS[50:52], alone=True)
+    assert len(known) == 52
+    assert [[task.spec.seed for task in known.next()] for _ in range(2)] == [[50], [51]]
+
+
+def test_a_batch_holds_trials_of_one_configuration() -> None:
+    kinds = [specification(0), specification(0, horizon=7)]
+    mixed = [kind.with_seed(seed) for seed in range(5) for kind in kinds]
+    batches = Chunks(mixed, seconds=1.0, slots=1, batch=3)
+    taken = []
+    while len(batches):
+        taken.append([task.spec for task in batches.next()])
+    assert [len(batch) for batch in taken] == [3, 2, 3, 2]
+    assert all(len({trial.config_key for trial in batch}) == 1 for batch in taken)
+    assert {t.trial_key for batch in taken for t in batch} == {t.trial_key for t in mixed}
+
 
 RECORD = LaunchRecord(argv=["work"], overrides=[], host="here", pid=1)
 
@@ -161,3 +242,68 @@ def test_a_file_that_is_not_the_stored_one_does_not_run(
 def test_a_configuration_of_another_version_is_refused() -> None:
     with pytest.raises(DoptError, match="another version of the code"):
         trial_of(stored(code_version=10**6, env={"name": "pendulum", "horizon": 6}), 1)
+
+
+def grid(seeds: int, width: int, form: str = "primal") -> Grid:
+    """Return trials of the pendulum; width 100 has q = 10,601 parameters and needs 1.69 GiB."""
+    settings: dict[str, Any] = {
+        "env": {"name": "pendulum"},
+        "policy": {"name": "d_optimal", "form": form},
+        "model": {"name": "mlp", "width": width},
+        "learner": {"name": "adam"},
+        "seed": 0,
+    }
+    return build_grid([Combination(settings, range(seeds))])
+
+
+def launch(executor: str = "local", **settings: Any) -> LaunchSettings:
+    return LaunchSettings(executor, "sqlite:///results.db", **settings)
+
+
+def test_what_fits_is_accepted() -> None:
+    check_memory(grid(100, 16), launch(workers=64), machine=2 * BYTES_PER_GIB)
+    check_memory(grid(100, 100), launch(workers=2), machine=4 * BYTES_PER_GIB)
+    check_memory(grid(2, 100), launch(workers=64), machine=4 * BYTES_PER_GIB)
+    check_memory(grid(100, 100), launch("inprocess"), machine=2 * BYTES_PER_GIB)
+
+
+def test_one_trial_that_does_not_fit_is_refused_with_what_decides() -> None:
+    with pytest.raises(LaunchError, match=r"policy=d_optimal needs 1\.6\d GiB .* has 1 GiB: make "):
+        check_memory(grid(1, 100), launch(), machine=BYTES_PER_GIB)
+
+
+@pytest.mark.parametrize(
+    ("settings", "advice"),
+    [
+        (launch(workers=8), "8 trials at the same time need 13.* set launch.workers=4"),
+        (launch("ray", workers=8), "set launch.workers=4"),
+        (launch("lockstep", executor_options={"batch": 20}), "20 trials .* set executor.batch=4"),
+    ],
+)
+def test_too_many_at_once_are_refused_with_how_many_fit(
+    settings: LaunchSettings, advice: str
+) -> None:
+    with pytest.raises(LaunchError, match=advice):
+        check_memory(grid(100, 100), settings, machine=8 * BYTES_PER_GIB)
+
+
+def test_of_another_machine_nothing_is_known() -> None:
+    check_memory(grid(9, 100), launch("ray", ray_address="ray://head:10001"), machine=BYTES_PER_GIB)
+    check_memory(
+        grid(9, 100), launch("lockstep", executor_options={"device": "cuda"}), machine=BYTES_PER_GIB
+    )
+
+
+def test_the_limit_of_a_worker_holds_everywhere() -> None:
+    with pytest.raises(LaunchError, match=r"launch\.memory_gib allows 0\.5 GiB: raise it"):
+        check_memory(grid(1, 100), launch("ray", ray_address="ray://h:1", memory_gib=0.5))
+
+
+def test_this_machine_has_memory() -> None:
+    assert 2**28 < memory_of_this_machine() < 2**50
+
+
+def test_only_the_cores_that_we_may_use_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: {3})
+    check_memory(grid(100, 100), launch(), machine=2 * BYTES_PER_GIB)

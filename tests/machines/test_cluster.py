@@ -1,16 +1,16 @@
-"""A grid on a Ray cluster of several hosts, of which some are lost on the way and others come."""
+"""A grid on a Ray cluster of several hosts: nodes, head and database are lost."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests.machines.hosts import Process, until
-from tests.machines.lab import Lab
-from tests.machines.outcome import Outcome
+from tests.machines.lab import Lab, Outcome, leave
 from tests.machines.witness import HOLD, PAUSE, let_go, read_notes
 
 Measured = Callable[[str, float], None]
@@ -157,3 +157,89 @@ def test_a_token_opens_the_cluster_and_appears_nowhere(lab: Lab, undisturbed: Ou
     lab.outcome().check_complete(undisturbed, seeds=2)
     everything = lab.host("db").run("pg_dump", "-h", "/tmp", "-U", "postgres", "postgres")
     assert token not in refused.output + launched.output + everything
+
+
+@pytest.mark.parametrize("fault", ["power off", "gcs_server stopped"])
+def test_without_its_head_a_launch_ends_and_a_new_cluster_completes_it(
+    lab: Lab, undisturbed: Outcome, measured: Callable[[str, float], None], fault: str
+) -> None:
+    lab.start_cluster("w1", "w2")
+    launched = lab.launch(witness=True)
+    lab.until_done(launched, 4)
+    start = time.monotonic()
+    if fault == "power off":
+        lab.network.power_off(lab.host("head"))
+    else:
+        lab.host("head").run("pkill", "-STOP", "gcs_server")  # its port still takes connections
+    until(lambda: lab.count("trial", "status = 'running'") == 0, 60.0, lambda: "free claim")
+    measured(f"head, {fault}: claims free", time.monotonic() - start)
+    assert launched.wait() == 75, launched.output
+    measured(f"head, {fault}: exit 75", time.monotonic() - start)
+    assert "error: The head of the Ray cluster at 10.77.0." in launched.output
+    assert "Traceback" not in launched.output
+    before = lab.done()
+    assert 4 <= before < len(undisturbed.trials)
+
+    if fault != "power off":
+        lab.network.power_off(lab.host("head"))
+    lab.network.replace(lab.host("head"))
+    with ThreadPoolExecutor() as threads:
+        list(threads.map(leave, map(lab.host, ("desk", "w1", "w2"))))
+    lab.start_cluster("w1", "w2")
+    again = lab.launch()
+    assert again.wait() == 0, again.output
+    assert f"{before} of {len(undisturbed.trials)} already done" in again.output
+    outcome = lab.outcome()
+    outcome.check_complete(undisturbed)
+    assert outcome.launches == [(1, "failed"), (2, "done")]
+
+
+Measured = Callable[[str, float], None]
+
+
+@pytest.mark.parametrize("mode", ["fast", "immediate"])
+def test_a_launch_waits_for_a_server_that_restarts(
+    lab: Lab, undisturbed: Outcome, measured: Measured, mode: str
+) -> None:
+    lab.start_cluster("w1", "w2")
+    launched = lab.launch(witness=True)
+    lab.until_done(launched, 4)
+    start = time.monotonic()
+    lab.database.stop(mode)
+    waits = "waiting for up to 30 s"
+    until(lambda: waits in launched.output, 20.0, lambda: f"'{waits}':\n{launched.output}")
+    lab.database.start()
+    before = lab.done()
+    lab.until_done(launched, before + 1)
+    measured(f"server restarted, {mode}: next trial stored", time.monotonic() - start)
+    assert launched.wait() == 0, launched.output
+    outcome = lab.outcome()
+    outcome.check_complete(undisturbed)
+    assert outcome.launches == [(1, "done")]
+
+
+def test_the_late_outcomes_of_a_launch_that_was_cut_off_are_refused(
+    lab: Lab, undisturbed: Outcome, measured: Measured
+) -> None:
+    """Past its lease another launch takes its trials; both finish them, and one counts."""
+    lease = ["launch.lease=5", "launch.patience=4"]
+    cut_off = lab.launch(*lease, seeds=10, witness=True, **{PAUSE: "2"})
+    lab.until_done(cut_off, 1)
+    other = lab.launch(*lease, seeds=10, on="desk2", witness=True)
+    lab.until_done(other, 5)
+    with lab.network.cut_between(lab.host("desk"), lab.host("db")):
+        measured(
+            "launch cut off from the database, lease of 5 s: its trials wait again",
+            lab.until_rows(other, "attempt", "outcome = 'lost'"),
+        )
+    assert other.wait() == 0, other.output
+    assert cut_off.wait() == 0, cut_off.output
+    outcome = lab.outcome()
+    outcome.check_complete(undisturbed, seeds=10)
+    lost = outcome.attempts_of("lost")
+    finished = read_notes(lab.host("desk").folder / "home", "finished")
+    late = set(lost) & set(finished)
+    assert late, "the launch that was cut off finished nothing that it had lost"
+    for seed in late:
+        assert lost[seed][5] == 1, "launch of the attempt that was lost"
+        assert outcome.attempts_of("done")[seed][4:6] == ("desk2", 2)
