@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import dataclasses
 import functools
+import importlib
 import inspect
 import re
 import sqlite3
@@ -14,12 +16,14 @@ from typing import Any
 
 import yaml
 
+from analysis.cli import parser
+from dopt import Explorer, Plant
 from dopt.control import TASKS
 from dopt.policies import POLICIES
 from dopt.systems import NAMED_SYSTEMS
 from dopt.systems.base import System
 from orchestrate.config.options import CONFIGURATION, option_names
-from orchestrate.export.bundle import COLUMNS
+from orchestrate.export.bundle import COLUMNS, TABLE_TITLES
 from orchestrate.store.schema import VIEWS, metadata
 
 ROOT = Path(__file__).parents[1]
@@ -42,10 +46,14 @@ def markdown(head: Sequence[str], rows: Rows) -> str:
     return "\n".join([first, "|---" * len(head) + "|", *others]) + "\n"
 
 
+def cell(text: str) -> str:
+    """Return a text of a docstring or comment as one cell of a table."""
+    plain = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", " ".join(text.split()))
+    return plain.replace("``", "`").rstrip(".:").replace("|", r"\|")
+
+
 def first_sentence(text: str) -> str:
-    """Return the first sentence of a docstring or comment, as one cell of a table."""
-    plain = re.sub(r":\w+:`~?([^`]*)`", r"`\1`", " ".join(text.split())).replace("``", "`")
-    return re.split(r"(?<=\.) (?=[A-Z`])", plain)[0].rstrip(".:").replace("|", r"\|")
+    return re.split(r"(?<=\.) (?=[A-Z`])", cell(text))[0].rstrip(".:")
 
 
 def comment(path: Path) -> str:
@@ -152,6 +160,54 @@ def views() -> str:
     return markdown(["view", "one row per", "columns"], rows)
 
 
+def tables() -> str:
+    return markdown(
+        ["table", "content"], [[f"`{name}`", one] for name, one in TABLE_TITLES.items()]
+    )
+
+
+def figure_options() -> str:
+    """Return the options of ``python -m analysis figures`` with their help."""
+    commands = next(
+        one for one in parser()._actions if one.dest == argparse.SUPPRESS and one.choices
+    )
+    rows = []
+    for one in commands.choices["figures"]._actions:
+        if one.dest not in ("help", "only"):
+            choices = f" `{'` `'.join(map(str, one.choices))}`" if one.choices else ""
+            rows.append(
+                [f"`{one.option_strings[0]}`{choices}", cell((one.help or "").replace("%%", "%"))]
+            )
+    return markdown(["option", "meaning"], rows)
+
+
+KERNEL = "dopt.kernel."
+HELPERS = (
+    "policies.prediction.predicted_state",
+    "policies.prediction.input_columns",
+    "policies.prediction.learned_columns",
+    "information.update.model_rows",
+    "information.primal.quadratic_forms",
+    "learners.samples.store_sample",
+    "learners.samples.sampled_point",
+    "learners.adam.adam_step",
+    "points.model_point",
+)
+
+
+def kernel_helpers() -> str:
+    """Return the functions of the kernel that compiled policies and learners may call."""
+    rows = []
+    for path in HELPERS:
+        module, _, name = path.rpartition(".")
+        made = getattr(importlib.import_module(KERNEL + module), name)
+        made = getattr(made, "py_func", made)
+        said = first_sentence(inspect.getdoc(made) or "").removeprefix("Return ")
+        names = ", ".join(inspect.signature(made).parameters)
+        rows.append([f"`{KERNEL}{path}({names})`", said])
+    return markdown(["function", "result"], rows)
+
+
 def source_map() -> str:
     """Return the modules and folders of the packages with the first lines of their docstrings."""
 
@@ -171,8 +227,39 @@ def source_map() -> str:
     return "```text\n" + "\n".join(lines) + "\n```\n"
 
 
+def arguments(cls: type) -> str:
+    """Return the arguments of a class as its docstring explains them."""
+    text = (inspect.getdoc(cls) or "").split("Parameters\n----------\n")[1]
+    text = text.split("\nRaises\n------")[0]
+    found = re.findall(r"^(\w.*?) : (.*)\n((?: +.*\n?|\n)+)", text, re.MULTILINE)
+    defaults = {one.name: one.default for one in inspect.signature(cls).parameters.values()}
+
+    def shown(names: str) -> str:
+        given = [defaults[name] for name in names.split(", ")]
+        return ", ".join(
+            f"`{one!r}`" for one in given if one not in (inspect.Parameter.empty, None)
+        )
+
+    rows = [[f"`{names}`", kind, shown(names), cell(said)] for names, kind, said in found]
+    return markdown(["argument", "type", "default", "meaning"], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
-    made.__name__: made for made in (launch_settings, system_settings, columns, views, source_map)
+    "plant_arguments": functools.partial(arguments, Plant),
+    "explorer_arguments": functools.partial(arguments, Explorer),
+}
+TABLES |= {
+    made.__name__: made
+    for made in (
+        launch_settings,
+        system_settings,
+        tables,
+        columns,
+        views,
+        source_map,
+        figure_options,
+        kernel_helpers,
+    )
 }
 TABLES |= {
     f"{group}_options": functools.partial(of_group, group)

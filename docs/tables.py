@@ -27,8 +27,8 @@ from docs.code_tables import markdown
 
 DOCS = Path(__file__).parent
 PAGES = (
-    "database.md", "findings.md", "method.md", "options.md", "structure.md", "wide_networks.md",
-    "yardsticks.md", "../README.md",
+    "compiled_plugins.md", "database.md", "figures.md", "findings.md", "method.md", "options.md",
+    "plants.md", "structure.md", "wide_networks.md", "yardsticks.md", "../README.md",
 )  # fmt: skip
 ALL = ("pendulum", "cartpole", "arm", "quadrotor")
 LEARNERS = ("adam_window", "adam_replay", "gauss_newton")
