@@ -18,10 +18,12 @@ import yaml
 
 from analysis.cli import parser
 from dopt import Explorer, Plant
+from dopt.assessment import MEASURES
 from dopt.control import TASKS
 from dopt.policies import POLICIES
 from dopt.systems import NAMED_SYSTEMS
 from dopt.systems.base import System
+from dopt.trial_view import TrialView
 from orchestrate.config.options import CONFIGURATION, option_names
 from orchestrate.export.bundle import COLUMNS, TABLE_TITLES
 from orchestrate.store.schema import VIEWS, metadata
@@ -166,6 +168,22 @@ def tables() -> str:
     )
 
 
+def measures() -> str:
+    rows = [[f"`{name}`", said] for name, said in MEASURES.items()]
+    return markdown(["measure", "value"], rows)
+
+
+def trial_view() -> str:
+    """Return the methods of a view of a trial."""
+    rows = []
+    for name, made in vars(TrialView).items():
+        if not name.startswith("_"):
+            said = first_sentence(inspect.getdoc(made) or "").removeprefix("Return ")
+            names = list(inspect.signature(made).parameters)[1:] if callable(made) else None
+            rows.append([f"`{name}`" if names is None else f"`{name}({', '.join(names)})`", said])
+    return markdown(["view", "is"], rows)
+
+
 def figure_options() -> str:
     """Return the options of ``python -m analysis figures`` with their help."""
     commands = next(
@@ -255,6 +273,8 @@ TABLES |= {
         system_settings,
         tables,
         columns,
+        measures,
+        trial_view,
         views,
         source_map,
         figure_options,

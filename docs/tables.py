@@ -28,7 +28,7 @@ from docs.code_tables import markdown
 DOCS = Path(__file__).parent
 PAGES = (
     "compiled_plugins.md", "database.md", "figures.md", "findings.md", "method.md", "options.md",
-    "plants.md", "structure.md", "wide_networks.md", "yardsticks.md", "../README.md",
+    "plants.md", "structure.md", "tutorial.md", "wide_networks.md", "yardsticks.md", "../README.md",
 )  # fmt: skip
 ALL = ("pendulum", "cartpole", "arm", "quadrotor")
 LEARNERS = ("adam_window", "adam_replay", "gauss_newton")

@@ -84,7 +84,7 @@ def test_every_query_has_the_same_answer_in_duckdb_on_a_bundle(small: str, tmp_p
 
 
 def test_the_page_counts_its_queries() -> None:
-    numbers = {"Nine": 9, "Ten": 10, "Eleven": 11}
+    numbers = {"Six": 6, "Seven": 7, "Eight": 8, "Nine": 9}
     (said,) = re.findall(r"^## (\w+) useful queries$", PAGES[DATABASE], flags=re.MULTILINE)
     assert numbers[said] == len(QUERIES)
 
