@@ -179,7 +179,7 @@ SCALING_ROUNDS = 2
 
 
 def scaling(quick: bool) -> list[Row]:
-    """Return the speed of two local workers in that of one, once all have loaded their code."""
+    """Return how many times as fast two local workers are as one, all with loaded code."""
     if usable_cores() < 2:
         return [Row("two workers in speeds of one", None, note="this machine has one core")]
     specs = [cartpole(seed=seed) for seed in range(24 if quick else 80)]

@@ -165,7 +165,7 @@ def compile_scan(spec: TrialSpec) -> Callable[[TrialSpec], Any]:
 
 
 def _with(function: Callable[..., Any], names: dict[str, Any]) -> Callable[..., Any]:
-    """Return a copy of a function whose elementary functions are those of JAX."""
+    """Return a copy of a function with the elementary functions of JAX."""
     assert isinstance(function, FunctionType)
     return FunctionType(
         function.__code__, {**function.__globals__, **names}, closure=function.__closure__

@@ -79,7 +79,7 @@ TARGET_SECONDS = 0.158
 
 
 def trial(quick: bool) -> list[Row]:
-    """Return seconds of a D-optimal trial of 500 steps, beside those of the authors' code.
+    """Return seconds of a D-optimal trial of 500 steps, beside the authors' code.
 
     For the default grid the anchor is 500 steps without any evaluation, which favours the authors'
     code: how long it takes for so few points is not known.
@@ -105,7 +105,7 @@ def trial(quick: bool) -> list[Row]:
 
 
 def _seconds(spec: TrialSpec) -> tuple[float, float]:
-    """Return the seconds of a trial, and those of the processor."""
+    """Return the seconds of a trial: elapsed, and of the processor."""
     wall, cpu = time.perf_counter(), time.process_time()
     run_trial(spec)
     return time.perf_counter() - wall, time.process_time() - cpu

@@ -29,7 +29,7 @@ from orchestrate.store import NoDatabaseError, Reader, Store
 
 SYSTEMS = ("pendulum", "cartpole", "arm", "quadrotor")
 POLICIES = ("random", "uniform", "periodic", "d_optimal", "oracle")
-"""Those of the paper."""
+"""Policies of the paper."""
 
 FIGURE_SEEDS = 212
 """With 19 configurations of 500 steps, two million rows."""

@@ -1,7 +1,7 @@
 """Rows of the benchmark table, speeds of others, and fixed work to compare machines by.
 
 The speeds of others were measured on one core of a two-core machine in float64: cartpole, two
-hidden layers of 16 units (386 parameters), D-optimal policy. The authors' figures are those of the
+hidden layers of 16 units (386 parameters), D-optimal policy. The authors' figures belong to the
 code that they released with the paper. Each says where and when it was measured, as far as kept.
 
 Each section of the fixed work is as short as what is measured, and the quickest one counts: another

@@ -33,7 +33,7 @@ def cartpole(
     grid: tuple[int, int, int] = (8, 16, 8),
     form: str = "auto",
 ) -> TrialSpec:
-    """Return a trial in the cartpole; ``form`` is that of the information matrix."""
+    """Return a trial in the cartpole; ``form``: form of the information matrix."""
     fields = {"form": form} if policy == "d_optimal" else {}
     return TrialSpec.from_mapping(
         {

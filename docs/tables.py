@@ -444,7 +444,7 @@ def active_sysid() -> str:
 
 
 def flex_example() -> str:
-    """Return final losses with intervals, and those of pairs by random inputs."""
+    """Return final losses and paired ratios to random inputs, with intervals."""
     losses = read("yardsticks/flex_example").pivot_table(
         index="seed", columns="policy", values="final_loss"
     )

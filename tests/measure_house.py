@@ -42,7 +42,7 @@ NO_CODE = {
 
 
 def files(folders: Iterable[str], *endings: str) -> list[Path]:
-    """Return the files of some folders by their endings, without those of others."""
+    """Return the files of some folders by their endings, vendored ones left out."""
     return sorted(
         path
         for folder in folders
@@ -72,9 +72,17 @@ def code_lines(text: str) -> int:
     return len(found - left_out)
 
 
-def words(paths: Iterable[Path]) -> int:
-    """Return the number of words of some pages, their tables and code included."""
-    return sum(len(path.read_text(encoding="utf-8").split()) for path in paths)
+GENERATED = re.compile(r"<!-- table: \w+ -->\n.*?<!-- end -->", re.DOTALL)
+"""Block of a page that ``docs/tables.py`` writes."""
+
+
+def words(paths: Iterable[Path], written: bool = False) -> int:
+    """Return the number of words of some pages, their tables and code included.
+
+    Generated blocks are left out where ``written`` is true.
+    """
+    texts = (path.read_text(encoding="utf-8") for path in paths)
+    return sum(len((GENERATED.sub("", text) if written else text).split()) for text in texts)
 
 
 def walk() -> tuple[int, int, int]:
@@ -145,7 +153,7 @@ def cases() -> str:
 
 
 def pages() -> list[Path]:
-    """Return the pages of ``docs`` but the method; generated ones lie in folders of their own."""
+    """Return the pages of ``docs`` except the method; generated pages lie in folders."""
     return [path for path in sorted((ROOT / "docs").glob("*.md")) if path.name != "method.md"]
 
 
@@ -181,6 +189,7 @@ def rows(with_cases: bool) -> Iterator[tuple[str, str]]:
         yield "test cases", cases()
     yield "words of README", f"{words([ROOT / 'README.md']):,}"
     yield "words of docs/*.md without method.md", f"{words(pages()):,}"
+    yield "  the same without generated blocks", f"{words(pages(), written=True):,}"
 
 
 def main() -> None:

@@ -65,7 +65,7 @@ def coverage(
 
 
 def resampled_coverages(studies: int) -> dict[tuple[str, str], Share]:
-    """Return the coverage for losses drawn from those of each configuration of the claims.
+    """Return the coverage for losses drawn from the losses of each configuration of the claims.
 
     Their logarithms are scaled to a spread of 0.15, so that the rule stops between its looks.
     """

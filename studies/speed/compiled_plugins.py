@@ -1,4 +1,4 @@
-"""Times of a compiled policy and learner of a user's own beside those of shipped ones.
+"""Times of a custom compiled policy and learner beside the times of shipped ones.
 
 Both run the same algorithm: the user's classes are written over the same documented structures and
 functions as the shipped ones.

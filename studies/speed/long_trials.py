@@ -1,7 +1,7 @@
 """Time and memory of long trials, on systems of up to 40 dimensions.
 
 ``python -m studies.speed.long_trials`` runs all; with SYSTEM STEPS it runs one of them and prints
-what its steps took. It is a process of its own, whose memory is that of the trial.
+what its steps took. It is a process of its own, whose memory is the memory of the trial.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def _check_finished(one: Yardstick, entries: Iterable[Entry], *, allowed: bool) 
 def _written(
     reader: Reader, one: Yardstick, entries: Sequence[Entry], folder: Path
 ) -> Sequence[TextTable]:
-    """Write the table of trials, that of the page and the provenance; return what is shown."""
+    """Write the table of trials, the table of the page and the provenance; return what is shown."""
     trials = one.measure(reader, entries)
     table = one.tabulate(trials)
     outputs.write_table(trials, folder, f"{one.name}_trials")

@@ -43,7 +43,7 @@ FLEX_LONGEST = 1000
 """Samples of the longest run in the table."""
 
 FLEX_STAR = {"random": "about 3", "episodic": "0.1 to 1", "FLEX": "about 1e-3"}
-"""Parameter errors, by policy; the episodic one plans anew every 50 steps."""
+"""Parameter errors, by policy; the episodic one plans again every 50 steps."""
 
 _PENDULUM, _CARTPOLE = ("pendulum", "mlp"), ("cartpole", "mlp")
 
@@ -64,7 +64,7 @@ ACTIVE_SYSID = {"random (passive)": 0.93, "gsx": 0.97, "igs": 0.83, "idw": 0.83}
 
 Array = npt.NDArray[np.float64]
 Interval = tuple[float, float, float]
-"""Centre, low and high; NaN where there is none."""
+"""Centre, low and high; NaN without an interval."""
 
 RESAMPLES = 9999
 FEWEST_SIZES = 3
@@ -159,10 +159,10 @@ def interval_columns(name: str, interval: Interval) -> dict[str, float]:
 
 
 def ratio_to_random(trials: pd.DataFrame, policy: str, measure: str, question: str) -> Interval:
-    """Return the geometric mean of a measure by that of random inputs of the same seed.
+    """Return the geometric mean of the ratio of a measure to random inputs of the same seed.
 
     ``trials`` has the columns ``policy``, ``seed`` and the measure; ``question`` names what they
-    have in common. It is NaN for random inputs themselves, and where there are none.
+    have in common. It is NaN for random inputs themselves, and without random inputs.
     """
     own, reference = (
         dict(zip(part.seed, part[measure], strict=True))

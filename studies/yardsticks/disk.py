@@ -76,7 +76,7 @@ def _enforced(entry: Entry) -> bool:
 
 
 def _policy(entry: Entry) -> str:
-    """Return the name of a row: that of the policy, or of its criterion of space filling."""
+    """Return the name of a row: the policy, or its criterion of space filling."""
     section = entry.config.config["policy"]
     return str(section["criterion"] if section["name"] == "space_filling" else section["name"])
 
@@ -147,7 +147,7 @@ def run_of_the_test(system: System) -> tuple[Array, Array]:
 def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
     """Return medians and ratios to random inputs, with intervals of 95 %, for each policy.
 
-    ``ratio`` is the geometric mean of the errors by those of random inputs of the same seed,
+    ``ratio`` is the geometric mean of the ratio of errors to random inputs of the same seed,
     ``reached`` the number of trials with at most the lowest published error, ``turned`` the median
     of the largest angles, and ``violations`` the mean share of steps beyond the bounds.
     """
@@ -187,7 +187,7 @@ def _error_table(table: pd.DataFrame) -> TextTable:
 def _ratio_table(table: pd.DataFrame) -> TextTable:
     kinds = _kinds(table)
     rows = _rows(table[table.policy != REFERENCE], kinds, ratio_text)
-    note = "Errors by those of random inputs: paired geometric mean [interval of 95 %]."
+    note = "Ratio of errors to random inputs: paired geometric mean [interval of 95 %]."
     return TextTable(["policy", *map(LIMITS.__getitem__, kinds)], rows, note)
 
 

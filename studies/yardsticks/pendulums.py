@@ -96,8 +96,9 @@ def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
 def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
     """Return medians, exponents and ratios to random inputs with their intervals of 95 %.
 
-    One row for each policy and number of pendulums. ``ratio`` is the geometric mean of the samples
-    by those of random inputs of the same seed, ``exponent`` that of the policy over all numbers.
+    One row for each policy and number of pendulums. ``ratio`` is the geometric mean of
+    the ratio of samples to random inputs of the same seed, ``exponent`` the exponent of the policy
+    over all numbers.
     """
     rows = []
     for policy, own in trials.groupby("policy", sort=False):
@@ -145,7 +146,7 @@ def samples_table(table: pd.DataFrame) -> TextTable:
 
 
 def ratio_table(table: pd.DataFrame) -> TextTable:
-    """Return the samples by those of random inputs, beside the published ratios."""
+    """Return the ratio of samples to random inputs, beside the published ratios."""
     sizes = sorted(set(table.n_pendulums))
     rows = [
         [policy, *(_cell(own, size, ratio_text) for size in sizes)]
@@ -156,7 +157,7 @@ def ratio_table(table: pd.DataFrame) -> TextTable:
     texts = [f"{a / b:.2f}" if b < np.inf else f"< {a / FLEX_LONGEST:.2f}" for a, b in pairs]
     printed = dict(zip(FLEX_SIZES, texts, strict=True))
     rows.append(["published: FLEX", *(printed.get(size, "–") for size in sizes)])
-    note = "Samples by those of random inputs: paired geometric mean [interval of 95 %]."
+    note = "Ratio of samples to random inputs: paired geometric mean [interval of 95 %]."
     return TextTable(["policy", *(f"N = {size}" for size in sizes)], rows, note)
 
 

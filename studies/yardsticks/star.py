@@ -31,7 +31,7 @@ from studies.yardsticks.common import (
 NAME = "flex_star"
 CENTRE = ("center_x", "center_y")
 LOST = 0.5
-"""Error above which a star is lost [m²]: that of a distance of 1 m, twice its radius."""
+"""Error above which a star is lost [m²]: at a distance of 1 m, twice its radius."""
 
 _SEED = 20_230_426
 
@@ -59,7 +59,7 @@ def _names(entry: Entry) -> tuple[str, str]:
 
 
 def _learner(entry: Entry) -> str:
-    """Return the name of a column: that of the learner, with the rate of one by gradients."""
+    """Return the name of a column: the learner, with the rate of one by gradients."""
     section = entry.config.config["learner"]
     rate = section.get("learning_rate")
     return str(section["name"]) if rate is None else f"{section['name']}, rate {rate:g}"
@@ -105,9 +105,9 @@ def _median_distance(system: System, states: Array) -> float:
 def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
     """Return medians, numbers of lost stars and ratios to random inputs, with intervals of 95 %.
 
-    One row for each learner and policy. ``ratio`` is the geometric mean of the errors by those of
-    random inputs of the same seed and learner, ``apart`` the median distance over the trials, and
-    ``lost`` counts the errors above :data:`LOST`.
+    One row for each learner and policy. ``ratio`` is the geometric mean of the ratio of errors
+    to random inputs of the same seed and learner, ``apart`` the median distance over the trials,
+    and ``lost`` counts the errors above :data:`LOST`.
     """
     rows = []
     for (learner, policy), own in trials.groupby(["learner", "policy"], sort=False):
@@ -155,7 +155,7 @@ def _ratio_table(table: pd.DataFrame) -> TextTable:
         for policy, own in table.groupby("policy", sort=False)
         if policy != REFERENCE
     ]
-    note = "Errors by those of random inputs: paired geometric mean [interval of 95 %]."
+    note = "Ratio of errors to random inputs: paired geometric mean [interval of 95 %]."
     return TextTable(["policy", *learners], rows, note)
 
 

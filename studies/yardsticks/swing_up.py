@@ -83,8 +83,8 @@ def measure(reader: Reader, found: Iterable[Entry]) -> pd.DataFrame:
     A trial whose policy learns the task itself has another one, for its own feedback.
 
     ``samples`` is the first assessed number of samples at which, and at all later ones, the episode
-    succeeds; ``first`` the first one at which it succeeds. They are inf where there is none, and
-    where the trial diverged before. ``horizon`` is the last assessed number.
+    succeeds; ``first`` the first one at which it succeeds. They are inf where the episode never
+    succeeds, and where the trial diverged before. ``horizon`` is the last assessed number.
     """
     parts = []
     for entry in (one for one in found if one.finished):
@@ -120,8 +120,8 @@ def tabulate(trials: pd.DataFrame) -> pd.DataFrame:
     """Return medians with intervals of 95 %, and how often a policy needs fewer than random inputs.
 
     One row for each system, model and policy. ``improvement`` is the share of seeds with fewer
-    samples than random inputs of the same seed, ties counted half, and ``p_adjusted`` that of the
-    sign test, adjusted over the table (Benjamini-Hochberg).
+    samples than random inputs of the same seed, ties counted half, and ``p_adjusted`` the p-value
+    of the sign test, adjusted over the table (Benjamini-Hochberg).
     """
     rows = []
     for _, column in trials.groupby(COLUMN, sort=False):

@@ -66,8 +66,8 @@ def test_the_method_page_says_how_far_free_steps_raise_the_energy() -> None:
     share, rise = ([value[i] for value in found.values()] for i in (0, 1))
     least, most = (min(found, key=lambda n: found[n][0]), max(found, key=lambda n: found[n][0]))
     phrases = (
-        f"{100 * min(share):.0f} % ({least}) to {100 * max(share):.0f} % ({most}) of the steps",
-        f"by at most {100 * min(rise):.0f} to {100 * max(rise):.0f} %",
+        f"{100 * min(share):.0f} % ({least}) to {100 * max(share):.0f} % ({most})",
+        f"{100 * min(rise):.0f} to {100 * max(rise):.0f} %",
     )
     page = " ".join(PAGES["docs/method.md"].split())
     for phrase in phrases:
