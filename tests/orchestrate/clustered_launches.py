@@ -34,6 +34,7 @@ from tests.waiting import PATIENCE_SECONDS, until
 
 RECORD = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
 ADDRESSES = [f"10.77.1.{number}" for number in range(1, 17)]
+SEEDS = 40
 LONG_SEED = 3
 LOSSES = 2
 NEW_CORES = 2
@@ -61,9 +62,9 @@ class Notes:
         return {path.name.split()[3] for path in self._folder.glob(f"{kind} *")}
 
 
-def tenth_of_a_second(notes: Notes, kind: str, spec: TrialSpec) -> TrialResult:
+def tenth_of_a_second(notes: Notes, spec: TrialSpec) -> TrialResult:
     time.sleep(0.1)
-    notes.add(kind)
+    notes.add("headless")
     return quick(spec)
 
 
@@ -126,7 +127,8 @@ class Launches:
 
     def __call__(self, name: str, run: Run, fault: Callable[[], None] = lambda: None) -> None:
         """Launch, and report the exit code and the error."""
-        grid = Grid([specification(seed) for seed in range(40)], n_jobs=40, left_out={})
+        trials = [specification(seed) for seed in range(SEEDS)]
+        grid = Grid(trials, n_jobs=SEEDS, left_out={})
         settings = LaunchSettings(
             executor="ray",
             store_url=f"sqlite:///{self.folder / name}.db",
@@ -134,7 +136,6 @@ class Launches:
             chunk_seconds=0.5,
         )
         work = Work(run, partial(self._prepare, self.notes, name))
-        start = time.monotonic()
         code, error = 75, ""
         with ThreadPoolExecutor() as threads:
             injected = threads.submit(fault)
@@ -143,8 +144,7 @@ class Launches:
             except InfrastructureError as caught:
                 error = str(caught)
             injected.result()
-        seconds = round(time.monotonic() - start, 1)
-        self.report[name] = {"code": code, "error": error, "seconds": seconds}
+        self.report[name] = {"code": code, "error": error}
 
     @staticmethod
     def _prepare(notes: Notes, name: str) -> None:
@@ -153,21 +153,19 @@ class Launches:
 
 
 def run_all(folder: Path) -> None:
-    """Launch undisturbed, then with each fault."""
+    """Launch on two nodes, of which one comes later, and then with each fault."""
     launch = Launches(folder)
-    nodes_with_faults(launch)
-    nodes_that_differ(launch)
-    no_head(launch)
-    (folder / "report.json").write_text(json.dumps(launch.report))
-
-
-def nodes_with_faults(launch: Launches) -> None:
-    """Launch on two nodes; lose two of three; launch on one that is left, and a new one."""
     nodes, notes = launch.nodes, launch.notes
-    two = {nodes.add(), nodes.add()}
-    launch("plain", partial(tenth_of_a_second, notes, "plain"))
-    launch.report["plain"]["both nodes"] = set(notes.nodes("plain")) == two
-    launch.report["plain"]["prepared"] = set(notes.nodes("prepared-plain")) == two
+    first = nodes.add()
+    both = {first}
+
+    def add_node() -> None:
+        until(lambda: notes.nodes("working"))
+        both.add(nodes.add(NEW_CORES))
+
+    launch("added", partial(until_many_work, notes), add_node)
+    launch.report["added"]["both nodes"] = set(notes.nodes("working")) == both
+    launch.report["added"]["prepared"] = set(notes.nodes("prepared-added")) == both
 
     def lose_nodes() -> None:
         for number in range(1, LOSSES + 1):
@@ -178,35 +176,17 @@ def nodes_with_faults(launch: Launches) -> None:
 
     launch("lost", partial(one_takes_long, notes), lose_nodes)
 
-    def add_node() -> None:
-        until(lambda: notes.nodes("working"))
-        nodes.add(NEW_CORES)
-
-    launch("added", partial(until_many_work, notes), add_node)
-
-
-def nodes_that_differ(launch: Launches) -> None:
-    """Launch on a node of other code, and on one of other settings."""
-    nodes = launch.nodes
-    nodes.remove_all()
-    nodes.add(PYTHONPATH=str(other_code(launch.folder)))
-    launch("other_code", quick)
-    nodes.remove_all()
-    nodes.add(RAY_health_check_period_ms="2000")
-    launch("other_settings", quick)
-    nodes.remove_all()
-
-
-def no_head(launch: Launches) -> None:
-    """Lose the head while a node works."""
-    nodes, notes = launch.nodes, launch.notes
-    nodes.add()
-
     def kill_head() -> None:
         until(lambda: notes.nodes("headless"))
         nodes.head.kill_gcs_server()
 
-    launch("headless", partial(tenth_of_a_second, notes, "headless"), kill_head)
+    nodes.remove_all()
+    nodes.add(PYTHONPATH=str(other_code(launch.folder)))
+    launch("other_code", quick)
+    nodes.remove_all()
+    nodes.add()
+    launch("headless", partial(tenth_of_a_second, notes), kill_head)
+    (folder / "report.json").write_text(json.dumps(launch.report))
 
 
 def other_code(folder: Path) -> Path:

@@ -20,10 +20,19 @@ from ray._private import services
 from orchestrate.errors import InfrastructureError, LaunchError
 from orchestrate.executors.base import WorkerLost
 from orchestrate.executors.ray import connection as ray_start
-from orchestrate.executors.ray.connection import SETTINGS_FILE, first_line, start, unreachable
+from orchestrate.executors.ray.connection import (
+    SETTINGS_FILE,
+    first_line,
+    run_where_alike,
+    setting_names,
+    start,
+    unreachable,
+)
 from orchestrate.executors.ray.executor import RayExecutor
+from orchestrate.fingerprint import fingerprint
 from orchestrate.store import Reader
-from tests.orchestrate.clustered_launches import ADDRESSES, LONG_SEED, LOSSES, ROOT
+from tests.machines.hosts import unavailable
+from tests.orchestrate.clustered_launches import ADDRESSES, LONG_SEED, LOSSES, ROOT, SEEDS
 from tests.orchestrate.conftest import Launches
 from tests.orchestrate.executors.conftest import ON_RAY, WORKERS
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
@@ -37,11 +46,15 @@ pytestmark = ON_RAY  # after the tests that share the instance which this ends
 
 @pytest.mark.usefixtures("shared_ray")
 def test_the_end_of_ray_itself_is_no_fault_of_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its workers have its number, by which they end with it."""
     executor = RayExecutor(slow, workers=WORKERS)
     executor.start()
     node: Any = ray._private.worker._global_node
+    raylet = node.all_processes["raylet"][0].process.pid
+    ask = ray.remote(num_cpus=1)(lambda: os.environ["RAY_RAYLET_PID"])
+    assert ray.get(ask.remote()) == str(raylet)
     executor.submit(tasks(range(20)))
-    os.kill(node.all_processes["raylet"][0].process.pid, signal.SIGKILL)
+    os.kill(raylet, signal.SIGKILL)
     with pytest.raises(InfrastructureError, match="Ray's raylet has ended"):
         drain(executor)
     monkeypatch.undo()
@@ -134,15 +147,6 @@ def test_a_folder_that_ray_cannot_use_is_named_and_not_tried_again(code: int | N
         assert isinstance(unreachable("local", error), InfrastructureError)
 
 
-def test_a_worker_is_given_the_number_of_its_raylet() -> None:
-    leave_services_out()
-    with RayExecutor(slow, 1):
-        node: Any = ray._private.worker._global_node
-        raylet = node.all_processes["raylet"][0].process.pid
-        ask = ray.remote(num_cpus=1)(lambda: os.environ["RAY_RAYLET_PID"])
-        assert ray.get(ask.remote()) == str(raylet)
-
-
 def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -156,8 +160,6 @@ def test_a_node_that_runs_low_on_memory_is_told_from_a_crash(
     assert (lost.cause, lost.node_lost) == ("out of memory", False)
     assert [seed_of(key) for key in lost.keys] == [BROKEN_SEED, 3]
 
-
-pytestmark = pytest.mark.xdist_group("ray")
 
 NAMESPACES = ["--net", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc"]
 SCRIPT = """
@@ -180,9 +182,6 @@ class Outcome:
         with Reader.open(f"sqlite:///{self._folder / name}.db") as reader:
             return [tuple(row) for row in reader.rows(sql)]
 
-    def curves(self, name: str) -> list[tuple[Any, ...]]:
-        return self.query(name, CURVES)
-
 
 CURVES = "SELECT seed, t, loss, reachable_loss FROM v_curve ORDER BY seed, t"
 
@@ -190,7 +189,9 @@ CURVES = "SELECT seed, t, loss, reachable_loss FROM v_curve ORDER BY seed, t"
 @pytest.fixture(scope="module")
 def outcome(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     """Start a cluster in namespaces of its own and run every launch on it."""
-    _need_namespaces()
+    probe = subprocess.run(["unshare", *NAMESPACES, "true"], capture_output=True, text=True)
+    if probe.returncode:
+        unavailable(f"needs root and network namespaces: {probe.stderr.strip()}")
     folder = tmp_path_factory.mktemp("cluster")
     settings = dict(
         line.split("=") for line in SETTINGS_FILE.read_text().splitlines() if line[:4] == "RAY_"
@@ -208,28 +209,18 @@ def outcome(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
 
 @pytest.fixture
 def undisturbed(launches: Launches) -> list[tuple[Any, ...]]:
-    launches(seeds=40)
+    launches(seeds=SEEDS)
     return launches.query(CURVES)
 
 
-def _need_namespaces() -> None:
-    probe = subprocess.run(["unshare", *NAMESPACES, "true"], capture_output=True, text=True)
-    if probe.returncode == 0:
-        return
-    message = f"needs root and network namespaces: {probe.stderr.strip()}"
-    if os.environ.get("DOPT_REQUIRE_MACHINES") == "1":
-        pytest.fail(message)
-    pytest.skip(message)
-
-
-def test_all_nodes_are_prepared_and_used(
+def test_a_node_that_joins_later_is_prepared_and_gets_its_share(
     outcome: Outcome, undisturbed: list[tuple[Any, ...]]
 ) -> None:
-    assert outcome.report["plain"].items() >= {
+    assert outcome.report["added"].items() >= {
         "code": 0, "both nodes": True, "prepared": True,
     }.items()  # fmt: skip
-    assert outcome.curves("plain") == undisturbed
-    assert outcome.query("plain", "SELECT max(attempt) FROM trial") == [(1,)]
+    assert outcome.query("added", CURVES) == undisturbed
+    assert outcome.query("added", "SELECT max(attempt) FROM trial") == [(1,)]
 
 
 def test_a_lost_node_costs_its_trials_nothing(
@@ -237,7 +228,7 @@ def test_a_lost_node_costs_its_trials_nothing(
 ) -> None:
     """A trial that had killed its worker as often would have failed."""
     assert outcome.report["lost"]["code"] == 0, outcome.report["lost"]
-    assert outcome.curves("lost") == undisturbed
+    assert outcome.query("lost", CURVES) == undisturbed
     sql = f"SELECT status, attempt FROM trial WHERE seed = {LONG_SEED}"
     assert outcome.query("lost", sql) == [("done", LOSSES + 1)]
     assert outcome.query("lost", "SELECT DISTINCT outcome, cause FROM attempt ORDER BY 1") == [
@@ -245,35 +236,26 @@ def test_a_lost_node_costs_its_trials_nothing(
     ]  # fmt: skip
 
 
-def test_a_node_that_joins_later_gets_its_share(
-    outcome: Outcome, undisturbed: list[tuple[Any, ...]]
-) -> None:
-    assert outcome.report["added"]["code"] == 0, outcome.report["added"]
-    assert outcome.curves("added") == undisturbed
-    assert outcome.query("added", "SELECT max(attempt) FROM trial") == [(1,)]
+def test_a_node_of_other_code_is_refused_before_it_computes_anything(outcome: Outcome) -> None:
+    assert outcome.report["other_code"]["code"] == 75
+    assert "the code of dopt is" in outcome.report["other_code"]["error"]
+    assert outcome.query("other_code", "SELECT DISTINCT status FROM trial") == [("pending",)]
 
 
-@pytest.mark.parametrize(
-    ("name", "difference"),
-    [
-        ("other_code", "the code of dopt is"),
-        ("other_settings", "period_ms is 2000, here it is 1000"),
-    ],
-)
-def test_a_node_that_is_not_alike_is_refused_before_it_computes_anything(
-    outcome: Outcome, name: str, difference: str
-) -> None:
-    assert outcome.report[name]["code"] == 75
-    assert difference in outcome.report[name]["error"]
-    assert outcome.query(name, "SELECT DISTINCT status FROM trial") == [("pending",)]
+def test_a_node_of_other_settings_says_so_and_runs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "RAY_health_check_period_ms"
+    monkeypatch.setenv(name, "1000")
+    expected = fingerprint(setting_names())
+    monkeypatch.setenv(name, "2000")
+    [difference] = run_where_alike(expected, b"no payload is read")
+    assert difference.endswith("period_ms is 2000, here it is 1000")
 
 
 def test_the_loss_of_the_head_ends_the_launch_and_frees_its_claims(outcome: Outcome) -> None:
     assert outcome.report["headless"]["code"] == 75
     assert "has not answered for 3 s" in outcome.report["headless"]["error"]
-    assert outcome.query("headless", "SELECT count(*) FROM trial WHERE status = 'running'") == [
-        (0,)
-    ]
+    running = "SELECT count(*) FROM trial WHERE status = 'running'"
+    assert outcome.query("headless", running) == [(0,)]
     assert outcome.query("headless", "SELECT state FROM launch") == [("failed",)]
 
 
