@@ -18,16 +18,16 @@ from dopt.kernel.run import KernelTrial
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from orchestrate.errors import ExitCode
-from orchestrate.executors.base import Executor, Task, TaskDone, WorkerLost, run_task
+from orchestrate.executors.base import Executor, Run, Task, TaskDone, WorkerLost, run_task
 from orchestrate.executors.limits import Limits, TrialTimeoutError, interrupted_after
 from orchestrate.executors.local import CrashReport, LocalExecutor
 from orchestrate.records import Failure
 from tests.dopt.trials import trial
 from tests.orchestrate.conftest import Launches
-from tests.orchestrate.executors.conftest import ALL, WITH_PROCESSES
+from tests.orchestrate.executors.conftest import ALL, ON_RAY, WITH_PROCESSES
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.faults.laboratory import alive
-from tests.orchestrate.standins import BROKEN_SEED, quick
+from tests.orchestrate.standins import BROKEN_SEED, deadly, exiting, malformed, quick
 from tests.orchestrate.unruly import (
     deaf,
     empty,
@@ -54,33 +54,57 @@ def only_the_broken_one_failed(launches: Launches) -> bool:
     return statuses.pop(BROKEN_SEED) == "failed" and set(statuses.values()) == {"done"}
 
 
-@pytest.mark.parametrize("executor", ALL, indirect=True)
-def test_a_hanging_trial_is_interrupted_and_says_where_it_hung(
-    launches: Launches, executor: str
-) -> None:
-    assert launches(hanging, seeds=SEEDS, executor=executor, timeout=LIMIT) == ExitCode.SOME_FAILED
-    assert only_the_broken_one_failed(launches)
-    assert failures(launches) == [
-        (BROKEN_SEED, "timeout", "TrialTimeoutError", "timeout after 5 s", 1)
-    ]
-    [(text,)] = launches.query("SELECT traceback FROM v_failures")
-    assert "in wait_for_nothing" in text
-    assert "1 failed: timeout after 5 s" in launches.said[-1]
+TIMEOUT = {"timeout": LIMIT}
+HUNG = ("timeout", "TrialTimeoutError", "timeout after 5 s", 1)
+GREEDY = ("out of memory", "MemoryError", "Unable to allocate", 1)
+LEFT = ("exception", "SystemExit", "3", 1)
+PAIR = {"workers": 2}
+"""Processes for which each chunk of so few trials is one trial, which has two attempts alone."""
 
 
-@pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
-def test_native_code_that_heeds_no_signal_ends_with_its_worker(
-    launches: Launches, executor: str
+@pytest.mark.parametrize(
+    ("executor", "run", "settings", "ends", "frame"),
+    [
+        *((name, hanging, TIMEOUT, HUNG, "in wait_for_nothing") for name in ALL[:2]),
+        pytest.param("ray", hanging, TIMEOUT, HUNG, "in wait_for_nothing", marks=ON_RAY),
+        ("local", deaf, TIMEOUT, HUNG, "in sleep_natively"),  # native code that heeds no signal
+        pytest.param("ray", deaf, TIMEOUT, HUNG, "", marks=ON_RAY),
+        ("local", greedy, {"memory_gib": 0.5}, GREEDY, "in hoard"),
+        pytest.param("ray", greedy, {"memory_gib": 1.0}, GREEDY, "in hoard", marks=ON_RAY),
+        ("local", faulty, PAIR, ("killed", "WorkerLost", "killed by signal 11", 2), "in faulty"),
+        ("local", deadly, PAIR, ("killed", "WorkerLost", "killed by signal 9", 2), ""),
+        ("local", malformed, {}, ("malformed", "InvalidResultError", "", 1), ""),
+        ("local", empty, {}, ("malformed", "_NoResultError", "returned NoneType, but a Tr", 1), ""),
+        ("local", exiting, {}, LEFT, "in exiting"),
+        ("inprocess", exiting, {}, LEFT, "in exiting"),
+    ],
+    indirect=["executor"],
+)  # fmt: skip
+def test_a_trial_fails_alone_with_its_cause_and_says_where(
+    launches: Launches,
+    executor: str,
+    run: Run,
+    settings: dict[str, float],
+    ends: tuple[str, str, str, int],
+    frame: str,
 ) -> None:
-    assert launches(deaf, seeds=SEEDS, executor=executor, timeout=LIMIT) == ExitCode.SOME_FAILED
+    code = launches(run, seeds=SEEDS, executor=executor, **{"workers": 1, **settings})
+    assert code == ExitCode.SOME_FAILED
     assert only_the_broken_one_failed(launches)
-    assert failures(launches) == [
-        (BROKEN_SEED, "timeout", "TrialTimeoutError", "timeout after 5 s", 1)
-    ]
-    assert launches.query("SELECT count(*) FROM attempt WHERE outcome = 'released'") == [(0,)]
-    if executor == "local":
-        [(text,)] = launches.query("SELECT traceback FROM v_failures")
-        assert "in sleep_natively" in text
+    [(seed, cause, kind, message, attempt)] = failures(launches)
+    assert (seed, cause, attempt) == (BROKEN_SEED, ends[0], ends[3])
+    assert ends[1] in str(kind)
+    assert ends[2] in str(message)
+    released = launches.query("SELECT count(*) FROM attempt WHERE outcome = 'released'")
+    assert released == [(attempt - 1,)]
+    assert "1 failed: " in launches.said[-1]
+    [(text, node, pid)] = launches.query(
+        "SELECT v.traceback, a.node, a.pid FROM v_failures v, attempt a WHERE a.outcome = 'failed'"
+    )
+    assert frame in text
+    if "ray" not in executor:
+        assert node == socket.gethostname()
+        assert pid > 0
 
 
 @pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
@@ -152,22 +176,9 @@ def test_somebody_elses_timer_goes_on() -> None:
 
 
 @pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
-def test_a_greedy_trial_fails_by_itself(launches: Launches, executor: str) -> None:
-    code = launches(greedy, seeds=SEEDS, executor=executor, memory_gib=1.0)
-    assert code == ExitCode.SOME_FAILED
-    assert only_the_broken_one_failed(launches)
-    [(seed, cause, kind, message, attempt)] = failures(launches)
-    assert (seed, cause, attempt) == (BROKEN_SEED, "out of memory", 1)
-    assert "MemoryError" in str(kind)
-    assert "Unable to allocate" in str(message)
-    [(text,)] = launches.query("SELECT traceback FROM v_failures")
-    assert "in hoard" in text
-
-
-@pytest.mark.parametrize("executor", WITH_PROCESSES, indirect=True)
 def test_a_trial_with_too_little_memory_gets_more_once(launches: Launches, executor: str) -> None:
     """Its process has 0.75 GiB, of which the trial that is greedy wants a half more."""
-    settings = {"seeds": SEEDS, "executor": executor, "memory_gib": 0.75}
+    settings = {"seeds": SEEDS, "executor": executor, "memory_gib": 0.75, "workers": 1}
     assert launches(wants_a_gigabyte, **settings, retry_memory=1.2) == ExitCode.SOME_FAILED
     assert only_the_broken_one_failed(launches)
     [(_, cause, _, _, attempt)] = failures(launches)
@@ -206,27 +217,6 @@ def test_a_trial_that_the_kernel_kills_for_want_of_memory_fails_after_two_attemp
     [(_, cause, kind, message, attempt)] = failures(launches)
     assert (cause, kind, attempt) == ("out of memory", "WorkerLost", 2)
     assert "killed by the kernel: out of memory" in str(message)
-
-
-def test_a_broken_access_to_memory_says_where_it_was(launches: Launches) -> None:
-    assert launches(faulty, seeds=SEEDS, executor="local") == ExitCode.SOME_FAILED
-    assert only_the_broken_one_failed(launches)
-    [(_, cause, _, message, attempt)] = failures(launches)
-    assert (cause, attempt) == ("killed", 2)
-    assert f"killed by signal {int(signal.SIGSEGV)}" in str(message)
-    [(text,)] = launches.query("SELECT traceback FROM v_failures")
-    assert "in faulty" in text
-    [(node, pid)] = launches.query("SELECT node, pid FROM attempt WHERE outcome = 'failed'")
-    assert node == socket.gethostname()
-    assert pid > 0
-
-
-def test_what_is_no_result_fails_its_trial_only(launches: Launches) -> None:
-    assert launches(empty, seeds=SEEDS, executor="local") == ExitCode.SOME_FAILED
-    assert only_the_broken_one_failed(launches)
-    [(_, cause, _, message, _)] = failures(launches)
-    assert cause == "malformed"
-    assert "returned NoneType, but a TrialResult is expected" in str(message)
 
 
 @pytest.mark.parametrize(

@@ -25,10 +25,7 @@ from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.losses import lose
 from tests.orchestrate.standins import (
     BROKEN_SEED,
-    deadly,
     diverging,
-    exiting,
-    malformed,
     quick,
     raising,
     specification,
@@ -74,15 +71,6 @@ def test_an_exception_is_recorded_and_the_grid_goes_on(launches: Launches) -> No
 
 
 @pytest.mark.parametrize("executor", ["inprocess", "local"])
-def test_a_trial_that_leaves_ends_neither_the_launch_nor_its_worker(
-    launches: Launches, executor: str
-) -> None:
-    assert launches(exiting, executor=executor) == ExitCode.SOME_FAILED
-    assert launches.statuses() == {0: "done", 1: "done", 2: "failed", 3: "done", 4: "done"}
-    assert launches.query("SELECT cause, type FROM v_failures") == [("exception", "SystemExit")]
-
-
-@pytest.mark.parametrize("executor", ["inprocess", "local"])
 def test_what_no_trial_can_run_on_ends_the_launch_and_fails_no_trial(
     launches: Launches, executor: str
 ) -> None:
@@ -119,20 +107,6 @@ def test_fail_fast_stops_at_the_first_failure(launches: Launches) -> None:
     left = launches.query("SELECT count(*) FROM trial WHERE status = 'pending'")[0][0]
     assert left > 50
     assert "stopped at the first failure" in launches.said[-1]
-
-
-def test_a_malformed_result_fails_its_trial_only(launches: Launches) -> None:
-    assert launches(malformed, executor="local") == ExitCode.SOME_FAILED
-    assert launches.statuses() == {0: "done", 1: "done", 2: "failed", 3: "done", 4: "done"}
-    assert launches.query("SELECT cause FROM v_failures") == [("malformed",)]
-
-
-def test_a_trial_that_kills_its_worker_twice_alone_fails_and_no_other(launches: Launches) -> None:
-    assert launches(deadly, seeds=12, executor="local") == ExitCode.SOME_FAILED
-    statuses = launches.statuses()
-    assert statuses.pop(BROKEN_SEED) == "failed"
-    assert set(statuses.values()) == {"done"}
-    assert launches.query("SELECT cause, type FROM v_failures") == [("killed", "WorkerLost")]
 
 
 def test_rows_do_not_depend_on_the_executor(launches: Launches) -> None:

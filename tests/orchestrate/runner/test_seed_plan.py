@@ -7,10 +7,10 @@ import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
@@ -27,11 +27,10 @@ from orchestrate.runner.chunks import (
     looks,
 )
 from orchestrate.runner.run_grid import Work, launch_grid
-from orchestrate.store import Reader
-from tests.orchestrate.conftest import RECORD
+from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.standins import diverged, grid_of, quick
 
-SEEDS = 60
+SEEDS = 40
 SPREADS = {"d_optimal": 0.02, "uniform": 0.1, "periodic": 0.13, "random": 0.5}
 """Spread of the logarithm of the final loss with each policy; its mean is 0."""
 
@@ -71,14 +70,10 @@ def unlucky(spec: TrialSpec, *, fail: bool) -> TrialResult:
     return diverged(spec, at=3)
 
 
-class Adaptive:
-    """Launches of a grid with a rule into one database."""
+class Adaptive(Launches):
+    """Launches of a grid with a rule into one database; ``said`` is of the last one."""
 
-    def __init__(self, folder: Path) -> None:
-        self.url = f"sqlite:///{folder / 'results.db'}"
-        self.said: list[str] = []
-
-    def __call__(
+    def __call__(  # type: ignore[override]
         self,
         run: Run = lossy,
         until: float | None = 0.05,
@@ -103,11 +98,9 @@ class Adaptive:
         assert match, self.report
         return int(match[1]), match[2]
 
-    def outcomes(self) -> list[tuple[str, int, str]]:
+    def outcomes(self) -> list[tuple[Any, ...]]:
         """Return what the database holds, pending trials included."""
-        sql = "SELECT policy, seed, status FROM v_trial ORDER BY policy, seed"
-        with Reader.open(self.url) as reader:
-            return [(str(row[0]), int(row[1]), str(row[2])) for row in reader.query(sql)]
+        return self.query("SELECT policy, seed, status FROM v_trial ORDER BY policy, seed")
 
 
 @pytest.fixture
@@ -134,7 +127,7 @@ def test_a_small_spread_needs_few_seeds_and_a_large_one_all(whole: Adaptive) -> 
     assert float(match[2]) < 5
     assert whole.result("random")[1].endswith("%")
     assert re.search(
-        rf"{sum(seeds.values())} of 240 trials .*, [23] of 4 means known$", whole.report
+        rf"{sum(seeds.values())} of 160 trials .*, [23] of 4 means known$", whole.report
     )
 
 
@@ -147,7 +140,7 @@ def test_the_database_holds_the_seeds_of_the_report_and_nothing_is_left_pending(
     assert {status for _, _, status in whole.outcomes()} == {"done"}
 
 
-@pytest.mark.parametrize("trials", [0, 1, 40, 41, 79, 120, 140])
+@pytest.mark.parametrize("trials", [0, 40, 41, 100])
 def test_an_interrupted_launch_ends_as_one_that_was_not(
     adaptive: Adaptive, whole: Adaptive, trials: int
 ) -> None:
@@ -233,6 +226,8 @@ def test_looks_are_spaced_evenly_up_to_the_maximum(maximum: int) -> None:
 
 
 def test_the_half_width_is_students() -> None:
+    from scipy import stats  # a worker, which imports this module, needs none of it
+
     losses = np.exp(np.random.default_rng(0).standard_normal(30))
     logs = np.log(losses)
     low, high = stats.t.interval(0.98, 29, np.mean(logs), stats.sem(logs))
