@@ -27,10 +27,9 @@ from analysis.tables.rendering import (
     CALIBRATION,
     CALIBRATION_HELP,
     TABLES,
-    TableKind,
     TextTable,
     comparison,
-    gaps_table,
+    incomplete,
 )
 from orchestrate.program import Parser, answered, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, default_url
@@ -82,18 +81,25 @@ def parser() -> Parser:
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
     add_workers(figures, "outputs")
-    summary = _command(commands, "summary", _summary, "mean final losses ± 2 SE, n")
-    compare = _command(commands, "compare", _compare, "every variant against the reference, paired")
+    summary = _command(commands, "summary", _table, "mean final losses ± 2 SE, n")
+    compare = _command(commands, "compare", _table, "every variant against the reference, paired")
     compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
     compare.add_argument(
         "--measure", choices=list(Measure), default=Measure.FINAL, help="what a trial is judged by"
     )
     aggregate = _command(
-        commands, "aggregate", _aggregate, "every variant against the reference, over all systems"
+        commands, "aggregate", _table, "every variant against the reference, over all systems"
     )
-    calibrated = _command(commands, "calibration", _calibration, CALIBRATION_HELP, diverged=False)
-    for table in (summary, compare, aggregate, calibrated):
+    calibrated = _command(commands, "calibration", _table, CALIBRATION_HELP, diverged=False)
+    tables = {
+        summary: lambda _: TABLES["summary"],
+        compare: lambda options: comparison(options.column, Measure(options.measure)),
+        aggregate: lambda _: TABLES["aggregate"],
+        calibrated: lambda _: CALIBRATION,
+    }
+    for table, kind in tables.items():
         table.add_argument("--format", choices=FORMATS, default=FORMATS[0])
+        table.set_defaults(table=kind)
     for command in (figures, compare):
         command.add_argument(
             "--epsilon", type=float, help="loss to reach (median final loss of random inputs)"
@@ -197,39 +203,37 @@ def _condition(text: str) -> tuple[str, object]:
 
 def _check_complete(selection: Selection, allow_partial: bool) -> None:
     if selection.gaps and not allow_partial:
-        missing = sum(len(gap.seeds) for gap in selection.gaps)
-        table = gaps_table(selection.gaps).markdown()
-        raise IncompleteError(
-            f"{table}\n\nerror: {missing} trials are missing, a complete "
-            f"grid is expected: run the launch again, narrow the request by --env and --policy, "
-            f"or give --allow-partial to go on with what there is."
-        )
+        raise incomplete(selection.gaps, "a complete grid is", "--env and --policy")
+
+
+def _plot_options(options: argparse.Namespace) -> PlotOptions:
+    """Return what a command was asked to show; options that it lacks are as usual."""
+    given = {
+        "rule": ("diverged", DivergenceRule),
+        "axis": ("x", Axis),
+        "statistic": ("statistic", Statistic),
+        "spread": ("style", Spread),
+        "epsilon": ("epsilon", None),
+        "color_by": ("color_by", None),
+        "band": ("band", BandKind),
+    }
+    found = {
+        field: kind(getattr(options, name)) if kind else getattr(options, name)
+        for field, (name, kind) in given.items()
+        if name in options
+    }
+    return PlotOptions(**found)
 
 
 def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
     from analysis.outputs import build  # Matplotlib: other commands do without it
 
-    plot_options = PlotOptions(
-        DivergenceRule(options.diverged),
-        Axis(options.x),
-        Statistic(options.statistic),
-        Spread(options.style),
-        options.epsilon,
-        options.color_by,
-        BandKind(options.band),
-    )
-    names = tuple(options.only or NAMES)
-    outcomes = build(
-        reader,
-        selection,
-        plot_options,
-        options.out,
-        names,
+    empty = 0
+    for outcome in build(
+        *(reader, selection, _plot_options(options), options.out, tuple(options.only or NAMES)),
         force=options.force,
         workers=options.workers,
-    )
-    empty = 0
-    for outcome in outcomes:
+    ):
         say(f"{options.out / outcome.name}: {outcome.state}")
         empty += bool(options.only) and outcome.state.startswith("not drawn")
     return 1 if empty else 0
@@ -256,29 +260,9 @@ def _animate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _summary(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    plot_options = PlotOptions(DivergenceRule(options.diverged))
-    return _print_table(TABLES["summary"], reader, selection, plot_options, options.format)
-
-
-def _aggregate(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    plot_options = PlotOptions(DivergenceRule(options.diverged))
-    return _print_table(TABLES["aggregate"], reader, selection, plot_options, options.format)
-
-
-def _compare(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    kind = comparison(options.column, Measure(options.measure))
-    plot_options = PlotOptions(DivergenceRule(options.diverged), epsilon=options.epsilon)
-    return _print_table(kind, reader, selection, plot_options, options.format)
-
-
-def _calibration(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
-    return _print_table(CALIBRATION, reader, selection, PlotOptions(), options.format)
-
-
-def _print_table(
-    kind: TableKind, reader: Reader, selection: Selection, plot_options: PlotOptions, form: str
-) -> int:
+def _table(reader: Reader, selection: Selection, options: argparse.Namespace) -> int:
+    """Print the table of a command."""
+    kind, plot_options, form = options.table(options), _plot_options(options), options.format
     table = kind.measure(reader, selection, plot_options)
     if selection.gaps:
         tell(sys.stderr, f"{partial_warning(selection)}\n")

@@ -10,26 +10,34 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import itemgetter
+from typing import Any
 
 import pandas as pd
 
 from analysis import outputs
 from analysis.data.matching import Filter
 from analysis.data.selection import Gap, Selection
-from analysis.errors import IncompleteError
 from analysis.formatting import (
     but_diverged,
     but_lost,
     number,
     p_text,
-    plus_minus,
     share,
     steps_text,
     within,
 )
 from analysis.line_styles import environment_title
 from analysis.stats.intervals import STUDENT_RANGE
-from analysis.tables.rendering import Columns, Row, TextTable, gaps_table, records, rendered
+from analysis.tables.rendering import (
+    Columns,
+    Row,
+    incomplete,
+    mean_text,
+    ratio_text,
+    records,
+    rendered,
+    text_of,
+)
 from analysis.tables.variants import (
     SAME,
     SIGNIFICANCE,
@@ -119,7 +127,7 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
         found = variant_groups(moment, wanted)
         gaps = [gap for group in found for gap in _gaps(group)]
         if gaps and not options.allow_partial:
-            raise IncompleteError(_refusal(gaps))
+            raise incomplete(gaps, "but all that are registered are", "--env, --policy and --where")
         table = adjust([tabulate_group(moment, group, options.diverged) for group in found])
         controlled = tabulate_control_of(moment, found)
         selection = Selection(tuple(one for group in found for one in group.variants))
@@ -151,11 +159,8 @@ def run(options: argparse.Namespace, wanted: Filter) -> int:
     return 0
 
 
-def _origin(facts: dict[str, object], *, controlled: bool) -> str:
-    versions = facts["versions"]
-    assert isinstance(versions, dict)
-    configs = facts["cells"]
-    assert isinstance(configs, list)
+def _origin(facts: Mapping[str, Any], *, controlled: bool) -> str:
+    versions, configs = facts["versions"], facts["cells"]
     trials = sum(config["n_finished"] for config in configs)
     control = f" and [{CONTROL}.csv]({CONTROL}.csv)" if controlled else ""
     return (
@@ -174,15 +179,6 @@ def _gaps(group: VariantGroup) -> Iterable[Gap]:
         missing = {trial.seed for trial in one.trials} - {trial.seed for trial in one.finished}
         if missing:
             yield Gap(group.env, one.label, tuple(sorted(missing)), f"{len(missing)} not finished")
-
-
-def _refusal(gaps: list[Gap]) -> str:
-    missing = sum(len(gap.seeds) for gap in gaps)
-    return (
-        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, but all that are "
-        f"registered are expected: run the launch again, narrow the request by --env, --policy "
-        f"and --where, or give --allow-partial to go on with what there is."
-    )
 
 
 def write_report(
@@ -221,7 +217,7 @@ def _finding(env: str, rows: Sequence[Row]) -> str:
     for reference, same in _same_settings(rows).items():
         said += [f"  - against {reference}, {line}" for line in _judged(same, f"{SAME}_loss")]
     turned = [
-        f"{row['variant']} ({number(_number(row, 'reachable_loss_ratio'))})"
+        f"{row['variant']} ({number(row['reachable_loss_ratio'])})"
         for row in rows[1:]
         if {verdict(row), verdict(row, "reachable_loss")} == {"better", "worse"}
     ]
@@ -233,8 +229,8 @@ def _finding(env: str, rows: Sequence[Row]) -> str:
 def _judged(rows: Sequence[Row], measure: str) -> list[str]:
     """Return which rows are better, worse and not told apart, the best first."""
     judged: dict[str, list[str]] = {"better": [], "worse": [], "open": []}
-    for row in sorted(rows, key=lambda row: _number(row, f"{measure}_ratio")):
-        words = f"{row['variant']} ({number(_number(row, f'{measure}_ratio'))})"
+    for row in sorted(rows, key=lambda row: row[f"{measure}_ratio"]):
+        words = f"{row['variant']} ({number(row[f'{measure}_ratio'])})"
         judged[verdict(row, measure)].append(words)
     names = {"better": "better", "worse": "worse", "open": "not told apart"}
     return [f"{names[kind]}: {'; '.join(found) or 'none'}" for kind, found in judged.items()]
@@ -253,21 +249,13 @@ def _same_settings(rows: Sequence[Row]) -> dict[str, list[Row]]:
 def _described(table: pd.DataFrame) -> str:
     """Return what each policy of the package does, in the words of its class."""
     labels = dict(zip(table["policy"], table["policy_label"], strict=True))
-    lines = [
-        f"- {label}: {_summary(POLICIES[policy])}"
-        for policy, label in labels.items()
-        if policy in POLICIES
-    ]
-    return "\n".join(lines)
-
-
-def _summary(policy: type) -> str:
-    return (policy.__doc__ or "").strip().splitlines()[0]
+    words = {name: (POLICIES[name].__doc__ or "").strip() for name in labels if name in POLICIES}
+    return "\n".join(f"- {labels[name]}: {text.splitlines()[0]}" for name, text in words.items())
 
 
 def _section(env: str, rows: Sequence[Row], picture: str | None) -> str:
     title = environment_title(env)
-    epsilon, dt = _number(rows[0], "epsilon"), _number(rows[0], "dt")
+    epsilon, dt = rows[0]["epsilon"], rows[0]["dt"]
     facts = f"{rows[0]['horizon']} steps of dt = {1e3 * dt:g} ms."
     if not math.isnan(epsilon):
         facts += f" ε = {number(epsilon)}."
@@ -278,123 +266,80 @@ def _section(env: str, rows: Sequence[Row], picture: str | None) -> str:
     return "\n\n".join(parts)
 
 
-def _losses_of(row: Row) -> str:
-    return plus_minus(_number(row, "loss"), _number(row, "loss_2se"))
-
-
 def _steps(row: Row) -> str:
-    steps = steps_text(_number(row, "steps"), int(_number(row, "horizon")))
-    reached = _number(row, "reached")
-    return steps if math.isnan(reached) else f"{steps} ({share(reached)})"
-
-
-def _ratio(measure: str) -> Callable[[Row], str]:
-    names = [f"{measure}_{name}" for name in ("ratio", "low", "high")]
-    return lambda row: within(*(_number(row, name) for name in names))
-
-
-def _p(measure: str) -> Callable[[Row], str]:
-    return lambda row: p_text(_number(row, f"{measure}_p_adjusted"))
+    steps = steps_text(row["steps"], row["horizon"])
+    return steps if math.isnan(row["reached"]) else f"{steps} ({share(row['reached'])})"
 
 
 LOSSES: Columns = (
     ("variant", itemgetter("variant")),
-    ("final loss", _losses_of),
-    ("ratio [95 %]", _ratio("loss")),
-    ("adjusted p", _p("loss")),
-    ("same setting, ratio", _ratio(f"{SAME}_loss")),
-    ("adjusted p", _p(f"{SAME}_loss")),
-    ("reachable set, ratio", _ratio("reachable_loss")),
-    ("curve, ratio", _ratio("auc")),
+    ("final loss", mean_text("loss")),
+    ("ratio [95 %]", ratio_text("loss_")),
+    ("adjusted p", text_of("loss_p_adjusted", p_text)),
+    ("same setting, ratio", ratio_text(f"{SAME}_loss_")),
+    ("adjusted p", text_of(f"{SAME}_loss_p_adjusted", p_text)),
+    ("reachable set, ratio", ratio_text("reachable_loss_")),
+    ("curve, ratio", ratio_text("auc_")),
     ("n", lambda row: but_diverged(row["n"], row["n_diverged"])),
 )
 EFFORT: Columns = (
     ("variant", itemgetter("variant")),
     ("steps to ε (share)", _steps),
-    ("adjusted p", _p("steps")),
-    ("coverage", lambda row: plus_minus(_number(row, "coverage"), _number(row, "coverage_2se"))),
+    ("adjusted p", text_of("steps_p_adjusted", p_text)),
+    ("coverage", mean_text("coverage")),
     (
         "control cost, ratio",
-        lambda row: but_lost(_ratio("control")(row), int(_number(row, "control_lost"))),
+        lambda row: but_lost(ratio_text("control_")(row), row["control_lost"]),
     ),
-    ("plan [µs]", lambda row: number(_number(row, "plan_us"))),
-    ("learn [µs]", lambda row: number(_number(row, "learn_us"))),
+    ("plan [µs]", text_of("plan_us", number)),
+    ("learn [µs]", text_of("learn_us", number)),
     ("runs on", itemgetter("path")),
 )
 
 
-def _number(row: Row, column: str) -> float:
-    value = row[column]
-    return float(value) if isinstance(value, int | float) else float("nan")
-
-
 def control_section(table: pd.DataFrame) -> str:
     """Return the section in Markdown of a table of :func:`tabulate_control_of`."""
-    parts = [_part(str(env), rows) for env, rows in table.groupby("env", sort=False)]
+    parts = [_part(str(env), records(rows)) for env, rows in table.groupby("env", sort=False)]
     return "\n\n".join(["## Control with the learned model", NOTE, *parts])
 
 
-def _part(env: str, table: pd.DataFrame) -> str:
+def _part(env: str, table: Sequence[Row]) -> str:
+    """Return two tables of an environment, a row for each variant, columns by explored steps."""
     rows: dict[str, dict[int, Row]] = {}
-    for row in table.to_dict("records"):
-        rows.setdefault(str(row["variant"]), {})[int(row["t"])] = {
-            str(key): value for key, value in row.items()
-        }
-    steps = sorted({t for found in rows.values() for t in found})
-    success = TextTable(
-        ["variant", *(f"success after {t}" for t in steps), "n"],
-        [
-            [label, *(_entry_text(found, t, _success) for t in steps), _last(found)["described"]]
-            for label, found in rows.items()
-        ],
+    for row in table:
+        rows.setdefault(row["variant"], {})[row["t"]] = row
+    steps = sorted({row["t"] for row in table})
+
+    def after(t: int, text: Callable[[Row], object]) -> Callable[[Row], object]:
+        return lambda row: text(row[t]) if t in row else "–"
+
+    success: Columns = (
+        *((f"success after {t}", after(t, _success)) for t in steps),
+        ("n", lambda row: row[max(row)]["described"]),
     )
-    worth = TextTable(
-        [
-            "variant",
-            *(f"cost after {t}" for t in steps),
-            *(f"loss after {t}" for t in steps if t),
-            "free run",
-        ],
-        [
-            [
-                label,
-                *(_entry_text(found, t, _cost) for t in steps),
-                *(
-                    _entry_text(found, t, lambda row: number(_number(row, "loss")))
-                    for t in steps
-                    if t
-                ),
-                _entry_text(found, steps[-1], _free_run_text),
-            ]
-            for label, found in rows.items()
-        ],
+    worth: Columns = (
+        *((f"cost after {t}", after(t, _cost)) for t in steps),
+        *((f"loss after {t}", after(t, text_of("loss", number))) for t in steps if t),
+        ("free run", after(steps[-1], _free_run)),
     )
-    return f"### {environment_title(env)}\n\n{success.markdown()}\n\n{worth.markdown()}"
-
-
-def _last(found: Mapping[int, Row]) -> Row:
-    return found[max(found)]
-
-
-def _entry_text(found: Mapping[int, Row], t: int, text: Callable[[Row], str]) -> str:
-    """Return the text of a number of steps, a dash without one."""
-    return text(found[t]) if t in found else "–"
+    name = ("variant", lambda row: next(iter(row.values()))["variant"])
+    tables = [rendered(rows.values(), (name, *own)).markdown() for own in (success, worth)]
+    return "\n\n".join([f"### {environment_title(env)}", *tables])
 
 
 def _success(row: Row) -> str:
-    centre, low, high = (_number(row, f"success{end}") for end in ("", "_low", "_high"))
-    star = "*" if _number(row, "success_p_adjusted") < SIGNIFICANCE else ""
+    centre, low, high = (row[f"success{end}"] for end in ("", "_low", "_high"))
+    star = "*" if row["success_p_adjusted"] < SIGNIFICANCE else ""
     return number(math.nan) if math.isnan(low) else f"{centre:.2f}{star} [{low:.2f}, {high:.2f}]"
 
 
 def _cost(row: Row) -> str:
-    centre, low, high = (_number(row, f"cost{end}") for end in ("", "_low", "_high"))
+    centre, low, high = (row[f"cost{end}"] for end in ("", "_low", "_high"))
     alone = "1" if row["variant"] == TRUTH and centre == 1 else number(centre)
-    text = alone if math.isnan(low) else within(centre, low, high)
-    return but_lost(text, int(_number(row, "lost")))
+    return but_lost(alone if math.isnan(low) else within(centre, low, high), row["lost"])
 
 
-def _free_run_text(row: Row) -> str:
+def _free_run(row: Row) -> str:
     if row["variant"] == TRUTH:
         return number(math.nan)
-    return but_lost(number(_number(row, "free_run")), int(_number(row, "free_run_lost")))
+    return but_lost(number(row["free_run"]), int(row["free_run_lost"]))

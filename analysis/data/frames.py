@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import Candidate, Filter, check_names, choose, latest, read_condition
+from analysis.data.matching import Filter, check_names, choose, latest, read_condition
 from analysis.data.samples import LearnedModel, learned_model
 from analysis.data.selection import environment_rank, policy_rank
 from analysis.errors import AnalysisError
@@ -164,7 +164,7 @@ class Results:
         Rows as in :meth:`configurations`. Raises ``AnalysisError`` where two
         configurations fit equally well.
         """
-        chosen = choose(Candidate(config, config.n) for config in self._configs())
+        chosen = choose(self._configs())
         return self.configurations().loc[[config.config_key for config in chosen]]
 
     def trials(self) -> pd.DataFrame:
@@ -278,8 +278,7 @@ class Results:
         )
 
     def _one(self, env: str, policy: str) -> ConfigRow:
-        fitting = [config for config in self._configs() if config.env == env]
-        chosen = choose(Candidate(config, config.n) for config in fitting)
+        chosen = choose(config for config in self._configs() if config.env == env)
         found = [config for config in chosen if config.policy == policy]
         if not found:
             have = ", ".join(sorted({f"{c.env} × {c.policy}" for c in self._configs()}))

@@ -7,8 +7,8 @@ then the one with most trials wins, then the one nearest to the defaults, which 
 setting. A policy that exists only with a model of its own (the oracle) is taken with that model, in
 the same env section and under the same limits. What was left out is said; a tie is an error.
 
-Configurations of older code are left out, and of those that differ in the state of a user's file
-alone all but the one whose trials were registered last.
+Configurations of older code are left out. Of several that differ in the state of a user's file
+alone, the one whose trials were registered last is taken.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ USUAL = {"model": "mlp", "learner": "adam_window"}
 COLUMNS = tuple(name for name in CONFIG_COLUMNS if name not in ("env", "label"))
 """Settings that have a column of their own."""
 
-Setting = tuple[str, str, str, str]
+Setting = tuple[str, ...]
 """JSON of the sections env, limits, model and learner; null for none."""
 
 _WORLD = 2
@@ -50,14 +50,6 @@ _LAST = (
     "SELECT max(r.trial_id) AS last FROM trial r JOIN config c ON c.config_id = r.config_id "
     "WHERE c.config_key = :config_key"
 )
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A configuration and the number of its registered trials."""
-
-    config: ConfigRow
-    n_trials: int
 
 
 @dataclass(frozen=True)
@@ -116,31 +108,29 @@ def read_condition(text: str) -> tuple[str, object] | None:
         return path, value
 
 
-def choose(candidates: Iterable[Candidate], reference: str = REFERENCE) -> list[ConfigRow]:
+def choose(configs: Iterable[ConfigRow], reference: str = REFERENCE) -> list[ConfigRow]:
     """Return one configuration for each (environment, policy); raise AnalysisError on a tie."""
-    groups: dict[str, list[Candidate]] = {}
-    for candidate in candidates:
-        groups.setdefault(candidate.config.env, []).append(candidate)
+    groups: dict[str, list[ConfigRow]] = {}
+    for config in configs:
+        groups.setdefault(config.env, []).append(config)
     return [config for group in groups.values() for config in _choose_policies(group, reference)]
 
 
 def choose_by(
-    candidates: Iterable[Candidate], keys: Sequence[str], reference: str = REFERENCE
+    configs: Iterable[ConfigRow], keys: Sequence[str], reference: str = REFERENCE
 ) -> list[ConfigRow]:
     """Return one configuration for each environment and combination of values of some settings.
 
     Where a combination has several policies it is the reference's, if there is one, else the first
     by name. Configurations without one of the settings are left out.
     """
-    groups: dict[tuple[object, ...], list[Candidate]] = {}
-    for candidate in candidates:
-        values = [setting_value(candidate.config, key) for key in keys]
+    groups: dict[tuple[object, ...], list[ConfigRow]] = {}
+    for config in configs:
+        values = [setting_value(config, key) for key in keys]
         if None not in values:
-            groups.setdefault((candidate.config.env, *map(repr, values)), []).append(candidate)
+            groups.setdefault((config.env, *map(repr, values)), []).append(config)
     chosen = [_choose_policies(group, reference) for group in groups.values()]
-    return [
-        min(configs, key=lambda one: (one.policy != reference, one.policy)) for configs in chosen
-    ]
+    return [min(own, key=lambda one: (one.policy != reference, one.policy)) for own in chosen]
 
 
 def setting_value(config: ConfigRow, key: str) -> object:
@@ -154,10 +144,7 @@ def check_keys(keys: Sequence[str], configs: Sequence[ConfigRow]) -> None:
     """Raise AnalysisError for a setting that no configuration has."""
     for key in keys:
         if all(setting_value(config, key) is None for config in configs):
-            known = {
-                *COLUMNS,
-                *(path for config in configs for path in flatten(config.config)),
-            }
+            known = {*COLUMNS}.union(*(flatten(config.config) for config in configs))
             near = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.4)
             raise AnalysisError(
                 f"'{key}' is no setting of a stored configuration, but a column or a dotted path "
@@ -166,56 +153,50 @@ def check_keys(keys: Sequence[str], configs: Sequence[ConfigRow]) -> None:
             )
 
 
-def _choose_policies(group: Sequence[Candidate], reference: str) -> list[ConfigRow]:
-    setting = _setting(_reference(group, reference).config)
+def _choose_policies(group: Sequence[ConfigRow], reference: str) -> list[ConfigRow]:
+    setting = _setting(_reference(group, reference))
     chosen = []
-    for policy in sorted({candidate.config.policy for candidate in group}):
-        own = [candidate for candidate in group if candidate.config.policy == policy]
-        same = [candidate for candidate in own if _setting(candidate.config) == setting]
-        world = [
-            candidate
-            for candidate in own
-            if _setting(candidate.config)[:_WORLD] == setting[:_WORLD]
-        ]
+    for policy in sorted({config.policy for config in group}):
+        own = [config for config in group if config.policy == policy]
+        same = [config for config in own if _setting(config) == setting]
+        world = [config for config in own if _setting(config)[:_WORLD] == setting[:_WORLD]]
         if same or world:
-            chosen.append(_most(same or world).config)
+            chosen.append(_most(same or world))
     return chosen
 
 
-def _reference(group: Sequence[Candidate], reference: str) -> Candidate:
-    """Return the candidate that fixes the setting; see the top of this file for the order."""
-    pool = [candidate for candidate in group if candidate.config.policy == reference] or group
+def _reference(group: Sequence[ConfigRow], reference: str) -> ConfigRow:
+    """Return the configuration that fixes the setting; see the top of this file for the order."""
+    pool = [config for config in group if config.policy == reference] or group
     totals: Counter[Setting] = Counter()
     policies: dict[Setting, set[str]] = {}
-    for candidate in group:
-        setting = _setting(candidate.config)
-        totals[setting] += candidate.n_trials
-        policies.setdefault(setting, set()).add(candidate.config.policy)
+    for config in group:
+        totals[_setting(config)] += config.n
+        policies.setdefault(_setting(config), set()).add(config.policy)
 
-    def rank(candidate: Candidate) -> tuple[int, ...]:
-        setting = _setting(candidate.config)
-        alone = len(policies[setting]) < 2
-        return -alone, totals[setting], candidate.n_trials, *nearness(candidate.config)
+    def rank(config: ConfigRow) -> tuple[int, ...]:
+        setting = _setting(config)
+        return -(len(policies[setting]) < 2), totals[setting], config.n, *nearness(config)
 
     best = _first(pool, rank)
-    if len({_setting(candidate.config) for candidate in best}) > 1:
+    if len({_setting(config) for config in best}) > 1:
         raise _tie(best)
     return best[0]
 
 
-def _most(candidates: Sequence[Candidate]) -> Candidate:
-    best = _first(candidates, lambda one: (one.n_trials, *nearness(one.config)))
+def _most(configs: Sequence[ConfigRow]) -> ConfigRow:
+    best = _first(configs, lambda one: (one.n, *nearness(one)))
     if len(best) > 1:
         raise _tie(best)
     return best[0]
 
 
 def _first(
-    candidates: Sequence[Candidate], rank: Callable[[Candidate], tuple[int, ...]]
-) -> list[Candidate]:
-    """Return the candidates of the highest rank."""
-    top = max(map(rank, candidates))
-    return [candidate for candidate in candidates if rank(candidate) == top]
+    configs: Sequence[ConfigRow], rank: Callable[[ConfigRow], tuple[int, ...]]
+) -> list[ConfigRow]:
+    """Return the configurations of the highest rank."""
+    top = max(map(rank, configs))
+    return [config for config in configs if rank(config) == top]
 
 
 def nearness(config: ConfigRow) -> tuple[int, int, int]:
@@ -252,23 +233,20 @@ def _sections(config: ConfigRow) -> dict[str, Mapping[str, Any]]:
     return {key: value for key, value in config.config.items() if isinstance(value, Mapping)}
 
 
-def _tie(pool: Sequence[Candidate]) -> AnalysisError:
+def _tie(pool: Sequence[ConfigRow]) -> AnalysisError:
     first = pool[0]
-    path, values = difference([candidate.config.config for candidate in pool])
+    path, values = difference([config.config for config in pool])
     listed = ", ".join(json.dumps(value, ensure_ascii=False) for value in values)
     return AnalysisError(
-        f"{len(pool)} configurations of {first.config.env} × {first.config.policy} have "
-        f"{first.n_trials} trials each and differ in {path} ({listed}): "
+        f"{len(pool)} configurations of {first.env} × {first.policy} have "
+        f"{first.n} trials each and differ in {path} ({listed}): "
         f"choose one with --where {path}={json.dumps(values[0], ensure_ascii=False)}."
     )
 
 
 def _setting(config: ConfigRow) -> Setting:
-    env, limits, model, learner = (
-        json.dumps(config.config.get(section), sort_keys=True)
-        for section in ("env", "limits", "model", "learner")
-    )
-    return env, limits, model, learner
+    sections = (config.config.get(name) for name in ("env", "limits", "model", "learner"))
+    return tuple(json.dumps(section, sort_keys=True) for section in sections)
 
 
 def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]:
@@ -277,12 +255,18 @@ def difference(configs: Sequence[Mapping[str, Any]]) -> tuple[str, list[object]]
     One that all of them have goes before one that some lack.
     """
     flat = [flatten(config) for config in configs]
+    paths = differing_paths(flat)
+    if not paths:
+        return "config_key", [None for _ in configs]
+    path = min(paths, key=lambda one: (not all(one in entry for entry in flat), one))
+    return path, [entry.get(path) for entry in flat]
+
+
+def differing_paths(flat: Sequence[Mapping[str, Any]]) -> set[str]:
+    """Return the dotted paths in which some flat configurations differ."""
+    first = flat[0]
     paths = set().union(*flat)
-    for path in sorted(paths, key=lambda one: (not all(one in entry for entry in flat), one)):
-        values = [entry.get(path) for entry in flat]
-        if any(value != values[0] for value in values):
-            return path, values
-    return "config_key", [None for _ in configs]
+    return {path for path in paths if any(own.get(path) != first.get(path) for own in flat)}
 
 
 def check_names(kind: str, given: Iterable[str], stored: set[str]) -> None:

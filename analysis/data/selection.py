@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 from analysis.data.matching import (
     REFERENCE,
-    Candidate,
     Filter,
     check_keys,
     check_names,
@@ -273,12 +272,11 @@ def select(reader: Reader, wanted: Filter, compatible: Compatible = is_possible)
         )
     check_keys(wanted.group_by, accepted)
     trials = {config.config_key: tuple(reader.trials(config.config_key)) for config in accepted}
-    candidates = [Candidate(config, len(trials[config.config_key])) for config in accepted]
     by_policy = wanted.group_by == ("policy",)
     chosen = (
-        choose(candidates, wanted.reference)
+        choose(accepted, wanted.reference)
         if by_policy
-        else choose_by(candidates, wanted.group_by, wanted.reference)
+        else choose_by(accepted, wanted.group_by, wanted.reference)
     )
     entries = tuple(
         labelled((Entry(config, trials[config.config_key]) for config in chosen), wanted.group_by)
@@ -382,12 +380,11 @@ def one_each(entries: Sequence[Entry], weight: Weight = number_of_trials) -> lis
 
     Several differ in their task alone: the losses of a trial are the same with any and without one.
     """
-    best: dict[tuple[str, ...], Entry] = {}
+    groups: dict[tuple[str, ...], list[Entry]] = {}
     for entry in entries:
         key = tuple(section_text(entry, name) for name in _IDENTITY)
-        if key not in best or weight(entry) > weight(best[key]):
-            best[key] = entry
-    return list(best.values())
+        groups.setdefault(key, []).append(entry)
+    return [max(group, key=weight) for group in groups.values()]
 
 
 def unfinished(entries: Iterable[Entry]) -> Iterator[str]:

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from analysis.data.matching import APART
 from analysis.figures.panels import TEXT_WIDTH, log_ticks, sheet
 from analysis.line_styles import BLUE, GREY, VERMILLION
+from analysis.tables.rendering import records
 from analysis.tables.variants import verdict
 
 _LOOK = {"better": (BLUE, "o"), "worse": (VERMILLION, "s"), "open": (GREY, "D")}
@@ -28,10 +29,10 @@ def draw_forest(part: pd.DataFrame) -> Figure:
 
 
 def _fill(axes: Axes, part: pd.DataFrame) -> None:
-    for place, row in enumerate(part.to_dict("records")):
-        colour, marker = _LOOK[verdict({str(key): value for key, value in row.items()})]
-        ratio = float(row["loss_ratio"])
-        ends = [[ratio - float(row["loss_low"])], [float(row["loss_high"]) - ratio]]
+    for place, row in enumerate(records(part)):
+        colour, marker = _LOOK[verdict(row)]
+        ratio = row["loss_ratio"]
+        ends = [[ratio - row["loss_low"]], [row["loss_high"] - ratio]]
         axes.errorbar(
             ratio, place, xerr=ends, fmt=marker, color=colour, markersize=3.5, elinewidth=1.0
         )

@@ -53,10 +53,7 @@ def loss_plot(name: str, column: str) -> Plot[Numbers]:
         measure=lambda reader, selection, options: (
             column,
             options,
-            measure_curves(
-                *(reader, selection, column, options.rule),
-                *(options.axis, options.statistic, options.color_by, options.band),
-            ),
+            measure_curves(reader, selection, column, options),
         ),
         tabulate=lambda numbers: tabulate_curves(numbers[2]),
         draw=draw,

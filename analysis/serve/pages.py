@@ -19,7 +19,7 @@ from analysis.data.samples import DivergenceRule, bounded_states
 from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
 from analysis.errors import AnalysisError
 from analysis.line_styles import policy_style
-from analysis.plot_options import Axis
+from analysis.plot_options import Axis, PlotOptions
 from analysis.serve.state import ServerState, read_progress
 from analysis.serve.web import NotFoundError, QueryParams, truncated
 from analysis.stats.curves import LossCurve, axis_parts, measure_curves, tabulate_curves
@@ -309,17 +309,19 @@ def _measured(state: ServerState, params: QueryParams) -> tuple[Selection, tuple
         )
     selection = state.select(reader, params.filter(env))
     column = params.choice("column", LOSSES, "loss")
-    rule = params.member("diverged", DivergenceRule, DivergenceRule.EXCLUDE)
-    axis = params.member("x", Axis, Axis.STEPS)
+    options = PlotOptions(
+        params.member("diverged", DivergenceRule, DivergenceRule.EXCLUDE),
+        params.member("x", Axis, Axis.STEPS),
+    )
 
     def measured(part: Selection) -> LossCurve:
         """Return a curve without the values of its trials, which the pages do not show."""
-        curve = measure_curves(reader, part, column, rule, axis)[0]
+        curve = measure_curves(reader, part, column, options)[0]
         values = curve.sample.values[:, :0].copy()
         return replace(curve, sample=replace(curve.sample, values=values))
 
     def cached(part: Selection) -> LossCurve:
-        key = ("curve", reader, part.fingerprint(), column, rule, axis)
+        key = ("curve", reader, part.fingerprint(), column, options)
         return state.cache.get_or_compute(key, lambda: measured(part))
 
     parts = [replace(selection, entries=(entry,), gaps=()) for entry in selection.entries]

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from analysis.data.matching import Candidate, choose
+from analysis.data.matching import choose
 from analysis.data.selection import (
     Entry,
     Selection,
@@ -110,8 +110,8 @@ def control_part(selection: Selection) -> Selection:
 def _of_one_task(entries: list[Entry], reference: str) -> list[Entry]:
     most = common_task(entries)
     same = {entry.config.config_key: entry for entry in entries if task_of(entry) == most}
-    candidates = [Candidate(entry.config, len(entry.trials)) for entry in same.values()]
-    return [same[config.config_key] for config in choose(candidates, reference)]
+    chosen = choose((entry.config for entry in same.values()), reference)
+    return [same[config.config_key] for config in chosen]
 
 
 def common_task(entries: Iterable[Entry]) -> str | None:

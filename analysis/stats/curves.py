@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,11 +11,11 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import check_keys, setting_value
-from analysis.data.samples import DivergenceRule, Sample, read_sample
+from analysis.data.samples import Sample, read_sample
 from analysis.data.selection import Entry, Selection
 from analysis.formatting import loss_unit
 from analysis.line_styles import LineStyle, policy_style, sequence_style
-from analysis.plot_options import Axis
+from analysis.plot_options import Axis, PlotOptions
 from analysis.stats.intervals import Band, BandKind, Statistic, band, tolerance_band
 from dopt.spec.trial import is_prequential, system_of
 from orchestrate.store import Reader
@@ -97,24 +97,12 @@ class LossCurve:
 
 
 def measure_curves(
-    reader: Reader,
-    selection: Selection,
-    column: str,
-    rule: DivergenceRule,
-    axis: Axis = Axis.STEPS,
-    statistic: Statistic = Statistic.MEAN,
-    color_by: str | None = None,
-    band_kind: BandKind = BandKind.CONFIDENCE,
+    reader: Reader, selection: Selection, column: str, options: PlotOptions
 ) -> tuple[LossCurve, ...]:
-    """Return a curve for each entry of the selection, in its order.
-
-    ``color_by`` is the setting whose values have a colour each, by default the first of those by
-    which the selection is grouped.
-    """
-    styles = line_styles(selection, color_by)
+    """Return a curve for each entry of the selection, in its order."""
+    styles = line_styles(selection, options.color_by)
     return tuple(
-        _curve(reader, entry, styles[entry.label], column, rule, axis, statistic, band_kind)
-        for entry in selection.entries
+        _curve(reader, entry, styles[entry.label], column, options) for entry in selection.entries
     )
 
 
@@ -131,45 +119,38 @@ def line_styles(selection: Selection, color_by: str | None = None) -> dict[str, 
     for entry in selection.entries:
         if entry.label in styles:
             continue
+        own = policy_style(entry.config.policy)
         if key == "policy" and selection.group_by == ("policy",):
-            styles[entry.label] = replace(policy_style(entry.config.policy), label=entry.label)
+            styles[entry.label] = replace(own, label=entry.label)
             continue
         value = repr(setting_value(entry.config, key))
-        base = policy_style(entry.config.policy).colour if key == "policy" else None
+        base = own.colour if key == "policy" else None
         styles[entry.label] = sequence_style(values.index(value), used[value], entry.label, base)
         used[value] += 1
     return styles
 
 
 def _curve(
-    reader: Reader,
-    entry: Entry,
-    style: LineStyle,
-    column: str,
-    rule: DivergenceRule,
-    axis: Axis,
-    statistic: Statistic,
-    band_kind: BandKind,
+    reader: Reader, entry: Entry, style: LineStyle, column: str, options: PlotOptions
 ) -> LossCurve:
-    sample = read_sample(reader, entry, column, rule)
+    config, sample = entry.config, read_sample(reader, entry, column, options.rule)
     t = np.arange(sample.values.shape[1])
-    system = system_of(entry.config.config)
-    scale = system.dt if axis is Axis.SECONDS else 1.0
-    names = entry.config.env, entry.config.policy, entry.label
-    x = scale * t.astype(float)
-    limits = tolerance_band if band_kind is BandKind.TOLERANCE else band
-    shown = limits(sample.values, statistic)
-    unit, prequential = loss_unit(system), is_prequential(entry.config.config)
-    return LossCurve(*names, style, t, x, unit, shown, statistic, sample, prequential)
+    system = system_of(config.config)
+    limits = tolerance_band if options.band is BandKind.TOLERANCE else band
+    return LossCurve(
+        *(config.env, config.policy, entry.label, style, t),
+        x=(system.dt if options.axis is Axis.SECONDS else 1.0) * t.astype(float),
+        unit=loss_unit(system),
+        band=limits(sample.values, options.statistic),
+        statistic=options.statistic,
+        sample=sample,
+        is_prequential=is_prequential(config.config),
+    )
 
 
-def tabulate_curves(curves: tuple[LossCurve, ...]) -> pd.DataFrame:
+def tabulate_curves(curves: Iterable[LossCurve]) -> pd.DataFrame:
     """Return what is drawn, one row for each environment, policy and step."""
-    return pd.concat([_table(curve) for curve in curves], ignore_index=True)
-
-
-def _table(curve: LossCurve) -> pd.DataFrame:
-    return pd.DataFrame(
+    tables = [
         {
             "env": curve.env,
             "policy": curve.policy,
@@ -182,4 +163,6 @@ def _table(curve: LossCurve) -> pd.DataFrame:
             "n": curve.band.n,
             "n_diverged": curve.sample.n_diverged,
         }
-    )
+        for curve in curves
+    ]
+    return pd.concat(map(pd.DataFrame, tables), ignore_index=True)

@@ -104,6 +104,11 @@ def mean(values: Array) -> Array:
     return centre(values, Statistic.MEAN)
 
 
+def mean_columns(name: str, values: Array) -> dict[str, float]:
+    """Return the mean of (n,) and two standard errors, as columns ``name`` and ``name_2se``."""
+    return {name: float(mean(values)), f"{name}_2se": 2 * float(standard_error(values))}
+
+
 def centre(values: Array, statistic: Statistic) -> Array:
     """Return a statistic along the first axis of (n, ...), NaN for none."""
     if not len(values):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 
@@ -18,11 +18,12 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from analysis.data.matching import nearness
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError
 from analysis.stats.control import relative_costs, scores_at
-from analysis.stats.intervals import Statistic, centre, standard_error, stratified_mean
+from analysis.stats.intervals import Statistic, centre, mean_columns, stratified_mean
 from analysis.stats.scores import (
     Comparison,
     Measure,
@@ -48,6 +49,7 @@ EPSILON_POLICY = "random"
 """The policy whose median final loss is the ε that others are to reach."""
 
 _SCORES: dict[Measure, Score] = {Measure.FINAL: final_losses, Measure.AUC: mean_losses}
+_ENDS = {"ratio": "centre", "low": "low", "high": "high"}
 ScoredPair = tuple[Scores, Scores]
 
 
@@ -56,7 +58,7 @@ def against_reference(
 ) -> Comparison:
     """Return how a variant compares with the reference on the seeds that they share.
 
-    The bootstrap has a random stream of its own for each environment, label and measure. A label
+    The bootstrap has its own random stream for each environment, label and measure. A label
     names what differs in the table, so that other groups draw other samples.
     """
     name = "/".join(("report", env, variant, measure))
@@ -135,12 +137,17 @@ def compare_steps(
 
 
 def loss_of_random_inputs(
-    reader: Reader, entries: tuple[Entry, ...], column: str, rule: DivergenceRule
+    reader: Reader, entries: Iterable[Entry], column: str, rule: DivergenceRule
 ) -> float | None:
-    """Return the median final loss of random inputs, None where there are no trials of them."""
-    found = (entry for entry in entries if entry.config.policy == EPSILON_POLICY)
-    finals = next((final_losses(reader, entry, column, rule).values for entry in found), None)
-    return float(np.median(finals)) if finals is not None and len(finals) else None
+    """Return the median final loss of random inputs, None without such trials.
+
+    Of several configurations the one nearest to the defaults is taken.
+    """
+    found = [one for one in entries if one.config.policy == EPSILON_POLICY and one.final_losses()]
+    if not found:
+        return None
+    usual = max(found, key=lambda one: nearness(one.config))
+    return float(np.median(final_losses(reader, usual, column, rule).values))
 
 
 def compare_control(reader: Reader, selection: Selection) -> pd.DataFrame:
@@ -299,9 +306,7 @@ def _aggregate_row(variant: str, pairs: list[ScoredPair]) -> dict[str, object]:
         "variant": variant,
         "reference": pairs[0][1].label,
         "systems": ", ".join(own.env for own, _ in pairs),
-        "ratio": float(np.exp(mean.centre)),
-        "low": float(np.exp(mean.low)),
-        "high": float(np.exp(mean.high)),
+        **{name: float(np.exp(getattr(mean, part))) for name, part in _ENDS.items()},
         "n_pairs": sum(map(len, logs)),
         "n_diverged": sum(own.n_diverged + reference.n_diverged for own, reference in pairs),
     }
@@ -326,24 +331,12 @@ def summarise(
 
 
 def _summary(reader: Reader, entry: Entry, rule: DivergenceRule) -> dict[str, object]:
-    grid = final_losses(reader, entry, "loss", rule)
-    reachable = final_losses(reader, entry, "reachable_loss", rule)
-    return {
-        "env": grid.env,
-        "policy": grid.policy,
-        "label": grid.label,
-        **_centres("loss", grid),
-        **_centres("reachable_loss", reachable),
-        "n": len(grid.by_seed),
-        "n_diverged": grid.n_diverged,
-    }
-
-
-def _centres(name: str, scores: Scores) -> dict[str, float]:
-    values = scores.values
-    return {
-        name: float(centre(values, Statistic.MEAN)),
-        f"{name}_2se": 2 * float(standard_error(values)),
-        f"{name}_median": float(centre(values, Statistic.MEDIAN)),
-        f"{name}_iqm": float(centre(values, Statistic.IQM)),
-    }
+    scores = {name: final_losses(reader, entry, name, rule) for name in ("loss", "reachable_loss")}
+    row: dict[str, object] = {"env": entry.config.env, "policy": entry.config.policy}
+    row["label"] = entry.label
+    for name, found in scores.items():
+        row |= mean_columns(name, found.values)
+        row[f"{name}_median"] = float(centre(found.values, Statistic.MEDIAN))
+        row[f"{name}_iqm"] = float(centre(found.values, Statistic.IQM))
+    grid = scores["loss"]
+    return row | {"n": len(grid.by_seed), "n_diverged": grid.n_diverged}

@@ -14,7 +14,7 @@ from tabulate import tabulate
 
 from analysis.data.samples import learned_model
 from analysis.data.selection import Entry, Gap, Selection
-from analysis.errors import AnalysisError
+from analysis.errors import AnalysisError, IncompleteError
 from analysis.formatting import (
     but_diverged,
     but_lost,
@@ -38,7 +38,6 @@ from analysis.tables.comparisons import (
     summarise,
 )
 from dopt.offline_fit import HeldOutFit, held_out_fit
-from dopt.types import Array
 from orchestrate.store import Reader
 
 _ESCAPED = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -116,9 +115,10 @@ Columns = Sequence[tuple[str, Callable[[Row], object]]]
 """Heading and text of each column."""
 
 
-def rendered(rows: Iterable[Row], columns: Columns, note: str = "") -> TextTable:
+def rendered(rows: Iterable[Row] | pd.DataFrame, columns: Columns, note: str = "") -> TextTable:
     """Return rows as a table of texts."""
-    texts = [[text(row) for _, text in columns] for row in rows]
+    found = records(rows) if isinstance(rows, pd.DataFrame) else rows
+    texts = [[text(row) for _, text in columns] for row in found]
     return TextTable([heading for heading, _ in columns], texts, note)
 
 
@@ -127,9 +127,22 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
     return [{str(name): value for name, value in row.items()} for row in table.to_dict("records")]
 
 
-def ratio_text(row: Row, measure: str = "") -> str:
-    """Return a ratio with its interval; ``measure`` is the beginning of the columns' names."""
-    return within(*(row[f"{measure}{name}"] for name in ("ratio", "low", "high")))
+Text = Callable[[Row], str]
+
+
+def text_of(column: str, words: Callable[[Any], str]) -> Text:
+    """Return a function that writes one column of a row."""
+    return lambda row: words(row[column])
+
+
+def mean_text(column: str) -> Text:
+    """Return a function that writes a column with its two standard errors."""
+    return lambda row: plus_minus(row[column], row[f"{column}_2se"])
+
+
+def ratio_text(prefix: str = "") -> Text:
+    """Return a function that writes a ratio with its interval; ``prefix`` begins the columns."""
+    return lambda row: within(*(row[f"{prefix}{name}"] for name in ("ratio", "low", "high")))
 
 
 def _paired(
@@ -146,9 +159,9 @@ def _paired(
         ("variant", itemgetter("variant")),
         (_reference(table), itemgetter("reference")),
         *own,
-        (f"P({better})", lambda row: share(row["improvement"])),
-        (f"{test} p", lambda row: p_text(row["p_value"])),
-        ("BH-adjusted p", lambda row: p_text(row["p_adjusted"])),
+        (f"P({better})", text_of("improvement", share)),
+        (f"{test} p", text_of("p_value", p_text)),
+        ("BH-adjusted p", text_of("p_adjusted", p_text)),
         ("pairs", lambda row: but_diverged(row["n_pairs"], row["n_diverged"])),
     )
 
@@ -158,13 +171,10 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
     columns: Columns = (
         ("env", itemgetter("env")),
         ("variant", itemgetter("label")),
-        ("final loss", lambda row: plus_minus(row["loss"], row["loss_2se"])),
-        ("median", lambda row: number(row["loss_median"])),
-        ("IQM", lambda row: number(row["loss_iqm"])),
-        (
-            "final reachable-set loss",
-            lambda row: plus_minus(row["reachable_loss"], row["reachable_loss_2se"]),
-        ),
+        ("final loss", mean_text("loss")),
+        ("median", text_of("loss_median", number)),
+        ("IQM", text_of("loss_iqm", number)),
+        ("final reachable-set loss", mean_text("reachable_loss")),
         ("n", itemgetter("n")),
         ("diverged", itemgetter("n_diverged")),
     )
@@ -172,12 +182,12 @@ def summary_table(table: pd.DataFrame, rule: str) -> TextTable:
         "Loss: mean ± 2 standard errors over n trials; IQM: mean of the middle half. "
         f"Diverged trials: {rule}."
     )
-    return rendered(records(table), columns, note)
+    return rendered(table, columns, note)
 
 
 def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.FINAL) -> TextTable:
     """Return the paired comparison of losses."""
-    columns = _paired(table, "improvement", "Wilcoxon", [("loss ratio [95 %]", ratio_text)])
+    columns = _paired(table, "improvement", "Wilcoxon", [("loss ratio [95 %]", ratio_text())])
     note = (
         f"Ratio: {_RATIO}; geometric mean over seeds of the "
         f"{_JUDGED[measure]}; interval: paired BCa bootstrap of the log ratio, {STUDENT_RANGE} "
@@ -185,7 +195,7 @@ def comparison_table(table: pd.DataFrame, rule: str, measure: Measure = Measure.
         f"p: two-sided Wilcoxon signed-rank test of the log ratio, {_TESTED}. "
         f"Diverged trials: {rule}."
     )
-    return rendered(records(table), columns, note)
+    return rendered(table, columns, note)
 
 
 def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
@@ -193,7 +203,7 @@ def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
     columns: Columns = (
         ("variant", itemgetter("variant")),
         ("reference", itemgetter("reference")),
-        ("loss ratio [95 %]", ratio_text),
+        ("loss ratio [95 %]", ratio_text()),
         ("systems", itemgetter("systems")),
         ("pairs", lambda row: but_diverged(row["n_pairs"], row["n_diverged"])),
     )
@@ -203,15 +213,15 @@ def aggregate_table(table: pd.DataFrame, rule: str) -> TextTable:
         "stratified by system. Compare only rows of the same systems. "
         f"Diverged trials: {rule}."
     )
-    return rendered(records(table), columns, note)
+    return rendered(table, columns, note)
 
 
 def control_table(table: pd.DataFrame) -> TextTable:
     """Return the paired comparison of the costs of control, with the shares of successes."""
     own: Columns = (
-        ("success", lambda row: share(row["success"])),
-        ("success of reference", lambda row: share(row["success_reference"])),
-        ("cost ratio [95 %]", lambda row: but_lost(ratio_text(row), row["n_lost"])),
+        ("success", text_of("success", share)),
+        ("success of reference", text_of("success_reference", share)),
+        ("cost ratio [95 %]", lambda row: but_lost(ratio_text()(row), row["n_lost"])),
     )
     steps = [("explored steps", itemgetter("t"))]
     columns = _paired(table, "improvement", "Wilcoxon", own, steps)
@@ -225,13 +235,13 @@ def control_table(table: pd.DataFrame) -> TextTable:
         "no finite cost; a lost episode counts as the worst in P(improvement) and p, one "
         "whose true model's was lost in neither. Trials that diverged before a step are left out."
     )
-    return rendered(records(table), columns, note)
+    return rendered(table, columns, note)
 
 
 def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
     """Return the paired comparison of the steps to a loss."""
     own: Columns = (
-        ("ε", lambda row: number(row["epsilon"])),
+        ("ε", text_of("epsilon", number)),
         ("steps", lambda row: steps_text(row["median"], row["horizon"])),
         ("steps of reference", lambda row: steps_text(row["median_reference"], row["horizon"])),
         ("reached", lambda row: f"{row['reached']}/{row['n_pairs']}"),
@@ -246,7 +256,7 @@ def hitting_times_table(table: pd.DataFrame, rule: str) -> TextTable:
         "P(earlier): share of seeds on which the variant is earlier, "
         f"ties half. p: two-sided sign test, {_TESTED}. Diverged trials: {rule}."
     )
-    return rendered(records(table), columns, note)
+    return rendered(table, columns, note)
 
 
 def _reference(table: pd.DataFrame) -> str:
@@ -266,6 +276,16 @@ def gaps_table(gaps: Iterable[Gap]) -> TextTable:
     """Return the table of what is missing."""
     rows = [[gap.env, gap.policy, len(gap.seeds), gap.states, gap.describe_seeds()] for gap in gaps]
     return TextTable(["env", "policy", "missing", "state", "seeds"], rows)
+
+
+def incomplete(gaps: Sequence[Gap], wanted: str, options: str) -> IncompleteError:
+    """Return the error for trials that are missing; ``options`` narrow the request."""
+    missing = sum(len(gap.seeds) for gap in gaps)
+    return IncompleteError(
+        f"{gaps_table(gaps).markdown()}\n\nerror: {missing} trials are missing, {wanted} "
+        f"expected: run the launch again, narrow the request by {options}, "
+        f"or give --allow-partial to go on with what there is."
+    )
 
 
 class Part(Protocol):
@@ -397,25 +417,25 @@ def _calibrated_trial(reader: Reader, entry: Entry, seed: int) -> dict[str, floa
         for kind, fit in zip(SETS, fits, strict=True)
         for name in HeldOutFit._fields
     }
-    return row | {"energy": _energy(stored.inputs, learned.spec.system.gamma)}
-
-
-def _energy(inputs: Array, gamma: float) -> float:
-    return float(np.mean(np.sum(inputs**2, axis=1)) / gamma**2)
+    energy = np.mean(np.sum(stored.inputs**2, axis=1)) / learned.spec.system.gamma**2
+    return row | {"energy": float(energy)}
 
 
 def calibration_table(table: pd.DataFrame) -> TextTable:
     """Return the table for people."""
-    measures = (("R²", "r_squared", number), ("within 90 %", "covered", share))
+    measures = (
+        *(("R²", "r_squared", number), ("within 90 %", "covered", share)),
+        ("log loss", "log_loss", number),
+    )
     columns: Columns = (
         ("env", itemgetter("env")),
         ("variant", itemgetter("label")),
         *(
-            (f"{title}, {kind}", lambda row, key=f"{kind}_{name}", text=text: text(row[key]))
-            for title, name, text in (*measures, ("log loss", "log_loss", number))
+            (f"{title}, {kind}", text_of(f"{kind}_{name}", text))
+            for title, name, text in measures
             for kind in SETS
         ),
-        ("energy", lambda row: number(row["energy"])),
+        ("energy", text_of("energy", number)),
         ("n", itemgetter("n")),
     )
     note = (
@@ -423,12 +443,12 @@ def calibration_table(table: pd.DataFrame) -> TextTable:
         "90 %: share of all within their interval of 90 %; log loss: mean negative log likelihood "
         "[nat]; a dash where the model has no covariance. Energy: mean of ‖u‖²/γ²."
     )
-    return rendered(records(table), columns, note)
+    return rendered(table, columns, note)
 
 
 CALIBRATION = TableKind(
     "Fit at held-out states",
-    lambda selection, _=None: selection,
+    _whole,
     lambda reader, selection, _: measure_calibration(reader, selection),
     lambda table, _: calibration_table(table),
 )

@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +31,7 @@ from analysis.data.selection import (
 )
 from analysis.errors import AnalysisError
 from analysis.stats.control import TrueModel, common_task, measure_control, scores_at, task_of
-from analysis.stats.intervals import mean, standard_error
+from analysis.stats.intervals import mean_columns
 from analysis.stats.scores import (
     benjamini_hochberg,
     censored_median,
@@ -76,7 +77,8 @@ TRUTH = "true model"
 SUCCESS, FREE_RUN = "control_success", "free_run_error"
 ESTIMATES = ("success", "success_low", "success_high", "cost", "cost_low", "cost_high")
 Array = npt.NDArray[np.float64]
-Row = Mapping[str, object]
+Row = Mapping[str, Any]
+ByMeasure = Mapping[str, BySeed]
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
 def _group(env: str, entries: Sequence[Entry], policy: str) -> VariantGroup | None:
     world = one_world(entries)
     task = common_task(world)
-    kept = _one_each(world, task)
+    kept = one_each(world, lambda one: (task_of(one) == task, len(one.trials)))
     references = [entry for entry in kept if entry.config.policy == policy]
     if not references or len(kept) < 2:
         return None
@@ -203,32 +205,15 @@ def _setting(entry: Entry) -> list[str]:
     return [section_text(entry, name) for name in _SETTING]
 
 
-def _one_each(entries: Sequence[Entry], task: str | None) -> list[Entry]:
-    """Return one entry for each policy and setting: of the task, if any, and with most trials."""
-
-    def weight(entry: Entry) -> tuple[int, ...]:
-        return task is not None and task_of(entry) == task, len(entry.trials)
-
-    return one_each(entries, weight)
-
-
 def tabulate_group(
     reader: Reader, group: VariantGroup, rule: DivergenceRule = DivergenceRule.EXCLUDE
 ) -> pd.DataFrame:
     """Return one row for each variant of an environment, the reference first."""
-    plane = Plane.of(system_of(group.reference.config.config))
-    epsilon = loss_of_random_inputs(reader, group.variants, "loss", rule)
-    scores = {one.label: _scores(reader, one, plane, rule) for one in group.variants}
-    costs = _control_costs(reader, group)
-    for label, own in scores.items():
-        own["control"] = costs.get(label, {})
+    found = loss_of_random_inputs(reader, group.variants, "loss", rule)
+    epsilon = math.nan if found is None else found
+    scores = _scores(reader, group, epsilon, rule)
     return pd.DataFrame(
-        [
-            _variant_row(reader, group, one, scores[one.label], scores)
-            | _under_same_setting(group, one, scores)
-            | _samples(reader, group, one, math.nan if epsilon is None else epsilon, rule)
-            for one in group.variants
-        ]
+        [_variant_row(reader, group, one, scores, epsilon) for one in group.variants]
     )
 
 
@@ -240,41 +225,41 @@ def adjust(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
     return table
 
 
-def verdict(row: Mapping[str, object], measure: str = "loss") -> str:
+def verdict(row: Row, measure: str = "loss") -> str:
     """Return "better" or "worse" than the reference, or "open".
 
     It is open unless both tell: the test, of ranks and adjusted, and the interval, of the mean.
     """
-    p, ratio, low, high = (
-        _float(row[f"{measure}_{name}"]) for name in ("p_adjusted", "ratio", "low", "high")
-    )
+    names = ("p_adjusted", "ratio", "low", "high")
+    p, ratio, low, high = (row[f"{measure}_{name}"] for name in names)
     if not p < SIGNIFICANCE or not (high < 1 or low > 1):
         return "open"
     return "better" if (ratio < 1) != (measure == "coverage") else "worse"
 
 
-def _float(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
-
-
 def _scores(
-    reader: Reader, variant: Entry, plane: Plane, rule: DivergenceRule
-) -> dict[str, BySeed]:
-    entry = variant
+    reader: Reader, group: VariantGroup, epsilon: float, rule: DivergenceRule
+) -> dict[str, dict[str, BySeed]]:
+    """Return the scores of each variant, by its label and by measure.
+
+    ``control`` is the relative cost after the first steps of the task; ``steps`` are the inputs
+    until the loss stays at most ε, inf where it does not.
+    """
+    plane = Plane.of(system_of(group.reference.config.config))
+    assessed = {one.label: one.config.config_key for one in group.assessed}
+    tasks = [reader.assessments(key, "control_cost").t.tolist() for key in assessed.values()]
+    first = min((t for steps in tasks for t in steps if t > 0), default=0)
     return {
-        "loss": final_losses(reader, entry, "loss", rule).by_seed,
-        "reachable_loss": final_losses(reader, entry, "reachable_loss", rule).by_seed,
-        "auc": mean_losses(reader, entry, "loss", rule).by_seed,
-        "coverage": _coverages(reader, variant, plane),
+        one.label: {
+            "loss": final_losses(reader, one, "loss", rule).by_seed,
+            "reachable_loss": final_losses(reader, one, "reachable_loss", rule).by_seed,
+            "auc": mean_losses(reader, one, "loss", rule).by_seed,
+            "coverage": _coverages(reader, one, plane),
+            "control": scores_at(reader, one, first).by_seed if one.label in assessed else {},
+            "steps": lasting_steps(reader, one, "loss", rule, epsilon).by_seed,
+        }
+        for one in group.variants
     }
-
-
-def _control_costs(reader: Reader, group: VariantGroup) -> dict[str, BySeed]:
-    """Return the relative costs of the assessed variants after the first steps of their task."""
-    keys = {one.label: one.config.config_key for one in group.assessed}
-    steps = {t for key in keys.values() for t in reader.assessments(key, "control_cost").t.tolist()}
-    first = min((t for t in steps if t > 0), default=0)
-    return {one.label: scores_at(reader, one, first).by_seed for one in group.assessed}
 
 
 def _coverages(reader: Reader, variant: Entry, plane: Plane) -> BySeed:
@@ -287,90 +272,63 @@ def _variant_row(
     reader: Reader,
     group: VariantGroup,
     variant: Entry,
-    own: Mapping[str, BySeed],
-    scores: Mapping[str, Mapping[str, BySeed]],
+    scores: Mapping[str, ByMeasure],
+    epsilon: float,
 ) -> dict[str, object]:
-    trials = variant.finished
+    config, own = variant.config, scores[variant.label]
+    reference = scores[group.reference.label]
     row: dict[str, object] = {
         "env": group.env,
         "variant": variant.label,
-        "policy": variant.config.policy,
-        "policy_label": policy_title(variant.config.policy),
-        "model": variant.config.model,
-        "learner": variant.config.learner,
-        "path": variant.config.config["path"],
-        "dt": variant.config.config["env"]["dt"],
+        "policy": config.policy,
+        "policy_label": policy_title(config.policy),
+        "model": config.model,
+        "learner": config.learner,
+        "path": config.config["path"],
+        "dt": config.config["env"]["dt"],
         "n": len(own["loss"]),
-        "n_diverged": sum(trial.status == "diverged" for trial in trials),
+        "n_diverged": sum(trial.status == "diverged" for trial in variant.finished),
         "plan_us": _typical(reader, variant, "plan_us"),
         "learn_us": _typical(reader, variant, "learn_us"),
     }
-    reference = scores[group.reference.label]
     for measure in MEASURES:
         values = np.array(list(own[measure].values()))
-        values = values[np.isfinite(values)]
-        row[measure] = float(mean(values)) if len(values) else math.nan
-        row[f"{measure}_2se"] = 2 * float(standard_error(values)) if len(values) else math.nan
-        row |= _against(own[measure], reference[measure], group.env, variant.label, measure)
+        row |= mean_columns(measure, values[np.isfinite(values)])
+        row |= _against(own, reference, variant, measure)
     row["control_lost"] = without_ratio(*paired(own["control"], reference["control"]))
-    return row
+    same = group.reference_with_setting_of(variant) or variant
+    row[f"{SAME}_reference"] = "" if same is variant else same.label
+    for measure in SAME_MEASURES:  # NaN where the reference policy has no such setting
+        row |= _against(own, scores[same.label], variant, measure, f"{SAME}_")
+    return row | {"epsilon": epsilon, "horizon": config.horizon} | _race(own, reference, epsilon)
 
 
-def _under_same_setting(
-    group: VariantGroup, variant: Entry, scores: Mapping[str, Mapping[str, BySeed]]
-) -> dict[str, object]:
-    """Compare with the reference policy under the same model and learner; NaN where it has none."""
-    reference = group.reference_with_setting_of(variant)
-    own = scores[variant.label]
-    with_setting = own if reference is None else scores[reference.label]
-    row: dict[str, object] = {
-        f"{SAME}_reference": "" if reference in (None, variant) else reference.label
-    }
-    for measure in SAME_MEASURES:
-        found = _against(own[measure], with_setting[measure], group.env, variant.label, measure)
-        row |= {f"{SAME}_{column}": value for column, value in found.items()}
-    return row
+def _race(own: ByMeasure, reference: ByMeasure, epsilon: float) -> dict[str, float]:
+    """Return the median steps to ε, the share of trials that get there, and p of the sign test.
 
-
-def _samples(
-    reader: Reader, group: VariantGroup, variant: Entry, epsilon: float, rule: DivergenceRule
-) -> dict[str, float]:
-    """Return how many inputs it takes until the loss stays at most ε.
-
-    They are the median over the trials, the share of those that get there, and the p of the sign
-    test against the reference. A trial that does not get there is censored: later than any that
-    does.
+    A trial that does not get there is censored: later than any that does. NaN without an ε.
     """
-    known = not math.isnan(epsilon)
-    own, reference = (
-        lasting_steps(reader, one, "loss", rule, epsilon).by_seed
-        for one in (variant, group.reference)
-    )
-    steps = np.array(list(own.values()))
-    compared = known and variant is not group.reference
+    steps = np.array([] if math.isnan(epsilon) else list(own["steps"].values()))
+    found = compare_hitting_times(*paired(own["steps"], reference["steps"]))
     return {
-        "epsilon": epsilon,
-        "horizon": variant.config.horizon,
-        "steps": censored_median(steps) if known else math.nan,
-        "reached": float(np.mean(np.isfinite(steps))) if known and len(steps) else math.nan,
-        "steps_p": _hitting_time_p(own, reference) if compared else math.nan,
+        "steps": censored_median(steps),
+        "reached": float(np.mean(np.isfinite(steps))) if len(steps) else math.nan,
+        "steps_p": math.nan if own is reference or math.isnan(epsilon) else found.p_value,
     }
-
-
-def _hitting_time_p(own: BySeed, reference: BySeed) -> float:
-    return compare_hitting_times(*paired(own, reference)).p_value
 
 
 def _against(
-    own: BySeed, reference: BySeed, env: str, variant: str, measure: str
+    own: ByMeasure, reference: ByMeasure, variant: Entry, measure: str, prefix: str = ""
 ) -> dict[str, float]:
-    """Return the ratio to the reference; nothing for the reference itself."""
-    columns = ("ratio", "low", "high", "improvement", "p")
-    if own is reference:
-        return {f"{measure}_{column}": math.nan for column in columns}
-    found = against_reference(own, reference, env, variant, measure)
-    values = (found.ratio, found.low, found.high, found.improvement, found.p_value)
-    return {f"{measure}_{column}": value for column, value in zip(columns, values, strict=True)}
+    """Return the ratio to the reference; NaN for the reference itself."""
+    found = None
+    if own is not reference:
+        names = variant.config.env, variant.label, measure
+        found = against_reference(own[measure], reference[measure], *names)
+    return {
+        f"{prefix}{measure}_{name.removesuffix('_value')}": getattr(found, name, math.nan)
+        for name in ("ratio", "low", "high", "improvement", "p_value")
+    }
 
 
 def _typical(reader: Reader, variant: Entry, column: str) -> float:
@@ -416,14 +374,10 @@ def _control_rows(reader: Reader, group: VariantGroup) -> Iterator[dict[str, obj
 
 def _truth(env: str, truth: TrueModel, t: int) -> dict[str, object]:
     """Return a row of the true model: the same after any number of steps, its cost the unit."""
+    names = ("n", "success", "success_low", "success_high")
     return {
-        "env": env,
-        "variant": TRUTH,
-        "t": t,
-        "n": truth.n,
-        "success": truth.success,
-        "success_low": truth.success_low,
-        "success_high": truth.success_high,
+        **{"env": env, "variant": TRUTH, "t": t},
+        **{name: getattr(truth, name) for name in names},
         "cost": 1.0 if truth.lost < truth.n else math.nan,
         "lost": truth.lost,
         "described": str(truth.n),
