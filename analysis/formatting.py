@@ -95,14 +95,14 @@ def loss_unit(system: System) -> str:
 
     Where these have several units the loss is the root of a sum over them: ``m/s², rad/s²``.
     """
-    units = [_rate(_unit_of(system.state_labels[row])) for row in system.learned_rows]
+    units = [_rate(unit_of(system.state_labels[row])) for row in system.learned_rows]
     return ", ".join(sorted(set(units)))
 
 
-def _unit_of(label: str) -> str:
-    """Return what stands in the brackets of a label, 1 without any."""
+def unit_of(label: str, without: str = "1") -> str:
+    """Return the unit in a label, such as N of ``u [N]``; ``without`` where it has none."""
     found = re.search(r"\[([^\]]+)\]", label)
-    return found.group(1) if found else "1"
+    return found.group(1) if found else without
 
 
 def _rate(unit: str) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import importlib
 import importlib.metadata
 import json
 import multiprocessing
@@ -29,7 +30,7 @@ import pandas as pd
 from analysis.data.selection import Selection
 from analysis.errors import AnalysisError
 from analysis.plot_options import PlotOptions
-from analysis.tables.rendering import TABLES, TableKind
+from analysis.tables.rendering import TABLES
 from dopt import __version__
 from orchestrate.files import make_folder, whole
 from orchestrate.program import COMMIT_VARIABLE, commit_of, git
@@ -39,21 +40,23 @@ LIBRARIES = ("matplotlib", "numpy", "pandas", "scipy", "sqlalchemy")
 PACKAGE = Path(__file__).parent
 """The folder of the analysis."""
 
-FIGURES = (
-    "figure1",
-    "figure1_reachable",
-    "figure2_phase_pendulum",
-    "figure2_phase_cartpole",
-    "figure2_spectrum",
-    "figure4_width",
-    "figure4_width_loss",
-    "figure5_control",
-    "figure6_pareto",
-    "figure7_profiles",
-    "figure8_sensitivity",
-    "figure9_limits",
-)
-"""Figures in the order of the registry."""
+_PLOTS = {
+    "figure1": ("loss_curves", "loss_plot", "loss"),
+    "figure1_reachable": ("loss_curves", "loss_plot", "reachable_loss"),
+    "figure2_phase_pendulum": ("phase_portraits", "phase_plot", "pendulum"),
+    "figure2_phase_cartpole": ("phase_portraits", "phase_plot", "cartpole"),
+    "figure2_spectrum": ("input_spectrum", "spectrum_plot", "cartpole"),
+    "figure4_width": ("width", "cost_plot"),
+    "figure4_width_loss": ("width", "loss_against_width_plot"),
+    "figure5_control": ("control", "control_plot"),
+    "figure6_pareto": ("pareto", "pareto_plot"),
+    "figure7_profiles": ("profiles", "profiles_plot"),
+    "figure8_sensitivity": ("sensitivity", "sensitivity_plot"),
+    "figure9_limits": ("limits", "limits_plot"),
+}
+"""Module, function and what it shows of each figure, in the order of the page."""
+
+FIGURES = tuple(_PLOTS)
 
 NAMES = (*FIGURES, *TABLES)
 
@@ -75,31 +78,10 @@ T = TypeVar("T")
 @functools.cache
 def plots() -> dict[str, Plot[Any]]:
     """Return all figures by name, in their order; Matplotlib is loaded by the first call."""
-    from analysis.figures.control import control_plot
-    from analysis.figures.input_spectrum import spectrum_plot
-    from analysis.figures.limits import limits_plot
-    from analysis.figures.loss_curves import loss_plot
-    from analysis.figures.pareto import pareto_plot
-    from analysis.figures.phase_portraits import phase_plot
-    from analysis.figures.profiles import profiles_plot
-    from analysis.figures.sensitivity import sensitivity_plot
-    from analysis.figures.width import cost_plot, loss_against_width_plot
-
-    found = (
-        loss_plot("figure1", "loss"),
-        loss_plot("figure1_reachable", "reachable_loss"),
-        phase_plot("pendulum"),
-        phase_plot("cartpole"),
-        spectrum_plot("cartpole", "figure2_spectrum"),
-        cost_plot("figure4_width"),
-        loss_against_width_plot("figure4_width_loss"),
-        control_plot("figure5_control"),
-        pareto_plot("figure6_pareto"),
-        profiles_plot("figure7_profiles"),
-        sensitivity_plot("figure8_sensitivity"),
-        limits_plot("figure9_limits"),
-    )
-    return {plot.name: plot for plot in found}
+    return {
+        name: getattr(importlib.import_module(f"analysis.figures.{module}"), make)(name, *shown)
+        for name, (module, make, *shown) in _PLOTS.items()
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,11 +141,16 @@ def _plan(
     force: bool,
 ) -> Task | str:
     """Return what is to be written, or why nothing is."""
-    part = _part(name, selection, options)
+    if name not in WITH_EXPLORATIONS:
+        selection = selection.simulated()
+    kind = plots()[name] if name in FIGURES else TABLES[name]
+    part = kind.part(selection, options)
     if not part.entries:
         return "not drawn, nothing is stored for it"
     facts = describe(reader, part) | {"request": options.as_dict(), "name": name}
-    mark = _mark(facts)
+    # Where the data lie and which commit was checked out is no part of the fingerprint.
+    marked = ("selection", "request", "versions", "name", "notes")
+    mark = fingerprint({key: facts[key] for key in marked} | {"code": code_hash()})
     endings = (*PICTURES, "csv", "txt") if name in FIGURES else TABLE_FILES
     if not force and is_current(folder, name, endings, mark):
         return "unchanged"
@@ -171,33 +158,15 @@ def _plan(
 
 
 def _write_output(reader: Reader, task: Task) -> None:
-    if task.name in FIGURES:
-        words = _draw(plots()[task.name], reader, task)
-    else:
-        words = _tabulate(TABLES[task.name], reader, task)
+    words = (_draw if task.name in FIGURES else _tabulate)(reader, task)
     facts = {**task.facts, **words, "fingerprint": task.mark}
     write_provenance(facts, task.folder, task.name)
 
 
-def _part(name: str, selection: Selection, options: PlotOptions) -> Selection:
-    if name not in WITH_EXPLORATIONS:
-        selection = selection.simulated()
-    if name in FIGURES:
-        return plots()[name].part(selection)
-    return TABLES[name].part(selection, options)
-
-
-def _mark(facts: dict[str, Any]) -> str:
-    """Return the fingerprint; where the data lie and which commit was checked out is no part."""
-    parts = ("selection", "request", "versions", "name", "notes")
-    content = {key: facts[key] for key in parts} | {"code": code_hash()}
-    return fingerprint(content)
-
-
-def _draw(plot: Plot[Any], reader: Reader, task: Task) -> dict[str, str]:
-    folder = task.folder
+def _draw(reader: Reader, task: Task) -> dict[str, str]:
     from analysis.figures.panels import styled
 
+    plot, folder = plots()[task.name], task.folder
     with styled():
         drawing = plot.make(reader, task.selection, task.options)
         caption = drawing.caption
@@ -211,19 +180,16 @@ def _draw(plot: Plot[Any], reader: Reader, task: Task) -> dict[str, str]:
     return plot.words(task.options) | {"caption": caption}
 
 
-def _tabulate(kind: TableKind, reader: Reader, task: Task) -> dict[str, str]:
-    name, folder = task.name, task.folder
+def _tabulate(reader: Reader, task: Task) -> dict[str, str]:
+    name, folder, kind = task.name, task.folder, TABLES[task.name]
     table = kind.measure(reader, task.selection, task.options)
     text_table = kind.render(table, task.options)
     warning = f"{partial_warning(task.selection)}\n\n" if task.selection.gaps else ""
     write_table(table, folder, name)
     write_text(warning + text_table.markdown(), folder / f"{name}.md")
-    write_text(_commented(warning) + text_table.latex(), folder / f"{name}.tex")
+    comment = f"% {warning.rstrip()}\n" if warning else ""
+    write_text(comment + text_table.latex(), folder / f"{name}.tex")
     return {"title": kind.title, "caption": warning + text_table.note}
-
-
-def _commented(warning: str) -> str:
-    return f"% {warning.rstrip()}\n" if warning else ""
 
 
 def partial_warning(selection: Selection) -> str:
@@ -378,13 +344,9 @@ def fingerprint(content: Mapping[str, Any]) -> str:
 
 def is_current(folder: Path, name: str, endings: tuple[str, ...], mark: str) -> bool:
     """Whether all files of an output exist and were made from the same content."""
-    if not all((folder / f"{name}.{ending}").is_file() for ending in (*endings, "json")):
-        return False
-    try:
-        found = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-    except ValueError:
-        return False
-    return bool(isinstance(found, dict) and found.get("fingerprint") == mark)
+    found = _facts(folder, name)
+    whole_set = all((folder / f"{name}.{ending}").is_file() for ending in endings)
+    return whole_set and found is not None and found.get("fingerprint") == mark
 
 
 def write_pictures(figure: Figure, folder: Path, name: str, title: str, mark: str) -> None:

@@ -17,6 +17,7 @@ from analysis.figures.panels import (
     MARKERS,
     TEXT_WIDTH,
     Plot,
+    half_widths,
     legend_below,
     log_scale,
     look,
@@ -45,7 +46,7 @@ def control_plot(name: str) -> Plot[Curves]:
         title="Control with the learned model",
         statistic="share of successful episodes; geometric mean of the cost by the true model's",
         band="95 % Wilson interval of the share; 95 % t-interval of the mean logarithm",
-        part=control_part,
+        part=lambda selection, _: control_part(selection),
         measure=lambda reader, selection, _: measure_control(reader, selection),
         tabulate=tabulate_control,
         draw=draw_control,
@@ -96,9 +97,8 @@ def _look(policy: str, markers: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _line(axes: Axes, x: np.ndarray, curve: ControlCurve, name: str, own: dict[str, Any]) -> None:
-    y, low, high = (getattr(curve, f"{name}{end}") for end in ("", "_low", "_high"))
-    half = np.nan_to_num(np.maximum(0.0, np.array([y - low, high - y])))
-    axes.errorbar(x, y, half, ms=3, elinewidth=0.7, capsize=1.5, **own)
+    ends = [getattr(curve, f"{name}{end}") for end in ("", "_low", "_high")]
+    axes.errorbar(x, ends[0], half_widths(*ends), ms=3, elinewidth=0.7, capsize=1.5, **own)
 
 
 def _counts(curves: Sequence[ControlCurve]) -> str:

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.data.matching import APART
-from analysis.figures.panels import TEXT_WIDTH, log_ticks, sheet
+from analysis.figures.panels import TEXT_WIDTH, half_widths, log_ticks, sheet
 from analysis.line_styles import BLUE, GREY, VERMILLION
 from analysis.tables.rendering import records
 from analysis.tables.variants import verdict
@@ -31,10 +31,15 @@ def draw_forest(part: pd.DataFrame) -> Figure:
 def _fill(axes: Axes, part: pd.DataFrame) -> None:
     for place, row in enumerate(records(part)):
         colour, marker = _LOOK[verdict(row)]
-        ratio = row["loss_ratio"]
-        ends = [[ratio - row["loss_low"]], [row["loss_high"] - ratio]]
+        ends = [[row[f"loss_{name}"]] for name in ("ratio", "low", "high")]
         axes.errorbar(
-            ratio, place, xerr=ends, fmt=marker, color=colour, markersize=3.5, elinewidth=1.0
+            ends[0],
+            place,
+            xerr=half_widths(*ends),
+            fmt=marker,
+            color=colour,
+            ms=3.5,
+            elinewidth=1.0,
         )
     axes.axvline(1.0, color="black", linewidth=0.8)
     axes.set_xscale("log")

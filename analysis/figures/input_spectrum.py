@@ -19,10 +19,9 @@ from analysis.figures.panels import (
     Plot,
     legend_below,
     log_scale,
-    log_ticks,
     sheet,
 )
-from analysis.formatting import but_diverged, count_text
+from analysis.formatting import but_diverged, count_text, unit_of
 from analysis.line_styles import environment_title, policy_style
 from analysis.stats.trajectories import Spectrum, average_spectrum
 from dopt.spec.trial import system_of
@@ -76,29 +75,23 @@ def measure_spectra(reader: Reader, selection: Selection, env: str) -> InputSpec
     entries = selection.of(env)
     system = system_of(entries[0].config.config)
     mode = eigenmode(system)
-    spectra = [_spectrum(reader, entry, system.dt) for entry in entries]
+    spectra = (_spectrum(reader, entry, system.dt) for entry in entries)
     found = tuple(spectrum for spectrum in spectra if spectrum is not None)
     if not found:
         raise AnalysisError(
             f"A spectrum of the inputs needs a finished trial, but {env} has none: run the grid."
         )
+    drawn = {spectrum.policy for spectrum in found}
     return InputSpectra(
         env=env,
         policies=found,
         eigenfrequency=mode.frequency / (2 * math.pi) if mode else None,
         gamma=system.gamma,
-        unit=unit_of(system.input_labels[0]),
+        unit=unit_of(system.input_labels[0], ""),
         diverged=tuple(
-            entry.config.policy
-            for entry, spectrum in zip(entries, spectra, strict=True)
-            if spectrum is None and entry.finished
+            one.config.policy for one in entries if one.finished and one.config.policy not in drawn
         ),
     )
-
-
-def unit_of(label: str) -> str:
-    """Return the unit in a label such as ``u [N]``; empty when it has none."""
-    return label[label.index("[") + 1 : label.index("]")] if "[" in label else ""
 
 
 def _spectrum(reader: Reader, entry: Entry, dt: float) -> PolicySpectrum | None:
@@ -132,14 +125,14 @@ def tabulate_spectra(spectra: InputSpectra) -> pd.DataFrame:
     )
 
 
-def spectrum_plot(env: str, name: str) -> Plot[InputSpectra]:
+def spectrum_plot(name: str, env: str) -> Plot[InputSpectra]:
     """Return the spectra of one environment's inputs."""
     return Plot(
         name=name,
         title=f"Spectral density of the inputs, {environment_title(env)}",
         statistic="mean over trials of the one-sided periodogram (boxcar, no detrending)",
         band="10 % to 90 % quantiles over trials of the D-optimal density",
-        part=lambda selection: selection.only([env], SHOWN).compared(),
+        part=lambda selection, _: selection.only([env], SHOWN).compared(),
         measure=lambda reader, selection, _: measure_spectra(reader, selection, env),
         tabulate=tabulate_spectra,
         draw=draw,
@@ -150,13 +143,11 @@ def spectrum_plot(env: str, name: str) -> Plot[InputSpectra]:
 def draw(spectra: InputSpectra) -> Figure:
     """Draw all spectra on logarithmic axes, between the zero and the Nyquist frequency."""
     figure, [[axes]] = sheet(1, 1, HEIGHT, width=COLUMN_WIDTH)
-    axes.set_xscale("log")
     for one in reversed(spectra.policies):
         _line(axes, one)
     log_scale(axes, *_limits(spectra))
     frequency = spectra.policies[0].spectrum.frequency
-    axes.set_xlim(frequency[1], frequency[-2])
-    log_ticks(axes.xaxis, frequency[1], frequency[-2])
+    log_scale(axes, frequency[1], frequency[-2], "x")
     axes.set_xlabel("frequency [Hz]")
     unit = f"({spectra.unit})" if " " in spectra.unit else spectra.unit
     axes.set_ylabel(f"power spectral density of u [{unit}²/Hz]")
@@ -172,15 +163,9 @@ def _line(axes: Axes, one: PolicySpectrum) -> None:
     label = f"{style.label}, mean (n = {but_diverged(spectrum.n, one.n_diverged)})"
     f = spectrum.frequency[INNER]
     if one.policy == REFERENCE:
-        axes.fill_between(
-            f,
-            spectrum.low[INNER],
-            spectrum.high[INNER],
-            color=colour,
-            alpha=0.2,
-            lw=0,
-            label=f"{style.label}, 10–90 % of trials",
-        )
+        ends = f, spectrum.low[INNER], spectrum.high[INNER]
+        label_of_band = f"{style.label}, 10–90 % of trials"
+        axes.fill_between(*ends, color=colour, alpha=0.2, lw=0, label=label_of_band)
     axes.plot(f, spectrum.mean[INNER], color=colour, ls=style.line, lw=style.width, label=label)
 
 
@@ -200,16 +185,9 @@ def _mark(axes: Axes, frequency: float | None) -> None:
     for factor, text in ((1, f"f₀ = {frequency:.3g} Hz"), (3, "3f₀")):
         axes.axvline(factor * frequency, **GUIDE, zorder=1.5)
         axes.annotate(
-            text,
-            (factor * frequency, 0.03),
-            xycoords=("data", "axes fraction"),
-            xytext=(2, 0),
-            textcoords="offset points",
-            rotation=90,
-            fontsize=6.5,
-            va="bottom",
-            ha="left",
-        )
+            text, (factor * frequency, 0.03), xycoords=("data", "axes fraction"), xytext=(2, 0),
+            textcoords="offset points", rotation=90, fontsize=6.5, va="bottom", ha="left",
+        )  # fmt: skip
 
 
 def caption(spectra: InputSpectra) -> str:

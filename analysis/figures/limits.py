@@ -243,7 +243,7 @@ def limits_plot(name: str) -> Plot[Panels]:
         title="States with limits, counted only and enforced",
         statistic="states of single trials; mean over trials of the share of steps beyond a bound",
         band="± 2 standard errors of the mean share (printed)",
-        part=limits_part,
+        part=lambda selection, _: limits_part(selection),
         measure=lambda reader, selection, _: measure_panels(reader, selection),
         tabulate=tabulate_panels,
         draw=draw,

@@ -18,11 +18,13 @@ from analysis.data.selection import policy_rank, why_impossible
 from analysis.figures.panels import (
     Plot,
     blank,
+    half_widths,
     legend_below,
     log_scale,
     look,
     mark_break,
     rows_and_columns,
+    shade,
 )
 from analysis.formatting import count_text
 from analysis.line_styles import GREY, LineStyle, environment_title
@@ -49,7 +51,7 @@ def loss_plot(name: str, column: str) -> Plot[Numbers]:
         title=f"Loss curves ({column})",
         statistic=f"{{centre}} over trials of {column} at every step",
         band="{interval}",
-        part=lambda selection: selection,
+        part=lambda selection, _: selection,
         measure=lambda reader, selection, options: (
             column,
             options,
@@ -118,7 +120,7 @@ def _lines(axes: Axes, curves: Sequence[LossCurve], limits: Limits, spread: Spre
         style, band = curve.style, curve.band
         axes.plot(curve.x, band.centre, **look(style))
         if spread is Spread.BAND:
-            axes.fill_between(curve.x, band.low, band.high, color=style.colour, alpha=0.18, lw=0)
+            shade(axes, curve.x, band, style.colour)
         else:
             _bars(axes, curve, (place + 1) / (len(curves) + 1))
     log_scale(axes, *limits)
@@ -130,8 +132,7 @@ def _bars(axes: Axes, curve: LossCurve, phase: float) -> None:
     steps = len(curve.x)
     shown = np.unique(((np.arange(BARS) + phase) * steps / BARS).astype(int))
     band = curve.band
-    ends = np.array([band.low[shown], band.high[shown]])
-    half = np.nan_to_num(np.abs(ends - band.centre[shown]))
+    half = half_widths(band.centre[shown], band.low[shown], band.high[shown])
     axes.errorbar(
         curve.x[shown], band.centre[shown], half, color=curve.style.colour,
         ls="none", elinewidth=0.8, capsize=1.6, capthick=0.8,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import matplotlib
+import numpy as np
 import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
@@ -123,7 +124,7 @@ class Plot(Generic[N]):
     title: str
     statistic: str
     band: str
-    part: Callable[[Selection], Selection]
+    part: Callable[[Selection, PlotOptions], Selection]
     measure: Callable[[Reader, Selection, PlotOptions], N]
     tabulate: Callable[[N], pd.DataFrame]
     draw: Callable[[N], Figure]
@@ -190,11 +191,21 @@ def mathematical(label: str) -> str:
     return "".join(pieces)
 
 
-def log_scale(axes: Axes, low: float, high: float) -> None:
-    """Make the vertical axis a logarithmic one over [low, high], with readable ticks."""
-    axes.set_yscale("log")
-    axes.set_ylim(low, high)
-    log_ticks(axes.yaxis, low, high)
+def log_scale(axes: Axes, low: float, high: float, axis: str = "y") -> None:
+    """Make an axis, by default the vertical one, logarithmic over [low, high]."""
+    axes.set(**{f"{axis}scale": "log", f"{axis}lim": (low, high)})
+    log_ticks(getattr(axes, f"{axis}axis"), low, high)
+
+
+def half_widths(centre: npt.ArrayLike, low: npt.ArrayLike, high: npt.ArrayLike) -> Any:
+    """Return the lower and upper half of an interval, (2, ...); 0 without an interval."""
+    found = np.stack([np.subtract(centre, low), np.subtract(high, centre)])
+    return np.maximum(0.0, np.nan_to_num(found))
+
+
+def shade(axes: Axes, x: npt.ArrayLike, band: Any, colour: str) -> None:
+    """Fill the interval of a band along x."""
+    axes.fill_between(x, band.low, band.high, color=colour, alpha=0.18, lw=0)
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
@@ -252,15 +263,10 @@ def mark_break(upper: Axes, lower: Axes) -> None:
     """Draw the two slanted strokes between the parts, and leave one time axis."""
     upper.spines["bottom"].set_visible(False)
     upper.tick_params(axis="x", which="both", bottom=False, labelbottom=False)
-    stroke: dict[str, Any] = {
-        "marker": [(-1, -0.6), (1, 0.6)],
-        "ms": 7,
-        "ls": "none",
-        "color": "black",
-        "mew": 0.7,
-    }
-    upper.plot([0], [0], transform=upper.transAxes, clip_on=False, **stroke)
-    lower.plot([0], [1], transform=lower.transAxes, clip_on=False, **stroke)
+    stroke: dict[str, Any] = {"marker": [(-1, -0.6), (1, 0.6)], "ms": 7, "ls": "none"}
+    stroke |= {"color": "black", "mew": 0.7, "clip_on": False}
+    upper.plot([0], [0], transform=upper.transAxes, **stroke)
+    lower.plot([0], [1], transform=lower.transAxes, **stroke)
 
 
 def legend_below(figure: Figure, ncols: int, **options: Any) -> Legend:

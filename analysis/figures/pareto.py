@@ -39,9 +39,9 @@ from analysis.figures.panels import (
     MARKERS,
     TEXT_WIDTH,
     Plot,
+    half_widths,
     legend_below,
     log_scale,
-    log_ticks,
     rows_and_columns,
     sheet,
 )
@@ -284,7 +284,7 @@ def pareto_plot(name: str) -> Plot[Numbers]:
         statistic="geometric mean over trials of the final loss; median over trials of the mean "
         "microseconds of planning and learning in a step",
         band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
-        part=pareto_part,
+        part=lambda selection, _: pareto_part(selection),
         measure=lambda reader, selection, options: (
             options.rule,
             measure_points(reader, selection, options.rule),
@@ -344,7 +344,7 @@ def _panel(
 
 def _dot(axes: Axes, point: Point, colour: str, marker: str) -> None:
     loss = point.loss
-    ends = np.nan_to_num([[loss.value - loss.low], [loss.high - loss.value]])
+    ends = half_widths([loss.value], [loss.low], [loss.high])
     face = "white" if point.n_diverged else colour
     axes.errorbar(
         point.us, loss.value, yerr=ends, fmt=marker, ms=4.2 if point.on_front else 3.4,
@@ -360,9 +360,7 @@ def _limits(axes: Axes, known: Sequence[Point], front: Sequence[Point]) -> None:
     left, right = log_limits(times, margin=1.6)
     low, high = log_limits(np.array(ends).ravel(), margin=1.3)
     low /= 1.2  # for the number of the lowest point
-    axes.set_xscale("log")
-    axes.set_xlim(left, right)
-    log_ticks(axes.xaxis, left, right)
+    log_scale(axes, left, right, "x")
     width, height = _list_share(front)
     above = [
         math.log(min(one.loss.value, one.loss.low))

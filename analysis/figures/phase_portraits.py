@@ -151,14 +151,14 @@ def tabulate_portraits(portraits: Portraits) -> pd.DataFrame:
     )
 
 
-def phase_plot(env: str) -> Plot[Portraits]:
+def phase_plot(name: str, env: str) -> Plot[Portraits]:
     """Return the phase portraits of one environment."""
     return Plot(
-        name=f"figure2_phase_{env}",
+        name=name,
         title=f"Phase portraits, {environment_title(env)}",
         statistic=f"one trajectory per policy: {SEED_RULE}; coverage: mean over trials",
         band="± 2 standard errors of the mean coverage (printed)",
-        part=lambda selection: selection.only([env]).compared(),
+        part=lambda selection, _: selection.only([env]).compared(),
         measure=lambda reader, selection, _: measure_portraits(reader, selection, env),
         tabulate=tabulate_portraits,
         draw=draw,

@@ -16,12 +16,21 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from analysis.data.matching import APART
-from analysis.data.selection import Entry, Selection
-from analysis.figures.panels import GUIDE, TEXT_WIDTH, Plot, legend_below, log_ticks, look, sheet
+from analysis.data.selection import Selection
+from analysis.figures.panels import (
+    GUIDE,
+    TEXT_WIDTH,
+    Plot,
+    legend_below,
+    log_scale,
+    look,
+    shade,
+    sheet,
+)
 from analysis.formatting import but_diverged, count_text
 from analysis.line_styles import LineStyle, environment_title
 from analysis.stats.curves import line_styles
-from analysis.stats.intervals import StratifiedMean, geometric_mean, stratified_mean
+from analysis.stats.intervals import Band, geometric_mean, stratified_mean
 
 Array = npt.NDArray[np.float64]
 
@@ -39,7 +48,7 @@ class Profile:
     ----------
     factors : (T,)
         Factors τ, ascending.
-    share : StratifiedMean
+    share : Band
         Of the runs with a loss of at most τ times the reference's: mean over environments.
     environments : tuple of str
         Those in which both it and the reference have a final loss.
@@ -51,7 +60,7 @@ class Profile:
     style: LineStyle
     reference: str
     factors: Array
-    share: StratifiedMean
+    share: Band
     environments: tuple[str, ...]
     n: int
     n_diverged: int
@@ -83,7 +92,7 @@ def measure_profiles(selection: Selection) -> tuple[Profile, ...]:
             style=styles[label],
             reference=reference,
             factors=factors,
-            share=stratified_mean([_within(part, factors) for part in own.values()]),
+            share=stratified_mean([(p[:, None] <= factors).astype(float) for p in own.values()]),
             environments=tuple(own),
             n=sum(map(len, own.values())),
             n_diverged=sum(int(np.isinf(part).sum()) for part in own.values()),
@@ -93,11 +102,6 @@ def measure_profiles(selection: Selection) -> tuple[Profile, ...]:
     )
 
 
-def _within(ratios: Array, factors: Array) -> Array:
-    """Return 1 where a run (n,) is within a factor (T,), else 0: (n, T)."""
-    return (ratios[:, None] <= factors).astype(float)
-
-
 def _ratios(selection: Selection, label: str) -> dict[str, Array]:
     """Return final loss / the reference's by environment, inf for a trial that diverged."""
     found = {}
@@ -105,13 +109,10 @@ def _ratios(selection: Selection, label: str) -> dict[str, Array]:
         reference = selection.reference_of(entry.config.env)
         if entry.label == label and reference is not None and entry.finished:
             scale = geometric_mean(np.array(list(reference.final_losses().values()))).value
-            found[entry.config.env] = _finals(entry) / scale
+            finals = entry.final_losses()
+            own = [finals.get(trial.seed, np.inf) for trial in entry.finished]
+            found[entry.config.env] = np.array(own) / scale
     return found
-
-
-def _finals(entry: Entry) -> Array:
-    finals = entry.final_losses()
-    return np.array([finals.get(trial.seed, np.inf) for trial in entry.finished])
 
 
 def tabulate_profiles(profiles: tuple[Profile, ...]) -> pd.DataFrame:
@@ -146,7 +147,7 @@ def profiles_plot(name: str) -> Plot[Profiles]:
         statistic="mean over environments of the share of trials whose final loss is within a "
         "factor of the reference's geometric mean",
         band="95 % percentile bootstrap, stratified by environment, pointwise",
-        part=profiles_part,
+        part=lambda selection, _: profiles_part(selection),
         measure=lambda _, selection, __: measure_profiles(selection),
         tabulate=tabulate_profiles,
         draw=draw,
@@ -159,14 +160,9 @@ def draw(profiles: Profiles) -> Figure:
     figure, [[axes]] = sheet(1, 1, HEIGHT, width=TEXT_WIDTH * 0.75)
     for one in reversed(profiles):
         axes.plot(one.factors, one.share.centre, **look(one.style))
-        axes.fill_between(
-            one.factors, one.share.low, one.share.high, color=one.style.colour, alpha=0.18, lw=0
-        )
+        shade(axes, one.factors, one.share, one.style.colour)
     axes.axvline(1.0, **GUIDE)
-    axes.set_xscale("log")
-    limits = float(profiles[0].factors[0]), float(profiles[0].factors[-1])
-    axes.set_xlim(*limits)
-    log_ticks(axes.xaxis, *limits)
+    log_scale(axes, float(profiles[0].factors[0]), float(profiles[0].factors[-1]), "x")
     axes.set_ylim(0, 1.01)
     axes.set_xlabel(f"final loss / geometric mean of {profiles[0].reference}: factor τ")
     axes.set_ylabel("share of runs within the factor")

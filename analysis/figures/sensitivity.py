@@ -16,12 +16,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from analysis.data.matching import nearness
+from analysis.data.matching import differing_paths, nearness
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Entry, Selection, one_each, one_world, policy_rank, unfinished
 from analysis.figures.panels import (
     GUIDE,
     Plot,
+    half_widths,
     legend_below,
     log_scale,
     look,
@@ -119,8 +120,7 @@ def _lines(base: Entry, entries: Sequence[Entry]) -> dict[str, list[Entry]]:
 
 
 def _differences(one: Entry, other: Entry) -> set[str]:
-    a, b = flatten(one.config.config), flatten(other.config.config)
-    paths = {path for path in a.keys() | b.keys() if a.get(path) != b.get(path)}
+    paths = differing_paths([flatten(entry.config.config) for entry in (one, other)])
     return {path for path in paths if not path.startswith(_TASK)}
 
 
@@ -191,7 +191,7 @@ def sensitivity_plot(name: str) -> Plot[Lines]:
         title="Final loss against single settings",
         statistic="geometric mean over trials of the loss after the last step",
         band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
-        part=sensitivity_part,
+        part=lambda selection, _: sensitivity_part(selection),
         measure=lambda reader, selection, options: measure_lines(reader, selection, options.rule),
         tabulate=tabulate_lines,
         draw=draw,
@@ -238,7 +238,7 @@ def _panel(axes: Axes, lines: Sequence[Line]) -> None:
             continue
         y, low, high = np.array([(one.value, one.low, one.high) for one in line.losses]).T
         axes.errorbar(
-            line.values, y, np.nan_to_num([y - low, high - y]), marker="o", ms=3, elinewidth=0.7,
+            line.values, y, half_widths(y, low, high), marker="o", ms=3, elinewidth=0.7,
             capsize=1.5, **look(style),
         )  # fmt: skip
     for usual in {line.usual for line in lines if not math.isnan(line.usual)}:

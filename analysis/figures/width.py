@@ -17,9 +17,9 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.data.matching import REFERENCE, nearness
+from analysis.data.matching import REFERENCE, differing_paths, nearness
 from analysis.data.samples import DivergenceRule, read_sample
-from analysis.data.selection import Entry, Selection
+from analysis.data.selection import Entry, Selection, unfinished
 from analysis.figures.loss_curves import loss_label
 from analysis.figures.panels import (
     COLUMN_WIDTH,
@@ -116,7 +116,8 @@ def width_part(selection: Selection) -> Selection:
     first = max(lines, key=_rank)
     others = [line for line in lines if line is not first and _differ_in_form(line[0], first[0])]
     entries = tuple(entry for line in (first, *others) for entry in line)
-    return Selection(entries, notes=tuple(_unfinished(entries)))
+    notes = unfinished(entries, lambda config: f"{config.env}, width {config.width}")
+    return Selection(entries, notes=tuple(notes))
 
 
 def _lines(entries: Iterable[Entry]) -> list[Line]:
@@ -135,17 +136,8 @@ def _rank(line: Line) -> tuple[int, ...]:
 
 
 def _differ_in_form(one: Entry, other: Entry) -> bool:
-    a, b = flatten(one.config.config), flatten(other.config.config)
-    paths = {path for path in a.keys() | b.keys() if a.get(path) != b.get(path)}
+    paths = differing_paths([flatten(entry.config.config) for entry in (one, other)])
     return paths <= {"policy.form", "model.width"}
-
-
-def _unfinished(entries: Iterable[Entry]) -> Iterable[str]:
-    for entry in entries:
-        missing = len(entry.trials) - len(entry.finished)
-        if missing:
-            config = entry.config
-            yield f"{config.env}, width {config.width}: {missing} trials are not finished"
 
 
 def form_of(entry: Entry) -> str:
@@ -240,7 +232,7 @@ def cost_plot(name: str) -> Plot[WidthCosts]:
         title="Planning cost against width",
         statistic="median over steps and trials of the microseconds of each part of a step",
         band="10 % to 90 % quantiles over steps and trials",
-        part=width_part,
+        part=lambda selection, _: width_part(selection),
         measure=lambda reader, selection, _: measure_costs(reader, selection),
         tabulate=tabulate_costs,
         draw=draw_costs,
@@ -255,7 +247,7 @@ def loss_against_width_plot(name: str) -> Plot[WidthLosses]:
         title="Final loss against width",
         statistic="mean over trials of the loss after the last step",
         band="± 2 standard errors of the mean",
-        part=width_part,
+        part=lambda selection, _: width_part(selection),
         measure=lambda reader, selection, options: measure_losses(reader, selection, options.rule),
         tabulate=tabulate_losses,
         draw=draw_losses,

@@ -24,6 +24,7 @@ from analysis.data.selection import (
     environment_rank,
     labelled,
     policy_rank,
+    unfinished,
 )
 from analysis.formatting import but_diverged, but_lost
 from analysis.stats.intervals import CONFIDENCE, band
@@ -103,8 +104,11 @@ def control_part(selection: Selection) -> Selection:
             [entry for entry in asked if entry.config.env == env], selection.reference
         )
     chosen.sort(key=lambda e: (environment_rank(e.config.env), policy_rank(e.config.policy)))
-    entries, notes = tuple(labelled(chosen)), tuple(_unfinished(chosen))
-    return replace(selection, entries=entries, gaps=(), notes=notes, stored=entries)
+    entries = tuple(labelled(chosen))
+    notes = unfinished(
+        chosen, lambda one: f"{one.env} × {one.policy}", "trials with a task not finished"
+    )
+    return replace(selection, entries=entries, gaps=(), notes=tuple(notes), stored=entries)
 
 
 def _of_one_task(entries: list[Entry], reference: str) -> list[Entry]:
@@ -131,14 +135,6 @@ def task_of(entry: Entry) -> str | None:
     """Return the task by which trials of an entry were assessed, as JSON, None without one."""
     task = entry.config.config.get("task")
     return json.dumps(task, sort_keys=True) if task and entry.final_losses() else None
-
-
-def _unfinished(entries: Iterable[Entry]) -> Iterable[str]:
-    for entry in entries:
-        left = len(entry.trials) - len(entry.finished)
-        if left:
-            config = entry.config
-            yield f"{config.env} × {config.policy}: {left} trials with a task not finished"
 
 
 def measure_control(reader: Reader, selection: Selection) -> tuple[ControlCurve, ...]:

@@ -32,7 +32,7 @@ BAND_RESAMPLES = 1999
 """Draws of a bootstrap band: the 2.5 % quantile is then the 50th smallest."""
 
 MEAN_RESAMPLES = 9999
-"""Draws of a bootstrap of one mean."""
+"""Draws of a bootstrap of one mean, and of means over systems."""
 
 FEWEST_BOOTSTRAP_VALUES = 30
 """Values below which a bootstrap is too narrow (95 % meant, of normal differences: 82 % for 5,
@@ -54,8 +54,6 @@ CONTENT = 0.9
 
 FEWEST = 46
 """Runs below which no two of them hold that share with that confidence."""
-
-RESAMPLES = 9999
 
 
 class Statistic(StrEnum):
@@ -121,17 +119,20 @@ def band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
     """Return the centre of trials (n, T) at each step, with its 95 % interval.
 
     Mean: ± t·SE, t the two-sided Student quantile of n - 1. Median and IQM: percentile bootstrap.
-    All draws come from a stream of their own, so that the band of the same trials is the same.
+    The draws have their own random stream, so that the band of the same trials is the same.
     """
     middle, n = centre(values, statistic), len(values)
     if n < 2:
-        nothing = np.full_like(middle, np.nan)
-        return Band(middle, nothing, nothing, n)
+        return _without_interval(middle, n)
     if statistic is Statistic.MEAN:
         half = student_quantile(n - 1) * standard_error(values)
         return Band(middle, middle - half, middle + half, n)
-    low, high = _bootstrap(values, statistic)
-    return Band(middle, low, high, n)
+    return Band(middle, *_bootstrap(values, statistic), n)
+
+
+def _without_interval(middle: Array, n: int) -> Band:
+    unknown = np.full_like(middle, np.nan)
+    return Band(middle, unknown, unknown, n)
 
 
 def interval_of_mean(values: Array, rng: np.random.Generator) -> tuple[float, float]:
@@ -174,8 +175,13 @@ def _bootstrap(values: Array, statistic: Statistic) -> tuple[Array, Array]:
     for t in range(steps):
         weights = _middle_counts(counts[order[:, t]], first, last)
         found[:, t] = ranked[:, t] @ weights.astype(float) / (last - first)
+    return _ends(found)
+
+
+def _ends(drawn: Array) -> tuple[Array, Array]:
+    """Return the percentile interval of draws (k, ...)."""
     tail = 100 * (1 - CONFIDENCE) / 2
-    low, high = np.percentile(found, [tail, 100 - tail], axis=0)
+    low, high = np.percentile(drawn, [tail, 100 - tail], axis=0)
     return low, high
 
 
@@ -234,11 +240,8 @@ class BandKind(StrEnum):
         """Return the name in a caption, beside a centre."""
         if self is BandKind.CONFIDENCE:
             return statistic.band
-        return (
-            f"tolerance interval, {CONTENT:.0%} of runs with {CONFIDENCE:.0%} confidence".replace(
-                "%", " %"
-            )
-        )
+        content, confidence = (f"{100 * one:.0f} %" for one in (CONTENT, CONFIDENCE))
+        return f"tolerance interval, {content} of runs with {confidence} confidence"
 
 
 def tolerance_band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band:
@@ -249,8 +252,7 @@ def tolerance_band(values: Array, statistic: Statistic = Statistic.MEAN) -> Band
     n = len(values)
     middle, places = centre(values, statistic), tolerance_places(n)
     if places is None:
-        nothing = np.full_like(middle, np.nan)
-        return Band(middle, nothing, nothing, n)
+        return _without_interval(middle, n)
     low, high = np.sort(values, axis=0)[list(places)]
     return Band(middle, low, high, n)
 
@@ -272,38 +274,27 @@ def tolerance_places(n: int) -> tuple[int, int] | None:
     return most - 1, n - most
 
 
-@dataclass(frozen=True)
-class StratifiedMean:
-    """A mean over systems of means over runs with its interval, each (k,)."""
-
-    centre: Array
-    low: Array
-    high: Array
-
-
-def stratified_mean(strata: Sequence[Array]) -> StratifiedMean:
+def stratified_mean(strata: Sequence[Array]) -> Band:
     """Return the mean over S systems of the means over their runs (n_s, k), each n_s at least 1.
 
     The interval of 95 % is a percentile bootstrap, pointwise in k; NaN where a system has one run.
-    The draws have a stream of their own: equal numbers of runs give equal draws.
+    The draws have their own random stream: equal numbers of runs give equal draws.
     """
-    centre = np.mean([np.mean(values, axis=0) for values in strata], axis=0)
+    middle = np.mean([np.mean(values, axis=0) for values in strata], axis=0)
+    n = sum(map(len, strata))
     if min(map(len, strata)) < 2:
-        nothing = np.full_like(centre, np.nan)
-        return StratifiedMean(centre, nothing, nothing)
-    drawn = np.zeros((RESAMPLES, *centre.shape))
+        return _without_interval(middle, n)
+    drawn = np.zeros((MEAN_RESAMPLES, *middle.shape))
     for place, values in enumerate(strata):
         drawn += _weights(len(values), place) @ values / len(strata)
-    tail = 100 * (1 - CONFIDENCE) / 2
-    low, high = np.percentile(drawn, [tail, 100 - tail], axis=0)
-    return StratifiedMean(centre, low, high)
+    return Band(middle, *_ends(drawn), n)
 
 
 @functools.lru_cache(maxsize=8)
 def _weights(n: int, place: int) -> Array:
-    """Return the share that each of n runs of a system has in each draw, (RESAMPLES, n)."""
+    """Return the share that each of n runs of a system has in each draw, (MEAN_RESAMPLES, n)."""
     rng = np.random.default_rng(place)
-    return np.asarray(rng.multinomial(n, np.full(n, 1 / n), size=RESAMPLES) / n)
+    return np.asarray(rng.multinomial(n, np.full(n, 1 / n), size=MEAN_RESAMPLES) / n)
 
 
 @dataclass(frozen=True)

@@ -301,12 +301,12 @@ def aggregate(
 
 def _aggregate_row(variant: str, pairs: list[ScoredPair]) -> dict[str, object]:
     logs = [_log_ratios(own, reference) for own, reference in pairs]
-    mean = stratified_mean(logs)
+    found = stratified_mean(logs)
     return {
         "variant": variant,
         "reference": pairs[0][1].label,
         "systems": ", ".join(own.env for own, _ in pairs),
-        **{name: float(np.exp(getattr(mean, part))) for name, part in _ENDS.items()},
+        **{name: float(np.exp(getattr(found, part))) for name, part in _ENDS.items()},
         "n_pairs": sum(map(len, logs)),
         "n_diverged": sum(own.n_diverged + reference.n_diverged for own, reference in pairs),
     }
