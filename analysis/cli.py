@@ -14,13 +14,13 @@ from pathlib import Path
 import pandas as pd
 
 from analysis import report
+from analysis import serve as browser
 from analysis.data.matching import REFERENCE, Filter, read_condition
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.outputs import NAMES, partial_warning
-from analysis.plot_options import Axis, PlotOptions, Spread, add_workers
-from analysis.serve import command as browser
+from analysis.stats.curves import Axis, PlotOptions, Spread
 from analysis.stats.intervals import BandKind, Statistic
 from analysis.stats.scores import Measure
 from analysis.tables.rendering import (
@@ -31,7 +31,8 @@ from analysis.tables.rendering import (
     comparison,
     incomplete,
 )
-from orchestrate.program import Parser, answered, path, positive, tell
+from dopt.process import usable_cores
+from orchestrate.program import Parser, UsageError, answered, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
 COLUMNS = ("loss", "reachable_loss")
@@ -80,7 +81,10 @@ def parser() -> Parser:
         help="intervals of figure 1: of the centre, or what holds 90 %% of the runs",
     )
     figures.add_argument("--force", action="store_true", help="draw again what is unchanged")
-    add_workers(figures, "outputs")
+    cores = usable_cores()
+    figures.add_argument(
+        "--workers", type=_workers, default=cores, help="outputs at a time (one for each core)"
+    )
     summary = _command(commands, "summary", _table, "mean final losses ± 2 SE, n")
     compare = _command(commands, "compare", _table, "every variant against the reference, paired")
     compare.add_argument("--column", choices=COLUMNS, default="loss", help="which loss")
@@ -140,6 +144,12 @@ def parser() -> Parser:
     serve.set_defaults(alone=browser.run)
     browser.add_arguments(serve)
     return top
+
+
+def _workers(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise UsageError(f"--workers is {text}, but at least 1 is expected: give a whole number.")
+    return int(text)
 
 
 def _command(
@@ -241,7 +251,7 @@ def _figures(reader: Reader, selection: Selection, options: argparse.Namespace) 
 
 def _animate(options: argparse.Namespace) -> int:
     from analysis import film  # Matplotlib: other commands do without it
-    from analysis.stats.trajectories import median_seed
+    from analysis.stats.curves import median_seed
 
     name = f"{options.env}_{options.policy}.gif".replace("/", "_")
     target = options.out or Path("figures") / name

@@ -19,10 +19,8 @@ from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
 from analysis.figures.loss_curves import loss_label
 from analysis.figures.panels import angle_ticks, log_ticks, mathematical, styled
-from analysis.formatting import loss_unit
-from analysis.line_styles import BLACK, GREY, environment_title, policy_style
-from analysis.stats.curves import log_limits
-from analysis.stats.trajectories import DrawnPlane
+from analysis.stats.curves import DrawnPlane, log_limits
+from analysis.style import BLACK, GREY, environment_title, loss_unit, policy_style
 from dopt.geometry import body
 from dopt.run import rerun
 from dopt.systems import System

@@ -29,7 +29,7 @@ import pandas as pd
 
 from analysis.data.selection import Selection
 from analysis.errors import AnalysisError
-from analysis.plot_options import PlotOptions
+from analysis.stats.curves import PlotOptions
 from analysis.tables.rendering import TABLES
 from dopt import __version__
 from orchestrate.files import make_folder, whole

@@ -17,17 +17,17 @@ import pandas as pd
 from analysis import outputs
 from analysis.data.matching import Filter
 from analysis.data.selection import Gap, Selection
-from analysis.formatting import (
+from analysis.stats.intervals import STUDENT_RANGE
+from analysis.style import (
     but_diverged,
     but_lost,
+    environment_title,
     number,
     p_text,
     share,
     steps_text,
     within,
 )
-from analysis.line_styles import environment_title
-from analysis.stats.intervals import STUDENT_RANGE
 from analysis.tables.rendering import (
     Columns,
     Row,

@@ -19,9 +19,9 @@ from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from analysis.formatting import number, plus_minus, share, within
 from analysis.stats.intervals import band, standard_error
 from analysis.stats.scores import compare
+from analysis.style import number, plus_minus, share, within
 from docs import code_tables
 from docs.code_tables import markdown
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
-from analysis.formatting import of_finished
+from analysis.style import of_finished
 from dopt.limits import VIOLATIONS, limits_from
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System

@@ -23,10 +23,9 @@ from analysis.figures.panels import (
     look,
     sheet,
 )
-from analysis.formatting import count_text, share
-from analysis.line_styles import environment_title, policy_style, text_by_environment
 from analysis.stats.control import ControlCurve, control_part, measure_control, tabulate_control
 from analysis.stats.curves import log_limits
+from analysis.style import count_text, environment_title, policy_style, share, text_by_environment
 
 ROW_HEIGHT = 1.9
 LEGEND_HEIGHT = 0.5

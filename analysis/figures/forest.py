@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from analysis.data.matching import APART
 from analysis.figures.panels import TEXT_WIDTH, half_widths, log_ticks, sheet
-from analysis.line_styles import BLUE, GREY, VERMILLION
+from analysis.style import BLUE, GREY, VERMILLION
 from analysis.tables.rendering import records
 from analysis.tables.variants import verdict
 

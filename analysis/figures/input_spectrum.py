@@ -21,9 +21,8 @@ from analysis.figures.panels import (
     log_scale,
     sheet,
 )
-from analysis.formatting import but_diverged, count_text, unit_of
-from analysis.line_styles import environment_title, policy_style
-from analysis.stats.trajectories import Spectrum, average_spectrum
+from analysis.stats.curves import Spectrum, average_spectrum
+from analysis.style import but_diverged, count_text, environment_title, policy_style, unit_of
 from dopt.spec.trial import system_of
 from dopt.systems.properties import eigenmode
 from orchestrate.store import Reader

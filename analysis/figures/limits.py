@@ -30,9 +30,8 @@ from analysis.data.selection import (
     unfinished,
 )
 from analysis.figures.panels import GUIDE, Plot, legend_below, mathematical, sheet
-from analysis.formatting import but_diverged, plus_minus
-from analysis.line_styles import BLUE, GREY, environment_title
 from analysis.stats.intervals import mean, standard_error
+from analysis.style import BLUE, GREY, but_diverged, environment_title, plus_minus
 from dopt.policies import policy_title
 from dopt.spec.label import flatten
 from dopt.spec.trial import system_of

@@ -26,11 +26,18 @@ from analysis.figures.panels import (
     rows_and_columns,
     shade,
 )
-from analysis.formatting import count_text
-from analysis.line_styles import GREY, LineStyle, environment_title
-from analysis.plot_options import Axis, PlotOptions, Spread
-from analysis.stats.curves import Limits, LossCurve, axis_parts, measure_curves, tabulate_curves
+from analysis.stats.curves import (
+    Axis,
+    Limits,
+    LossCurve,
+    PlotOptions,
+    Spread,
+    axis_parts,
+    measure_curves,
+    tabulate_curves,
+)
 from analysis.stats.intervals import FEWEST, BandKind
+from analysis.style import GREY, LineStyle, count_text, environment_title
 from dopt.policies import policy_title
 
 PANEL_HEIGHT = 2.3

@@ -29,8 +29,8 @@ from matplotlib.ticker import (
 )
 
 from analysis.data.selection import Selection
-from analysis.line_styles import LineStyle
-from analysis.plot_options import PlotOptions
+from analysis.stats.curves import PlotOptions
+from analysis.style import LineStyle
 from orchestrate.store import Reader
 
 N = TypeVar("N")

@@ -45,18 +45,19 @@ from analysis.figures.panels import (
     rows_and_columns,
     sheet,
 )
-from analysis.formatting import count_text, loss_unit
-from analysis.line_styles import (
-    BLACK,
-    GREY,
-    SEQUENCE,
-    environment_title,
-    policy_style,
-    text_by_environment,
-)
 from analysis.stats.curves import log_limits
 from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
 from analysis.stats.scores import final_losses, on_front
+from analysis.style import (
+    BLACK,
+    GREY,
+    SEQUENCE,
+    count_text,
+    environment_title,
+    loss_unit,
+    policy_style,
+    text_by_environment,
+)
 from dopt.spec.trial import system_of
 from orchestrate.store import Reader
 

@@ -26,10 +26,9 @@ from analysis.figures.panels import (
     rows_and_columns,
     sheet,
 )
-from analysis.formatting import but_diverged, plus_minus
-from analysis.line_styles import BLACK, environment_title, policy_style
+from analysis.stats.curves import DrawnPlane, median_seed
 from analysis.stats.intervals import mean, standard_error
-from analysis.stats.trajectories import DrawnPlane, median_seed
+from analysis.style import BLACK, but_diverged, environment_title, plus_minus, policy_style
 from dopt.assessment import CELLS
 from dopt.spec.trial import system_of
 from orchestrate.store import Reader

@@ -27,10 +27,9 @@ from analysis.figures.panels import (
     shade,
     sheet,
 )
-from analysis.formatting import but_diverged, count_text
-from analysis.line_styles import LineStyle, environment_title
 from analysis.stats.curves import line_styles
 from analysis.stats.intervals import Band, geometric_mean, stratified_mean
+from analysis.style import LineStyle, but_diverged, count_text, environment_title
 
 Array = npt.NDArray[np.float64]
 

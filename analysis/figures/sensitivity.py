@@ -29,11 +29,16 @@ from analysis.figures.panels import (
     sheet,
     value_ticks,
 )
-from analysis.formatting import count_text, loss_unit
-from analysis.line_styles import environment_title, policy_style, text_by_environment
 from analysis.stats.curves import log_limits
 from analysis.stats.intervals import STUDENT_RANGE, Estimate, geometric_mean
 from analysis.stats.scores import Scores, final_losses
+from analysis.style import (
+    count_text,
+    environment_title,
+    loss_unit,
+    policy_style,
+    text_by_environment,
+)
 from dopt.policies import policy_title
 from dopt.spec.label import flatten, value_label
 from dopt.spec.trial import system_of

@@ -30,11 +30,19 @@ from analysis.figures.panels import (
     sheet,
     value_ticks,
 )
-from analysis.formatting import count_text, loss_unit
-from analysis.line_styles import BLUE, GREEN, GREY, VERMILLION, environment_title, policy_style
 from analysis.stats.curves import log_limits
 from analysis.stats.intervals import mean, standard_error
 from analysis.stats.scores import final_losses
+from analysis.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    VERMILLION,
+    count_text,
+    environment_title,
+    loss_unit,
+    policy_style,
+)
 from dopt.spec.label import flatten
 from dopt.spec.trial import system_of
 from orchestrate.store import Reader

@@ -23,14 +23,15 @@ from starlette.staticfiles import StaticFiles
 
 from analysis.serve import is_loopback, pages, sql
 from analysis.serve.server import LONGEST_QUERY, SecurityMiddleware
-from analysis.serve.state import Database, ServerState
 from analysis.serve.web import (
     FOLDER,
     BusyError,
+    Database,
     ForbiddenError,
     NotFoundError,
     QueryParams,
     RequestError,
+    ServerState,
     as_csv,
     as_json,
     as_page,

@@ -18,13 +18,19 @@ from analysis.data.matching import latest
 from analysis.data.samples import DivergenceRule, bounded_states
 from analysis.data.selection import Selection, absent_pairs, environment_rank, policy_rank
 from analysis.errors import AnalysisError
-from analysis.line_styles import policy_style
-from analysis.plot_options import Axis, PlotOptions
-from analysis.serve.state import ServerState, read_progress
-from analysis.serve.web import NotFoundError, QueryParams, truncated
-from analysis.stats.curves import LossCurve, axis_parts, measure_curves, tabulate_curves
+from analysis.serve.web import NotFoundError, QueryParams, ServerState, read_progress, truncated
+from analysis.stats.curves import (
+    Axis,
+    DrawnPlane,
+    LossCurve,
+    PlotOptions,
+    axis_parts,
+    measure_curves,
+    periodogram,
+    tabulate_curves,
+)
 from analysis.stats.intervals import mean, standard_error
-from analysis.stats.trajectories import DrawnPlane, periodogram
+from analysis.style import policy_style
 from dopt.errors import SpecificationError
 from dopt.spec.config import completed
 from dopt.spec.label import flatten, labels

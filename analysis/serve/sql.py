@@ -16,8 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from analysis.serve.state import ServerState
-from analysis.serve.web import BusyError, ForbiddenError, QueryParams
+from analysis.serve.web import BusyError, ForbiddenError, QueryParams, ServerState
 from orchestrate.store import READ_VARIABLE, Table
 from orchestrate.store.errors import QueryError
 

@@ -1,25 +1,36 @@
-"""Requests and answers: query parameters, errors, and content as JSON, CSV or an HTML page."""
+"""Requests, answers and state: query parameters, errors, pages, database, caches, events."""
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from decimal import Decimal
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from starlette.responses import HTMLResponse, Response
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response, StreamingResponse
 
 from analysis.data.matching import Filter, read_condition
+from analysis.data.selection import Selection, select
 from analysis.errors import AnalysisError
-from analysis.formatting import number, plus_minus
-from analysis.line_styles import environment_title
-from dopt.errors import suggestion
+from analysis.style import environment_title, number, plus_minus
+from dopt.errors import DoptError, suggestion
+from orchestrate.store import Reader
+from orchestrate.store.database_url import parse, read_login, safe, sqlite_path
 
 E = TypeVar("E", bound=StrEnum)
 
@@ -201,3 +212,209 @@ _pages.filters.update(
     title=environment_title,
     exact=lambda value: f"{value:.10g}",
 )
+
+
+PERIOD = 1.0
+"""Least time between two readings of the progress [s]; a reading may take a tenth of it."""
+
+SILENCE = 15.0
+"""Time after which an unchanged stream sends a comment [s], so that nobody takes it for dead."""
+
+COMMENT = ": nothing new\n\n"
+MEDIA_TYPE = "text/event-stream"
+
+_TRIALS = """
+SELECT status, count(*) AS n, sum(attempt) AS attempts, sum(coalesce(n_steps, 0)) AS steps
+FROM trial GROUP BY status ORDER BY status
+"""
+_LAUNCHES = """
+SELECT count(*) AS n, max(launch_id) AS newest, count(*) FILTER (WHERE state = 'running') AS running
+FROM launch
+"""
+
+T = TypeVar("T")
+Identity = tuple[int, int] | None
+
+
+class Database:
+    """Access to the database at a URL, which may be missing, created later or replaced."""
+
+    def __init__(self, url: str) -> None:
+        parsed = parse(url)
+        self.safe_url = safe(parsed)
+        self._url = url
+        self.is_file = parsed.get_backend_name() != "postgresql"
+        self.user = parsed.username
+        self.read_login = read_login(parsed)
+        self._path = sqlite_path(parsed) if parsed.get_backend_name() == "sqlite" else None
+        self._lock = threading.Lock()
+        self._reader: Reader | None = None
+        self._identity: Identity = None
+
+    def reader(self) -> Reader:
+        """Return a reader; raise ``StoreError`` for a missing database or another schema."""
+        with self._lock:
+            identity = self._file()
+            if self._reader is None or identity != self._identity:
+                self.close()
+                self._reader = Reader.open(self._url)
+                self._identity = identity
+            return self._reader
+
+    def close(self) -> None:
+        """Close the connections."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def _file(self) -> Identity:
+        """Return device and inode of the database file; None without one or on PostgreSQL."""
+        if self._path is None:
+            return None
+        try:
+            found = self._path.stat()
+        except OSError:
+            self.close()
+            return None
+        return found.st_dev, found.st_ino
+
+
+class Cache:
+    """Thread-safe cache that drops the least recently used entry beyond ``size`` entries.
+
+    A key contains everything that its value depends on, such as the finished trials of a
+    configuration, so a cached value is never stale. Two threads may compute one value concurrently.
+    """
+
+    def __init__(self, size: int = 1024) -> None:
+        self._size = size
+        self._lock = threading.Lock()
+        self._values: OrderedDict[Hashable, object] = OrderedDict()
+
+    def get_or_compute(self, key: Hashable, compute: Callable[[], T]) -> T:
+        """Return the value of a key; compute it when it is not cached."""
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return cast("T", self._values[key])
+        value = compute()
+        with self._lock:
+            self._values[key] = value
+            while len(self._values) > self._size:
+                self._values.popitem(last=False)
+        return value
+
+
+def read_progress(reader: Reader) -> dict[str, Any]:
+    """Return the counts of trials by status, and a token that changes when a trial changes."""
+    trials = [[row.status, *map(int, row[1:])] for row in reader.rows(_TRIALS)]
+    (launches,) = reader.rows(_LAUNCHES)
+    counts = {status: n for status, n, *_ in trials}
+    content = json.dumps([trials, list(launches)])
+    return {
+        "token": hashlib.sha256(content.encode()).hexdigest()[:16],
+        "counts": counts,
+        "total": sum(counts.values()),
+        "ended": sum(n for status, n in counts.items() if status not in ("pending", "running")),
+        "launches_running": int(launches.running),
+    }
+
+
+@dataclass
+class Events:
+    """Progress of the database, read once a second for all streams together while one is open."""
+
+    database: Database
+    _latest: str = ""
+    _n_open: int = 0
+    ended: bool = False
+    _reading: asyncio.Task[None] | None = None
+    _changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def stream(self) -> AsyncIterator[str]:
+        """Yield the progress, and again after every change, until the server ends."""
+        self._n_open += 1
+        if self._reading is None:
+            self._reading = asyncio.create_task(self._read())
+        try:
+            sent = ""
+            while not self.ended:
+                if self._latest == sent and not await self._change():
+                    yield COMMENT
+                elif self._latest != sent:
+                    sent = self._latest
+                    yield sent
+        finally:
+            self._n_open -= 1
+            if not self._n_open:
+                self._reading.cancel()
+                self._reading, self._latest = None, ""
+
+    def end(self) -> None:
+        """End all streams, now and later."""
+        self.ended = True
+        self._tell()
+
+    def respond(self, request: Request) -> Response:
+        """Return the stream."""
+        if request.method == "HEAD":
+            return Response(media_type=MEDIA_TYPE)
+        return StreamingResponse(self.stream(), media_type=MEDIA_TYPE)
+
+    async def _change(self) -> bool:
+        """Wait for the next change; return whether it came. Raises what the reading raised."""
+        assert self._reading
+        change = asyncio.ensure_future(self._changed.wait())
+        done, _ = await asyncio.wait(
+            [change, self._reading], timeout=SILENCE, return_when=asyncio.FIRST_COMPLETED
+        )
+        change.cancel()
+        if self._reading in done:
+            await self._reading
+        return bool(done)
+
+    async def _read(self) -> None:
+        while True:
+            start = time.monotonic()
+            latest = await asyncio.to_thread(self._event)
+            if latest != self._latest:
+                self._latest = latest
+                self._tell()
+            await asyncio.sleep(max(PERIOD, 10 * (time.monotonic() - start)))
+
+    def _tell(self) -> None:
+        """Wake all streams."""
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    def _event(self) -> str:
+        """Return the event ``progress``, or ``unavailable`` for a database that has none."""
+        try:
+            name, content = "progress", read_progress(self.database.reader())
+        except DoptError as error:
+            name, content = "unavailable", {"error": str(error)}
+        return f"event: {name}\ndata: {json.dumps(content)}\n\n"
+
+
+@dataclass(frozen=True)
+class ServerState:
+    """The database with its event stream, and caches of computed values.
+
+    ``exposed``: other machines reach the server. ``token``: secret of this process's forms.
+    """
+
+    database: Database
+    exposed: bool = False
+    token: str = field(default_factory=secrets.token_urlsafe)
+    cache: Cache = field(default_factory=Cache)
+    selections: Cache = field(default_factory=lambda: Cache(6))  # each contains all its trials
+
+    @cached_property
+    def events(self) -> Events:
+        """The event stream of the database."""
+        return Events(self.database)
+
+    def select(self, reader: Reader, wanted: Filter) -> Selection:
+        """Return the requested trials; they are read again after any trial changed."""
+        key = ("selection", reader, read_progress(reader)["token"], repr(wanted))
+        return self.selections.get_or_compute(key, lambda: select(reader, wanted))

@@ -26,9 +26,9 @@ from analysis.data.selection import (
     policy_rank,
     unfinished,
 )
-from analysis.formatting import but_diverged, but_lost
 from analysis.stats.intervals import CONFIDENCE, band
 from analysis.stats.scores import Scores
+from analysis.style import but_diverged, but_lost
 from orchestrate.store import Assessments, Reader
 
 Array = npt.NDArray[np.float64]

@@ -1,24 +1,65 @@
-"""Loss curves as numbers: mean loss over trials with its interval at each step; limits of axes."""
+"""Loss curves, phase-plane lines and input spectra as numbers; the options of figures."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import check_keys, setting_value
-from analysis.data.samples import Sample, read_sample
+from analysis.data.samples import DivergenceRule, Sample, read_sample
 from analysis.data.selection import Entry, Selection
-from analysis.formatting import loss_unit
-from analysis.line_styles import LineStyle, policy_style, sequence_style
-from analysis.plot_options import Axis, PlotOptions
 from analysis.stats.intervals import Band, BandKind, Statistic, band, tolerance_band
+from analysis.style import LineStyle, loss_unit, policy_style, sequence_style
+from dopt.assessment import TURN, Plane, turns, wrap
 from dopt.spec.trial import is_prequential, system_of
 from orchestrate.store import Reader
+
+
+class Axis(StrEnum):
+    """What the horizontal axis counts."""
+
+    STEPS = "steps"
+    SECONDS = "seconds"
+
+
+class Spread(StrEnum):
+    """Drawing of the interval of a loss curve: a band over all steps, or bars at a few."""
+
+    BAND = "band"
+    ERRORBAR = "errorbar"
+
+
+@dataclass(frozen=True)
+class PlotOptions:
+    """Options of the plots; ``epsilon`` is the loss of the comparison of steps, None the default's.
+
+    ``axis``, ``statistic``, ``spread`` and ``color_by``, the setting whose values have a colour
+    each, and ``band``, what the intervals are of, belong to the loss curves.
+    """
+
+    rule: DivergenceRule = DivergenceRule.EXCLUDE
+    axis: Axis = Axis.STEPS
+    statistic: Statistic = Statistic.MEAN
+    spread: Spread = Spread.BAND
+    epsilon: float | None = None
+    color_by: str | None = None
+    band: BandKind = BandKind.CONFIDENCE
+
+    @property
+    def interval(self) -> str:
+        """Return the name of the intervals of the loss curves."""
+        return self.band.label(self.statistic)
+
+    def as_dict(self) -> dict[str, str]:
+        return {key: str(value) for key, value in asdict(self).items()}
+
 
 Array = npt.NDArray[np.float64]
 Limits = tuple[float, float]
@@ -166,3 +207,90 @@ def tabulate_curves(curves: Iterable[LossCurve]) -> pd.DataFrame:
         for curve in curves
     ]
     return pd.concat(map(pd.DataFrame, tables), ignore_index=True)
+
+
+Array = npt.NDArray[np.float64]
+QUANTILES = (0.1, 0.9)
+
+
+def wrapped_line(line: Array, axis: int, centre: float = 0.0) -> Array:
+    """Wrap one coordinate of a line, (n, 2) -> (n', 2), and break the line where it jumps.
+
+    Where the angle leaves on one side and comes back on the other, the line is drawn up to the
+    edge, a row of NaN breaks it, and it goes on from the opposite edge. A step of more than one
+    turn is a break without edges: between the two samples nothing is known.
+    """
+    count = turns(line[:, axis], centre)
+    pieces = [_wrapped(line[:1], axis, centre)]
+    for before, after, jump in zip(line[:-1], line[1:], np.diff(count), strict=True):
+        if jump:
+            pieces.append(_crossing(before, after, axis, centre, jump))
+        pieces.append(_wrapped(after[None], axis, centre))
+    return np.concatenate(pieces)
+
+
+def _wrapped(line: Array, axis: int, centre: float) -> Array:
+    inside = line.copy()
+    inside[:, axis] = wrap(line[:, axis], centre)
+    return inside
+
+
+def _crossing(before: Array, after: Array, axis: int, centre: float, jump: float) -> Array:
+    """Return the rows edge, NaN, opposite edge between two samples (2,) on different turns."""
+    gap = np.full((1, 2), np.nan)
+    if abs(jump) != 1:
+        return gap
+    edge = centre + math.pi + TURN * float(turns(before[axis], centre) - (jump < 0))
+    share = (edge - before[axis]) / (after[axis] - before[axis])
+    leaving, entering = (before + share * (after - before) for _ in range(2))
+    leaving[axis], entering[axis] = centre + jump * math.pi, centre - jump * math.pi
+    return np.concatenate([leaving[None], gap, entering[None]])
+
+
+class DrawnPlane(Plane):
+    """A phase plane and the lines in it."""
+
+    def line(self, points: Array) -> Array:
+        """Return the line to draw through points (n, 2)."""
+        for axis in range(2):
+            if self.angles[axis]:
+                points = wrapped_line(points, axis, self.centres[axis])
+        return points
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Mean over trials and the 10 % and 90 % quantiles across them, each (F,)."""
+
+    frequency: Array
+    mean: Array
+    low: Array
+    high: Array
+    n: int
+
+
+def periodogram(inputs: Array, dt: float) -> tuple[Array, Array]:
+    """Return f [Hz] and S [unit² / Hz] of inputs (n, T, m) sampled every dt seconds.
+
+    Neither window nor detrending: the sum of S times the spacing of f is the mean square of u
+    (Parseval).
+    """
+    from scipy import signal  # its import takes longer than most commands
+
+    frequency, density = signal.periodogram(
+        inputs, fs=1 / dt, window="boxcar", detrend=False, scaling="density", axis=1
+    )
+    return np.asarray(frequency, dtype=float), np.asarray(density, dtype=float).sum(axis=2)
+
+
+def average_spectrum(inputs: Array, dt: float) -> Spectrum:
+    """Return mean and quantiles over trials of the periodograms of inputs (n, T, m)."""
+    frequency, density = periodogram(inputs, dt)
+    low, high = np.quantile(density, QUANTILES, axis=0)
+    return Spectrum(frequency, np.mean(density, axis=0), low, high, len(density))
+
+
+def median_seed(losses: dict[int, float]) -> int:
+    """Return the seed with the median loss, the lower one of two; ties go to the lower seed."""
+    ranked = sorted(losses, key=lambda seed: (losses[seed], seed))
+    return ranked[(len(ranked) - 1) // 2]

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from analysis.data.samples import DivergenceRule, read_sample
 from analysis.data.selection import Entry
-from analysis.formatting import of_finished
 from analysis.stats.intervals import interval_of_mean
+from analysis.style import of_finished
 from orchestrate.store import Reader
 
 Array = npt.NDArray[np.float64]

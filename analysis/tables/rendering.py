@@ -15,7 +15,11 @@ from tabulate import tabulate
 from analysis.data.samples import learned_model
 from analysis.data.selection import Entry, Gap, Selection
 from analysis.errors import AnalysisError, IncompleteError
-from analysis.formatting import (
+from analysis.stats.control import control_part
+from analysis.stats.curves import PlotOptions
+from analysis.stats.intervals import STUDENT_RANGE
+from analysis.stats.scores import Measure
+from analysis.style import (
     but_diverged,
     but_lost,
     number,
@@ -25,10 +29,6 @@ from analysis.formatting import (
     steps_text,
     within,
 )
-from analysis.plot_options import PlotOptions
-from analysis.stats.control import control_part
-from analysis.stats.intervals import STUDENT_RANGE
-from analysis.stats.scores import Measure
 from analysis.tables.comparisons import (
     EPSILON_POLICY,
     aggregate,

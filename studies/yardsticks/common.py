@@ -25,8 +25,8 @@ import pandas as pd
 from analysis.data.matching import latest
 from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
-from analysis.formatting import within
 from analysis.stats.intervals import CONFIDENCE
+from analysis.style import within
 from analysis.tables.comparisons import against_reference
 from orchestrate.store import ConfigRow, Reader
 

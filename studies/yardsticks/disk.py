@@ -12,7 +12,7 @@ import pandas as pd
 from analysis.data.matching import Filter
 from analysis.data.samples import learned_model, violation_shares
 from analysis.data.selection import Entry, policy_rank
-from analysis.formatting import within
+from analysis.style import within
 from analysis.tables.rendering import TextTable
 from dopt.assessment import model_forecast
 from dopt.control.planning import forecast_by_equations

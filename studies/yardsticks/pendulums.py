@@ -11,8 +11,8 @@ import pandas as pd
 from analysis.data.matching import Filter
 from analysis.data.samples import read_curves
 from analysis.data.selection import Entry, policy_rank
-from analysis.formatting import steps_text, within
 from analysis.stats.scores import last_passage
+from analysis.style import steps_text, within
 from analysis.tables.rendering import TextTable
 from dopt.assessment import loss_by_parameter_error
 from dopt.spec.trial import system_of

@@ -11,7 +11,7 @@ import pandas as pd
 from analysis.data.matching import Filter
 from analysis.data.samples import learned_model
 from analysis.data.selection import Entry, policy_rank
-from analysis.formatting import within
+from analysis.style import within
 from analysis.tables.rendering import TextTable
 from dopt.assessment import parameter_error
 from dopt.models import GreyBox

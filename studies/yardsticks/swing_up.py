@@ -10,13 +10,13 @@ import pandas as pd
 
 from analysis.data.matching import Filter
 from analysis.data.selection import Entry, environment_rank, policy_rank
-from analysis.formatting import p_text, share, steps_text
 from analysis.stats.scores import (
     benjamini_hochberg,
     compare_hitting_times,
     first_passage,
     last_passage,
 )
+from analysis.style import p_text, share, steps_text
 from analysis.tables.comparisons import paired
 from analysis.tables.rendering import TextTable
 from dopt.systems import Cartpole, Pendulum

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from analysis.cli import main
-from analysis.serve.state import Cache
-from analysis.serve.web import loss_text, plain
+from analysis.serve.web import Cache, loss_text, plain
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, expect
 
-from analysis.serve import state
-from analysis.serve.state import Database, Events, read_progress
+from analysis.serve import web
+from analysis.serve.web import Database, Events, read_progress
 from orchestrate.store import Store
 from tests.analysis.browser import chromium, grids
 from tests.analysis.synthetic import fake_result, make_grid
@@ -89,8 +89,8 @@ def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.Mon
         readings.append(time.monotonic())
         return read_progress(reader) | {"n": len(readings)}
 
-    monkeypatch.setattr(state, "read_progress", read)
-    monkeypatch.setattr(state, "PERIOD", 0.05)
+    monkeypatch.setattr(web, "read_progress", read)
+    monkeypatch.setattr(web, "PERIOD", 0.05)
 
     async def follow(stream: AsyncIterator[str]) -> int:
         return len([await anext(stream) for _ in range(5)])
@@ -112,7 +112,7 @@ def test_all_streams_share_one_reading(sqlite_grid: str, monkeypatch: pytest.Mon
 def test_a_silent_stream_says_that_it_is_alive(
     sqlite_grid: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(state, "SILENCE", 0.05)
+    monkeypatch.setattr(web, "SILENCE", 0.05)
 
     async def follow() -> list[str]:
         shared = Events(Database(sqlite_grid))
@@ -122,13 +122,13 @@ def test_a_silent_stream_says_that_it_is_alive(
         return said + [text async for text in shared.stream()]
 
     said = run(follow())
-    assert state.COMMENT in said
+    assert web.COMMENT in said
     assert sum(text.startswith("event: progress") for text in said) == 1
     assert len(said) == 20, "a stream that is opened after the end ends at once"
 
 
 def test_a_defect_ends_the_stream(sqlite_grid: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(state, "read_progress", lambda _: {}["no such entry"])
+    monkeypatch.setattr(web, "read_progress", lambda _: {}["no such entry"])
 
     async def follow() -> None:
         async for _ in Events(Database(sqlite_grid)).stream():

@@ -13,8 +13,7 @@ from starlette.testclient import TestClient
 from analysis.data.matching import Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import select
-from analysis.plot_options import Axis
-from analysis.stats.curves import measure_curves, tabulate_curves
+from analysis.stats.curves import Axis, measure_curves, tabulate_curves
 from analysis.tables.comparisons import summarise
 from orchestrate.store import Reader
 

@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 
 from analysis.serve import sql
 from analysis.serve.app import create_app
-from analysis.serve.state import Database, ServerState
+from analysis.serve.web import Database, ServerState
 from orchestrate.store import Store
 from tests.analysis.browser import grids
 from tests.analysis.browser.conftest import BASE

@@ -10,8 +10,7 @@ from analysis.data.samples import DivergenceRule
 from analysis.data.selection import select
 from analysis.figures.input_spectrum import measure_spectra, tabulate_spectra
 from analysis.figures.phase_portraits import measure_portraits, tabulate_portraits
-from analysis.plot_options import PlotOptions
-from analysis.stats.curves import measure_curves, tabulate_curves
+from analysis.stats.curves import PlotOptions, measure_curves, tabulate_curves
 from analysis.stats.intervals import Statistic
 from analysis.tables.rendering import TABLES
 from orchestrate.store import Reader

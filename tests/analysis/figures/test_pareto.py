@@ -22,7 +22,7 @@ from analysis.figures.pareto import (
     policies_of,
     policy_colours,
 )
-from analysis.plot_options import PlotOptions
+from analysis.stats.curves import PlotOptions
 from analysis.stats.intervals import Estimate
 from analysis.stats.scores import on_front
 from dopt.result import TrialResult

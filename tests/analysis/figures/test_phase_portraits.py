@@ -9,7 +9,7 @@ from analysis.data.matching import Filter
 from analysis.data.selection import select
 from analysis.errors import AnalysisError
 from analysis.figures.phase_portraits import measure_portraits, tabulate_portraits
-from analysis.stats.trajectories import median_seed
+from analysis.stats.curves import median_seed
 from dopt.assessment import Plane
 from dopt.systems import SYSTEMS
 from orchestrate.store import Reader

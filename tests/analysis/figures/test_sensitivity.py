@@ -18,7 +18,7 @@ from analysis.figures.sensitivity import (
     sensitivity_part,
     sensitivity_plot,
 )
-from analysis.plot_options import PlotOptions
+from analysis.stats.curves import PlotOptions
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT
 from tests.analysis.synthetic import fill, make_grid

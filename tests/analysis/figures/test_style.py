@@ -18,8 +18,8 @@ from analysis.figures.panels import (
     rows_and_columns,
     styled,
 )
-from analysis.line_styles import SEQUENCE, policy_style, sequence_style
 from analysis.stats.curves import log_limits
+from analysis.style import SEQUENCE, policy_style, sequence_style
 from dopt.policies import POLICIES
 from orchestrate.config.options import option_names
 

@@ -17,7 +17,7 @@ from analysis.figures.width import (
     width_part,
 )
 from analysis.outputs import build
-from analysis.plot_options import PlotOptions
+from analysis.stats.curves import PlotOptions
 from dopt.spec.trial import TrialSpec
 from orchestrate.store import Reader
 from tests.analysis.conftest import SHORT, wide

@@ -24,7 +24,7 @@ from analysis.figures.input_spectrum import spectrum_plot
 from analysis.figures.loss_curves import _title, loss_plot
 from analysis.figures.phase_portraits import Portrait, coverage_text, phase_plot
 from analysis.outputs import FIGURES, NAMES, Task, build, plots
-from analysis.plot_options import PlotOptions
+from analysis.stats.curves import PlotOptions
 from orchestrate.store import Reader
 from tests.analysis.conftest import limited
 from tests.analysis.synthetic import fill

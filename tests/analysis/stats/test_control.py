@@ -12,7 +12,6 @@ from analysis.data.matching import Filter
 from analysis.data.selection import Selection, select
 from analysis.figures.control import caption_control, draw_control
 from analysis.outputs import build
-from analysis.plot_options import PlotOptions
 from analysis.stats.control import (
     ControlCurve,
     control_part,
@@ -22,6 +21,7 @@ from analysis.stats.control import (
     tabulate_control,
     true_model,
 )
+from analysis.stats.curves import PlotOptions
 from analysis.tables.comparisons import compare_control
 from analysis.tables.rendering import control_table
 from dopt.result import Assessment, TrialResult

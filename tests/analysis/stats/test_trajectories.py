@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from analysis.stats.trajectories import average_spectrum, periodogram, wrapped_line
+from analysis.stats.curves import average_spectrum, periodogram, wrapped_line
 from dopt.assessment import TURN, turns, wrap
 
 

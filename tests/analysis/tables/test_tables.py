@@ -15,11 +15,10 @@ from analysis.data.matching import Filter
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import select
 from analysis.errors import AnalysisError
-from analysis.formatting import count_text, number, p_text, plus_minus
-from analysis.plot_options import Axis
 from analysis.report import CAPTION, EXPLAINED
-from analysis.stats.curves import measure_curves, tabulate_curves
+from analysis.stats.curves import Axis, measure_curves, tabulate_curves
 from analysis.stats.scores import Measure
+from analysis.style import count_text, number, p_text, plus_minus
 from analysis.tables.comparisons import compare_policies, summarise
 from analysis.tables.rendering import comparison_table, control_table, summary_table
 from dopt.offline_fit import held_out_fit

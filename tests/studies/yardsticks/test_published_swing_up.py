@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.formatting import steps_text
+from analysis.style import steps_text
 from studies.yardsticks.swing_up import tabulate
 from tests.pages import DOCS
 
