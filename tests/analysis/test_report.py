@@ -36,14 +36,8 @@ from orchestrate.store import Reader
 from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec
 
 SHORT = {"env": {"horizon": 40}}
-
-
 SEEDS = range(6)
-
-
 KINDS = ("png", "svg", "pdf")
-
-
 ONE_SAMPLE = {"learner": {"name": "adam", "window": 1}}
 
 
@@ -145,6 +139,19 @@ def test_steps_until_the_loss_stays_at_that_of_random_inputs_are_counted(
     assert table.loc["D-optimal", "steps"] == sorted(steps)[len(steps) // 2]
     assert table.loc["D-optimal", "reached"] == np.mean(np.isfinite(steps))
     assert table.loc["random", "reached"] <= 0.5
+
+
+def test_the_loss_to_reach_is_that_of_the_usual_random_inputs(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/random.db"
+    near = {"learner": {"window": 50}}
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), SEEDS, **SHORT, **ONE_SAMPLE)
+    specs += make_grid(("pendulum",), ("random",), SEEDS, **SHORT, **near)
+    fill(url, specs, edit=lambda s, r: r if s.learner.window == 50 else replace(r, loss=3 * r.loss))
+    with Reader.open(url) as opened:
+        table = tabulate_group(opened, variant_groups(opened, Filter())[0])
+    finals = [fake_result(make_spec("pendulum", "random", s, **SHORT)).loss[-1] for s in SEEDS]
+    assert next(name for name in table.variant if "random" in name) == "random, adam"
+    assert table.epsilon.iloc[0] == pytest.approx(np.median(finals))
 
 
 def test_without_random_inputs_there_is_no_loss_to_reach(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from analysis.serve.app import create_app
 from orchestrate.store import QueryError, Reader
 from tests.analysis.browser import grids
 from tests.analysis.browser.conftest import BASE
-from tests.analysis.browser.forms import post
+from tests.analysis.browser.grids import post
 from tests.machines.hosts import unavailable
 from tests.pages import PAGES
 from tests.paths import ROOT

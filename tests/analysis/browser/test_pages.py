@@ -1,4 +1,4 @@
-"""The pages in a real browser: what users click, without a complaint or a stray request."""
+"""Clicks, sizes and positions in a real browser."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, Route, ViewportSize, expect
 
 from tests.analysis.browser import chromium, grids
 from tests.orchestrate.faults.trials import Gate
@@ -277,3 +277,106 @@ def test_the_same_pages_over_postgresql(show: Callable[[str], Page], postgresql_
     page.goto("/trials?status=diverged")
     page.locator("tbody a").click()
     page.wait_for_selector("#charts[data-drawn]")
+
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+
+DESK: ViewportSize = {"width": 1400, "height": 900}
+BOXES = """(tiles) => tiles.map((tile) => {
+  const { left, right, top, bottom } = tile.getBoundingClientRect();
+  return { left, right, top, bottom, inner: tile.scrollHeight - tile.clientHeight };
+})"""
+
+Box = dict[str, float]
+
+
+@pytest.fixture
+def desk(browser: Browser, variants: str) -> Iterator[Page]:
+    """Return a page over the grid of variants on a desk's screen."""
+    with chromium.strict_page(browser, variants, viewport=DESK) as opened:
+        yield opened
+
+
+def boxes(desk: Page, selector: str) -> list[Box]:
+    found: list[Box] = desk.locator(selector).evaluate_all(BOXES)
+    return found
+
+
+def overlap(one: Box, other: Box) -> bool:
+    apart = (
+        one["right"] <= other["left"]
+        or other["right"] <= one["left"]
+        or one["bottom"] <= other["top"]
+        or other["bottom"] <= one["top"]
+    )
+    return not apart
+
+
+def test_tiles_are_apart_and_inside_the_window(desk: Page) -> None:
+    desk.goto("/")
+    found = boxes(desk, ".tile")
+    assert len(found) == 10
+    for place, one in enumerate(found):
+        assert one["inner"] <= 0, "a text does not fit into its tile"
+        assert one["left"] >= 0
+        assert one["right"] <= DESK["width"]
+        assert not any(overlap(one, other) for other in found[place + 1 :])
+    cells = boxes(desk, ".heat td:has(.tile)")
+    for one in found:
+        assert any(
+            cell["top"] <= one["top"] + 1 and one["bottom"] <= cell["bottom"] + 1
+            for cell in cells
+            if overlap(cell, one)
+        )
+
+
+def test_tiles_of_one_cell_say_how_they_differ(desk: Page) -> None:
+    desk.goto("/")
+    cell = desk.locator(".heat tbody tr").first.locator("td").first
+    labels = cell.locator(".tile small:nth-of-type(2)").all_inner_texts()
+    assert len(labels) == len(set(labels)) >= 4
+    assert any("γ=3" in label for label in labels)
+    assert any("adam_replay" in label for label in labels)
+
+
+def test_hover_values_are_inside_the_window(desk: Page) -> None:
+    desk.goto("/curves?env=pendulum")
+    check_hover(desk, "#chart", "D-optimal")
+    desk.goto("/trials?env=quadrotor&policy=random&seed=0")
+    desk.locator("tbody a").click()
+    desk.wait_for_selector("#charts[data-drawn]")
+    for chart, text in (("#loss", "reachable set"), ("#inputs", "u₁"), ("#spectrum", "density")):
+        check_hover(desk, chart, text)
+
+
+def check_hover(desk: Page, chart: str, text: str) -> None:
+    """Move the mouse over a chart; check that its box has the text and is inside the window."""
+    over, hover = desk.locator(f"{chart} .u-over"), desk.locator(f"{chart} .hover")
+    over.scroll_into_view_if_needed()
+    size = over.bounding_box()
+    assert size
+    for share in (0.02, 0.5, 0.98):
+        over.hover(position={"x": share * size["width"], "y": share * size["height"]})
+        expect(hover).to_be_visible()
+        expect(hover).to_contain_text(text)
+        (box,) = boxes(desk, f"{chart} .hover")
+        assert box["left"] >= 0
+        assert box["top"] >= 0
+        assert box["right"] <= DESK["width"]
+        assert box["bottom"] <= DESK["height"]
+        assert box["inner"] <= 0
+    desk.mouse.move(2, 2)
+    expect(hover).to_be_hidden()
+
+
+def test_two_inputs_have_a_legend(desk: Page) -> None:
+    desk.goto("/trials?env=quadrotor&policy=random&seed=0")
+    desk.locator("tbody a").click()
+    legend = desk.locator("#inputs-legend li")
+    expect(legend).to_have_text(["u₁ [N]", "u₂ [N]"])
+    colours = {line.get_attribute("stroke") for line in legend.locator("line").all()}
+    assert len(colours) == 2
+    desk.goto("/trials?env=pendulum&policy=random&seed=0")
+    desk.locator("tbody a").first.click()
+    desk.wait_for_selector("#charts[data-drawn]")
+    expect(desk.locator("#inputs-legend")).to_be_hidden()

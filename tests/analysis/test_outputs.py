@@ -1,8 +1,9 @@
-"""Files of figures and tables: provenance, and what is written again."""
+"""Files of ``analysis figures``, the command line, and an analysis without the browser."""
 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import re
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 
 from analysis import outputs
+from analysis.cli import main, parser
 from analysis.data.matching import Filter
 from analysis.data.selection import Selection, select
 from analysis.errors import AnalysisError
@@ -26,8 +28,8 @@ from analysis.figures.phase_portraits import Portrait, coverage_text, phase_plot
 from analysis.outputs import FIGURES, NAMES, Task, build, plots
 from analysis.stats.curves import PlotOptions
 from orchestrate.store import Reader
-from tests.analysis.conftest import limited
-from tests.analysis.synthetic import fill
+from tests.analysis.conftest import SHORT, limited
+from tests.analysis.synthetic import fill, make_grid
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 
@@ -55,8 +57,6 @@ def test_the_commit_is_that_of_the_code_and_not_of_a_folder_around_it(
 
 
 QUICK = ("figure2_spectrum", "comparison")
-
-
 pytestmark = pytest.mark.xdist_group("figures")  # all outputs are drawn once for all of them
 
 
@@ -138,8 +138,10 @@ def test_a_line_that_cannot_be_is_explained(folder: Path) -> None:
 
 
 def test_all_portraits_have_the_same_axes(reader: Reader) -> None:
-    plot = phase_plot("pendulum")
-    panels = plot.make(reader, plot.part(select(reader, Filter())), PlotOptions()).figure.axes[:5]
+    plot = phase_plot("phase", "pendulum")
+    panels = plot.make(
+        reader, plot.part(select(reader, Filter()), PlotOptions()), PlotOptions()
+    ).figure.axes[:5]
     assert len({(*axes.get_xlim(), *axes.get_ylim()) for axes in panels}) == 1
 
 
@@ -155,7 +157,7 @@ def test_a_long_title_is_broken_between_counts() -> None:
 
 def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:
     alone = select(reader, Filter(("cartpole",), ("d_optimal",)))
-    curves, spectrum = loss_plot("figure1", "loss"), spectrum_plot("cartpole", "spectrum")
+    curves, spectrum = loss_plot("figure1", "loss"), spectrum_plot("spectrum", "cartpole")
     assert "slanted strokes" not in curves.make(reader, alone, PlotOptions()).caption
     assert "in grey" not in spectrum.make(reader, alone, PlotOptions()).caption
     grey = select(reader, Filter(("cartpole",), ("d_optimal", "random")))
@@ -312,9 +314,212 @@ def test_neither_torch_nor_ray_is_needed() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-"""Figures and tables of curves, states, inputs, assessments, limits and final losses, as PNG: that
-the other formats show the same is tested where they are written.
+@pytest.fixture(scope="module")
+def partial(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a grid that stopped in the middle; every random trial that ran diverged."""
+    address = f"sqlite:///{tmp_path_factory.mktemp('partial')}/results.db"
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(4), **SHORT)
+    lost = {spec.trial_key: 9 for spec in specs if spec.policy.name == "random"}
+    fill(address, specs, skipped=specs[1:3], diverged=lost)
+    return address
+
+
+def test_what_a_command_writes_by_default_is_ignored_by_git() -> None:
+    """Otherwise later launches would be marked as run with changes."""
+    ignored = (ROOT / ".gitignore").read_text().splitlines()
+    for words in (["figures"], ["report"]):
+        assert f"/{parser().parse_args(words).out}/" in ignored
+
+
+def test_summary_prints_markdown_or_csv(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["summary", "--db", url]) == 0
+    assert "| cartpole  | random    |" in capsys.readouterr().out
+    assert main(["summary", "--db", url, "--format", "csv", "--env", "pendulum"]) == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert [row["policy"] for row in rows] == [
+        "d_optimal",
+        "oracle",
+        "uniform",
+        "periodic",
+        "random",
+    ]
+
+
+def test_compare_prints_every_variant(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", "--db", url, "--format", "csv", "--column", "reachable_loss"]) == 0
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert len(rows) == 11
+    assert all(0 <= float(row["p_adjusted"]) <= 1 for row in rows)
+
+
+def test_the_database_may_come_from_the_environment(
+    url: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", url)
+    assert main(["summary"]) == 0
+    assert "D-optimal" in capsys.readouterr().out
+
+
+def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "mine/x.db")
+    assert main(["summary"]) == 2
+    error = capsys.readouterr().err
+    assert "environment variable DOPT_DB" in error
+    assert "write it as sqlite:///mine/x.db." in error
+
+
+def test_missing_trials_are_refused_with_a_table(
+    partial: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["figures", "--db", partial, "--out", str(tmp_path)]) == 3
+    error = capsys.readouterr().err
+    assert "| pendulum | d_optimal | 2         | 2 pending | 1-2     |" in error
+    assert "2 trials are missing" in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_partial_figures_are_drawn_and_marked_on_request(
+    partial: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    only = ["--only", "figure1", "--only", "summary", "--allow-partial"]
+    assert main(["figures", "--db", partial, "--out", str(tmp_path), *only]) == 0
+    assert "figure1: written" in capsys.readouterr().out
+    for name in ("figure1.txt", "summary.md"):
+        assert (tmp_path / name).read_text().startswith("PARTIAL: 2 trials missing.")
+    assert (tmp_path / "summary.tex").read_text().startswith("% PARTIAL: 2 trials missing.\n")
+    assert b"PARTIAL" not in (tmp_path / "figure1.csv").read_bytes()
+
+
+def test_an_output_asked_for_by_name_that_has_no_trials_is_a_failure(
+    partial: str, tmp_path: Path
+) -> None:
+    only = ["--only", "figure2_spectrum", "--allow-partial"]
+    assert main(["figures", "--db", partial, "--out", str(tmp_path), *only]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--env", "submarine"], "no trial of environment 'submarine'"),
+        (["--where", "model.width"], "is no condition, PATH=VALUE is expected"),
+        (["--where", "model.width=9"], "fits no stored configuration"),
+        (["--where", "modle.width=9"], "names no value"),
+    ],
+)
+def test_a_wrong_request_is_one_sentence(
+    url: str, capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    assert main(["summary", "--db", url, *arguments]) == 2
+    captured = capsys.readouterr()
+    assert sentence in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["sumary"], "command 'sumary' is unknown.* did you mean 'summary'"),
+        ([], "arguments are required: COMMAND: see python -m analysis --help"),
+        (["figures", "--only", "figur1"], "--only 'figur1' is unknown.* did you mean 'figure1'"),
+        (["summary", "--formt", "csv"], "'--formt' is unknown.* did you mean '--format'"),
+        (["summary", "--format", "cvs"], "--format 'cvs' is unknown.* did you mean 'csv'"),
+        (["summary", "--db"], "--db: expected one argument: see python -m analysis summary --help"),
+        (["figures", "--workers", "0"], "--workers is 0, but at least 1 is expected"),
+        (["figures", "--workers", "two"], "--workers is two, but at least 1 is expected"),
+        (["floor", "--env", "arm"], "'analysis floor' was removed: .*dopt.fit_offline"),
+        (["yardsticks"], "'analysis yardsticks' was removed: python -m studies.yardsticks"),
+        (["summary", "more"], "unexpected argument 'more'"),
+    ],
+)
+def test_wrong_words_are_one_sentence(
+    capsys: pytest.CaptureFixture[str], arguments: list[str], sentence: str
+) -> None:
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert re.fullmatch(f"error: .*{sentence}.*[.?]\n", captured.err), captured.err
+    assert captured.out == ""
+
+
+@pytest.mark.parametrize("command", ["calibration", "figures", "summary"])
+def test_help_shows_a_percent_sign_once(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    shown = capsys.readouterr().out
+    assert "%%" not in shown
+    assert "--where PATH=VALUE" in shown
+
+
+def test_a_reader_that_closes_the_output_ends_the_command(url: str) -> None:
+    command = [sys.executable, "-m", "analysis", "summary", "--db", url]
+    with subprocess.Popen(
+        command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert "rror" not in process.stderr.read()
+    assert process.returncode == 0
+
+
+def test_no_database_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["summary", "--db", f"sqlite:///{tmp_path}/none.db"]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_made_is_one_sentence(
+    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["figures", "--db", url, "--out", str(tmp_path / "file" / "figures")]) == 2
+    assert "choose another --out" in capsys.readouterr().err
+
+
+COMMANDS = [["--help"], *([name, "--help"] for name in ("figures", "compare", "report", "serve"))]
+SERVE = ["serve"]
+PROGRAM = """
+import contextlib, io, json, sys
+for name in ("starlette", "uvicorn", "jinja2"):
+    sys.modules[name] = None
+from analysis.cli import main
+for words in json.loads(sys.argv[1]):
+    out, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
+        try:
+            code = main(words)
+        except SystemExit as end:
+            code = end.code or 0
+    print(json.dumps([code, out.getvalue(), errors.getvalue()]))
 """
 
 
-"""Those of the tables of steps, of trajectories and of trials, which are stored otherwise there."""
+@pytest.fixture(scope="module")
+def answers() -> dict[str, tuple[int, str, str]]:
+    """Return exit code, output and errors of each command, all run in one process."""
+    given = [*COMMANDS, SERVE]
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, json.dumps(given)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = map(json.loads, done.stdout.splitlines())
+    return {" ".join(words): tuple(line) for words, line in zip(given, lines, strict=True)}
+
+
+@pytest.mark.parametrize("command", [" ".join(words) for words in COMMANDS])
+def test_a_command_explains_itself(command: str, answers: dict[str, tuple[int, str, str]]) -> None:
+    code, out, errors = answers[command]
+    assert (code, errors) == (0, "")
+    assert "usage" in out.lower()
+
+
+def test_the_browser_names_the_extra(answers: dict[str, tuple[int, str, str]]) -> None:
+    code, _, errors = answers["serve"]
+    assert code == 2
+    assert errors.count("\n") == 1
+    assert "pip install 'dopt-exploration[serve]'" in errors

@@ -1,0 +1,469 @@
+"""Numbers and drawings of figures 4, 6, 7 and 8."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.cli import main
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import Selection, select
+from analysis.figures import pareto as figure6
+from analysis.figures import profiles as figure7
+from analysis.figures import sensitivity as figure8
+from analysis.figures.pareto import (
+    Point,
+    measure_points,
+    pareto_part,
+    pareto_plot,
+    policies_of,
+    policy_colours,
+)
+from analysis.figures.profiles import (
+    measure_profiles,
+    profiles_part,
+    tabulate_profiles,
+)
+from analysis.figures.sensitivity import (
+    Line,
+    measure_lines,
+    sensitivity_part,
+    sensitivity_plot,
+)
+from analysis.figures.width import (
+    exponent,
+    measure_costs,
+    measure_losses,
+    tabulate_costs,
+    tabulate_losses,
+    width_part,
+)
+from analysis.outputs import build
+from analysis.stats.curves import PlotOptions
+from analysis.stats.intervals import Estimate
+from analysis.stats.scores import on_front
+from analysis.tables.comparisons import compare_policies
+from dopt.result import TrialResult
+from dopt.spec.trial import TrialSpec
+from orchestrate.store import Reader
+from tests.analysis.conftest import SHORT, wide
+from tests.analysis.synthetic import fill, make_grid
+
+
+def test_a_profile_counts_runs_and_rises_to_those_that_did_not_diverge(reader: Reader) -> None:
+    selection = select(reader, Filter())
+    profiles = {one.label: one for one in measure_profiles(profiles_part(selection))}
+    random = profiles["random"]
+    assert random.environments == ("pendulum", "cartpole", "quadrotor")
+    assert (random.n, random.n_diverged) == (15, 1)
+    assert (np.diff(random.share.centre) >= 0).all()
+    assert random.share.centre[-1] == pytest.approx((1 + 0.8 + 1) / 3)
+    assert profiles["D-optimal"].share.centre[-1] == 1.0
+    assert profiles["periodic"].environments == ("pendulum", "cartpole")
+
+
+def test_a_point_of_a_profile_by_hand(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",), ("d_optimal", "random")))
+    own, reference = (
+        np.array(list(entry.final_losses().values()))
+        for entry in sorted(selection.entries, key=lambda one: one.config.policy != "random")
+    )
+    [profile] = [one for one in measure_profiles(selection) if one.label == "random"]
+    place = 150
+    limit = profile.factors[place] * np.exp(np.mean(np.log(reference)))
+    assert profile.share.centre[place] == np.mean(own <= limit)
+
+
+def test_the_caption_says_what_is_in_fewer_environments(reader: Reader) -> None:
+    profiles = measure_profiles(profiles_part(select(reader, Filter())))
+    words = figure7.caption(profiles)
+    assert "In fewer environments: periodic: pendulum, cartpole" in words
+    assert "random: 15, 1 diverged" in words
+    [legend] = figure7.draw(profiles).legends
+    assert "periodic (2 of 3 systems)" in [text.get_text() for text in legend.get_texts()]
+    assert len(tabulate_profiles(profiles)) == 301 * 4  # all but the oracle
+
+
+def test_one_policy_has_no_profile(reader: Reader) -> None:
+    alone = select(reader, Filter(policies=("d_optimal",)))
+    assert profiles_part(alone).entries == ()
+
+
+def test_the_ratio_over_systems_is_the_geometric_mean_of_theirs(
+    reader: Reader, url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["aggregate", "--db", url, "--format", "csv"]) == 0
+    rows = {row["variant"]: row for row in csv.DictReader(io.StringIO(capsys.readouterr().out))}
+    table = compare_policies(reader, select(reader, Filter()))
+    for variant, part in table.groupby("variant"):
+        row = rows.pop(str(variant))
+        assert float(row["ratio"]) == pytest.approx(np.exp(np.log(part["ratio"]).mean()))
+        assert float(row["low"]) < float(row["ratio"]) < float(row["high"])
+        assert int(row["n_pairs"]) == part["n_pairs"].sum()
+    assert not rows
+
+
+def test_the_table_says_which_systems_a_row_is_of(
+    url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["aggregate", "--db", url]) == 0
+    printed = capsys.readouterr().out
+    assert "| pendulum, cartpole            | 10" in printed
+    assert "14, 1 diverged" in printed
+    assert main(["aggregate", "--db", url, "--policy", "random"]) == 2
+    assert "needs trials of the reference d_optimal" in capsys.readouterr().err
+
+
+RATES = (1e-3, 1e-2, 1e-1)
+RIDGES = (1e-4, 1e-3, 1e-2)
+
+
+@pytest.fixture(scope="module")
+def varied(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return two policies in two systems under three learning rates and three λ, one diverged."""
+    address = f"sqlite:///{tmp_path_factory.mktemp('sensitivity')}/results.db"
+    envs, both, seeds = ("pendulum", "arm"), ("d_optimal", "random"), range(3)
+    specs = [
+        spec
+        for rate in RATES
+        for spec in make_grid(envs, both, seeds, learner={"learning_rate": rate}, **SHORT)
+    ]
+    for ridge in RIDGES:
+        specs += make_grid(envs, both[:1], seeds, policy={"regularization": ridge}, **SHORT)
+    two = {"learning_rate": 0.1}, {"regularization": 0.01}  # differ in both: part of no line
+    specs += make_grid(envs, both[:1], seeds, learner=two[0], policy=two[1], **SHORT)
+    specs += make_grid(envs, ("uniform",), seeds, **SHORT)  # has no line of its own
+    specs = list({spec.trial_key: spec for spec in specs}.values())
+    lost = [s for s in specs if s.policy.name == "random" and s.system.name == "arm"]
+    slow = [s for s in lost if s.to_mapping()["learner"]["learning_rate"] == 1e-3 and s.seed == 0]
+    fill(address, specs, diverged={slow[0].trial_key: 20})
+    return address
+
+
+def measured(url: str) -> tuple[Line, ...]:
+    with Reader.open(url) as reader:
+        part = sensitivity_part(select(reader, Filter()))
+        return measure_lines(reader, part, DivergenceRule.EXCLUDE)
+
+
+def test_a_line_varies_one_setting_and_others_have_a_level(varied: str) -> None:
+    lines = {(one.env, one.policy, one.setting): one for one in measured(varied)}
+    assert len(lines) == 2 * 2 * 2
+    rates = lines["arm", "random", "learner.learning_rate"]
+    assert (rates.values, rates.usual) == (RATES, 1e-2)
+    ridges = lines["pendulum", "d_optimal", "policy.regularization"]
+    assert (ridges.values, ridges.usual) == (RIDGES, 1e-3)
+    level = lines["pendulum", "random", "policy.regularization"]
+    assert level.values == ()
+    assert level.losses == (lines["pendulum", "random", "learner.learning_rate"].losses[1],)
+
+
+def test_losses_are_geometric_means_and_diverged_trials_are_counted(varied: str) -> None:
+    [line] = [
+        one
+        for one in measured(varied)
+        if (one.env, one.policy, one.setting) == ("arm", "random", "learner.learning_rate")
+    ]
+    assert [one.describe() for one in line.scores] == ["2/3, 1 diverged", "3", "3"]
+    for loss, scores in zip(line.losses, line.scores, strict=True):
+        assert loss.value == pytest.approx(np.exp(np.log(scores.values).mean()))
+    assert "random, learning_rate=0.001: 2/3, 1 diverged" in figure8.caption((line,))
+
+
+def test_it_has_a_row_for_each_system_and_a_column_for_each_setting(varied: str) -> None:
+    lines = measured(varied)
+    figure = figure8.draw(lines)
+    assert len(figure.axes) == 2 * 2
+    labels = [axes.get_xlabel() for axes in figure.axes[2:]]
+    assert labels == ["λ of the information matrix", "learning rate"]
+    assert "Level: random" in figure8.caption(lines)
+
+
+def test_two_values_are_too_few(reader: Reader, tmp_path: Path) -> None:
+    address = f"sqlite:///{tmp_path}/few.db"
+    for rate in RATES[:2]:
+        learner = {"learning_rate": rate}
+        fill(address, make_grid(("arm",), ("random",), range(2), learner=learner, **SHORT))
+    with Reader.open(address) as few:
+        assert sensitivity_part(select(few, Filter())).entries == ()
+    plot = sensitivity_plot("name")
+    part = plot.part(select(reader, Filter()), PlotOptions())
+    assert {entry.config.policy for entry in part.entries} == {"random"}
+    table = plot.make(reader, part, PlotOptions()).table
+    assert table["value"].tolist() == [10.0, 20.0, 40.0, 60.0, 100.0]
+
+
+def reader_of(folder: Path, *fillings: tuple[list[TrialSpec], list[TrialSpec]]) -> Reader:
+    address = f"sqlite:///{folder}/results.db"
+    for specs, skipped in fillings:
+        fill(address, specs, skipped=skipped)
+    return Reader.open(address)
+
+
+def widths_of(selection: Selection) -> list[int | None]:
+    return [entry.config.width for entry in selection.entries]
+
+
+def test_other_widths_leave_the_selection_of_the_other_figures_alone(reader: Reader) -> None:
+    selection = select(reader, Filter())
+    assert selection.gaps == ()
+    assert {entry.config.width for entry in selection.of("cartpole")} == {16, None}
+    assert len(selection.of("cartpole")) == 5
+
+
+@pytest.mark.parametrize("seeds", [3, 5, 9])
+def test_however_many_trials_another_width_has(tmp_path: Path, seeds: int) -> None:
+    grid = make_grid(("cartpole",), ("d_optimal", "random", "oracle"), range(5), **SHORT)
+    extra = wide(64, range(seeds)) + wide(16, range(seeds), learner={"name": "adam"})
+    extra += wide(16, range(seeds), policy={"regularization": 0.5})[: min(seeds, 5)]
+    with reader_of(tmp_path, (grid + extra, [])) as reader:
+        selection = select(reader, Filter())
+    assert selection.gaps == ()
+    assert {entry.config.config_key for entry in selection.entries} == {s.config_key for s in grid}
+
+
+def test_a_database_of_widths_alone_takes_the_width_of_the_paper(tmp_path: Path) -> None:
+    specs = [spec for width in (8, 16, 32) for spec in wide(width, range(3))]
+    with reader_of(tmp_path, (specs, [])) as reader:
+        selection = select(reader, Filter())
+    assert widths_of(selection) == [16]
+    assert widths_of(width_part(selection)) == [8, 16, 32]
+
+
+def test_all_widths_are_taken_and_the_condition_of_the_user_holds(reader: Reader) -> None:
+    assert widths_of(width_part(select(reader, Filter()))) == [4, 8, 16, 32, 64]
+    narrowed = select(reader, Filter(where={"model.width": 16}))
+    assert width_part(narrowed).entries == ()
+    assert width_part(select(reader, Filter(("pendulum",)))).entries == ()
+
+
+def test_two_widths_are_too_few_and_that_is_said(tmp_path: Path) -> None:
+    with reader_of(tmp_path, (wide(8, range(2)) + wide(16, range(2)), [])) as reader:
+        names = ("figure4_width", "figure4_width_loss")
+        outcomes = list(build(reader, select(reader, Filter()), PlotOptions(), tmp_path, names))
+    assert {one.state for one in outcomes} == {"not drawn, nothing is stored for it"}
+
+
+def test_costs_are_medians_over_steps_and_trials(reader: Reader) -> None:
+    part = width_part(select(reader, Filter()))
+    numbers = measure_costs(reader, part)
+    assert [cost.part for cost in numbers.costs] == ["plan", "learn", "evaluate"]
+    assert numbers.limit_us == pytest.approx(20_000)
+    plan = numbers.costs[0]
+    values = reader.curves(part.entries[0].config.config_key, "plan_us").values
+    assert plan.median[0] == np.median(values)
+    assert (plan.low[0], plan.high[0]) == tuple(np.quantile(values, [0.1, 0.9]))
+    assert plan.n.tolist() == [5] * 5
+    assert plan.exponent == pytest.approx(2.0, abs=0.2)
+    table = tabulate_costs(numbers)
+    assert len(table) == 15
+    assert table.query("part == 'plan'")["median_us"].tolist() == plan.median.tolist()
+
+
+def test_a_diverged_trial_counts_in_neither(tmp_path: Path) -> None:
+    specs = [spec for width in (8, 16, 32) for spec in wide(width, range(4))]
+    address = f"sqlite:///{tmp_path}/results.db"
+    fill(address, specs, diverged={specs[1].trial_key: 20})
+    with Reader.open(address) as reader:
+        part = width_part(select(reader, Filter()))
+        costs = measure_costs(reader, part)
+        losses = measure_losses(reader, part, DivergenceRule.EXCLUDE)
+    assert costs.costs[0].n.tolist() == [3, 4, 4]
+    assert losses.n == (3, 4, 4)
+    assert losses.counts == ("3/4, 1 diverged", "4", "4")
+
+
+def test_losses_have_two_standard_errors(reader: Reader) -> None:
+    part = width_part(select(reader, Filter()))
+    numbers = measure_losses(reader, part, DivergenceRule.EXCLUDE)
+    finals = reader.curves(part.entries[2].config.config_key).values[:, -1]
+    assert numbers.mean[2] == pytest.approx(finals.mean())
+    table = tabulate_losses(numbers)
+    assert table["width"].tolist() == [4, 8, 16, 32, 64]
+    assert table["two_standard_errors"][2] == pytest.approx(2 * finals.std(ddof=1) / 5**0.5)
+
+
+def test_unfinished_trials_are_noted(tmp_path: Path) -> None:
+    specs = [spec for width in (8, 16, 32) for spec in wide(width, range(3))]
+    with reader_of(tmp_path, (specs, specs[-1:])) as reader:
+        part = width_part(select(reader, Filter()))
+    assert part.notes == ("cartpole, width 32: 1 trials are not finished",)
+
+
+def test_other_forms_of_the_information_matrix_are_lines_of_their_own(tmp_path: Path) -> None:
+    widths = (8, 16, 32)
+    usual = [spec for width in widths for spec in wide(width, range(3))]
+    dual = [s for width in widths for s in wide(width, range(3), policy={"form": "dual"})]
+    other = [s for width in widths for s in wide(width, range(3), policy={"regularization": 0.5})]
+    with reader_of(tmp_path, (dual + other + usual, [])) as reader:
+        part = width_part(select(reader, Filter()))
+        costs = measure_costs(reader, part).costs
+        losses = measure_losses(reader, part, DivergenceRule.EXCLUDE)
+    assert [(cost.form, cost.part) for cost in costs] == [
+        ("auto", "plan"),
+        ("auto", "learn"),
+        ("auto", "evaluate"),
+        ("dual", "plan"),
+    ]
+    assert losses.widths.tolist() == list(widths)
+
+
+def test_the_exponent_is_that_of_the_upper_half() -> None:
+    widths = np.array([8, 16, 32, 64, 128, 256])
+    assert exponent(widths, 3.0 * widths**1.5) == pytest.approx(1.5)
+    costs = np.where(widths < 64, 7.0, widths.astype(float) ** 2)
+    assert exponent(widths, costs) == pytest.approx(2.0)
+    assert exponent(widths[:3], widths[:3]) == pytest.approx(1.0)
+
+
+LEARNERS: tuple[dict[str, object], ...] = (
+    {"name": "adam"},
+    {"name": "adam_window"},
+    {"name": "gauss_newton"},
+    {"name": "gauss_newton", "refit_every": 10},
+)
+NETWORKS = {"model": {"name": "ensemble"}, "learner": {"name": "gauss_newton"}}
+TASK = {"name": "control", "checkpoints": [20]}
+ENVS = ("pendulum", "quadrotor")
+
+
+def refits(spec: TrialSpec, result: TrialResult) -> TrialResult:
+    """Return a result whose learner takes 1 µs, and 100 µs in each step that fits."""
+    every = getattr(spec.learner, "refit_every", 1)
+    learn = np.where(np.arange(len(result.loss)) % every == 0, 100.0, 1.0)
+    return replace(result, plan_us=np.full_like(result.plan_us, 5.0), learn_us=learn)
+
+
+@pytest.fixture(scope="module")
+def learners(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a database of policies and learners; some trials diverged, of one pair all."""
+    address = f"sqlite:///{tmp_path_factory.mktemp('pareto')}/results.db"
+    specs = [
+        spec
+        for learner in LEARNERS
+        for spec in make_grid(ENVS, ("d_optimal", "random"), range(3), learner=learner, **SHORT)
+    ]
+    fresh = {"information": "fresh"}
+    specs += make_grid(ENVS, ("d_optimal",), range(3), policy=fresh, **SHORT)
+    specs += make_grid(ENVS, ("random",), range(3), **NETWORKS, **SHORT)
+    specs += make_grid(ENVS[:1], ("d_optimal",), range(3), task=TASK, **SHORT)
+    specs += make_grid(ENVS[:1], ("random",), range(2), env={"horizon": 60, "gamma": 3.0})
+    specs += make_grid(("arm",), ("random",), range(3), **SHORT)
+    lost = [s for s in specs if s.learner.name == "adam" and s.policy.name == "random"]
+    gone = {s.trial_key: 20 for s in lost if s.system.name == "quadrotor" or s.seed == 1}
+    fill(address, specs, diverged=gone, edit=refits)
+    return address
+
+
+def points_of(url: str, rule: DivergenceRule = DivergenceRule.EXCLUDE) -> tuple[Point, ...]:
+    with Reader.open(url) as reader:
+        return measure_points(reader, pareto_part(select(reader, Filter())), rule)
+
+
+def test_a_point_is_a_configuration_of_an_environment_that_has_several(learners: str) -> None:
+    points = points_of(learners)
+    labels = [point.label for point in points if point.env == "pendulum"]
+    assert len(labels) == len(set(labels)) == 10  # the task and the other bound are none
+    assert {point.env for point in points} == set(ENVS)
+    assert "random, gauss_newton, refit_every=10" in labels
+    words = {(one.policy_words, one.learner_words) for one in points if one.env == "pendulum"}
+    assert len(words) == 10
+    assert {("random", "gauss_newton"), ("random", "gauss_newton, ensemble")} <= words
+    assert list(policies_of(points)) == ["D-optimal", "D-optimal, information=fresh", "random"]
+
+
+def test_time_counts_the_fits_of_some_steps_and_loss_is_a_geometric_mean(learners: str) -> None:
+    found = {(one.env, one.label): one for one in points_of(learners)}
+    assert found["pendulum", "random, gauss_newton"].us == pytest.approx(105.0)
+    every_tenth = found["pendulum", "random, gauss_newton, refit_every=10"]
+    assert every_tenth.us == pytest.approx(5.0 + (100.0 + 9 * 1.0) / 10)
+    with Reader.open(learners) as reader:
+        [config] = [
+            one
+            for one in reader.configs()
+            if (one.env, one.policy) == ("pendulum", "random")
+            and one.config["learner"].get("refit_every") == 10
+        ]
+        finals = [trial.final_loss for trial in reader.trials(config.config_key)]
+    assert every_tenth.loss.value == pytest.approx(np.exp(np.mean(np.log(finals))))
+    assert every_tenth.loss.low < every_tenth.loss.value < every_tenth.loss.high
+
+
+def test_the_front_is_that_of_each_environment(learners: str) -> None:
+    points = [one for one in points_of(learners) if one.env == "pendulum"]
+    front = on_front(np.array([(one.us, one.loss.value) for one in points]))
+    assert [one.on_front for one in points] == front.tolist()
+    assert 0 < front.sum() < len(points)
+
+
+def test_diverged_trials_are_counted_and_said(learners: str) -> None:
+    points = points_of(learners)
+    [some] = [one for one in points if (one.env, one.label) == ("pendulum", "random, adam")]
+    assert (some.n, some.n_diverged, some.counts) == (2, 1, "2/3, 1 diverged")
+    [none] = [one for one in points if (one.env, one.label) == ("quadrotor", "random, adam")]
+    assert not none.known
+    assert not none.on_front
+    words = pareto_plot("name").caption((DivergenceRule.EXCLUDE, points))
+    assert "No point, as no trial has a positive final loss: quadrotor, random, adam (0/3" in words
+    assert "random, adam: 2/3, 1 diverged" in words
+    lent = points_of(learners, DivergenceRule.WORST)
+    assert [one.n for one in lent if (one.env, one.label) == ("pendulum", "random, adam")] == [3]
+
+
+def test_it_is_drawn_from_the_command_line(learners: str, tmp_path: Path) -> None:
+    given = ("--db", learners, "--out", str(tmp_path), "--allow-partial")
+    assert main(["figures", *given, "--only", "figure6_pareto"]) == 0
+    assert (tmp_path / "figure6_pareto.png").read_bytes().startswith(b"\x89PNG")
+    with (tmp_path / "figure6_pareto.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 20
+    assert {row["on_front"] for row in rows} == {"True", "False"}
+
+
+def point(place: int, us: float, loss: float, label: str) -> Point:
+    estimate = Estimate(loss, 0.8 * loss, 1.2 * loss)
+    names = {"policy": "random", "policy_words": f"random {place}", "learner_words": "adam"}
+    counts = {"n": 20, "n_finished": 20, "n_diverged": 0, "counts": "20"}
+    return Point("arm", label, us=us, loss=estimate, unit="rad/s²", limit_us=2e4, on_front=True,
+                 **names, **counts)  # type: ignore[arg-type] # fmt: skip
+
+
+def test_the_list_of_the_front_covers_no_point() -> None:
+    label = "look-ahead, gauss_newton, refit_every=10"
+    points = [point(i, 10.0 * 2**i, 1.0 / 1.1**i, label) for i in range(14)]
+    figure = figure6.draw(tuple(points))
+    figure.draw_without_rendering()
+    [axes] = figure.axes
+    [listed] = [text for text in axes.texts if label in text.get_text()]
+    corner = listed.get_window_extent()
+    places = axes.transData.transform([(one.us, one.loss.low) for one in points])
+    assert not any(corner.contains(*place) for place in places)
+    assert any("dt = 20 ms" in text.get_text() for text in axes.texts)
+
+
+def test_numbers_of_points_in_one_place_are_drawn_together() -> None:
+    places = [(10.0, 2.0), (100.0, 0.5), (100.1, 0.499), (1000.0, 0.1)]
+    points = [point(i, us, loss, f"random {i}") for i, (us, loss) in enumerate(places)]
+    [axes] = figure6.draw(tuple(points)).axes
+    assert {"1", "2, 3", "4"} <= {text.get_text() for text in axes.texts}
+
+
+def test_policies_of_one_colour_are_told_apart() -> None:
+    words = {"random": "random", "iCEM": "icem", "D-optimal": "d_optimal", "fresh": "d_optimal"}
+    colours = policy_colours(words)
+    assert len(set(colours.values())) == 4
+    assert list(colours) == list(words)
+
+
+def test_the_paper_s_grid_has_one_too(reader: Reader) -> None:
+    plot = pareto_plot("figure6_pareto")
+    drawing = plot.make(reader, plot.part(select(reader, Filter()), PlotOptions()), PlotOptions())
+    assert len(drawing.figure.axes) == 3
+    assert "D-optimal, width 64" in set(drawing.table["label"])
+    assert "oracle" not in set(drawing.table["policy"])

@@ -1,0 +1,640 @@
+"""Tables, control, lines in a phase plane and spectra as numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+import analysis
+from analysis.cli import main
+from analysis.data.matching import Filter
+from analysis.data.samples import DivergenceRule
+from analysis.data.selection import Selection, select
+from analysis.errors import AnalysisError
+from analysis.figures.control import caption_control, draw_control
+from analysis.figures.input_spectrum import caption, measure_spectra, tabulate_spectra
+from analysis.outputs import build
+from analysis.report import CAPTION, EXPLAINED
+from analysis.stats.control import (
+    ControlCurve,
+    control_part,
+    measure_control,
+    relative_costs,
+    scores_at,
+    tabulate_control,
+    true_model,
+)
+from analysis.stats.curves import (
+    Axis,
+    PlotOptions,
+    average_spectrum,
+    measure_curves,
+    periodogram,
+    tabulate_curves,
+    wrapped_line,
+)
+from analysis.stats.scores import Measure
+from analysis.style import count_text, number, p_text, plus_minus, unit_of
+from analysis.tables.comparisons import compare_control, compare_policies, summarise
+from analysis.tables.rendering import comparison_table, control_table, summary_table
+from dopt.assessment import TURN, turns, wrap
+from dopt.offline_fit import held_out_fit
+from dopt.result import Assessment, TrialResult
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+from orchestrate.store import Assessments, Reader
+from tests.analysis.conftest import SHORT
+from tests.analysis.synthetic import fake_result, fill, make_grid, make_spec, simulated
+from tests.dopt.trials import trial
+
+SEEDS = range(5)
+
+
+def final(env: str, policy: str, seed: int) -> float:
+    spec = make_spec(env, policy, seed, env={"horizon": 60})
+    return float(fake_result(spec).loss[-1])
+
+
+def test_summary_is_that_of_the_trials(reader: Reader) -> None:
+    table = summarise(reader, select(reader, Filter()))
+    row = table[(table.env == "pendulum") & (table.policy == "uniform")].iloc[0]
+    losses = np.array([final("pendulum", "uniform", seed) for seed in SEEDS])
+    assert row.loss == pytest.approx(losses.mean())
+    assert row.loss_2se == pytest.approx(2 * losses.std(ddof=1) / math.sqrt(5))
+    assert row.reachable_loss == pytest.approx(losses.mean() / 2)
+    assert row.n == 5
+
+
+def test_a_diverged_trial_is_left_out_counted_or_the_worst(reader: Reader) -> None:
+    selection = select(reader, Filter(("cartpole",), ("random",)))
+    losses = [final("cartpole", "random", seed) for seed in SEEDS if seed != 2]
+    left_out = summarise(reader, selection).iloc[0]
+    assert (left_out.n, left_out.n_diverged) == (4, 1)
+    assert left_out.loss == pytest.approx(np.mean(losses))
+    worst = summarise(reader, selection, DivergenceRule.WORST).iloc[0]
+    assert worst.n == 5
+    assert worst.loss == pytest.approx(np.mean([*losses, max(losses)]))
+
+
+def test_comparison_pairs_the_seeds(reader: Reader) -> None:
+    table = compare_policies(reader, select(reader, Filter()))
+    row = table[(table.env == "cartpole") & (table.policy == "random")].iloc[0]
+    seeds = [seed for seed in SEEDS if seed != 2]
+    logs = [
+        math.log(final("cartpole", "random", seed) / final("cartpole", "d_optimal", seed))
+        for seed in seeds
+    ]
+    assert (row.n_pairs, row.n_diverged) == (4, 1)
+    assert row.ratio == pytest.approx(math.exp(np.mean(logs)))
+    assert row.low <= row.ratio <= row.high
+    assert row.p_adjusted >= row.p_value
+    assert len(table) == 4 + 4 + 3
+
+
+def test_a_row_does_not_depend_on_the_others(reader: Reader) -> None:
+    whole = compare_policies(reader, select(reader, Filter()))
+    part = compare_policies(
+        reader, select(reader, Filter(("cartpole",), ("d_optimal", "periodic")))
+    )
+    same = whole[(whole.env == "cartpole") & (whole.policy == "periodic")]
+    columns = ["n_pairs", "ratio", "low", "high", "p_value"]
+    assert same[columns].to_numpy().tolist() == part[columns].to_numpy().tolist()
+
+
+def test_the_other_column(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",)))
+    loss, reachable = (
+        compare_policies(reader, selection, column) for column in ("loss", "reachable_loss")
+    )
+    assert reachable.ratio.to_numpy() == pytest.approx(loss.ratio.to_numpy())
+
+
+def test_nothing_to_compare_is_a_sentence(reader: Reader) -> None:
+    with pytest.raises(AnalysisError, match="only random is selected"):
+        compare_policies(reader, select(reader, Filter(policies=("random",))))
+
+
+def test_curves_are_means_on_the_exact_grid(reader: Reader) -> None:
+    selection = select(reader, Filter(("pendulum",), ("random",)))
+    table = tabulate_curves(measure_curves(reader, selection, "loss", PlotOptions()))
+    losses = [
+        fake_result(make_spec("pendulum", "random", seed, env={"horizon": 60})).loss
+        for seed in SEEDS
+    ]
+    assert table["t"].tolist() == list(range(60))
+    assert table["mean"].to_numpy() == pytest.approx(np.mean(losses, axis=0))
+    timed = PlotOptions(axis=Axis.SECONDS)
+    seconds = tabulate_curves(measure_curves(reader, selection, "loss", timed))
+    dt = selection.entries[0].config.dt
+    assert seconds["x"].to_numpy() == pytest.approx(dt * table["x"].to_numpy())
+
+
+@pytest.mark.parametrize(
+    ("mean", "error", "text"),
+    [
+        (12.345, 0.567, "12.35 ± 0.57"),
+        (1234.5, 56.7, "1234 ± 57"),
+        (0.01234, 0.00056, "0.01234 ± 0.00056"),
+        (4.021e-5, 6.2e-6, "(4.02 ± 0.62)e-05"),
+        (2.0, math.nan, "2.00"),
+        (math.nan, math.nan, "–"),
+    ],
+)
+def test_plus_minus(mean: float, error: float, text: str) -> None:
+    assert plus_minus(mean, error) == text
+
+
+def test_numbers() -> None:
+    assert number(0.5) == "0.500"
+    assert number(1234.0) == "1230"
+    assert number(0.0123456) == "0.0123"
+    assert number(0.9996) == "1.00"
+    assert number(999.6) == "1000"
+    assert number(1.5e-7) == "1.50e-07"
+    assert number(0.0) == "0"
+    assert p_text(0.0123) == "0.012"
+    assert p_text(3.21e-9) == "3e-09"
+
+
+def test_markdown_shows_counts_and_dashes() -> None:
+    nothing = {"ratio": math.nan, "low": math.nan, "high": math.nan, "improvement": math.nan}
+    row = {
+        "env": "arm",
+        "variant": "random",
+        "reference": "D-optimal",
+        "n_pairs": 0,
+        "n_diverged": 3,
+        **nothing,
+    }
+    table = pd.DataFrame([row | {"p_value": math.nan, "p_adjusted": math.nan}])
+    assert "Student's below 30 and above 2000 pairs" in comparison_table(table, "exclude").note
+    line = comparison_table(table, "exclude").markdown().splitlines()[2]
+    assert [field.strip() for field in line.strip("|").split("|")] == [
+        "arm", "random", "D-optimal", "–", "–", "–", "–", "0, 3 diverged",
+    ]  # fmt: skip
+    values = {
+        f"{name}{part}": value
+        for name in ("loss", "reachable_loss")
+        for part, value in (("", 1.0), ("_2se", 0.1), ("_median", 0.9), ("_iqm", 0.95))
+    }
+    counts = {"env": "arm", "policy": "random", "label": "random", "n": 98, "n_diverged": 2}
+    summary = summary_table(pd.DataFrame([counts | values]), "worst").markdown()
+    assert "1.00 ± 0.10" in summary
+    assert "Diverged trials: worst." in summary
+
+
+def test_every_caption_says_what_is_divided_by_what() -> None:
+    for note in (
+        comparison_table(pd.DataFrame(), "exclude").note,
+        comparison_table(pd.DataFrame(), "exclude", Measure.AUC).note,
+        control_table(pd.DataFrame()).note,
+    ):
+        assert "atio: variant / reference, below 1 the variant is better" in note
+    explained = " ".join(EXPLAINED)
+    assert "Ratio: variant / reference" in explained
+    assert "below 1 the variant is better" in explained
+    assert "variant / reference: left of the line, below 1, the variant is better" in CAPTION
+
+
+def test_count_text() -> None:
+    assert count_text({"a": "5", "b": "5"}) == "n = 5"
+    assert count_text({"a": "5", "b": "4/5, 1 diverged", "c": "5"}) == ("n = 5; b: 4/5, 1 diverged")
+
+
+LEARNER = {"name": "gauss_newton"}
+TAUGHT = [trial("pendulum", "d_optimal", seed, learner=LEARNER) for seed in range(3)]
+UNSURE = [trial("pendulum", "random", seed, learner={"name": "adam_window"}) for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> str:
+    address = f"sqlite:///{tmp_path_factory.mktemp('calibration')}/results.db"
+    fill(address, TAUGHT + UNSURE, edit=simulated)
+    return address
+
+
+def test_rows_are_the_medians_of_the_trials(small: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibration", "--db", small, "--format", "csv"]) == 0
+    table = pd.read_csv(io.StringIO(capsys.readouterr().out)).set_index("policy")
+    results = [run_trial(spec) for spec in TAUGHT]
+    fits = [
+        held_out_fit(spec, one.parameters, one.states, one.inputs)
+        for spec, one in zip(TAUGHT, results, strict=True)
+    ]
+    row = table.loc["d_optimal"]
+    for name in ("r_squared", "covered", "log_loss"):
+        for kind in ("grid", "reachable"):
+            average = np.mean if name == "covered" else np.median
+            expected = average([getattr(getattr(fit, kind), name) for fit in fits])
+            assert row[f"{kind}_{name}"] == pytest.approx(expected, rel=1e-3)
+    assert row.energy == pytest.approx(1.0)  # every input is on the sphere
+    assert row.n == 3
+    assert np.isnan(table.loc["random", "grid_covered"])
+
+
+def test_a_model_without_a_covariance_has_a_dash(
+    small: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibration", "--db", small, "--policy", "random"]) == 0
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if "pendulum" in line]
+    cells = [cell.strip() for cell in row.split("|")[1:-1]]
+    assert cells[4:8] == ["–"] * 4
+    assert "–" not in cells[2:4] + cells[8:]
+
+
+def test_a_database_without_a_finished_trial_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    address = f"sqlite:///{tmp_path}/none.db"
+    fill(address, TAUGHT, skipped=TAUGHT)
+    assert main(["calibration", "--db", address, "--allow-partial"]) == 2
+    assert "No selected trial is done" in capsys.readouterr().err
+
+
+Edit = Callable[[TrialSpec, TrialResult], TrialResult]
+
+
+@pytest.fixture
+def part(reader: Reader) -> Selection:
+    return control_part(select(reader, Filter()))
+
+
+def curve_of(curves: tuple[ControlCurve, ...], env: str, policy: str) -> ControlCurve:
+    return next(one for one in curves if (one.env, one.policy) == (env, policy))
+
+
+def test_only_trials_with_a_task_are_taken(reader: Reader, part: Selection) -> None:
+    assert part.environments == ("pendulum", "quadrotor")
+    assert part.policies == ("d_optimal", "uniform", "random")
+    assert all(entry.config.config["task"] for entry in part.entries)
+    whole = select(reader, Filter())
+    assert not any("task" in entry.config.config for entry in whole.entries)
+
+
+def test_the_numbers_are_those_of_the_trials(reader: Reader, part: Selection) -> None:
+    curves = measure_control(reader, part)
+    curve = curve_of(curves, "pendulum", "uniform")
+    entry = next(e for e in part.of("pendulum") if e.config.policy == "uniform")
+    task = entry.config.config["task"]
+    specs = make_grid(("pendulum",), ("uniform",), range(5), **SHORT, task=task)
+    rows = [fake_result(spec).assessments for spec in specs]
+    assert curve.t.tolist() == [0, 20, 40, 60]
+    assert curve.n.tolist() == [5] * 4
+    for j, t in enumerate(curve.t):
+        costs = [_value(of, t, "control_cost") / 100.0 for of in rows]
+        assert curve.cost[j] == pytest.approx(np.exp(np.mean(np.log(costs))))
+        assert curve.cost_low[j] < curve.cost[j] < curve.cost_high[j]
+        assert curve.success[j] == np.mean([_value(of, t, "control_success") for of in rows])
+
+
+@pytest.mark.parametrize(
+    "measure",
+    [
+        lambda reader, part: measure_control(reader, part)[0].cost,
+        lambda reader, part: relative_costs(reader, part.entries[0]).values,
+        lambda reader, part: list(scores_at(reader, part.entries[0], 20).by_seed.items()),
+        lambda reader, part: dataclasses.astuple(true_model(reader, part.entries)),
+    ],
+)
+def test_what_is_finished_during_a_read_is_not_in_a_part_of_it(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    measure: Callable[[Reader, Selection], object],
+) -> None:
+    address, task = f"sqlite:///{tmp_path}/live.db", {"name": "control", "checkpoints": [20]}
+    specs = make_grid(("pendulum",), ("random",), range(6), **SHORT, task=task)
+    fill(address, specs, skipped=specs[2:])
+    read, left = Reader.assessments, [spec for spec in specs[2:] if spec.seed % 2]
+
+    def assessments(self: Reader, config_key: str, measure: str) -> Assessments:
+        found = read(self, config_key, measure)
+        if left:
+            fill(address, [left.pop()])
+        return found
+
+    with Reader.open(address) as reader:
+        part = control_part(select(reader, Filter()))
+        expected = measure(reader, part)
+        fill(address, specs[2::2])  # between the selection and the read
+        monkeypatch.setattr(Reader, "assessments", assessments)
+        np.testing.assert_array_equal(measure(reader, part), expected)
+    assert len(left) < 2
+
+
+def _value(rows: tuple[Assessment, ...], t: int, measure: str) -> float:
+    return next(row.value for row in rows if (row.t, row.measure) == (t, measure))
+
+
+def test_wilson_intervals_are_those_of_the_textbook(reader: Reader, part: Selection) -> None:
+    curve = curve_of(measure_control(reader, part), "pendulum", "d_optimal")
+    first, last = 0, -1
+    assert (curve.success[first], curve.success[last]) == (0.0, 1.0)
+    z = 1.959963985
+    edge = z**2 / (5 + z**2)  # no success in five
+    assert (curve.success_low[first], curve.success_high[first]) == pytest.approx((0, edge))
+    assert (curve.success_low[last], curve.success_high[last]) == pytest.approx((1 - edge, 1))
+
+
+def test_the_comparison_pairs_seeds(reader: Reader, part: Selection) -> None:
+    table = compare_control(reader, part)
+    assert sorted(set(table.t)) == [20, 40, 60]
+    row = table[(table.env == "quadrotor") & (table.t == 40) & (table.policy == "random")]
+    entries = {entry.config.policy: entry for entry in part.of("quadrotor")}
+    ours, theirs = (
+        scores_at(reader, entries[name], 40).by_seed for name in ("d_optimal", "random")
+    )
+    ratios = [np.log(theirs[seed] / ours[seed]) for seed in range(5)]
+    assert row.ratio.item() == pytest.approx(np.exp(np.mean(ratios)))
+    assert row.n_pairs.item() == 5
+    assert row.improvement.item() == 0.0
+    sheet = control_table(table)
+    assert len(sheet.rows) == len(table) == 2 * 3 * 2
+    assert "| quadrotor |" in sheet.markdown()
+
+
+def test_a_number_that_is_missing_is_left_out(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("random",), range(3), **SHORT, **task)
+    fill(url, specs)
+    with Reader.open(url) as reader:
+        part = control_part(select(reader, Filter()))
+        (entry,) = part.entries
+        costs = relative_costs(reader, entry)
+        assert costs.values.shape == (3, 3)
+        assert scores_at(reader, entry, 19).by_seed == {}
+        assert sorted(scores_at(reader, entry, 20).by_seed) == [0, 1, 2]
+        assert tabulate_control(measure_control(reader, part)).n.tolist() == [3, 3, 3]
+
+
+def valued(
+    measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t: int, value: float
+) -> Edit:
+    """Return an edit that gives a measure of some trials a value."""
+
+    def edit(spec: TrialSpec, result: TrialResult) -> TrialResult:
+        if spec.policy.name not in policies or spec.seed not in seeds:
+            return result
+        rows = (
+            row._replace(value=value) if (row.t, row.measure) == (t, measure) else row
+            for row in result.assessments
+        )
+        return dataclasses.replace(result, assessments=tuple(rows))
+
+    return edit
+
+
+def overflown(measure: str, policies: tuple[str, ...], seeds: tuple[int, ...], t: int) -> Edit:
+    """Return an edit that makes a number infinite, as the episode of a crashed plant has it."""
+    return valued(measure, policies, seeds, t, np.inf)
+
+
+def test_episodes_without_a_finite_cost_are_counted(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/lost.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **task)
+    fill(url, specs, edit=overflown("control_cost", ("random",), (1, 3), 20))
+    with Reader.open(url) as reader:
+        part = control_part(select(reader, Filter()))
+        curves = measure_control(reader, part)
+        entry = next(entry for entry in part.entries if entry.config.policy == "random")
+        scores = scores_at(reader, entry, 20).by_seed
+        table = compare_control(reader, part)
+    curve = curve_of(curves, "pendulum", "random")
+    assert curve.n.tolist() == [5, 5, 5]
+    assert curve.lost.tolist() == [0, 2, 0]
+    assert {seed for seed, score in scores.items() if np.isinf(score)} == {1, 3}
+    finite = [score for score in scores.values() if np.isfinite(score)]
+    assert curve.cost[1] == pytest.approx(np.exp(np.mean(np.log(finite))))
+    assert tabulate_control(curves).lost.tolist() == [0, 0, 0, 0, 2, 0]
+    assert "random: 5, 2 lost" in caption_control(curves)
+    assert "Lost: episodes" in caption_control(curves)
+    assert "2 lost" in draw_control(curves).axes[0].get_title()
+    row = table[table.t == 20].iloc[0]
+    assert (row.n_pairs, row.n_lost, row.improvement) == (5, 2, 0.0)
+    assert row.p_value == pytest.approx(2 / 2**5)  # all five, the lost ones too
+    lines = control_table(table).markdown().splitlines()
+    assert "], 2 lost |" in lines[2]
+    assert "lost" not in lines[3]
+
+
+def test_costs_without_a_true_model_to_divide_by_are_counted(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/truth.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(5), **SHORT, **task)
+    fill(url, specs, edit=overflown("true_model_cost", ("d_optimal", "random"), tuple(range(5)), 0))
+    with Reader.open(url) as reader:
+        part = control_part(select(reader, Filter()))
+        curves = measure_control(reader, part)
+        table = compare_control(reader, part)
+    assert [curve.lost.tolist() for curve in curves] == [[5, 5, 5]] * 2
+    assert np.isnan(curves[0].cost).all()
+    assert curves[0].success[-1] == 1.0
+    assert "| –, 5 lost |" in " ".join(control_table(table).markdown().split())
+
+
+def test_the_picture_has_a_column_for_each_task(reader: Reader, part: Selection) -> None:
+    curves = measure_control(reader, part)
+    figure = draw_control(curves)
+    titles = [axes.get_title() for axes in figure.axes]
+    assert [title.split("\n")[0] for title in titles[:2]] == ["pendulum", "quadrotor"]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["D-optimal", "uniform", "random", "true model"]
+    caption = caption_control(curves)
+    assert "Wilson" in caption
+    assert "pendulum: n = 5" in caption
+    odd = dataclasses.replace(curves[0], cost=np.full(4, np.nan), cost_low=np.full(4, np.nan))
+    draw_control((odd,))
+
+
+def test_the_true_model_is_the_ceiling_of_success(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/ceiling.db"
+    task = {"task": {"name": "control", "checkpoints": [20]}}
+    specs = make_grid(("pendulum",), ("d_optimal",), range(3), **SHORT, **task)
+    specs += make_grid(("pendulum",), ("random",), range(5), **SHORT, **task)
+    policies = ("d_optimal", "random")
+    missed = valued("true_model_success", policies, (0, 4), 0, 0.0)
+    crashed = overflown("true_model_cost", policies, (4,), 0)
+    fill(url, specs, edit=lambda spec, result: crashed(spec, missed(spec, result)))
+    with Reader.open(url) as reader:
+        curves = measure_control(reader, control_part(select(reader, Filter())))
+    truth = curves[0].truth
+    assert truth == curves[1].truth
+    assert (truth.n, truth.lost) == (5, 1)  # each seed once
+    assert truth.success == pytest.approx(3 / 5)
+    assert truth.success_low < 3 / 5 < truth.success_high
+    assert set(tabulate_control(curves).true_model_success) == {truth.success}
+    rates, costs = draw_control(curves).axes
+    for axes, height in ((rates, truth.success), (costs, 1.0)):
+        flat = [line for line in axes.get_lines() if list(line.get_ydata()) == [height] * 2]
+        assert [line.get_linestyle() != "-" for line in flat] == [True]
+    assert "dashed: of the same planner with the true model" in caption_control(curves)
+    assert "(pendulum 0.60)" in caption_control(curves)
+
+
+def test_a_grid_without_a_task_has_no_such_figure(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    fill(url, make_grid(("pendulum",), ("d_optimal", "random"), range(2), **SHORT))
+    names = ("figure5_control", "comparison_control")
+    with Reader.open(url) as reader:
+        outcomes = build(
+            reader, select(reader, Filter()), PlotOptions(), tmp_path / "figures", names
+        )
+        states = {outcome.name: outcome.state for outcome in outcomes}
+    assert all(states[name] == "not drawn, nothing is stored for it" for name in names)
+
+
+def test_assessments_as_a_frame(url: str) -> None:
+    with analysis.load(url, env="pendulum") as results:
+        frame = results.assessments("control_cost", "coverage")
+        assert set(frame.measure) == {"control_cost", "coverage"}
+        assert len(frame) == 3 * 5 * 4 * 2
+        assert frame[frame.measure == "coverage"].groupby("t").value.first().tolist() == [
+            0.0,
+            pytest.approx(1 / 3),
+            pytest.approx(2 / 3),
+            1.0,
+        ]
+        assert set(results.assessments().measure) > set(frame.measure)
+    with analysis.load(url, env="cartpole") as results:
+        assert results.assessments().empty
+
+
+@given(
+    st.integers(2, 65).flatmap(
+        lambda steps: arrays(float, (2, steps, 2), elements=st.floats(-10, 10, width=32))
+    ),
+    st.floats(0.001, 1.0),
+)
+def test_parseval(inputs: np.ndarray, dt: float) -> None:
+    frequency, density = periodogram(inputs, dt)
+    power = density.sum(axis=1) * (frequency[1] - frequency[0])
+    assert power == pytest.approx((inputs**2).sum(axis=2).mean(axis=1), rel=1e-9, abs=1e-12)
+    assert frequency[-1] <= 0.5 / dt * (1 + 1e-12)
+
+
+def test_a_sine_on_the_grid_is_one_line_of_half_its_squared_amplitude() -> None:
+    dt, steps, cycles = 0.02, 500, 7
+    time = dt * np.arange(steps)
+    wave = 3 * np.sin(2 * np.pi * cycles / (steps * dt) * time)
+    frequency, density = periodogram(wave[None, :, None], dt)
+    peak = np.argmax(density[0])
+    assert frequency[peak] == pytest.approx(cycles / (steps * dt))
+    assert density[0, peak] * frequency[1] == pytest.approx(9 / 2)
+    assert np.delete(density[0], peak).max() < 1e-20
+
+
+def test_white_noise_is_flat_at_its_variance_over_the_nyquist_frequency() -> None:
+    dt, variance = 0.02, 4.0
+    noise = np.sqrt(variance) * np.random.default_rng(0).normal(size=(400, 200, 1))
+    spectrum = average_spectrum(noise, dt)
+    level = variance / (0.5 / dt)
+    assert spectrum.mean[1:-1] == pytest.approx(level, rel=0.25)
+    # a periodogram ordinate is exponential: its quantiles are -log(0.9) and -log(0.1) of the mean
+    assert spectrum.low[1:-1].mean() == pytest.approx(-np.log(0.9) * level, rel=0.1)
+    assert spectrum.high[1:-1].mean() == pytest.approx(-np.log(0.1) * level, rel=0.1)
+    assert spectrum.n == 400
+
+
+ANGLES = st.lists(st.floats(-30, 30), min_size=1, max_size=30)
+CENTRES = st.sampled_from([0.0, math.pi, -1.0])
+
+
+@given(ANGLES, CENTRES)
+def test_wrapped_angles_are_the_same_angle_within_one_turn(
+    angles: list[float], centre: float
+) -> None:
+    given_angles = np.array(angles)
+    inside = wrap(given_angles, centre)
+    assert np.all(np.abs(inside - centre) <= math.pi + 1e-9)
+    assert np.cos(inside) == pytest.approx(np.cos(given_angles), abs=1e-9)
+    assert np.sin(inside) == pytest.approx(np.sin(given_angles), abs=1e-9)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=40), CENTRES)
+def test_a_line_is_never_drawn_across_the_panel(steps: list[float], centre: float) -> None:
+    angle = np.cumsum(steps)
+    line = wrapped_line(np.stack([angle, np.arange(len(angle))], axis=1), 0, centre)
+    jumps = np.abs(np.diff(line[:, 0]))
+    drawn = jumps[np.isfinite(jumps)]
+    assert np.all(drawn <= np.max(np.abs(np.diff(angle))) + 1e-9)
+    finite = line[np.isfinite(line[:, 0])]
+    assert np.all(np.abs(finite[:, 0] - centre) <= math.pi + 1e-9)
+    breaks = np.isnan(line[:, 0]).sum()
+    assert breaks == np.count_nonzero(np.diff(turns(angle, centre)))
+
+
+def test_a_crossing_reaches_both_edges_at_the_interpolated_height() -> None:
+    line = wrapped_line(np.array([[math.pi - 1, 0.0], [math.pi + 3, 4.0]]), 0)
+    expected = np.array(
+        [[math.pi - 1, 0], [math.pi, 1], [np.nan, np.nan], [-math.pi, 1], [-math.pi + 3, 4]]
+    )
+    assert line == pytest.approx(expected, nan_ok=True)
+
+
+def test_a_crossing_to_the_other_side() -> None:
+    line = wrapped_line(np.array([[-math.pi + 1, 0.0], [-math.pi - 1, 2.0]]), 0)
+    assert line[1] == pytest.approx([-math.pi, 1])
+    assert line[3] == pytest.approx([math.pi, 1])
+
+
+def test_the_second_coordinate_can_be_the_angle() -> None:
+    line = wrapped_line(np.array([[0.0, 0.0], [1.0, 4.0]]), 1)
+    assert line[1] == pytest.approx([math.pi / 4, math.pi])
+    assert line[-1] == pytest.approx([1.0, 4.0 - TURN])
+
+
+def test_more_than_a_turn_in_a_step_is_a_plain_break() -> None:
+    line = wrapped_line(np.array([[0.0, 0.0], [3 * TURN, 1.0]]), 0)
+    assert line == pytest.approx(np.array([[0, 0], [np.nan, np.nan], [0, 1]]), nan_ok=True)
+
+
+def test_a_line_within_one_turn_stays_as_it_is() -> None:
+    points = np.array([[3.0, 1.0], [-3.0, 2.0], [0.0, 3.0]])
+    assert np.array_equal(wrapped_line(points, 0), points)
+
+
+def test_frequencies_inputs_and_counts(reader: Reader) -> None:
+    spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
+    by_name = {one.policy: one for one in spectra.policies}
+    assert (by_name["random"].spectrum.n, by_name["random"].n_diverged) == (4, 1)
+    assert spectra.unit == "N"
+    # cart and pole about hanging: below this, the pole alone on a fixed cart swings slower
+    assert spectra.eigenfrequency is not None
+    assert spectra.eigenfrequency > math.sqrt(10) / (2 * math.pi)
+
+
+def test_the_power_of_a_bang_bang_input_is_its_bound_squared(reader: Reader) -> None:
+    spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
+    table = tabulate_spectra(spectra)
+    rows = table[table.policy == "d_optimal"]
+    spacing = rows.frequency_hz.iloc[1]
+    assert rows["mean"].sum() * spacing == pytest.approx(spectra.gamma**2)
+    assert np.all(rows["quantile_10"] <= rows["quantile_90"])
+
+
+def test_a_policy_of_which_every_trial_diverged_is_named(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/results.db"
+    specs = make_grid(("cartpole",), ("d_optimal", "random"), range(3), **SHORT)
+    lost = {spec.trial_key: 9 for spec in specs if spec.policy.name == "random"}
+    fill(url, specs, diverged=lost)
+    with Reader.open(url) as reader:
+        spectra = measure_spectra(reader, select(reader, Filter()), "cartpole")
+    assert [one.policy for one in spectra.policies] == ["d_optimal"]
+    assert spectra.diverged == ("random",)
+    assert "Not drawn, because every trial diverged: random." in caption(spectra)
+
+
+def test_unit_of() -> None:
+    assert unit_of("u [N m]") == "N m"
+    assert unit_of("u", "") == ""
