@@ -7,19 +7,22 @@ missing and ``--allow-partial`` was not given; 130: interrupted.
 from __future__ import annotations
 
 import argparse
+import os
+import socket
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import pandas as pd
 
 from analysis import report
-from analysis import serve as browser
 from analysis.data.matching import REFERENCE, Filter, read_condition
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
 from analysis.outputs import NAMES, partial_warning
+from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread
 from analysis.stats.intervals import BandKind, Statistic
 from analysis.stats.scores import Measure
@@ -31,12 +34,16 @@ from analysis.tables.rendering import (
     comparison,
     incomplete,
 )
+from dopt.errors import install_command
 from dopt.process import usable_cores
 from orchestrate.program import Parser, UsageError, answered, path, positive, tell
 from orchestrate.store import DEFAULT_URL, Reader, default_url
 
 COLUMNS = ("loss", "reachable_loss")
 FORMATS = ("markdown", "latex", "csv")
+SERVE_HELP = "show the results in a browser, read-only, while a launch writes"
+PORT = 8000
+HOST = "127.0.0.1"
 
 
 @answered
@@ -140,9 +147,7 @@ def parser() -> Parser:
     for option, default, what in (("--frames", 150, "pictures in all"), ("--fps", 15, "a second")):
         number = positive(option, int)
         animate.add_argument(option, type=number, default=default, help=f"{what} ({default})")
-    serve = commands.add_parser("serve", help=browser.HELP, description=browser.HELP)
-    serve.set_defaults(alone=browser.run)
-    browser.add_arguments(serve)
+    _add_serve(commands)
     return top
 
 
@@ -289,3 +294,75 @@ def _text(text_table: TextTable, table: pd.DataFrame, form: str) -> str:
 def say(text: str) -> None:
     """Print one line of progress."""
     tell(sys.stdout, f"{text}\n")
+
+
+def _add_serve(commands: argparse._SubParsersAction[Parser]) -> None:
+    serve = commands.add_parser("serve", help=SERVE_HELP, description=SERVE_HELP)
+    serve.set_defaults(alone=_serve)
+    serve.add_argument(
+        "--db", nargs="+", default=[default_url()], metavar="URL", help=f"(DOPT_DB, {DEFAULT_URL})"
+    )
+    serve.add_argument("--port", type=int, default=PORT, help=f"port, 0: any free one ({PORT})")
+    serve.add_argument("--host", default=HOST, help=f"address to listen at ({HOST})")
+
+
+def _serve(options: argparse.Namespace) -> int:
+    """Serve until the user ends it with Ctrl-C."""
+    _check_one_database(options)
+    try:
+        from analysis.serve.app import create_app
+        from analysis.serve.server import Server
+    except ModuleNotFoundError as error:
+        raise AnalysisError(
+            f"The browser needs the library {error.name}: "
+            f"install it with {install_command('serve')}."
+        ) from error
+    app = create_app(options.db[0], options.host)
+    listening = _listen(options.host, options.port)
+    sys.stdout.write(_greeting(options, listening.getsockname()[1]))
+    sys.stdout.flush()
+    try:
+        Server(app, leave=lambda: os._exit(0)).run(sockets=[listening])
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        listening.close()
+    return 0
+
+
+def _check_one_database(options: argparse.Namespace) -> None:
+    if len(options.db) > 1:
+        raise AnalysisError(
+            f"A browser shows one database, but {len(options.db)} are given: start one for each, "
+            f"with --port 0, or put them together with orchestrate merge."
+        )
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Return a bound socket; raise ``AnalysisError`` where the address is taken or wrong."""
+    if not 0 <= port < 2**16:
+        raise AnalysisError(f"--port is {port}, expected is a number of 0 to 65535: give one.")
+    with ExitStack() as failing:
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(
+                host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )[0]
+            listening = failing.enter_context(socket.socket(family, kind, protocol))
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listening.bind(address)
+            listening.listen()  # a browser that comes before the first page is ready waits
+        except OSError as error:
+            raise AnalysisError(
+                f"The browser cannot listen at {host}:{port} ({error.strerror or error}): "
+                f"give another --port or --host, --port 0 takes any free port."
+            ) from error
+        failing.pop_all()
+    return listening
+
+
+def _greeting(options: argparse.Namespace, port: int) -> str:
+    host = f"[{options.host}]" if ":" in options.host else options.host
+    text = f"Results browser at http://{host}:{port}/ (read-only; Ctrl-C ends it)\n"
+    if not is_loopback(options.host):
+        text += "Whoever reaches this machine can read the database: there is no password.\n"
+    return text
