@@ -17,10 +17,9 @@ from typing import Any
 import yaml
 
 from analysis.cli import parser
-from dopt import Explorer, Plant
+from dopt import LEARNERS, MODELS, POLICIES, Explorer, Plant
 from dopt.assessment import MEASURES
 from dopt.control import TASKS
-from dopt.policies import POLICIES
 from dopt.systems import NAMED_SYSTEMS
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
@@ -35,9 +34,10 @@ Rows = Iterable[Sequence[str]]
 CLASSES: dict[str, Mapping[str, type]] = {
     "env": NAMED_SYSTEMS,
     "policy": POLICIES,
+    "model": MODELS,
+    "learner": LEARNERS,
     "task": TASKS,
 }
-"""Classes of the options that have no file."""
 
 COMMENTED = re.compile(r"^ *([\w.]+):(?: +([^#\n]*?))? *(?:# (.*))?$", re.MULTILINE)
 """A setting of a file of options: key, value and comment."""
@@ -65,15 +65,24 @@ def comment(path: Path) -> str:
     return " ".join(line.lstrip("# ") for line in lines[:end])
 
 
-def settings(values: Mapping[str, Any]) -> str:
-    """Return settings with their defaults, as one cell of a table."""
+def choices(cls: type) -> dict[str, tuple[str, ...]]:
+    """Return the choices of the fields that are one of some words."""
+    return {one.name: one.metadata.get("choices", ()) for one in dataclasses.fields(cls)}
+
+
+def settings(values: Mapping[str, Any], among: Mapping[str, tuple[str, ...]]) -> str:
+    """Return settings with their defaults and other choices, as one cell of a table."""
 
     def text(value: object) -> str:
         if value is None or isinstance(value, bool):
             return "null" if value is None else str(value).lower()
         return str(value).replace(" ", "").replace("'", "")
 
-    return " ".join(f"`{key}={text(value)}`" for key, value in values.items() if key != "name")
+    def shown(key: str, value: object) -> str:
+        others = [f"`{one}`" for one in among.get(key, ()) if one != value]
+        return f"`{key}={text(value)}`" + (f" (or {', '.join(others)})" if others else "")
+
+    return " ".join(shown(key, value) for key, value in values.items() if key != "name")
 
 
 def fields(cls: type) -> dict[str, object]:
@@ -83,17 +92,18 @@ def fields(cls: type) -> dict[str, object]:
 
 def option(group: str, name: str) -> list[str]:
     """Return the row of an option: name, what it is, its settings with their defaults."""
-    path = CONFIGURATION / group / f"{name}.yaml"
+    path, known = CONFIGURATION / group / f"{name}.yaml", CLASSES.get(group, {})
     if path.exists():
         said, found = comment(path), yaml.safe_load(path.read_text())
         own = {key: one for key, one in found.get(group, found).items() if key != "defaults"}
+        cls = known.get(str(own.get("name")))
     else:
         folder, _, short = name.rpartition("/")
-        cls = CLASSES[group][f"mujoco_{short}" if folder == "mujoco" else short]
+        cls = known[f"mujoco_{short}" if folder == "mujoco" else short]
         said, own = inspect.getdoc(cls) or "", fields(cls)
     shared = fields(System) if group == "env" else {}
     own = {key: one for key, one in own.items() if key not in shared}
-    return [f"`{name}`", first_sentence(said), settings(own)]
+    return [f"`{name}`", first_sentence(said), settings(own, choices(cls) if cls else {})]
 
 
 def of_group(group: str) -> str:

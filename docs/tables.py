@@ -1,6 +1,6 @@
 """``python docs/tables.py``: write the tables of the pages from CSV files and from the code.
 
-Numbers come from the CSV files of the studies, the rest from :mod:`docs.code_tables`. A table
+Numbers come from the CSV files of the studies, the rest from ``code_tables.py``. A table
 stands in a page between ``<!-- table: NAME -->`` and ``<!-- end -->``. ``--check`` writes nothing
 and fails where a page differs from its sources.
 """
@@ -17,13 +17,15 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
+sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import code_tables
+from code_tables import markdown
 
 from analysis.stats.intervals import band, standard_error
 from analysis.stats.scores import compare
 from analysis.style import number, plus_minus, share, within
-from docs import code_tables
-from docs.code_tables import markdown
 
 DOCS = Path(__file__).parent
 PAGES = (
