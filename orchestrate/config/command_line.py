@@ -13,7 +13,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,7 +94,6 @@ def read_command_line() -> Request | None:
     given = tuple(word for word in words if not _OF_HYDRA.match(word))
     found: list[Request | Exception] = []
 
-    @hydra.main(config_path=str(CONFIGURATION), config_name="config", version_base="1.3")
     def capture(config: DictConfig) -> None:
         try:
             found.append(_grid(config, given) if grid else _single(config, given))
@@ -103,10 +102,17 @@ def read_command_line() -> Request | None:
 
     register()
     answer = io.StringIO()
-    with _arguments([*options, *(_of_launch(words) if grid else words)]), _errors_let_through():
+    words = _of_launch(words) if grid else words
+    with _arguments([*options, *words]), _errors_let_through():
         try:
             with contextlib.redirect_stdout(answer):
-                capture()
+                if options or any(map(_OF_HYDRA.match, words)):
+                    folder = str(CONFIGURATION)
+                    hydra.main(version_base="1.3", config_path=folder, config_name="config")(
+                        capture
+                    )()
+                else:
+                    _call_with_composed(capture, words)
         finally:
             if text := answer.getvalue():
                 sys.stdout.write(as_started(text))
@@ -114,6 +120,14 @@ def read_command_line() -> Request | None:
     if isinstance(request, Exception):
         raise request
     return request
+
+
+def _call_with_composed(task: Callable[[DictConfig], None], words: Sequence[str]) -> None:
+    """Call ``task`` as :func:`hydra.main` does, which composes everything twice."""
+    with hydra.initialize_config_dir(str(CONFIGURATION), version_base="1.3"):
+        config = hydra.compose("config", list(words), return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        task(config)
 
 
 def _parser() -> Parser:
