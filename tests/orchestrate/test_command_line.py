@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
+import argparse
+import os
 import re
 import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from analysis.cli import main as analysis
+from analysis.cli import parser as parser_of_analysis
+from dopt.errors import _say_once
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
+from orchestrate.__main__ import main as orchestrate
+from orchestrate.commands import COMMANDS
+from orchestrate.program import SUCCESSORS
 from orchestrate.runner import run_grid
 from orchestrate.runner.run_grid import Work
-from orchestrate.store import Reader
+from orchestrate.store import Reader, StoreError, default_url
+from orchestrate.store.backends.sqlite_engine import existing_path
+from orchestrate.store.database_url import parse
 from tests.orchestrate.standins import quick, raising, unusable
+from tests.pages import commands
 from tests.paths import ROOT
 
 Command = Callable[..., tuple[int, str, str]]
@@ -314,3 +325,240 @@ def test_a_single_trial_that_is_interrupted_before_its_start_says_so(
     code, output, errors = command_line("env=pendulum", *SHORT)
     assert (code, errors) == (130, "")
     assert re.fullmatch(r"env=pendulum .* · not started · sqlite:.*\n", output)
+
+
+def test_a_dry_run_shows_the_grid_and_makes_no_database(
+    command_line: Command, tmp_path: Path
+) -> None:
+    grid = ("-m", "policy=random", "width=8,16", "seed=range(4)", *SHORT)
+    code, output, _ = command_line(*grid, "launch.dry_run=true")
+    assert code == 0
+    assert list(tmp_path.iterdir()) == []
+    assert re.search(r"pendulum +random, .*width 8 +4 +0 +0 +4\n", output)
+    assert "8 trials, 0 done, 8 to run" in output
+    command_line(*grid, "seed=range(3)")
+    assert "8 trials, 6 done, 2 to run" in command_line(*grid, "launch.dry_run=true")[1]
+
+
+def test_a_dry_run_counts_trials_that_run_again(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Failed(dict[str, str]):
+        def get(self, _key: str, _default: object = None) -> str:  # type: ignore[override]
+            return "failed"
+
+    monkeypatch.setattr("orchestrate.runner.start._statuses", lambda _: Failed())
+    grid = ("-m", "policy=random", "seed=range(4)", "launch.dry_run=true", *SHORT)
+    assert "4 trials, 0 done, 0 to run" in command_line(*grid)[1]
+    assert "4 trials, 0 done, 4 to run" in command_line(*grid, "launch.retry=failed")[1]
+
+
+def test_a_dry_run_tells_its_configs_apart(command_line: Command) -> None:
+    _, output, _ = command_line(
+        "-m", "env=arm,pendulum", "policy=random", "env.mass=2,3", "env.dt=0.01,0.02", "seed=0",
+        "launch.dry_run=true",
+    )  # fmt: skip
+    assert "env.mass applies to env=pendulum only\n" in output
+    assert re.search(r"env +configuration +trials", output)
+    assert re.search(r"arm +random, dt=0.01 +1", output)
+    assert re.search(r"pendulum +random, .*mass=3 +1", output)
+    assert "6 trials" in output
+
+
+def test_width_reaches_the_model_and_a_model_without_width_runs_once(
+    command_line: Command,
+) -> None:
+    _, output, _ = command_line(
+        "-m", "policy=random,oracle", "width=4,8", "seed=0", "launch.dry_run=true"
+    )
+    assert re.search(r"random, width 4 .* 1\n", output)
+    assert re.search(r"random, width 8 .* 1\n", output)
+    assert len(re.findall("oracle", output)) == 1
+
+
+SHOWN = {word for command in commands("launch.py") for word in command.words}
+"""Words of the commands on the pages, which ``tests/test_docs.py`` gives."""
+
+
+def test_every_experiment_is_a_grid(command_line: Command) -> None:
+    """Those of the pages are run there; a setting of one grid is not said to hold for others."""
+    said = {}
+    for path in (ROOT / "conf" / "experiment").glob("*.yaml"):
+        name = f"experiment={path.stem}"
+        if path.stem == "beyond" or name not in SHOWN:
+            code, output, errors = command_line("-m", name, "seed=0", "launch.dry_run=true")
+            assert code == 0, errors
+            assert re.search(r"[1-9][\d,]* trials, 0 done", output)
+            said[path.stem] = output
+    assert said["beyond"].startswith("learner.forgetting applies to learner=ekf only\n")
+
+
+LAUNCH = [str(ROOT / "orchestrate/launch.py"), "-m", "policy=random", "seed=0,1", *SHORT]
+
+
+@pytest.mark.parametrize("worker", [False, True])
+def test_a_grid_goes_on_when_its_output_is_closed(tmp_path: Path, worker: bool) -> None:
+    """As by ``| head``."""
+    url = f"sqlite:///{tmp_path}/results/results.db"
+    words = LAUNCH
+    if worker:
+        leave = [sys.executable, *LAUNCH, "launch.detach=true"]
+        subprocess.run(leave, cwd=tmp_path, check=True, capture_output=True)
+        words = ["-m", "orchestrate", "work", "--db", url]
+    with subprocess.Popen(
+        [sys.executable, *words], cwd=tmp_path, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert "rror" not in process.stderr.read()
+    assert process.returncode == 0
+    with Reader.open(url) as reader:
+        rows = reader.query("SELECT count(*) FROM trial WHERE status = 'done'")
+        assert [tuple(row) for row in rows] == [(2,)]
+
+
+@pytest.mark.parametrize("word", [name for name in SUCCESSORS if name.startswith("launch.")])
+def test_settings_of_a_launch(command_line: Callable[..., tuple[int, str, str]], word: str) -> None:
+    code, output, errors = command_line("-m", word if "=" in word else f"{word}=1")
+    assert (code, output) == (2, "")
+    assert errors == f"error: '{word}' was removed: {SUCCESSORS[word]}.\n"
+
+
+@pytest.mark.parametrize("words", [["work", "--live", "1"], ["work", "--live=1"]])
+def test_options(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert orchestrate(words) == 2
+    assert f"'--live' was removed: {SUCCESSORS['--live']}." in capsys.readouterr().err
+
+
+FROM_VARIABLE = "The database URL in the environment variable DOPT_DB cannot be read"
+
+
+def test_the_database_of_the_environment(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/mine.db")
+    assert command_line(*SHORT)[0] == 0
+    assert (tmp_path / "mine.db").exists()
+
+
+def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "mine/x.db")
+    code, _, errors = command_line(*SHORT)
+    assert code == 2
+    assert f"{FROM_VARIABLE}: write it as sqlite:///mine/x.db." in errors
+    monkeypatch.setenv("DOPT_DB", "me:secret@host/x.db")
+    _, _, errors = command_line(*SHORT)
+    assert f"{FROM_VARIABLE}: write it as sqlite:///results/results.db or " in errors
+    assert "secret" not in errors
+    _, _, errors = command_line(*SHORT, "store.url=mine/x.db")
+    assert "The database URL cannot be read: write it as sqlite:///mine/x.db." in errors
+
+
+def test_an_empty_variable_counts_as_unset(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "")
+    code, output, errors = command_line(*SHORT)
+    assert (code, errors) == (0, "")
+    assert "sqlite:///results/results.db" in output
+    assert default_url() == "sqlite:///results/results.db"
+
+
+TRIAL = ("env=pendulum", "policy=random", *SHORT)
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    _say_once.cache_clear()
+    (tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+@pytest.mark.parametrize(
+    "given", ["sqlite:///~/r.db", "sqlite:///~/r.db\n", " sqlite:/// ~/r.db\t"]
+)
+def test_a_database_in_the_home_folder(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch, home: Path, given: str
+) -> None:
+    monkeypatch.setenv("DOPT_DB", given)
+    code, output, errors = command_line(*TRIAL)
+    assert (code, errors) == (0, "")
+    assert output.rstrip().endswith(f"sqlite:///{home}/r.db")
+    assert (home / "r.db").is_file()
+    assert orchestrate(["status"]) == 0
+    assert orchestrate(["status", "--db", f"{given} "]) == 0
+    monkeypatch.delenv("DOPT_DB")
+    assert "already done" in command_line(*TRIAL, f"store.url={given}")[1]
+    assert [path.name for path in Path.cwd().iterdir()] == ["home"]
+
+
+@pytest.mark.usefixtures("home")
+def test_a_variable_in_the_address_makes_no_folder(
+    command_line: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", "sqlite:///${HOME}/r.db")
+    code, output, errors = command_line(*TRIAL)
+    assert (code, output) == (2, "")
+    assert "in the environment variable DOPT_DB is '${HOME}/r.db', but ${HOME} is expand" in errors
+    assert [path.name for path in Path.cwd().iterdir()] == ["home"]
+
+
+def test_a_password_may_hold_what_a_path_may_not() -> None:
+    url = parse("postgresql://me:$HOME%7E~%0A@host/dopt\n")
+    assert (url.password, url.database) == ("$HOME~~\n", "dopt")
+    with pytest.raises(StoreError, match="holds the control character") as raised:
+        Reader.open("postgresql://me:secret@host/do\npt")
+    assert "secret" not in str(raised.value)
+    assert str(existing_path(parse("sqlite:////dev/../etc/hostname "))) == "/etc/hostname"
+
+
+def parsers() -> Iterator[argparse.ArgumentParser]:
+    yield from (command.parser() for command in COMMANDS)
+    for action in parser_of_analysis()._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            yield from action.choices.values()
+
+
+def test_no_option_takes_a_path_unread() -> None:
+    actions = [one for parser in parsers() for one in parser._actions]
+    assert not [one.dest for one in actions if one.type in (Path, os.fspath)]
+    assert sum("given_path" in repr(one.type) for one in actions) >= 6
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["backup", "$X/r.db"], ["export", "curves", "--out", "$X/c.csv"], ["merge", "$X/other.db"]],
+)
+def test_options_of_the_commands(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert orchestrate(words) == 2
+    assert "'$X/" in capsys.readouterr().err
+
+
+def test_options_of_the_analysis(capsys: pytest.CaptureFixture[str]) -> None:
+    assert analysis(["figures", "--out", "$X/f"]) == 2
+    assert "--out is '$X/f', but $X is expanded by a shell" in capsys.readouterr().err
+
+
+def test_the_cache_of_the_kernel(tmp_path: Path, home: Path) -> None:
+    def run(folder: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, str(ROOT / "orchestrate/launch.py"), *TRIAL, "launch.dry_run=true"],
+            env={**os.environ, "DOPT_CACHE": folder},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+
+    refused = run("$HOME/cache")
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("error: DOPT_CACHE is '$HOME/cache', but $HOME is expanded")
+    assert run("~/cache\n").returncode == 0
+    assert [path.name for path in home.iterdir()] == ["cache"]
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]

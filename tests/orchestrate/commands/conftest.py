@@ -106,6 +106,12 @@ def grid(store: Store) -> int:  # noqa: F811
 
 
 @pytest.fixture
+def ask(grid: int, command: Callable[..., Answer]) -> Callable[..., Answer]:  # noqa: ARG001
+    """Return ``command`` on the database with the grid."""
+    return command
+
+
+@pytest.fixture
 def bundle(
     grid: int,
     store: Store,  # noqa: F811

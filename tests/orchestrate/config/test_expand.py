@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +17,19 @@ from hydra import initialize_config_dir
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 
 from dopt.errors import SpecificationError
 from orchestrate.config import Combination
-from orchestrate.config import expand as expansion
+from orchestrate.config.expand import expand
+from orchestrate.config.sweeps import parsed_overrides, read_axes
 
 SAMPLE = Path(__file__).parent / "sample"
 SECTIONS = (
@@ -66,9 +71,9 @@ def sample() -> Iterator[Sample]:
         yield Sample(loader, loader.load_configuration("config", [], RunMode.MULTIRUN))
 
 
-def expand(sample: Sample, *grids: Sequence[str], sections: Sequence[str]) -> list[Combination]:
+def expanded(sample: Sample, *grids: Sequence[str], sections: Sequence[str]) -> list[Combination]:
     master = sample.master.hydra
-    return expansion.expand(master, *grids, sections=sections, check=lambda _: None)
+    return expand(master, *grids, sections=sections, check=lambda _: None)
 
 
 @st.composite
@@ -95,7 +100,7 @@ def plain(config: Any, key: Any) -> object:
 
 def by_us(sample: Sample, arguments: Sequence[str]) -> Counter[str]:
     jobs: Counter[str] = Counter()
-    for combination in expand(sample, arguments, sections=SECTIONS):
+    for combination in expanded(sample, arguments, sections=SECTIONS):
         inner = combination.seeds or [combination.settings["seed"]]
         jobs.update(frozen({**combination.settings, "seed": seed}) for seed in inner)
     return jobs
@@ -173,8 +178,8 @@ def test_an_option_is_exchanged_although_another_is_not_alone_in_its_section(
 
 
 def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> None:
-    apart = expand(sample, ["seed=range(4)"], sections=SECTIONS)
-    together = expand(sample, ["seed=range(4)", "model=linear"], sections=("policy", "seed"))
+    apart = expanded(sample, ["seed=range(4)"], sections=SECTIONS)
+    together = expanded(sample, ["seed=range(4)", "model=linear"], sections=("policy", "seed"))
     assert [one.seeds for one in apart] == [None] * 4
     assert [one.seeds for one in together] == [(0, 1, 2, 3)]
 
@@ -192,7 +197,7 @@ def test_seeds_stay_together_unless_something_follows_them(sample: Sample) -> No
 )
 def test_sweeps_without_values_are_errors(sample: Sample, override: str, words: str) -> None:
     with pytest.raises((SpecificationError, HydraException), match=words):
-        expand(sample, [override], sections=SECTIONS)
+        expanded(sample, [override], sections=SECTIONS)
 
 
 MIXED: list[tuple[list[str], list[list[str]]]] = [
@@ -224,7 +229,7 @@ def test_a_key_that_some_choices_lack_holds_for_the_others(
         by_hydra(sample, arguments)
     expected: Counter[str] = sum((by_hydra(sample, part) for part in parts), Counter())
     assert by_us(sample, arguments) == expected
-    combinations = expand(sample, arguments, sections=SECTIONS)
+    combinations = expanded(sample, arguments, sections=SECTIONS)
     assert {one.unused for one in combinations} >= {()}
     assert len({one.unused for one in combinations}) == 2
 
@@ -251,15 +256,352 @@ def test_a_key_that_every_choice_lacks_is_answered_with_the_names_of_all(
     with pytest.raises(HydraException):
         by_hydra(sample, ["model=linear,mlp", override])
     with pytest.raises(SpecificationError, match=sentence):
-        expand(sample, ["model=linear,mlp", override], sections=SECTIONS)
+        expanded(sample, ["model=linear,mlp", override], sections=SECTIONS)
 
 
 def test_a_key_has_to_be_known_to_one_of_several_grids(sample: Sample) -> None:
     grids = [["model=linear", "model.order=3"], ["model=mlp", "model.order=3"]]
-    together = expand(sample, *grids, sections=SECTIONS)
+    together = expanded(sample, *grids, sections=SECTIONS)
     assert [(one.used, one.unused) for one in together] == [
         (("model.order",), ()),
         ((), ("model.order",)),
     ]
     with pytest.raises(SpecificationError, match="did you mean 'order'"):
-        expand(sample, *grids, ["model=linear", "model.oder=3"], sections=SECTIONS)
+        expanded(sample, *grids, ["model=linear", "model.oder=3"], sections=SECTIONS)
+
+
+@pytest.fixture(scope="module")
+def loader() -> Iterator[ConfigLoader]:
+    with initialize_config_dir(str(SAMPLE), version_base="1.3"):
+        yield GlobalHydra.instance().config_loader()
+
+
+@pytest.fixture(scope="module")
+def hydra_settings(loader: ConfigLoader) -> DictConfig:
+    return loader.load_configuration("config", [], RunMode.RUN).hydra
+
+
+def swept(loader: ConfigLoader, word: str) -> list[object]:
+    """Return the values of an override; what is set is what is shown."""
+    (axis,) = read_axes(loader, [f"scale={word}"])
+    shown = [parsed_overrides([f"scale={text}"])[0].value() for text in axis.texts]
+    assert shown == list(axis.values)
+    assert [type(value) for value in shown] == [type(value) for value in axis.values]
+    return shown
+
+
+def decimals(start: str, stop: str, step: str) -> list[float]:
+    """Return the values of a range by school arithmetic."""
+    first, last, by = Decimal(start), Decimal(stop), Decimal(step)
+    values = []
+    while (first < last) if by > 0 else (first > last):
+        values.append(float(first))
+        first += by
+    return values
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("sort(range(0,5,2),reverse=true)", [4, 2, 0]),
+        ("sort(range(10,31,7),reverse=true)", [24, 17, 10]),
+        ("sort(range(10,0,-3))", [1, 4, 7, 10]),
+        ("sort(range(10,0,-3),reverse=true)", [10, 7, 4, 1]),
+        ("sort(sweep=range(0,5,2),reverse=true)", [4, 2, 0]),
+        ("sort(shuffle(range(0,5,2)))", [0, 2, 4]),
+        ("sort(tag(a,range(0,5,2)),reverse=true)", [4, 2, 0]),
+        ("sort(range(0,1,0.3),reverse=true)", [0.9, 0.6, 0.3, 0.0]),
+        ("float(sort(range(3),reverse=true))", [2.0, 1.0, 0.0]),
+        ("sort(3,1,2,reverse=true)", [3, 2, 1]),
+        ("range(10,0,-3)", [10, 7, 4, 1]),
+        ("range(1,0,-0.3)", [1.0, 0.7, 0.4, 0.1]),
+        ("range(0,0.9,0.3)", [0.0, 0.3, 0.6]),
+        ("range(1e-3,5e-3,1e-3)", [0.001, 0.002, 0.003, 0.004]),
+        ("range(1e20,1e20,1)", []),
+        ("range(3.0)", [0.0, 1.0, 2.0]),
+        ("float(range(3))", [0.0, 1.0, 2.0]),
+        ("int(range(0.5,3.5))", [0, 1, 2]),
+        ("range(stop=3,start=1)", [1, 2]),
+        ("range(3),5", [0, 1, 2, 5]),
+        ("5,range(0,0.2,0.1)", [5, 0.0, 0.1]),
+        ("shuffle(range(4))", [0, 1, 2, 3]),
+        ("shuffle(3,1,2)", [3, 1, 2]),
+        ("shuffle(choice(b,a))", ["b", "a"]),
+        ("str(1,2)", ["1", "2"]),
+        ("str(1,a,true,'it is')", ["1", "a", "true", "it is"]),
+        ("tag(a,b,choice(2,1))", [2, 1]),
+        ("choice(1,1)", [1, 1]),  # which the grid runs once
+    ],
+)
+def test_the_values_are_those_of_the_words(
+    loader: ConfigLoader, word: str, expected: list[object]
+) -> None:
+    if not expected:
+        with pytest.raises(HydraException, match="has no values"):
+            swept(loader, word)
+        return
+    found = swept(loader, word)
+    assert found == expected
+    assert [type(value) for value in found] == [type(value) for value in expected]
+
+
+TENTHS = st.integers(-400, 400).map(lambda k: f"{Decimal(k).scaleb(-2)}")
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(start=TENTHS, stop=TENTHS, step=TENTHS)
+def test_a_range_has_the_nearest_decimals(
+    loader: ConfigLoader, start: str, stop: str, step: str
+) -> None:
+    assume(Decimal(step) != 0)
+    expected = decimals(start, stop, step)
+    assume(expected)
+    assert swept(loader, f"range({start},{stop},{step})") == expected
+    for reverse in ("true", "false"):
+        word = f"sort(range({start},{stop},{step}),reverse={reverse})"
+        assert swept(loader, word) == sorted(expected, reverse=reverse == "true")
+
+
+def test_the_digits_are_those_that_a_person_writes(loader: ConfigLoader) -> None:
+    values = swept(loader, "range(0,1,0.1)")
+    assert [repr(value) for value in values] == [f"0.{k}" for k in range(10)]
+    assert not any(math.isclose(value, 1.0) for value in values if isinstance(value, float))
+
+
+@pytest.mark.parametrize(
+    ("word", "words"),
+    [
+        ("scale=interval(0,1)", "no finite list"),
+        ("scale=range(0,5,0)", "a step other than 0"),
+        ("scale=range(0,1,0.0)", "a step other than 0"),
+        ("scale=int(range(0,3,0.5))", "a step other than 0"),
+        ("scale=range(0,inf)", "no finite list"),
+        ("scale=range(nan,1)", "no finite list"),
+        ("scale=sort(range(0,inf))", "no finite list"),
+        ("scale=range(0,1e9)", "more than 1,000,000"),
+        ("scale=str(range(3))", "int or float"),
+        ("scale=shuffle([1,2,3])", "another value each time"),
+        ("scale=shuffle(list=[1,2,3])", "another value each time"),
+        ("scale=[range(3)]", "within a list or a mapping"),
+        ("nested={value:[shuffle(1,2)]}", "within a list or a mapping"),
+    ],
+)
+def test_what_has_no_such_values_is_refused(loader: ConfigLoader, word: str, words: str) -> None:
+    with pytest.raises(HydraException, match=words):
+        read_axes(loader, [word])
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["nested.inner={value:3}", "nested.inner={items:[4]}"],
+        ["nested={inner:{value:3,items:[4]}}", "nested={inner:{items:[5]}}"],
+        ["nested.inner={value:3}", "nested.inner.value=4", "nested.inner={items:[5]}"],
+        ["nested.inner={value:3}", "nested.inner.value=4", "nested.inner={value:5}"],
+        ["nothing={a:1}", "nothing=3", "nothing={b:2}"],
+        ["++nothing={a:1}", "++nothing={b:2}", "++nothing=null"],
+        ["++nothing={a:{b:1,c:[1]}}", "++nothing={a:{c:[2]}}"],
+        ["++nothing={a:'x,y'}", '++nothing={b:"it is"}'],
+        ["+new={a:1}", "+new={b:2}"],
+        ["++new={a:1}", "++new={a:2,b:2}"],
+        ["scale=1.0", "nested={inner:{value:1}}", "scale=2.0"],
+    ],
+)
+def test_repeated_overrides_hold_as_in_a_single_trial(
+    loader: ConfigLoader, hydra_settings: DictConfig, words: list[str]
+) -> None:
+    single = loader.load_configuration("config", words, RunMode.RUN)
+    expected = {key: single[key] for key in SECTIONS if key in single}
+    (one,) = expand(hydra_settings, words, sections=SECTIONS, check=lambda _: None)
+    plain: dict[Any, Any] = {
+        key: OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
+        for key, part in expected.items()
+    }
+    assert one.settings == plain
+
+
+def test_repeated_mappings_are_swept_together(hydra_settings: DictConfig) -> None:
+    words = ["++new={a:1},{a:2}", "++new={b:3},{b:4}"]
+    found = expand(hydra_settings, words, sections=SECTIONS, check=lambda _: None)
+    assert [one.settings["new"] for one in found] == [
+        {"a": a, "b": b} for a in (1, 2) for b in (3, 4)
+    ]
+    assert [one.overrides for one in found][:2] == [
+        ("++new={a:1}", "++new={b:3}"),
+        ("++new={a:1}", "++new={b:4}"),
+    ]
+
+
+NAMES = ("plain", "random", "far/exact", "far/random", "far/trace", "near/plain")
+
+
+@pytest.fixture
+def loader_globs(tmp_path: Path) -> Iterator[ConfigLoader]:
+    for name in NAMES:
+        path = tmp_path / f"choice_of/{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("value: 1\n")
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(tmp_path), version_base="1.3"):
+        yield GlobalHydra.instance().config_loader()
+
+
+def found(loader_globs: ConfigLoader, glob: str) -> tuple[str, ...]:
+    return read_axes(loader_globs, [f"choice_of={glob}"])[0].texts
+
+
+@pytest.mark.parametrize(
+    "glob", ["glob(*)", "glob(p*)", "glob([r*,p*])", "glob(*,exclude=p*)", "glob(*,exclude=[p*,z])"]
+)
+def test_without_a_folder_it_is_that_of_hydra(loader_globs: ConfigLoader, glob: str) -> None:
+    parser = OverridesParser.create(config_loader=loader_globs)
+    (override,) = parser.parse_overrides([f"choice_of={glob}"])
+    assert isinstance(override.value(), Glob)
+    assert found(loader_globs, glob) == tuple(override.sweep_string_iterator())
+
+
+@pytest.mark.parametrize(
+    ("glob", "names"),
+    [
+        ("glob(far/*)", ("far/exact", "far/random", "far/trace")),
+        ("glob([*,far/*])", ("plain", "random", "far/exact", "far/random", "far/trace")),
+        ("glob([far/*,near/*],exclude=*)", ("far/exact", "far/random", "far/trace", "near/plain")),
+        ("glob([*,far/*],exclude=[p*,far/r*])", ("random", "far/exact", "far/trace")),
+    ],
+)
+def test_with_a_folder_it_is_what_is_in_there(
+    loader_globs: ConfigLoader, glob: str, names: tuple[str, ...]
+) -> None:
+    assert found(loader_globs, glob) == names
+
+
+def test_one_that_matches_nothing_names_what_is_near(loader_globs: ConfigLoader) -> None:
+    with pytest.raises(SpecificationError, match=r"did you mean 'far/exact'.* near/plain"):
+        found(loader_globs, "glob(far/exakt)")
+    assert loader_globs.get_group_options("choice_of", ObjectType.GROUP) == ["far", "near"]
+
+
+Command = Callable[..., tuple[int, str, str]]
+
+SEVERAL = """
+# @package _global_
+hydra:
+  sweeper:
+    params: {env: arm, seed: "range(0,3)"}
+    grids:
+      - {policy: "random,uniform"}
+      - {policy: uniform, env: "arm,pendulum"}
+"""
+
+
+@pytest.fixture
+def several(tmp_path: Path) -> tuple[str, ...]:
+    """Return the words that choose an experiment of two grids, which share the uniform arm."""
+    folder = tmp_path / "settings/experiment"
+    folder.mkdir(parents=True)
+    (folder / "several.yaml").write_text(SEVERAL)
+    return "--config-dir", str(folder.parent), "experiment=several"
+
+
+def test_an_experiment_can_be_several_grids(
+    command_line: Command, several: tuple[str, ...]
+) -> None:
+    code, output, errors = command_line("-m", *several, "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    assert "9 trials, 0 done, 9 to run" in output  # 2 × 3 and 2 × 3, of which 3 are the same
+
+
+def test_values_of_a_grid_are_those_of_yaml(command_line: Command, tmp_path: Path) -> None:
+    folder = tmp_path / "settings/experiment"
+    folder.mkdir(parents=True)
+    values = "{policy: beyond/task, policy.goal: [1, 0.5], policy.count: 3, seed: 7}"
+    words = f"# @package _global_\nhydra:\n  sweeper:\n    grids: [{values}]\n"
+    (folder / "typed.yaml").write_text(words)
+    given = ("-m", "--config-dir", str(folder.parent), "experiment=typed")
+    code, output, errors = command_line(*given, "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    assert "1 trial, 0 done, 1 to run" in output
+
+
+def test_a_word_of_the_command_line_holds_for_every_grid(
+    command_line: Command, several: tuple[str, ...]
+) -> None:
+    code, output, _ = command_line("-m", *several, "seed=5", "env=pendulum", "launch.dry_run=true")
+    assert code == 0
+    assert "2 trials, 0 done, 2 to run" in output
+
+
+def test_several_grids_are_no_single_trial(command_line: Command, several: tuple[str, ...]) -> None:
+    code, _, errors = command_line(*several, "seed=5", "env=pendulum", "launch.dry_run=true")
+    assert code == 2
+    assert "experiment=several is a grid (policy=uniform): add -m" in errors
+
+
+def test_a_setting_holds_for_the_grids_that_have_it(
+    command_line: Command, several: tuple[str, ...]
+) -> None:
+    """And what is said of it does not count the grids that never asked for it."""
+    more = ("-m", *several, "policy.iterations=3", "launch.dry_run=true")
+    code, output, errors = command_line(*more)
+    assert (code, errors) == (0, "")
+    assert output.startswith("policy.iterations applies to policy=uniform only\n")
+    code, _, errors = command_line("-m", *several, "policy.iteratons=3", "launch.dry_run=true")
+    assert code == 2
+    assert "did you mean 'iterations'? Choose one of iterations." in errors
+
+
+SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
+
+
+def test_a_setting_holds_for_the_choices_that_have_it(command_line: Command) -> None:
+    code, output, errors = command_line(
+        "-m", "env=arm", "policy=random,uniform,d_optimal", "policy.regularization=1e-2,1e-3",
+        "model.depth=1", "seed=0,1", "launch.dry_run=true",
+    )  # fmt: skip
+    assert (code, errors) == (0, "")
+    assert "policy.regularization applies to policy=d_optimal only\n" in output
+    assert "model.depth" not in output
+    assert "8 trials, 0 done, 8 to run" in output  # 2 random, 2 uniform, 4 D-optimal
+
+
+@pytest.mark.parametrize(
+    ("choice", "setting", "note"),
+    [
+        ("policy=beyond/exact,beyond/trace", "policy.budget_us=20", ""),
+        ("policy=d_optimal,beyond/exact", "policy.candidates=8", "policy=exact"),
+        ("learner=ekf,adam_window", "learner.forgetting=0.99", "learner=ekf"),
+        ("task=none,control", "task.steps=60", "task=control"),
+    ],
+)
+def test_a_single_value_may_be_one_that_the_default_choice_lacks(
+    command_line: Command, choice: str, setting: str, note: str
+) -> None:
+    code, output, errors = command_line("-m", choice, setting, "seed=0", "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    key = setting.partition("=")[0]
+    assert output.startswith(f"{key} applies to {note} only\n") == bool(note)
+    assert "2 trials, 0 done, 2 to run" in output
+
+
+def test_a_setting_of_the_launch_may_refer_to_one_of_a_trial(
+    command_line: Command, tmp_path: Path
+) -> None:
+    named = "store.url=sqlite:///of${env.horizon}.db"
+    assert command_line("-m", "policy=random,oracle", "seed=0", named, *SHORT)[0] == 0
+    assert (tmp_path / "of5.db").exists()
+
+
+def test_a_setting_of_a_model_that_one_policy_brings_along(command_line: Command) -> None:
+    code, output, _ = command_line(
+        "-m", "policy=random,oracle", "model.depth=3", "seed=0", "launch.dry_run=true"
+    )
+    assert code == 0
+    assert output.startswith("model.depth applies to model=mlp only\n")
+    assert "2 trials" in output
+
+
+def test_a_helper_that_another_setting_refers_to_is_read(command_line: Command) -> None:
+    arguments = ("-m", "+strength=3,4", "env.gamma=${strength}", "seed=0", "launch.dry_run=true")
+    code, output, errors = command_line(*arguments)
+    assert (code, errors) == (0, "")
+    assert "2 trials" in output

@@ -24,7 +24,7 @@ import psycopg
 from orchestrate.store import NoDatabaseError, Reader, StoreError
 from tests.orchestrate.faults.program import Order, carry_out, errors_beside
 from tests.orchestrate.faults.trials import Gate
-from tests.orchestrate.store.places import execute
+from tests.orchestrate.store.databases import execute
 from tests.orchestrate.store.processes import CLEAN
 from tests.waiting import PATIENCE_SECONDS, until
 

@@ -11,7 +11,7 @@ from sqlalchemy import Engine, text
 
 from orchestrate.store import Claim, Reader, Store
 from tests.orchestrate.store.fakes import LAUNCH, Spec
-from tests.orchestrate.store.migrations.released import VERSIONS, restore
+from tests.orchestrate.store.released import VERSIONS, restore
 
 
 @pytest.fixture

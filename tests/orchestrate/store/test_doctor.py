@@ -15,8 +15,8 @@ from sqlalchemy.engine import make_url
 from orchestrate.store import Claim, Reader, Store, StoreError
 from orchestrate.store.doctor import Finding, examine
 from orchestrate.store.schema import STEP_VALUES
+from tests.orchestrate.store.databases import columns, contents
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
-from tests.orchestrate.store.structure import columns, contents
 
 Take = Callable[..., list[Claim]]
 

@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from dopt.result import Assessment
-from orchestrate.store import Claim, Failure, InvalidResultError, Reader, Store
+from orchestrate.store import (
+    Claim,
+    Failure,
+    InvalidResultError,
+    Reader,
+    Store,
+    StoreUnavailableError,
+)
+from orchestrate.store.doctor import examine
+from orchestrate.store.records import DTYPE, finite_list, pack, unpack, utc_text
+from orchestrate.store.schema import STEP_VALUES
+from orchestrate.store.upgrade import upgrade
+from tests.orchestrate.store.databases import execute
 from tests.orchestrate.store.fakes import (
     HORIZON,
     LAUNCH,
     RUN,
+    Array,
     FakeResult,
     Spec,
     assessed,
     diverged,
     result,
 )
-from tests.orchestrate.store.places import execute
 
 Take = Callable[..., list[Claim]]
 
@@ -281,3 +297,146 @@ class TestFailure:
         (row,) = reader.query("SELECT message, traceback FROM v_failures")
         assert row.message == r"a zero \x00 and the name of a file, \udcff"
         assert row.traceback == f"Traceback\n{row.message}"
+
+
+SEEDS = range(4)
+
+
+@pytest.fixture
+def finished(store: Store, take: Take) -> list[Spec]:
+    """Return done trials of one configuration, and a diverged one."""
+    specs = [Spec(seed) for seed in SEEDS]
+    for spec, claim in zip(specs, take(*specs), strict=True):
+        store.commit(claim, diverged(3) if spec.seed == 2 else result(spec.seed), RUN)
+    return specs
+
+
+def matrices(reader: Reader) -> list[np.ndarray]:
+    return [reader.curves(Spec().config_key, name).values for name in STEP_VALUES]
+
+
+def stored_once(reader: Reader) -> list[np.ndarray]:
+    rows = reader.rows(
+        f"SELECT {', '.join(STEP_VALUES)} FROM step JOIN trial USING (trial_id) ORDER BY seed, t"
+    )
+    numbers = np.array([tuple(row) for row in rows], dtype=np.float64)
+    return [column.reshape(len(SEEDS), -1) for column in numbers.T]
+
+
+def test_they_are_the_numbers_of_the_steps(finished: list[Spec], reader: Reader) -> None:
+    assert len(reader.rows("SELECT * FROM curve")) == len(finished)
+    for packed, steps in zip(matrices(reader), stored_once(reader), strict=True):
+        np.testing.assert_array_equal(packed, steps)
+
+
+def test_no_step_is_read_where_they_are(finished: list[Spec], reader: Reader, url: str) -> None:
+    before = matrices(reader)
+    execute(url, "DELETE FROM step")
+    np.testing.assert_array_equal(matrices(reader), before)
+    assert len(before[0]) == len(finished)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "DELETE FROM curve",
+        "DELETE FROM curve WHERE trial_id = 2",
+        "UPDATE curve SET attempt = 7, loss = reachable_loss WHERE trial_id IN (1, 4)",
+    ],
+)
+def test_steps_are_read_where_they_are_not(
+    finished: list[Spec], reader: Reader, url: str, change: str
+) -> None:
+    before = matrices(reader)
+    execute(url, change)
+    np.testing.assert_array_equal(matrices(reader), before)
+    done = upgrade(url)
+    assert 0 < done.packed <= len(finished)
+    assert upgrade(url).packed == 0
+    execute(url, "DELETE FROM step")
+    np.testing.assert_array_equal(matrices(reader), before)
+
+
+@pytest.mark.usefixtures("finished")
+def test_a_damaged_array_is_found_and_not_read(reader: Reader, url: str) -> None:
+    execute(url, "UPDATE curve SET loss = (SELECT states FROM trajectory WHERE trial_id = 1)")
+    with pytest.raises(StoreUnavailableError, match=r"incomplete \(0 steps instead of 28"):
+        reader.curves(Spec().config_key)
+    (found,) = [one for one in examine(url) if one.severity == "error"]
+    assert (found.count, "upgrade" in found.advice) == (len(SEEDS), True)
+    execute(url, "DELETE FROM curve")
+    upgrade(url)
+    assert [one for one in examine(url) if one.severity == "error"] == []
+
+
+@pytest.mark.usefixtures("finished")
+def test_a_trial_that_runs_again_has_its_new_one(store: Store, reader: Reader, take: Take) -> None:
+    assert store.retry("diverged") == 1
+    assert len(reader.rows("SELECT * FROM curve")) == len(SEEDS) - 1
+    (claim,) = take(Spec(2))
+    store.commit(claim, result(2), RUN)
+    found = reader.curves(Spec().config_key)
+    np.testing.assert_array_equal(found.values[2], result(2).loss)
+    assert not found.diverged.any()
+
+
+class Explored(Spec):
+    @property
+    def config_json(self) -> str:
+        return '{"env":{"loss":"prequential"}}'
+
+
+def test_that_of_an_exploration_grows_with_it(url: str) -> None:
+    with Store.open(url) as store:
+        launch = store.begin_launch(LAUNCH)
+        last = store.save(launch, Explored(), first_steps(3), RUN)
+        store.save(launch, Explored(), first_steps(5), RUN, last)
+        store.end_launch(launch, "done")
+    execute(url, "DELETE FROM step")
+    with Reader.open(url) as reader:
+        found = reader.curves(Explored().config_key).values
+    np.testing.assert_array_equal(found, [result().loss[:5]])
+
+
+def first_steps(n: int) -> FakeResult:
+    """Return a result that has come to its first n steps."""
+    whole = result()
+    cut = {name: getattr(whole, name)[:n] for name in (*STEP_VALUES, "inputs")}
+    final = float(whole.loss[n - 1])
+    return replace(whole, **cut, states=whole.states[: n + 1], n_steps=n, final_loss=final)
+
+
+@given(arrays.arrays(np.float64, arrays.array_shapes(min_dims=1, max_dims=2, min_side=0)))
+def test_packed_arrays_come_back_bit_for_bit(array: Array) -> None:
+    shape, data = pack(array)
+    back = unpack(DTYPE, shape, data)
+    assert back.shape == array.shape
+    assert back.tobytes() == array.tobytes()
+
+
+def test_arrays_of_any_layout_are_packed_rows_first() -> None:
+    array = np.asfortranarray(np.arange(6.0).reshape(2, 3)).astype(">f8")
+    shape, data = pack(array)
+    assert json.loads(shape) == [2, 3]
+    assert data == np.arange(6, dtype="<f8").tobytes()
+
+
+@given(st.lists(st.floats()))
+def test_numbers_that_are_not_finite_become_none(numbers: list[float]) -> None:
+    expected = [x if np.isfinite(x) else None for x in numbers]
+    assert finite_list(np.array(numbers, dtype=np.float64)) == expected
+
+
+def test_times_are_utc_text_that_sorts() -> None:
+    east = timezone(timedelta(hours=5, minutes=30))
+    assert utc_text(datetime(2026, 1, 1, 5, 30, tzinfo=east)) == "2026-01-01T00:00:00.000000Z"
+
+
+def test_a_launch_keeps_its_provenance(store: Store, reader: Reader) -> None:
+    store.begin_launch(LAUNCH)
+    (row,) = reader.query("SELECT * FROM launch")
+    assert json.loads(row.argv) == list(LAUNCH.argv)
+    assert json.loads(row.overrides) == list(LAUNCH.overrides)
+    assert json.loads(row.versions) == dict(LAUNCH.versions)
+    assert (row.host, row.pid, row.git_commit) == ("here", 17, LAUNCH.git_commit)
+    assert (row.git_dirty, row.git_diff_hash, row.state) == (1, LAUNCH.git_diff_hash, "running")

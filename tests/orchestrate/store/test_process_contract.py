@@ -10,8 +10,8 @@ from contextlib import ExitStack
 import numpy as np
 
 from orchestrate.store import Claim, Reader, Store
+from tests.orchestrate.store.databases import execute
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
-from tests.orchestrate.store.places import execute
 from tests.orchestrate.store.processes import (
     die_in_commit,
     eight_open,

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ProgrammingError
 
 from orchestrate.store import (
@@ -16,17 +17,26 @@ from orchestrate.store import (
     Reader,
     SchemaVersionError,
     Store,
+    StoreError,
     StoreUnavailableError,
 )
 from orchestrate.store import upgrade as migration
 from orchestrate.store.backends.file_locks import LaunchLocks
 from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
 from orchestrate.store.upgrade import upgrade
+from tests.orchestrate.store.databases import (
+    backups,
+    columns,
+    contents,
+    execute,
+    file_of,
+    restored,
+    schema_of,
+    structure,
+)
 from tests.orchestrate.store.fakes import LAUNCH, Spec
-from tests.orchestrate.store.migrations.released import VERSIONS
-from tests.orchestrate.store.places import backups, execute, file_of
 from tests.orchestrate.store.processes import CLEAN, hear, kill, running, upgrade_and_tell
-from tests.orchestrate.store.structure import columns, contents, structure
+from tests.orchestrate.store.released import VERSIONS, restore
 
 
 @pytest.fixture
@@ -224,3 +234,81 @@ def test_a_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(SchemaVersionError, match="not a results database"):
         upgrade(f"sqlite:///{path}")
     assert path.read_bytes() == before
+
+
+def test_the_backup_is_what_was_there(old: str) -> None:
+    before, kept = structure(old), columns(old)
+    rows = contents(old, kept)
+    name = upgrade(old).backup
+    assert name is not None
+    backup = restored(Path(name), old)
+    assert structure(backup) == before
+    assert contents(backup, kept) == rows
+    assert upgrade(backup, backup=False).changed
+
+
+def test_a_backup_replaces_no_other(old: str, version: int) -> None:
+    if old.startswith("sqlite"):
+        taken, free = f"{file_of(old)}.v{version}-backup", f"{file_of(old)}.v{version}-backup-2"
+    else:
+        base = Path.cwd() / f"{make_url(old).database}-{schema_of(old)}.v{version}-backup"
+        taken, free = f"{base}.dump", f"{base}-2.dump"
+    Path(taken).write_text("precious")
+    assert upgrade(old).backup == free
+    assert Path(taken).read_text() == "precious"
+
+
+def test_a_backup_can_be_left_out(old: str) -> None:
+    done = upgrade(old, backup=False)
+    assert done.changed
+    assert done.backup is None
+    assert backups(old) == []
+
+
+def test_a_full_disk_refuses_the_backup(sqlite_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    restore(VERSIONS[-1], sqlite_url)
+    before = structure(sqlite_url)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("orchestrate.store.backends.backups.os.fsync", full)
+    with pytest.raises(StoreUnavailableError, match=r"No space left.*--no-backup"):
+        upgrade(sqlite_url)
+    assert structure(sqlite_url) == before
+    assert backups(sqlite_url) == []
+
+
+OLDER = """#!/bin/sh
+echo "pg_dump: error: aborting because of server version mismatch" >&2
+echo "pg_dump: detail: server version: 16.1; pg_dump version: 15.2" >&2
+exit 1
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("", "pg_dump, which is not installed: .*, or give --no-backup"),
+        (OLDER, r"older than the server .*16\.1; .*15\.2\).* or give --no-backup"),
+    ],
+)
+def test_a_server_without_a_program_that_fits_is_upgraded_without_a_backup_alone(
+    postgresql_url: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    program: str,
+    said: str,
+) -> None:
+    restore(VERSIONS[-1], postgresql_url)
+    before = structure(postgresql_url)
+    if program:
+        (tmp_path / "pg_dump").write_text(program)
+        (tmp_path / "pg_dump").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StoreError, match=said):
+        upgrade(postgresql_url)
+    assert structure(postgresql_url) == before
+    assert backups(postgresql_url) == []
+    assert upgrade(postgresql_url, backup=False).changed

@@ -1,23 +1,135 @@
-"""Shares of a grid in databases of their own, collected in a folder and merged."""
+"""The trials themselves, not stand-ins, through every executor: the same rows."""
 
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from dopt.errors import SpecificationError
+from dopt.run import run_trial
+from dopt.spec.config import without_versions
+from dopt.spec.trial import TrialSpec
 from orchestrate.__main__ import main
+from orchestrate.config import Combination, Grid, build_grid
 from orchestrate.config.launch_settings import LaunchSettings, Share, share
-from orchestrate.errors import LaunchError
-from orchestrate.runner.run_grid import collected
+from orchestrate.errors import ExitCode, LaunchError
+from orchestrate.runner import launch
+from orchestrate.runner.run_grid import Work, collected, launch_grid
 from orchestrate.store import NoDatabaseError, Reader, Store, StoreError
+from orchestrate.store.doctor import examine
 from orchestrate.store.maintenance import collect, merge_collected
+from tests.orchestrate.conftest import RECORD
 from tests.orchestrate.faults.laboratory import flaws, results
-from tests.orchestrate.standins import grid_of
+from tests.orchestrate.standins import grid_of, specification
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.paths import ROOT
 from tests.waiting import until
+
+
+def words(executor: str, url: str) -> list[str]:
+    """Return the words that launch two short trials of two systems, one of which changes."""
+    grid = ["-m", "env=pendulum,beyond/drifting_pendulum", "policy=d_optimal", "seed=range(2)"]
+    return [*grid, "env.horizon=12", f"executor={executor}", f"store.url={url}"]
+
+
+def losses(url: str) -> list[float]:
+    with Reader.open(url) as reader:
+        configs = sorted(reader.configs(), key=lambda config: config.config_key)
+        return [
+            float(loss)
+            for config in configs
+            for loss in reader.curves(config.config_key).values.ravel().tolist()
+        ]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> list[float]:
+    """Return the losses of the trials one after the other in this process."""
+    url = f"sqlite:///{tmp_path_factory.mktemp('alone') / 'results.db'}"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("DOPT_DB", raising=False)
+        patch.setattr(sys, "argv", ["launch.py", *words("inprocess", url)])
+        assert launch.main() == 0
+    return losses(url)
+
+
+@pytest.mark.parametrize("executor", ["local", "ray"])
+@pytest.mark.xdist_group("real trials")  # one run in one process for all of them
+def test_every_executor_stores_the_same_losses(
+    executor: str, alone: list[float], tmp_path: Path
+) -> None:
+    url = f"sqlite:///{tmp_path / executor}.db"
+    done = subprocess.run(
+        [sys.executable, "orchestrate/launch.py", *words(executor, url)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert len(alone) == 48
+    assert losses(url) == alone
+
+
+SHORT = {
+    "name": "control",
+    "checkpoints": [3],
+    "steps": 12,
+    "settle_steps": 2,
+    "samples": 8,
+    "elites": 2,
+    "lookahead": 3,
+    "free_run_steps": 4,
+}
+
+
+def grid(task: object, seeds: int) -> Grid:
+    settings = {**specification(0).to_mapping(), "task": task}
+    return build_grid([Combination(settings, seeds=range(seeds))])
+
+
+def launched(folder: Path, executor: str, trials: Grid) -> str:
+    """Run a grid of real trials into a database of its own; return its URL."""
+    url = f"sqlite:///{folder / executor}.db"
+    settings = LaunchSettings(executor=executor, store_url=url, workers=2)
+    work = Work(run_trial, prepare=lambda: None)
+    code = launch_grid(trials, settings, RECORD, work, lambda _: None, stream=None)
+    assert code is ExitCode.DONE
+    return url
+
+
+def rows(url: str) -> list[tuple[object, ...]]:
+    with Reader.open(url) as reader:
+        sql = "SELECT seed, t, measure, value FROM v_assessment ORDER BY seed, t, measure"
+        return [tuple(row) for row in reader.query(sql)]
+
+
+def test_the_rows_do_not_depend_on_the_executor(tmp_path: Path) -> None:
+    trials = grid(SHORT, seeds=3)
+    alone = launched(tmp_path, "inprocess", trials)
+    assert len(rows(alone)) == 3 * (2 + 4 * 3)
+    assert rows(launched(tmp_path, "local", trials)) == rows(alone)
+    assert [one for one in examine(alone) if one.severity == "error"] == []
+    with Reader.open(alone) as reader:
+        (config,) = reader.configs()
+    again = TrialSpec.from_mapping(without_versions(config.config))
+    assert [trial.trial_key for trial in trials.trials][:1] == [again.trial_key]
+
+
+def test_a_task_of_none_is_no_task() -> None:
+    keys = [trial.trial_key for trial in grid({"name": "none"}, seeds=2).trials]
+    assert keys == [specification(seed).trial_key for seed in range(2)]
+
+
+def test_a_checkpoint_beyond_the_end_stops_before_anything_runs() -> None:
+    with pytest.raises(SpecificationError, match="step 9, but a trial has 5 steps"):
+        grid({**SHORT, "checkpoints": [9]}, seeds=1)
+
 
 GRID = ("-m", "policy=random", "seed=range(20)", "env.horizon=5", "executor=inprocess")
 SHARES = 3

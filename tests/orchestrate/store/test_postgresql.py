@@ -1,0 +1,474 @@
+"""Behaviour of a server alone: leases on its clock, connections that it ends."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import pickle
+import socket
+import sqlite3
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import psycopg
+import pytest
+from sqlalchemy import Engine, create_engine, text
+from sqlalchemy.engine import make_url
+
+from orchestrate.store import Claim, Reader, Store, StoreUnavailableError
+from orchestrate.store.backends import base, file_locks, postgresql
+from orchestrate.store.backends.transient_errors import is_transient
+from orchestrate.store.records import Array
+from tests.orchestrate.store.databases import execute, file_of, schema_of
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.waiting import PATIENCE_SECONDS, until
+
+
+@pytest.fixture
+def url(postgresql_url: str) -> str:
+    return postgresql_url
+
+
+@pytest.fixture
+def sleeper(url: str, open_store: Callable[..., Store]) -> tuple[Store, int, Claim]:
+    """Return a launch that claimed a trial and shows no life since, as after SIGSTOP."""
+    store = open_store()
+    launch = store.begin_launch(LAUNCH)
+    (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+    end_lease(url, launch)
+    return store, launch, claim
+
+
+def end_lease(url: str, launch: int) -> None:
+    """Let the lease of a launch run out, as time does."""
+    execute(url, f"UPDATE launch SET lease_until = 0 WHERE launch_id = {launch}")
+
+
+def test_a_lease_runs_out_by_itself(store: Store, open_store: Callable[..., Store]) -> None:
+    late = open_store(3.0)
+    launch = late.begin_launch(LAUNCH)
+    assert len(late.claim(launch, late.register(launch, [Spec()]).todo)) == 1
+    until(store.recover)
+
+
+def test_claims_are_free_after_the_lease(
+    store: Store, sleeper: tuple[Store, int, Claim], reader: Reader
+) -> None:
+    late, launch, claim = sleeper
+    assert store.recover() == 1
+    assert not late.commit(claim, result(), RUN)
+    assert reader.query("SELECT state FROM launch")[0].state == "lost"
+    late.heartbeat(launch)
+    assert reader.query("SELECT state, ended FROM launch")[0].state == "running"
+
+
+def test_a_heartbeat_renews_the_lease(store: Store, sleeper: tuple[Store, int, Claim]) -> None:
+    late, launch, claim = sleeper
+    late.heartbeat(launch)
+    assert store.recover() == 0
+    assert late.commit(claim, result(), RUN)
+
+
+def test_a_claim_renews_the_lease(store: Store, sleeper: tuple[Store, int, Claim]) -> None:
+    late, launch, claim = sleeper
+    assert late.claim(launch, []) == []
+    assert store.recover() == 0
+    assert late.commit(claim, result(), RUN)
+
+
+def test_an_ended_connection_costs_one_error(
+    store: Store, launch: int, url: str, take: Callable[..., list[Claim]]
+) -> None:
+    (claim,) = take(Spec())
+    insert_steps = store._backend.insert_steps
+
+    def cut(*arguments: object) -> None:
+        connection = arguments[0]
+        pid = connection.execute(text("SELECT pg_backend_pid()")).scalar_one()  # type: ignore[attr-defined]
+        _end_backend(url, pid)
+        insert_steps(*arguments)  # type: ignore[arg-type]
+
+    store._backend.insert_steps = cut  # type: ignore[method-assign]
+    with pytest.raises(StoreUnavailableError, match="server runs and answers"):
+        store.commit(claim, result(), RUN)
+    store._backend.insert_steps = insert_steps  # type: ignore[method-assign]
+    assert store.commit(claim, result(), RUN)
+    store.end_launch(launch, "done")
+
+
+def _end_backend(url: str, pid: int) -> None:
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        connection.execute(text("SELECT pg_terminate_backend(:pid)"), {"pid": pid})
+    engine.dispose()
+
+
+@pytest.fixture
+def without_encoding(server: Engine) -> Iterator[str]:
+    """Return the URL of a new database as a server without a locale makes it."""
+    name = f"test_{uuid.uuid4().hex}"
+    engine = server.execution_options(isolation_level="AUTOCOMMIT")
+    locale = "ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C'"
+    with engine.connect() as connection:
+        connection.execute(text(f"CREATE DATABASE {name} TEMPLATE template0 {locale}"))
+    yield server.url.set(database=name).render_as_string(hide_password=False)
+    with engine.connect() as connection:
+        connection.execute(text(f"DROP DATABASE {name} WITH (FORCE)"))
+
+
+def test_a_database_without_an_encoding_is_read_and_written(without_encoding: str) -> None:
+    with Store.open(without_encoding) as store:
+        launch = store.begin_launch(LAUNCH)
+        (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+        assert store.commit(claim, result(), RUN)
+    with Reader.open(without_encoding) as reader:
+        assert [row.status for row in reader.trials(Spec().config_key)] == ["done"]
+
+
+def test_a_sleeper_that_sends_its_steps_is_ended(
+    url: str,
+    store: Store,
+    open_store: Callable[..., Store],
+    reader: Reader,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    late = open_store()
+    launch = late.begin_launch(LAUNCH)
+    sent, other = late.claim(launch, late.register(launch, [Spec(0), Spec(1)]).todo)
+    sends, wakes = threading.Event(), threading.Event()
+
+    def asleep(column: Array) -> Iterator[float | None]:
+        if not sends.is_set():
+            sends.set()
+            wakes.wait(PATIENCE_SECONDS)
+        yield from column.tolist()
+
+    monkeypatch.setattr("orchestrate.store.backends.postgresql.finite_list", asleep)
+    with ThreadPoolExecutor(1) as pool:
+        committed = pool.submit(late.commit, sent, result(), RUN)
+        assert sends.wait(PATIENCE_SECONDS)
+        end_lease(url, launch)
+        freed = store.recover()
+        slept = not committed.done()
+        wakes.set()
+        with pytest.raises(StoreUnavailableError, match="the connection is lost"):
+            committed.result(PATIENCE_SECONDS)
+    assert slept, "others waited for the sleeper"
+    while freed < 2:  # the server ends its session soon, not at once
+        freed += store.recover()
+    assert freed == 2
+    assert not late.commit(sent, result(), RUN)
+    assert not late.commit(other, result(1), RUN)
+    rows = reader.query("SELECT outcome FROM attempt")
+    assert [tuple(row) for row in rows] == [("lost",), ("lost",)]
+
+
+def test_a_session_of_a_live_launch_is_left_alone(
+    url: str, store: Store, open_store: Callable[..., Store]
+) -> None:
+    busy = open_store()
+    launch = busy.begin_launch(LAUNCH)
+    works, may_end = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with busy._backend.transaction() as connection:
+            connection.execute(text("SELECT 1"))
+            works.set()
+            may_end.wait(PATIENCE_SECONDS)
+            connection.execute(text("SELECT 1"))
+
+    with ThreadPoolExecutor(1) as pool:
+        worked = pool.submit(work)
+        assert works.wait(PATIENCE_SECONDS)
+        for _ in range(5):
+            end_lease(url, launch)
+            busy.heartbeat(launch)
+            assert store.recover() == 0
+        may_end.set()
+    assert worked.exception() is None
+
+
+def test_the_server_asks_for_a_silent_launch(store: Store) -> None:
+    with store._backend.transaction() as connection:
+        for name in ("idle", "interval", "count"):
+            asked = connection.execute(text(f"SHOW tcp_keepalives_{name}")).scalar_one()
+            assert 0 < int(str(asked)) <= 5
+
+
+PATIENCE = 0.6
+LOCKED = "LOCK TABLE store_lock IN SHARE ROW EXCLUSIVE MODE"
+ROW = "SELECT * FROM launch FOR UPDATE"
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Announce a wait after a fraction of the two seconds."""
+    for module in (base, file_locks, postgresql):
+        monkeypatch.setattr(module, "ANNOUNCE_SECONDS", 0.2)
+    monkeypatch.setattr(postgresql, "_WATCH_SECONDS", 0.05)
+
+
+@contextmanager
+def session(url: str, name: str = "meddler") -> Iterator[psycopg.Connection]:
+    parsed = make_url(url)
+    with psycopg.connect(
+        host=parsed.host,
+        port=parsed.port,
+        user=parsed.username,
+        password=parsed.password,
+        dbname=parsed.database,
+        application_name=name,
+        options=f"-csearch_path={schema_of(url)}",
+    ) as connection:
+        yield connection
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [one.getMessage() for one in caplog.records if one.levelno == logging.WARNING]
+
+
+@pytest.mark.parametrize("sql", [LOCKED, ROW])
+def test_a_lock_of_a_session_is_said_and_ends_the_wait(
+    sql: str, postgresql_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Store.open(postgresql_url, patience=PATIENCE) as store:
+        launch = store.begin_launch(LAUNCH)
+        with session(postgresql_url) as meddler:
+            meddler.execute(sql)  # type: ignore[arg-type]
+            who = f"process {meddler.info.backend_pid} of the user {meddler.info.user} (meddler)"
+            with pytest.raises(StoreUnavailableError) as caught:
+                store.heartbeat(launch) if sql == ROW else store.recover()
+        assert f"{who} has held a lock on it for" in str(caught.value)
+        assert not caught.value.transient, "it has waited long enough"
+        assert warnings(caplog) == [f"waiting for a lock of {store.safe_url}, which {who} holds"]
+        assert store.recover() == 0, "the connection works afterwards"
+
+
+def test_a_lock_that_ends_in_time_costs_nothing(
+    postgresql_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Store.open(postgresql_url) as store, session(postgresql_url) as meddler:
+        launch = store.begin_launch(LAUNCH)
+        meddler.execute(LOCKED)  # type: ignore[arg-type]
+        thread = threading.Thread(target=store.register, args=(launch, [Spec()]))
+        thread.start()
+        while not warnings(caplog):
+            assert thread.is_alive()
+        meddler.rollback()
+        thread.join()
+        assert store.register(launch, [Spec()]).todo == [Spec().trial_key]
+    assert len(warnings(caplog)) == 1
+
+
+def test_a_launch_that_holds_it_gets_its_whole_lease(
+    postgresql_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It may be dead: then the server ends it when the lease is over."""
+    store = Store.open(postgresql_url, lease_seconds=2.0, patience=0.3)
+    with store, session(postgresql_url, "dopt launch 123") as sleeper:
+        sleeper.execute(LOCKED)  # type: ignore[arg-type]
+        with pytest.raises(StoreUnavailableError, match=r"has held a lock on it for ([2-9]|\d\d)"):
+            store.recover()
+    assert len(warnings(caplog)) == 1
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT pg_advisory_lock(hashtext('dopt.store.' || current_schema()))",
+        "SELECT pg_advisory_lock_shared(hashtext('dopt.store.' || current_schema()))",
+        "SELECT * FROM store_lock",
+        "SELECT * FROM store_lock FOR UPDATE",
+        "SELECT * FROM trial FOR KEY SHARE",
+        "ANALYZE trial",
+    ],
+)
+def test_no_select_stops_a_launch(sql: str, postgresql_url: str) -> None:
+    with Store.open(postgresql_url, patience=PATIENCE) as store:
+        launch = store.begin_launch(LAUNCH)
+        with session(postgresql_url) as reader:
+            reader.execute(sql)  # type: ignore[arg-type]
+            (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+            store.recover()
+            assert store.release(launch) == 1
+            assert claim.attempt == 1
+
+
+def test_a_role_that_reads_everything_cannot_take_the_lock(postgresql_url: str) -> None:
+    schema = schema_of(postgresql_url)
+    role = f"reader_{schema}"
+    Store.open(postgresql_url).close()
+    with session(postgresql_url) as owner:
+        owner.execute(f"CREATE ROLE {role}")  # type: ignore[arg-type]
+        owner.execute(f"GRANT USAGE ON SCHEMA {schema} TO {role}")  # type: ignore[arg-type]
+        owner.execute(f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {role}")  # type: ignore[arg-type]
+        owner.execute(f"SET ROLE {role}")  # type: ignore[arg-type]
+        with pytest.raises(psycopg.errors.InsufficientPrivilege):
+            owner.execute(LOCKED)  # type: ignore[arg-type]
+        owner.rollback()
+
+
+def test_a_schema_of_another_program_gets_no_table(postgresql_url: str) -> None:
+    with session(postgresql_url) as owner:
+        owner.execute("CREATE TABLE notes (line text)")
+        owner.commit()
+        with pytest.raises(Exception, match="not a results database"):
+            Store.open(postgresql_url)
+        found = owner.execute("SELECT to_regclass('store_lock')").fetchone()
+    assert found == (None,)
+
+
+def test_a_locked_file_is_said_and_ends_the_wait(
+    sqlite_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Store.open(sqlite_url, patience=PATIENCE) as store:
+        with closing(sqlite3.connect(file_of(sqlite_url), isolation_level=None)) as meddler:
+            meddler.execute("BEGIN IMMEDIATE")
+            named = rf"process {os.getpid()} has locked it for more than 0.6 s; end it"
+            with pytest.raises(StoreUnavailableError, match=named) as caught:
+                store.begin_launch(LAUNCH)
+        assert not caught.value.transient, "it has waited long enough"
+        (said,) = warnings(caplog)
+        assert said.startswith("waiting for a lock of ")
+        assert said.endswith(f"which process {os.getpid()} holds")
+        assert store.begin_launch(LAUNCH) == 1
+
+
+def test_a_creation_that_hangs_is_said_and_ends_the_wait(
+    sqlite_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    Store.open(sqlite_url).close()
+    lock = Path(f"{file_of(sqlite_url)}-locks") / "create"
+    with lock.open("w") as hung:
+        fcntl.flock(hung, fcntl.LOCK_EX)
+        named = rf"process {os.getpid()} has locked it for more than 0.6 s; end it"
+        with pytest.raises(StoreUnavailableError, match=named):
+            Store.open(sqlite_url, patience=PATIENCE)
+    assert len(warnings(caplog)) == 1
+    Store.open(sqlite_url).close()
+
+
+@pytest.mark.parametrize("patience", [0.05, 0.5])
+def test_a_free_file_is_locked_at_once(
+    tmp_path: Path, patience: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    taken: list[float] = []
+
+    def locked(seconds: float) -> bool:
+        taken.append(seconds)
+        return True
+
+    file_locks.patiently(locked, patience, tmp_path, tmp_path)
+    assert taken == [min(0.2, patience)]
+    assert not warnings(caplog)
+
+
+def _transient(url: str) -> bool:
+    with pytest.raises(StoreUnavailableError) as caught:
+        Store.open(url)
+    return caught.value.transient
+
+
+def test_nobody_listens() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        port = unused.getsockname()[1]
+        assert _transient(f"postgresql://me@127.0.0.1:{port}/db")
+
+
+def test_an_unknown_host_is_a_mistake_unless_it_has_answered_before() -> None:
+    assert not _transient("postgresql://me@no-such-host.invalid/db")
+    with pytest.raises(psycopg.OperationalError) as caught:
+        psycopg.connect("host=no-such-host.invalid")
+    assert is_transient(caught.value, known_host=True)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"), [("database", "does not exist"), ("username", "does not exist")]
+)
+def test_a_refused_login(postgresql_url: str, wrong: str, reason: str) -> None:
+    url = make_url(postgresql_url).set(**{wrong: "nobody_knows"})  # type: ignore[arg-type]
+    with pytest.raises(StoreUnavailableError, match=f"refuses the connection.*{reason}") as caught:
+        Store.open(url.render_as_string(hide_password=False))
+    assert not caught.value.transient
+
+
+def _end_own_backend(store: Store, other: Store) -> None:
+    with store._backend.transaction() as connection:
+        pid = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
+        with other._backend.transaction() as ends:
+            ends.exec_driver_sql(f"SELECT pg_terminate_backend({pid})")
+        connection.exec_driver_sql("SELECT 1")
+
+
+def test_a_connection_that_an_administrator_ended(postgresql_url: str) -> None:
+    with Store.open(postgresql_url) as store, Store.open(postgresql_url) as other:
+        with pytest.raises(StoreUnavailableError) as caught:
+            _end_own_backend(store, other)
+        assert caught.value.transient
+        assert store.begin_launch(LAUNCH) == 1
+
+
+def _write_read_only(store: Store) -> None:
+    with store._backend.transaction() as connection:
+        connection.exec_driver_sql("SET TRANSACTION READ ONLY")
+        connection.exec_driver_sql("DELETE FROM trial")
+
+
+def test_a_read_only_server(postgresql_url: str) -> None:
+    with Store.open(postgresql_url) as store:
+        with pytest.raises(StoreUnavailableError, match="server is read-only") as caught:
+            _write_read_only(store)
+        assert not caught.value.transient
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [("57P01", True), ("57P03", True), ("08006", True), ("40P01", True), ("53300", True),
+     ("53100", False), ("28P01", False), ("58030", False), ("XX001", False), ("57P04", False)],
+)  # fmt: skip
+def test_codes_of_the_server(state: str, expected: bool) -> None:
+    error = psycopg.errors.lookup(state)("the server's words")
+    assert is_transient(error, known_host=False) is expected
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("FATAL:  the database system is starting up", True),
+        ("FATAL:  sorry, too many clients already", True),
+        ("server closed the connection unexpectedly", True),
+        ('FATAL:  password authentication failed for user "me"', False),
+    ],
+)
+def test_words_of_the_server_while_a_connection_is_made(text: str, expected: bool) -> None:
+    assert is_transient(psycopg.OperationalError(text), known_host=False) is expected
+
+
+def test_a_lock_that_another_process_holds(tmp_path: Path) -> None:
+    path = tmp_path / "results.db"
+    with Store.open(f"sqlite:///{path}", patience=0.1) as store:
+        other = sqlite3.connect(path, isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreUnavailableError, match="locked") as caught:
+            store.begin_launch(LAUNCH)
+        other.close()
+        assert not caught.value.transient, "it was waited for with all patience"
+        assert store.begin_launch(LAUNCH) == 1
+
+
+def test_a_file_that_is_no_database(tmp_path: Path) -> None:
+    path = tmp_path / "results.db"
+    path.write_text("Some notes, long enough to be taken for a header of a database. " * 4)
+    assert not _transient(f"sqlite:///{path}")
+
+
+@pytest.mark.parametrize("transient", [False, True])
+def test_the_error_travels_between_processes(transient: bool) -> None:
+    error = StoreUnavailableError("The database is gone.", transient=transient)
+    assert pickle.loads(pickle.dumps(error)).transient is transient
