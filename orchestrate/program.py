@@ -103,7 +103,7 @@ class Parser(argparse.ArgumentParser):
 _UNSEEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-"""Control characters but for the tab and the newline, and what changes the direction of text."""
+"""Control characters except the tab and the newline, and what changes the direction of text."""
 
 
 def visible(text: str) -> str:
@@ -489,7 +489,7 @@ def _plain(char: str) -> str:
 
 
 def _tolerate_warnings() -> None:
-    """Print the warnings that PYTHONWARNINGS makes errors: those of libraries end no program."""
+    """Print the warnings that PYTHONWARNINGS makes errors: libraries' warnings end no program."""
     if any(action == "error" for action, *_ in warnings.filters):
         warnings.resetwarnings()
         warnings.simplefilter("default")

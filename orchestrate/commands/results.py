@@ -258,7 +258,7 @@ def listed(
 def the_one(trials: Sequence[ListedTrial], start: str | None) -> ListedTrial:
     """Return the only trial, or the only one with a key that starts with ``start``.
 
-    Raises ``UsageError`` if there is none, or more than one.
+    Raises ``UsageError`` unless exactly one fits.
     """
     if start is not None:
         _check(start)

@@ -146,7 +146,7 @@ def _parser() -> Parser:
 def _checked(flags: argparse.Namespace) -> argparse.Namespace:
     if flags.multirun and flags.cfg:
         raise UsageError(
-            "-m and --cfg cannot be combined, a configuration is that of one trial: look at a grid "
+            "-m and --cfg cannot be combined, a configuration describes one trial: look at a grid "
             "with launch.dry_run=true, or leave out -m."
         )
     given = {

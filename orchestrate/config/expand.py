@@ -1,7 +1,7 @@
 """Expansion of overrides to the combinations of a grid.
 
 :func:`hydra.compose` composes the configuration of each choice of groups; scalar sweeps are a
-product over its plain values. The result equals that of Hydra's basic sweeper wherever that one
+product over its plain values. The result equals what Hydra's basic sweeper gives wherever that one
 succeeds, except for the values of some sweeps (:mod:`orchestrate.config.sweeps`).
 
 The basic sweeper fails if an override sets a key that only some of the choices have, such as

@@ -1,6 +1,6 @@
 """Axes of a grid: one for each override, with its values.
 
-The values are those that the words say, also where stock Hydra has others: those of a sorted range,
+The values are what the words say, also where stock Hydra has others: of a sorted range,
 the nearest decimals of a range of real numbers, and the same order each time of a shuffled sweep.
 """
 

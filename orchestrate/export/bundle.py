@@ -269,7 +269,7 @@ def write_bundle(
     """Write the folder, whole or not at all, in place of an earlier bundle; return its provenance.
 
     It holds all trials of the configurations, whatever their status. ``reader`` sees one moment,
-    that of ``configs``. Raises ``ExportError``.
+    the one of ``configs``. Raises ``ExportError``.
     """
     if not configs:
         raise ExportError(

@@ -56,7 +56,7 @@ class BundleExport:
 def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict[str, Any]:
     """Write the file, and after it its manifest; return what the manifest says.
 
-    Both appear whole or not at all. ``reader`` sees one moment, that of ``configs``. Raises
+    Both appear whole or not at all. ``reader`` sees the moment of ``configs``. Raises
     ``ExportError``, or ``OutputError`` if they cannot be written.
     """
     _expect_trials(reader, configs, wanted)

@@ -1,7 +1,7 @@
 """Bundles: folders with the tables of a results database as Parquet files, and their import.
 
 Each table of the schema is a file with typed columns; arrays of the table ``trajectory``, packed
-bytes in a database, are lists of numbers there. An import is bit for bit but for one number: SQLite
+bytes in a database, are lists of numbers there. An import keeps every bit, except that SQLite
 stores -0.0 in a column of numbers as 0.0, as in a launch. Losses and times are never -0.0, and
 arrays keep it.
 """
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TABLES = tuple(sorted({*metadata.tables} - {alembic_version.name, curve.name}))
-"""Names of the tables but those of the version, which the provenance holds, and packed curves."""
+"""Names of the tables except the version, which the provenance holds, and the packed curves."""
 
 ARRAY_AXES = {"states": 2, "inputs": 2, "parameters": 1}
 """Number of axes of the arrays of a trajectory: states (T + 1, d), inputs (T, m), parameters."""
@@ -88,7 +88,7 @@ def write_checksums(folder: Path) -> None:
 
 
 def merge_bundle(url: str, folder: Path, trial_key: TrialKey | None = None) -> Merged:
-    """Import the trials of a bundle into a database, as :func:`merge` does those of another one.
+    """Import the trials of a bundle into a database, as :func:`merge` does from another one.
 
     Raises ``StoreError`` for a folder that is no bundle, ``SchemaVersionError`` for a bundle of
     another schema, and ``StoreUnavailableError`` for a damaged file, which the message names.
@@ -173,7 +173,7 @@ def _batches(file: Path, expected: pa.Schema) -> Iterator[pa.RecordBatch]:
         with pa.parquet.ParquetFile(file) as parquet:
             if not parquet.schema_arrow.equals(expected):
                 raise SchemaVersionError(
-                    f"The columns of {file} are not those of schema {SCHEMA_VERSION}: import the "
+                    f"The columns of {file} differ from schema {SCHEMA_VERSION}: import the "
                     "bundle with the release that has written it, and upgrade that database."
                 )
             yield from parquet.iter_batches(_ROWS)

@@ -52,7 +52,7 @@ def claim(
     trial_keys: Sequence[str],
     only_alike: bool = False,
 ) -> list[Claim]:
-    """Claim those of the trials that are pending, in the given order.
+    """Claim the pending ones of the trials, in the given order.
 
     ``only_alike`` leaves out what code with another fingerprint has registered.
     """
@@ -416,7 +416,7 @@ class OpenConfig:
     pending, running
         Number of its trials that wait, and that a launch has claimed.
     mean_seconds, max_seconds
-        Wall time of its finished trials; None if there is none.
+        Wall time of its finished trials; None without one.
     """
 
     config_id: int
@@ -534,7 +534,7 @@ def suspects(connection: Connection, launch: int, losses: int) -> list[OpenTrial
 def final_losses(
     connection: Connection, backend: Backend, trial_keys: Sequence[str]
 ) -> dict[str, float]:
-    """Return the final loss of those of the trials that are done and did not diverge."""
+    """Return the final loss of each given trial that is done and did not diverge."""
     statement = select(trial.c.trial_key, trial.c.final_loss).where(
         trial.c.trial_key.in_(backend.members(trial_keys)),
         trial.c.status == "done",

@@ -29,7 +29,7 @@ from orchestrate.store.schema import ENDED, N_ROWS
 def back_up(url: str, target: Path) -> int:
     """Write a consistent copy of a database to a new file and return its bytes.
 
-    That of SQLite is a database file, checked and complete in itself; that of PostgreSQL is an
+    The copy of SQLite is a database file, checked and complete in itself; of PostgreSQL it is an
     archive for ``pg_restore`` with the tables and views of the schema. The file gets its name when
     it is complete. Raises ``StoreError`` if the file exists, ``OutputError`` if it cannot be
     written, and ``StoreUnavailableError`` if the database cannot be read.
@@ -63,7 +63,7 @@ class Vacuumed:
 def vacuum(url: str) -> Vacuumed:
     """Give the space of deleted rows back: SQLite to the disk, PostgreSQL to later rows.
 
-    SQLite writes the file anew, for which as much space must be free on its disk, and lets nobody
+    SQLite writes the file again, for which as much space must be free on its disk, and lets nobody
     else write meanwhile; PostgreSQL works beside launches. Raises as :meth:`Reader.open` does, and
     ``LaunchAliveError`` if a launch is writing to a SQLite file.
     """
@@ -123,7 +123,7 @@ def merge_collected(
 ) -> Iterator[Merged]:
     """Merge the copies in a folder into a database, one after the other.
 
-    Raises ``NoDatabaseError`` if there is none, and as :func:`merge` does.
+    Raises ``NoDatabaseError`` if it holds none, and as :func:`merge` does.
     """
     found = sorted(folder.glob(pattern))
     if not found:

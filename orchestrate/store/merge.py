@@ -76,7 +76,7 @@ _ASSESSMENTS = (
     f"SELECT trial_id, t, measure, value FROM assessment WHERE {_FINISHED} "
     "ORDER BY trial_id, t, measure"
 )
-# All trials of a configuration have the same number of assessments, but for explorations.
+# All trials of a configuration have the same number of assessments, except explorations.
 _EXPECTED = (
     "SELECT config_id, max(n) FROM (SELECT r.config_id, count(*) AS n FROM assessment a "
     "JOIN trial r ON r.trial_id = a.trial_id JOIN config c ON c.config_id = r.config_id "
@@ -116,7 +116,7 @@ class Page:
     curves
         Rows of the finished trials; none for a trial of which some are missing.
     contradictory
-        Trials whose key is not that of their configuration, or whose arrays have other shapes.
+        Trials whose key does not match their configuration, or whose arrays have other shapes.
     """
 
     trials: list[dict[str, Any]]
@@ -479,7 +479,7 @@ class Merged:
     incomplete
         Trials with missing rows there, which were not copied.
     contradictory
-        Trials there whose key is not that of their configuration and seed, or whose arrays have
+        Trials there whose key does not match their configuration and seed, or whose arrays have
         other shapes than they say, which were not copied.
     launches
         New launches.
@@ -509,7 +509,7 @@ class Merged:
 def merge(url: str, other_url: str, trial_key: TrialKey | None = None) -> Merged:
     """Bring the trials with an outcome of ``other_url`` into ``url``, and what belongs to them.
 
-    Either may be SQLite or PostgreSQL; the first is created where there is none, the other is only
+    Either may be SQLite or PostgreSQL; the first is created where nothing is, the other is only
     read. ``trial_key`` is as in :func:`orchestrate.store.examine`. Raises ``StoreError`` as the
     opening of a store and of a reader do.
     """

@@ -144,7 +144,7 @@ _NONE: Array = np.empty(0)
 def _parts(trials: Sequence[Row[Any]], stepwise: Array, rest: Sequence[int]) -> list[Array]:
     """Return the numbers of each trial: those that are not packed are taken from ``stepwise``.
 
-    Those of a damaged array are none.
+    A damaged array gives an empty one.
     """
     pieces = iter(np.split(stepwise, np.cumsum(rest)[:-1]))
     return [next(pieces) if row.packed is None else unpacked(row.packed) for row in trials]

@@ -105,7 +105,7 @@ def _postgresql(request: Request) -> Iterator[Any]:
         yield True
         end = time.monotonic() + (request["seconds"] or 0)
 
-        def limit_time() -> None:  # anew for each statement: the one before may have changed it
+        def limit_time() -> None:  # for each statement again: the one before may have changed it
             left = max(1, round(1000 * (end - time.monotonic()))) if request["seconds"] else 0
             connection.execute(f"SET statement_timeout = {left}")
 

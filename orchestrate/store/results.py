@@ -314,7 +314,7 @@ PAGE = 50
 
 
 def prune(connection: Connection, backend: Backend, trial_keys: Sequence[str]) -> int:
-    """Delete those of the trials that have an outcome and none of a living launch; count them."""
+    """Delete the trials that have an outcome and belong to no living launch; count them."""
     alive = [one.launch_id for one in living(connection, backend)]
     chosen = (
         select(trial.c.trial_id)
@@ -415,7 +415,7 @@ def save(
 
 
 def is_longer(connection: Connection, backend: Backend, spec: Registrable, result: Result) -> bool:
-    """Tell whether the database holds more steps of an exploration.
+    """Return True if the stored exploration has more steps.
 
     Raises ``StoreError`` if it holds another exploration of the same key.
     """
@@ -439,7 +439,7 @@ def is_longer(connection: Connection, backend: Backend, spec: Registrable, resul
 
 
 def _is_mine(connection: Connection, last: Saved) -> bool:
-    """Tell whether no other session has written the trial since; lock it."""
+    """Return True if no other session has written the trial since; lock it."""
     statement = select(trial.c.trial_key, trial.c.attempt, trial.c.launch_id)
     one = statement.where(trial.c.trial_id == last.claim.trial_id).with_for_update()
     row = connection.execute(one).one_or_none()
@@ -465,7 +465,7 @@ def _take(
 def _write_steps(
     connection: Connection, backend: Backend, rows: PreparedRows, n_stored: int
 ) -> None:
-    """Append the new steps; those of a diverged exploration go on to the horizon, as NaN."""
+    """Append the new steps; a diverged exploration gets steps of NaN up to the horizon."""
     trial_id, steps = rows.claim.trial_id, rows.steps
     if rows.summary["diverged_at"] is not None:
         statement = select(config.c.horizon).join(trial, trial.c.config_id == config.c.config_id)

@@ -377,7 +377,7 @@ def create_views(connection: Connection) -> None:
         drop_views(connection)
         create = "CREATE VIEW"
     else:
-        create = "CREATE OR REPLACE VIEW"  # those of others may depend on them
+        create = "CREATE OR REPLACE VIEW"  # views of others may depend on them
     for name, query in VIEWS.items():
         connection.execute(text(f"{create} {name} AS {query}"))
 

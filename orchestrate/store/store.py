@@ -27,7 +27,7 @@ class Store:
     def open(
         cls, url: str, lease_seconds: float = LEASE_SECONDS, patience: float = PATIENCE_SECONDS
     ) -> Self:
-        """Open a database, and create it if there is none.
+        """Open a database; create it where nothing is yet.
 
         ``lease_seconds`` is the time after its last heartbeat for which a launch on PostgreSQL is
         alive; on SQLite a file lock decides. ``patience`` bounds the wait for a lock of another
@@ -94,7 +94,7 @@ class Store:
             return launches.register(connection, self._backend, launch, grid)
 
     def final_losses(self, trial_keys: Sequence[str]) -> dict[str, float]:
-        """Return the final loss of those of the trials that are done and did not diverge."""
+        """Return the final loss of each given trial that is done and did not diverge."""
         with self._backend.transaction() as connection:
             return final_losses(connection, self._backend, trial_keys)
 
@@ -129,7 +129,7 @@ class Store:
             return launches.suspects(connection, launch, losses)
 
     def claim(self, launch: int, trial_keys: Sequence[str], *, alike: bool = False) -> list[Claim]:
-        """Claim those of the trials that are pending, in the given order.
+        """Claim the pending ones of the trials, in the given order.
 
         ``alike`` leaves out what code with another fingerprint has registered.
         """
@@ -212,9 +212,9 @@ class Store:
             return launches.retry(connection, self._backend, status, trial_keys)
 
     def prune(self, trial_keys: Sequence[str]) -> int:
-        """Delete those of the trials that have an outcome, and return their number.
+        """Delete the trials that have an outcome, and return their number.
 
-        Those of a living launch stay. The trials are deleted in several transactions, so that
+        Trials of a living launch stay. The trials are deleted in several transactions, so that
         launches wait for none of them long; one that was interrupted can be repeated.
         """
         deleted = 0

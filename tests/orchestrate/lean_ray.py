@@ -1,8 +1,8 @@
 """Ray without the services that no launch asks for: half of the time of its start.
 
 They are the autoscaler, the dashboard, which runs even where it is refused, and what collects logs.
-The end and the death of a launch, of its workers, of the raylet and of the head are those of a
-whole Ray, which ``tests/orchestrate/test_real_trials.py`` starts.
+The end and the death of a launch, of its workers, of the raylet and of the head are as in a
+whole Ray, which ``tests/orchestrate/test_launches.py`` starts.
 """
 
 from __future__ import annotations

@@ -301,7 +301,7 @@ PASSWORDS = st.text(
 ).filter(lambda text: text.strip() == text and not set(text) & set("@&'"))
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(password=PASSWORDS, place=st.sampled_from(sorted(PLACES)))
 def test_no_password_of_a_command_line_is_written_down_or_said(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, password: str, place: str
@@ -316,7 +316,7 @@ def test_no_password_of_a_command_line_is_written_down_or_said(
     assert quote(password) not in shown
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(password=PASSWORDS, name=st.sampled_from(["PGPASSWORD", "MY_DB_PASSWORD", "A_TOKEN"]))
 def test_no_password_of_the_environment_is_said(
     monkeypatch: pytest.MonkeyPatch, password: str, name: str

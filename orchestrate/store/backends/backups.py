@@ -75,7 +75,7 @@ _OF_THE_COPY = {
 
 @contextmanager
 def _of_the_copy(partial: Path) -> Iterator[None]:
-    """Raise ``OSError`` for the errors of a copy that are not those of its source."""
+    """Raise ``OSError`` for an error that the copy, and not its source, has."""
     try:
         yield
     except sqlite3.OperationalError as error:

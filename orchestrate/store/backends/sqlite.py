@@ -213,7 +213,7 @@ class SQLiteBackend(Backend):
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return device and inode of a file, or None if there is none."""
+    """Return device and inode of a file, or None without a file."""
     try:
         found = path.stat()
     except OSError:

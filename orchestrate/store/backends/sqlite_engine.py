@@ -32,7 +32,10 @@ def read_engine(url: URL) -> Engine:
 
 def _reader(path: Path) -> sqlite3.Connection:
     connection = _connect(read_address(path))
-    for name, query in VIEWS.items():  # before those of the file, which a stranger may have made
+    for (
+        name,
+        query,
+    ) in VIEWS.items():  # first: a stranger may have made views of the file
         connection.execute(f"CREATE TEMP VIEW {name} AS {query}")
     return connection
 

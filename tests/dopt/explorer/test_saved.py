@@ -27,7 +27,7 @@ from orchestrate.store.doctor import examine
 from orchestrate.store.merge import merge
 from tests.dopt.explorer.saves import content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN
-from tests.orchestrate.store.test_heartbeat import wait_for_renewals
+from tests.orchestrate.store.test_leases import wait_for_renewals
 
 
 def test_it_runs_until_it_is_closed(url: str, run: Explorer) -> None:

@@ -62,6 +62,15 @@ def _refuse(constant: str) -> float:
     raise AssertionError(f"{constant} is not JSON")
 
 
+on_both = pytest.mark.parametrize("url", ["sqlite", "postgresql"], indirect=True)
+
+
+@pytest.fixture
+def url(request: pytest.FixtureRequest) -> str:
+    """URL of a file, or with ``on_both`` of each kind: commands use the store, which has both."""
+    return str(request.getfixturevalue(f"{getattr(request, 'param', 'sqlite')}_url"))
+
+
 @pytest.fixture
 def command(url: str, capsys: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
     """Return a function that runs ``python -m orchestrate`` on the database."""

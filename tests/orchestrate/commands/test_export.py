@@ -41,6 +41,7 @@ from tests.orchestrate.commands.conftest import (
     ODD,
     SECRET,
     Answer,
+    on_both,
     run_now,
 )
 from tests.orchestrate.store.fakes import (
@@ -79,6 +80,7 @@ def manifest(path: Path) -> dict[str, Any]:
 
 @pytest.mark.usefixtures("grid")
 class TestTables:
+    @on_both
     @pytest.mark.parametrize("ending", ["csv", "parquet"])
     def test_curves(self, command: Run, tmp_path: Path, ending: str) -> None:
         out = tmp_path / f"curves.{ending}"
@@ -176,6 +178,7 @@ class TestMatrices:
         axes = described["pendulum/random/16/loss"]
         assert axes == {"axes": ["seed", "t"], "shape": [3, HORIZON], "dtype": "float64"}
 
+    @on_both
     def test_trajectories(self, command: Run, tmp_path: Path) -> None:
         arrays = self.load(command, "trajectories", tmp_path / "trajectories.npz")
         for name in ("states", "inputs", "parameters"):
@@ -308,6 +311,7 @@ def rows(reader: Reader, table: str) -> list[list[object]]:
     return [[bytes(x) if isinstance(x, memoryview) else x for x in row] for row in found]
 
 
+@on_both
 class TestRoundTrip:
     def test_every_row_of_every_table_is_the_same(self, bundle: Path, url: str) -> None:
         with Reader.open(url) as there, opened(bundle) as here:

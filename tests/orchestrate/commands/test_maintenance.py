@@ -19,7 +19,7 @@ from orchestrate.store.maintenance import back_up
 from orchestrate.store.merge import merge
 from orchestrate.store.records import utc_text
 from orchestrate.store.schema import SCHEMA_VERSION
-from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, WAITING, Answer
+from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, WAITING, Answer, on_both
 from tests.orchestrate.standins import specification
 from tests.orchestrate.store.databases import execute, restored
 from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, everything, result
@@ -86,6 +86,7 @@ def _path(url: str) -> Path:
 
 
 class TestMerge:
+    @on_both
     def test_names_what_it_brought(self, command: Run, url: str, other: Path) -> None:
         run_trials(url, 0, 1)
         run_trials(f"sqlite:///{other}", 1, 2, 3)
@@ -121,6 +122,7 @@ class TestDoctor:
         assert "2 notes" in answer.out
         assert "error" not in answer.out
 
+    @on_both
     def test_names_what_is_wrong(self, command: Run, url: str) -> None:
         restore(5, url)
         command("upgrade", "--no-backup")
@@ -175,6 +177,7 @@ def ended(grid: int, store: Store) -> int:
     return grid
 
 
+@on_both
 class TestBackup:
     def test_while_a_launch_writes(
         self, grid: int, command: Run, store: Store, url: str, tmp_path: Path
@@ -218,13 +221,14 @@ class TestBackup:
         assert "exists, a new one is expected" in answer.err
         assert copy.read_text() == "mine"
 
-    def test_without_the_program_of_the_server(
-        self, postgresql_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        Store.open(postgresql_url).close()
-        monkeypatch.setenv("PATH", str(tmp_path))
-        with pytest.raises(Exception, match="pg_dump, which is not installed"):
-            back_up(postgresql_url, tmp_path / "copy")
+
+def test_without_the_program_of_the_server(
+    postgresql_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Store.open(postgresql_url).close()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(Exception, match="pg_dump, which is not installed"):
+        back_up(postgresql_url, tmp_path / "copy")
 
 
 class TestPrune:
@@ -237,6 +241,7 @@ class TestPrune:
         assert "3 more stay" in answer.out
         assert everything(url) == before
 
+    @on_both
     def test_by_query(self, ended: int, command: Run, url: str) -> None:
         before = counts(url)
         sql = "SELECT trial_key FROM v_trial WHERE status IN ('diverged', 'failed')"
@@ -313,6 +318,7 @@ class TestPrune:
         assert everything(url) == before
 
 
+@on_both
 class TestVacuum:
     def test_gives_space_back(self, ended: int, command: Run, url: str) -> None:
         kept = everything(url)
@@ -361,6 +367,7 @@ def statuses(url: str) -> dict[str, str]:
         return {row[0]: row[1] for row in reader.query("SELECT trial_key, status FROM trial")}
 
 
+@on_both
 def test_failed_trials_wait_again(ask: Run, url: str) -> None:
     before = statuses(url)
     answer = ask("retry", "failed")
@@ -371,6 +378,7 @@ def test_failed_trials_wait_again(ask: Run, url: str) -> None:
     assert "There is no failed trial to retry." in ask("retry", "failed").out
 
 
+@on_both
 def test_diverged_trials_lose_what_they_had_written(ask: Run, url: str) -> None:
     assert "1 diverged trial waits" in ask("retry", "diverged").out
     assert statuses(url)[BAD.trial_key] == "pending"

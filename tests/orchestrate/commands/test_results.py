@@ -27,7 +27,16 @@ from orchestrate.commands.results import sparkline
 from orchestrate.errors import ExitCode
 from orchestrate.program import Parser
 from orchestrate.store import Store
-from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, Answer, failure, run_now
+from tests.orchestrate.commands.conftest import (
+    BAD,
+    BROKEN,
+    DONE,
+    RUNNING,
+    Answer,
+    failure,
+    on_both,
+    run_now,
+)
 from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
@@ -257,6 +266,7 @@ def test_json_has_columns_and_rows(ask: Run) -> None:
     assert answer.document["cut"] is False
 
 
+@on_both
 def test_what_is_missing_or_not_finite_is_null(ask: Run) -> None:
     sql = "SELECT loss, 1e308 * 10 FROM v_curve WHERE seed = 5 AND t = 4"
     if "postgresql" in ask("status", "--json").document["database"]:
@@ -265,6 +275,7 @@ def test_what_is_missing_or_not_finite_is_null(ask: Run) -> None:
     assert ask("query", sql, "--csv").out.splitlines()[1] == ","
 
 
+@on_both
 def test_bytes_and_sums_are_json_too(ask: Run) -> None:
     sql = "SELECT sum(seed), avg(seed), max(states_shape), count(states) FROM trial JOIN trajectory"
     (row,) = ask("query", f"{sql} USING (trial_id)", "--json").document["rows"]
@@ -285,6 +296,7 @@ def test_it_says_when_rows_are_cut(ask: Run) -> None:
     assert ask("query", STEPS, "--limit", "2", "--json").document["cut"] is True
 
 
+@on_both
 def test_what_is_refused_is_one_sentence(ask: Run) -> None:
     for sql in ("DELETE FROM step", "SELECT * FROM nowhere", "SELECT 1; SELECT 2", ""):
         answer = ask("query", sql)
@@ -295,6 +307,7 @@ def test_what_is_refused_is_one_sentence(ask: Run) -> None:
     assert "longer than 0.2 s" in answer.err
 
 
+@on_both
 def test_no_text_of_the_database_drives_the_terminal(ask: Run) -> None:
     sql = "SELECT chr(27) || '[31m' AS x" if _is_postgresql(ask) else "SELECT char(27, 91) AS x"
     assert "\x1b" not in ask("query", sql).out
@@ -320,6 +333,7 @@ def test_a_done_trial(ask: Run) -> None:
     assert "Traceback" not in out
 
 
+@on_both
 def test_the_json_has_everything(ask: Run, grid: int) -> None:
     document = ask("show", DONE[1].trial_key, "--json").document
     assert document["trial"]["trial_key"] == DONE[1].trial_key
@@ -331,6 +345,7 @@ def test_the_json_has_everything(ask: Run, grid: int) -> None:
     assert (attempt["outcome"], attempt["node"], attempt["wall_seconds"]) == ("done", "here", 0.5)
 
 
+@on_both
 def test_a_failed_trial_shows_every_attempt(store: Store, ask: Run, grid: int) -> None:
     spec = BROKEN[0]
     store.retry("failed", [spec.trial_key])

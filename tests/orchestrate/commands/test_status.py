@@ -37,7 +37,7 @@ from orchestrate.store import (
     Store,
     StoreUnavailableError,
 )
-from tests.orchestrate.commands.conftest import WAITING, Answer, failure, run_now
+from tests.orchestrate.commands.conftest import WAITING, Answer, failure, on_both, run_now
 from tests.orchestrate.runner.test_scheduler import Scripted, finish, keys
 from tests.orchestrate.standins import quick, raising, unusable
 from tests.orchestrate.standins import trial_of as short_trial
@@ -65,6 +65,7 @@ class TestOnce:
             "total 3 9 2 1 1 2",
         ]
 
+    @on_both
     def test_groups_failures_and_says_where(self, command: Run) -> None:
         out = command("status").out
         assert "2 trials (2 attempts), exception: pendulum/d_optimal" in out
@@ -75,6 +76,7 @@ class TestOnce:
         assert f"{grid} on here, process 17, since " in command("status").out
         assert "alive for" in command("status").out
 
+    @on_both
     def test_json(self, command: Run, grid: int) -> None:
         document = command("status", "--json").document
         assert document["trials"] == {
@@ -110,6 +112,7 @@ class TestOnce:
             assert "hunter2" not in answer.out + answer.err
 
 
+@on_both
 def test_a_dead_launch_is_called_dead(open_store: Callable[..., Store], command: Run) -> None:
     dead = open_store()
     launch = dead.begin_launch(LAUNCH)
@@ -128,6 +131,7 @@ def test_without_a_launch_it_says_how_to_go_on(store: Store, command: Run) -> No
     assert "run the same launch command again to continue" in command("status").out
 
 
+@on_both
 def test_attempts_that_were_made_good_are_no_failed_trials(
     store: Store, take: Take, command: Run, launch: int
 ) -> None:
@@ -140,6 +144,7 @@ def test_attempts_that_were_made_good_are_no_failed_trials(
     assert (kind["cause"], kind["trials"], kind["attempts"]) == ("killed", 0, 1)
 
 
+@on_both
 def test_the_rate_is_that_of_the_living(store: Store, take: Take, reader: Reader, url: str) -> None:
     for claim in take(*(Spec(seed) for seed in range(4))):
         store.commit(claim, result(), run_now())

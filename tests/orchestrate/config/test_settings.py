@@ -286,3 +286,129 @@ def test_a_single_trial_has_no_seeds_to_choose_from(command_line: CommandLine) -
 def test_a_dry_run_says_that_these_are_the_most(command_line: CommandLine) -> None:
     output = command_line(*GRID, "launch.until=ci<5%", "launch.dry_run=true")[1]
     assert output.endswith("launch.until may need fewer of these seeds: they are run in batches\n")
+
+
+SEVERAL = """
+# @package _global_
+hydra:
+  sweeper:
+    params: {env: arm, seed: "range(0,3)"}
+    grids:
+      - {policy: "random,uniform"}
+      - {policy: uniform, env: "arm,pendulum"}
+"""
+
+
+@pytest.fixture
+def several(tmp_path: Path) -> tuple[str, ...]:
+    """Return the words that choose an experiment of two grids, which share the uniform arm."""
+    folder = tmp_path / "settings/experiment"
+    folder.mkdir(parents=True)
+    (folder / "several.yaml").write_text(SEVERAL)
+    return "--config-dir", str(folder.parent), "experiment=several"
+
+
+def test_an_experiment_can_be_several_grids(
+    command_line: CommandLine, several: tuple[str, ...]
+) -> None:
+    code, output, errors = command_line("-m", *several, "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    assert "9 trials, 0 done, 9 to run" in output  # 2 × 3 and 2 × 3, of which 3 are the same
+
+
+def test_values_of_a_grid_are_those_of_yaml(command_line: CommandLine, tmp_path: Path) -> None:
+    folder = tmp_path / "settings/experiment"
+    folder.mkdir(parents=True)
+    values = "{policy: beyond/task, policy.goal: [1, 0.5], policy.count: 3, seed: 7}"
+    words = f"# @package _global_\nhydra:\n  sweeper:\n    grids: [{values}]\n"
+    (folder / "typed.yaml").write_text(words)
+    given = ("-m", "--config-dir", str(folder.parent), "experiment=typed")
+    code, output, errors = command_line(*given, "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    assert "1 trial, 0 done, 1 to run" in output
+
+
+def test_a_word_of_the_command_line_holds_for_every_grid(
+    command_line: CommandLine, several: tuple[str, ...]
+) -> None:
+    code, output, _ = command_line("-m", *several, "seed=5", "env=pendulum", "launch.dry_run=true")
+    assert code == 0
+    assert "2 trials, 0 done, 2 to run" in output
+
+
+def test_several_grids_are_no_single_trial(
+    command_line: CommandLine, several: tuple[str, ...]
+) -> None:
+    code, _, errors = command_line(*several, "seed=5", "env=pendulum", "launch.dry_run=true")
+    assert code == 2
+    assert "experiment=several is a grid (policy=uniform): add -m" in errors
+
+
+def test_a_setting_holds_for_the_grids_that_have_it(
+    command_line: CommandLine, several: tuple[str, ...]
+) -> None:
+    """And what is said of it does not count the grids that never asked for it."""
+    more = ("-m", *several, "policy.iterations=3", "launch.dry_run=true")
+    code, output, errors = command_line(*more)
+    assert (code, errors) == (0, "")
+    assert output.startswith("policy.iterations applies to policy=uniform only\n")
+    code, _, errors = command_line("-m", *several, "policy.iteratons=3", "launch.dry_run=true")
+    assert code == 2
+    assert "did you mean 'iterations'? Choose one of iterations." in errors
+
+
+SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
+
+
+def test_a_setting_holds_for_the_choices_that_have_it(command_line: CommandLine) -> None:
+    code, output, errors = command_line(
+        "-m", "env=arm", "policy=random,uniform,d_optimal", "policy.regularization=1e-2,1e-3",
+        "model.depth=1", "seed=0,1", "launch.dry_run=true",
+    )  # fmt: skip
+    assert (code, errors) == (0, "")
+    assert "policy.regularization applies to policy=d_optimal only\n" in output
+    assert "model.depth" not in output
+    assert "8 trials, 0 done, 8 to run" in output  # 2 random, 2 uniform, 4 D-optimal
+
+
+@pytest.mark.parametrize(
+    ("choice", "setting", "note"),
+    [
+        ("policy=beyond/exact,beyond/trace", "policy.budget_us=20", ""),
+        ("policy=d_optimal,beyond/exact", "policy.candidates=8", "policy=exact"),
+        ("learner=ekf,adam_window", "learner.forgetting=0.99", "learner=ekf"),
+        ("task=none,control", "task.steps=60", "task=control"),
+    ],
+)
+def test_a_single_value_may_be_one_that_the_default_choice_lacks(
+    command_line: CommandLine, choice: str, setting: str, note: str
+) -> None:
+    code, output, errors = command_line("-m", choice, setting, "seed=0", "launch.dry_run=true")
+    assert (code, errors) == (0, "")
+    key = setting.partition("=")[0]
+    assert output.startswith(f"{key} applies to {note} only\n") == bool(note)
+    assert "2 trials, 0 done, 2 to run" in output
+
+
+def test_a_setting_of_the_launch_may_refer_to_one_of_a_trial(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
+    named = "store.url=sqlite:///of${env.horizon}.db"
+    assert command_line("-m", "policy=random,oracle", "seed=0", named, *SHORT)[0] == 0
+    assert (tmp_path / "of5.db").exists()
+
+
+def test_a_setting_of_a_model_that_one_policy_brings_along(command_line: CommandLine) -> None:
+    code, output, _ = command_line(
+        "-m", "policy=random,oracle", "model.depth=3", "seed=0", "launch.dry_run=true"
+    )
+    assert code == 0
+    assert output.startswith("model.depth applies to model=mlp only\n")
+    assert "2 trials" in output
+
+
+def test_a_helper_that_another_setting_refers_to_is_read(command_line: CommandLine) -> None:
+    arguments = ("-m", "+strength=3,4", "env.gamma=${strength}", "seed=0", "launch.dry_run=true")
+    code, output, errors = command_line(*arguments)
+    assert (code, errors) == (0, "")
+    assert "2 trials" in output

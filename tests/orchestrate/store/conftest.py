@@ -75,9 +75,13 @@ def take(store: Store, launch: int) -> Callable[..., list[Claim]]:
     return register_and_claim
 
 
-@pytest.fixture(params=VERSIONS)
+each_version = pytest.mark.parametrize("version", VERSIONS, indirect=True)
+
+
+@pytest.fixture
 def version(request: pytest.FixtureRequest) -> int:
-    return int(request.param)
+    """Return the schema of an older database: the oldest, whose upgrade takes every step."""
+    return int(getattr(request, "param", VERSIONS[0]))
 
 
 @pytest.fixture
@@ -88,9 +92,15 @@ def old(version: int, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     return url
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def other(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """URL of another database, of each kind for each kind of the first."""
-    if request.param == "sqlite":
+each_other = pytest.mark.parametrize("other", ["sqlite", "postgresql"], indirect=True)
+
+
+@pytest.fixture
+def other(request: pytest.FixtureRequest, url: str, tmp_path: Path) -> str:
+    """URL of another database, of the other kind, or with ``each_other`` of each kind."""
+    first = "sqlite" if url.startswith("sqlite") else "postgresql"
+    kind = getattr(request, "param", "postgresql" if first == "sqlite" else "sqlite")
+    if kind == "sqlite":
         return f"sqlite:///{tmp_path}/other/results.db"
-    return str(request.getfixturevalue("another_postgresql_url"))
+    name = "another_postgresql_url" if first == kind else "postgresql_url"
+    return str(request.getfixturevalue(name))

@@ -126,7 +126,7 @@ def contents(url: str, columns: dict[str, tuple[str, ...]]) -> dict[str, list[st
 
 
 def columns(url: str) -> dict[str, tuple[str, ...]]:
-    """Return the names of the columns of each table, without that of the version."""
+    """Return the names of the columns of each table except the version."""
     engine = create_engine(url)
     with engine.begin() as connection:
         pairs = connection.execute(text(_COLUMNS[engine.name])).all()

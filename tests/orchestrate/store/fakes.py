@@ -112,7 +112,7 @@ def result(seed: int = 0, horizon: int = HORIZON) -> FakeResult:
 
 
 def assessed(seed: int = 0) -> FakeResult:
-    """Return a result with a number that is not finite among those of its assessment."""
+    """Return a result with a number that is not finite in its assessment."""
     random = np.random.default_rng(1000 + seed)
     rows = [Assessment(t, name, random.random()) for t in (0, 3, 7) for name in ("cost", "error")]
     return replace(result(seed), assessments=(*rows[:-1], rows[-1]._replace(value=np.inf)))

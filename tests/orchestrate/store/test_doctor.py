@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import random
+import shutil
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
@@ -175,10 +176,11 @@ def path(sqlite_url: str) -> Path:
     return Path(str(make_url(sqlite_url).database))
 
 
-@pytest.fixture
-def file(sqlite_url: str, path: Path) -> Path:
+@pytest.fixture(scope="module")
+def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a SQLite database with forty long trials, in one file."""
-    with Store.open(sqlite_url) as store:
+    path = tmp_path_factory.mktemp("forty") / "results.db"
+    with Store.open(f"sqlite:///{path}") as store:
         launch = store.begin_launch(LAUNCH)
         specs = [Spec(seed, horizon=300) for seed in range(40)]
         claims = store.claim(launch, store.register(launch, specs).todo)
@@ -187,6 +189,13 @@ def file(sqlite_url: str, path: Path) -> Path:
     connection = sqlite3.connect(path)
     connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     connection.close()
+    return path
+
+
+@pytest.fixture
+def file(forty: Path, path: Path) -> Path:
+    path.parent.mkdir()
+    shutil.copy(forty, path)
     return path
 
 

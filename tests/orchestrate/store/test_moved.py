@@ -314,7 +314,7 @@ TABLES = {
         "/data/results.db",
         ("/data", "nfs4"),
     ),
-    "a folder whose name begins as that of a mount": (
+    "a folder whose name begins as the name of a mount": (
         ROOT + "60 29 0:50 / /data rw - nfs4 nas:/data rw\n",
         "/database/results.db",
         ("/", "ext4"),

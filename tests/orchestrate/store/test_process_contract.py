@@ -27,7 +27,7 @@ KEY = Spec().config_key
 
 
 def _recover_from_the_dead(store: Store, url: str, but: int = 0) -> int:
-    """Recover when all leases but that of a launch have run out; a kernel lock ends by itself."""
+    """Recover when all leases except one launch's have run out; a kernel lock ends by itself."""
     execute(url, f"UPDATE launch SET lease_until = 0 WHERE launch_id <> {but} AND lease_until > 0")
     freed = 0
 
@@ -41,7 +41,7 @@ def _recover_from_the_dead(store: Store, url: str, but: int = 0) -> int:
 
 
 def _is_whole(reader: Reader) -> bool:
-    """Tell whether each finished trial has all of its rows, and every other one none."""
+    """Return True if each finished trial has all of its rows, and every other one no row."""
     rows = reader.query(
         "SELECT r.status IN ('done', 'diverged') AS finished, "
         "(SELECT count(*) FROM step s WHERE s.trial_id = r.trial_id) AS steps, "

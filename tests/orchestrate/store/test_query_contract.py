@@ -34,6 +34,9 @@ ESCAPES = (
     "CREATE TEMP TABLE trial AS SELECT 1 AS x",
     "COMMIT",
     "ROLLBACK",
+    "DROP VIEW v_trial",
+    "COMMIT; DROP VIEW v_trial",
+    "COMMIT; CREATE TABLE more (x INTEGER)",
 )
 SQLITE_ESCAPES = (
     "ATTACH DATABASE '{other}' AS other",
@@ -64,53 +67,61 @@ def two_trials(store: Store, take: Callable[..., list[Claim]]) -> None:
         store.commit(claim, result(), RUN)
 
 
+@pytest.fixture
+def file(sqlite_url: str) -> Iterator[Reader]:
+    Store.open(sqlite_url).close()
+    with Reader.open(sqlite_url) as opened:
+        yield opened
+
+
+@pytest.fixture
+def on_server(postgresql_url: str) -> Iterator[Reader]:
+    Store.open(postgresql_url).close()
+    with Reader.open(postgresql_url) as opened:
+        yield opened
+
+
 def rows_left(reader: Reader) -> int:
     return len(reader.query("SELECT * FROM step"))
 
 
 @pytest.mark.usefixtures("two_trials")
-@pytest.mark.parametrize("escape", ESCAPES)
-def test_it_cannot_write(reader: Reader, escape: str) -> None:
-    with pytest.raises(QueryError):
-        reader.query(escape)
-    assert rows_left(reader) == 2 * HORIZON
-
-
-@pytest.mark.parametrize("escape", SQLITE_ESCAPES)
-def test_it_cannot_leave_the_file(sqlite_url: str, tmp_path: Path, escape: str) -> None:
-    other = tmp_path / "other.db"
-    other.write_text("not for you")
-    Store.open(sqlite_url).close()
-    with Reader.open(sqlite_url) as reader:
-        with pytest.raises(QueryError):
-            reader.query(escape.format(other=other))
-        assert reader.query("SELECT * FROM trial") == []
-    assert other.read_text() == "not for you"
-
-
-@pytest.mark.parametrize("escape", POSTGRESQL_ESCAPES)
-def test_it_cannot_change_the_session(postgresql_url: str, escape: str) -> None:
-    Store.open(postgresql_url).close()
-    with Reader.open(postgresql_url) as reader:
+def test_it_cannot_write(reader: Reader) -> None:
+    for escape in ESCAPES:
         with pytest.raises(QueryError):
             reader.query(escape)
-        assert reader.query("SELECT * FROM trial") == []
+        assert len(reader.rows("SELECT * FROM step")) == 2 * HORIZON, escape
+    assert rows_left(reader) == 2 * HORIZON
+    assert reader.query("SELECT * FROM v_trial")
 
 
-def test_a_setting_does_not_outlive_its_query(postgresql_url: str) -> None:
-    Store.open(postgresql_url).close()
-    with Reader.open(postgresql_url) as reader:
-        reader.query("SELECT set_config('default_transaction_read_only', 'off', false)")
-        ((value,),) = reader.query("SELECT current_setting('default_transaction_read_only')")
-        assert value == "on"
+def test_it_cannot_leave_the_file(file: Reader, tmp_path: Path) -> None:
+    other = tmp_path / "other.db"
+    other.write_text("not for you")
+    for escape in SQLITE_ESCAPES:
+        with pytest.raises(QueryError):
+            file.query(escape.format(other=other))
+        assert other.read_text() == "not for you", escape
+    assert file.query("SELECT * FROM trial") == []
 
 
-def test_functions_that_return_tables_answer(sqlite_url: str) -> None:
-    Store.open(sqlite_url).close()
-    with Reader.open(sqlite_url) as reader:
-        assert len(reader.query("SELECT value FROM json_each('[1, 2]')")) == 2
-        assert reader.query("SELECT name FROM pragma_table_info('trial')")
-        assert reader.query("EXPLAIN QUERY PLAN SELECT * FROM v_curve")
+def test_it_cannot_change_the_session(on_server: Reader) -> None:
+    for escape in POSTGRESQL_ESCAPES:
+        with pytest.raises(QueryError):
+            on_server.query(escape)
+    assert on_server.query("SELECT * FROM trial") == []
+
+
+def test_a_setting_does_not_outlive_its_query(on_server: Reader) -> None:
+    on_server.query("SELECT set_config('default_transaction_read_only', 'off', false)")
+    ((value,),) = on_server.query("SELECT current_setting('default_transaction_read_only')")
+    assert value == "on"
+
+
+def test_functions_that_return_tables_answer(file: Reader) -> None:
+    assert len(file.query("SELECT value FROM json_each('[1, 2]')")) == 2
+    assert file.query("SELECT name FROM pragma_table_info('trial')")
+    assert file.query("EXPLAIN QUERY PLAN SELECT * FROM v_curve")
 
 
 @pytest.mark.usefixtures("two_trials")
@@ -140,25 +151,10 @@ def test_nothing_is_no_query(reader: Reader) -> None:
         reader.query("-- nothing")
 
 
-def test_a_lost_server_is_not_the_fault_of_the_query(postgresql_url: str) -> None:
-    Store.open(postgresql_url).close()
-    with Reader.open(postgresql_url) as reader, pytest.raises(StoreUnavailableError) as caught:
-        reader.query("SELECT pg_terminate_backend(pg_backend_pid())")
+def test_a_lost_server_is_not_the_fault_of_the_query(on_server: Reader) -> None:
+    with pytest.raises(StoreUnavailableError) as caught:
+        on_server.query("SELECT pg_terminate_backend(pg_backend_pid())")
     assert caught.value.transient
-
-
-@pytest.fixture
-def file(sqlite_url: str) -> Iterator[Reader]:
-    Store.open(sqlite_url).close()
-    with Reader.open(sqlite_url) as opened:
-        yield opened
-
-
-@pytest.fixture
-def on_server(postgresql_url: str) -> Iterator[Reader]:
-    Store.open(postgresql_url).close()
-    with Reader.open(postgresql_url) as opened:
-        yield opened
 
 
 def test_one_call_is_ended_after_its_time(file: Reader) -> None:

@@ -102,17 +102,6 @@ class TestReader:
         with pytest.raises(QueryError, match="nowhere"):
             reader.query("SELECT * FROM nowhere")
 
-    @pytest.mark.parametrize("before", ["", "COMMIT; "])
-    @pytest.mark.parametrize(
-        "write",
-        ["DELETE FROM step", "DROP VIEW v_trial", "CREATE TABLE more (x INTEGER)"],
-    )
-    def test_cannot_write(self, reader: Reader, before: str, write: str) -> None:
-        with pytest.raises(QueryError):
-            reader.query(before + write)
-        assert len(reader.query("SELECT * FROM step")) == 3 * HORIZON
-        assert reader.query("SELECT * FROM v_trial")
-
 
 @pytest.mark.usefixtures("grid")
 class TestViews:
@@ -186,16 +175,21 @@ def _fill(url: str) -> None:
         store.fail(claims[-2], Failure("ValueError", "no", "Traceback"), RUN)
 
 
-@pytest.mark.parametrize("view", VIEWS)
-def test_both_databases_show_the_same(sqlite_url: str, postgresql_url: str, view: str) -> None:
-    answers = []
-    for url in (sqlite_url, postgresql_url):
-        _fill(url)
-        with Reader.open(url) as reader:
-            columns = [c for c in reader.query(f"SELECT * FROM {view}")[0]._fields if c != "ended"]
-            rows = reader.query(f"SELECT {', '.join(columns)} FROM {view}")
-            answers.append((columns, sorted(map(_rounded, rows))))
+def test_both_databases_show_the_same(sqlite_url: str, postgresql_url: str) -> None:
+    answers = [_views(url) for url in (sqlite_url, postgresql_url)]
     assert answers[0] == answers[1]
+
+
+def _views(url: str) -> dict[str, object]:
+    """Return columns and rows of each view of a database that is filled first."""
+    _fill(url)
+    shown: dict[str, object] = {}
+    with Reader.open(url) as reader:
+        for view in VIEWS:
+            columns = [c for c in reader.rows(f"SELECT * FROM {view}")[0]._fields if c != "ended"]
+            rows = reader.rows(f"SELECT {', '.join(columns)} FROM {view}")
+            shown[view] = columns, sorted(map(_rounded, rows))
+    return shown
 
 
 def _rounded(row: tuple[object, ...]) -> list[str]:

@@ -17,13 +17,7 @@ from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
 from tests.waiting import PATIENCE_SECONDS
 
 FAILURE = Failure("ZeroDivisionError", "no", "here")
-LOSSES = (
-    ["question"],
-    ["answer"],
-    ["question", "answer"],
-    ["answer", "question", "answer"],
-    ["answer", "answer", "answer"],
-)
+LOSSES = (["question", "answer"], ["answer", "question", "answer"], ["answer", "answer", "answer"])
 SPECS = [Spec(seed) for seed in range(4)]
 
 losses = pytest.mark.parametrize("lost", LOSSES, ids="-".join)

@@ -84,7 +84,7 @@ def test_curves_are_read_without_a_sort(
 
 
 def test_creation_is_safe_many_times_over(tmp_path: Path) -> None:
-    urls = [f"sqlite:///{tmp_path}/{i}.db" for i in range(15)]
+    urls = [f"sqlite:///{tmp_path}/{i}.db" for i in range(5)]
     eight_open(urls)
     for url in urls:
         with Store.open(url) as store:
@@ -289,14 +289,23 @@ COMMITTED = 12
 FRAME = 24 + 4096
 
 
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a database whose writer was killed."""
+    folder = tmp_path_factory.mktemp("killed")
+    url = f"sqlite:///{folder}/results.db"
+    Store.open(url).close()
+    with running(run_and_stop, url, COMMITTED) as (process, pipe):
+        assert hear(pipe) == "committed"
+        kill(process)
+    return folder
+
+
 class TestTornLog:
     @pytest.fixture
-    def wal(self, url: str, path: Path) -> Path:
+    def wal(self, killed: Path, path: Path) -> Path:
         """Return the log of a database whose writer was killed, with all of its trials in it."""
-        Store.open(url).close()
-        with running(run_and_stop, url, COMMITTED) as (process, pipe):
-            assert hear(pipe) == "committed"
-            kill(process)
+        shutil.copytree(killed, path.parent)
         wal = path.with_name("results.db-wal")
         assert wal.stat().st_size > COMMITTED * FRAME
         return wal
@@ -356,15 +365,23 @@ def _check_prefix_and_complete(url: str, at_most: int) -> int:
     return done
 
 
+@pytest.fixture(scope="module")
+def sixty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a database with sixty trials."""
+    folder = tmp_path_factory.mktemp("sixty")
+    with Store.open(f"sqlite:///{folder}/results.db") as store:
+        launch = store.begin_launch(LAUNCH)
+        claims = store.claim(launch, store.register(launch, [Spec(s) for s in range(60)]).todo)
+        store.commit_many([(claim, result(claim.trial_id), RUN) for claim in claims])
+        store.end_launch(launch, "done")
+    return folder
+
+
 class TestDamagedFile:
     @pytest.fixture
-    def damaged(self, url: str, path: Path) -> Callable[[str], None]:
+    def damaged(self, sixty: Path, path: Path) -> Callable[[str], None]:
         """Return a function that overwrites the first page of a table."""
-        with Store.open(url) as store:
-            launch = store.begin_launch(LAUNCH)
-            claims = store.claim(launch, store.register(launch, [Spec(s) for s in range(60)]).todo)
-            store.commit_many([(claim, result(claim.trial_id), RUN) for claim in claims])
-            store.end_launch(launch, "done")
+        shutil.copytree(sixty, path.parent)
 
         def damage(table: str) -> None:
             connection = sqlite3.connect(path)
@@ -433,7 +450,7 @@ class TestReadOnly:
 
     @pytest.fixture
     def folder(self) -> Iterator[Path]:
-        """Return a folder that everybody may enter; those of pytest are private."""
+        """Return a folder that everybody may enter; the folders of pytest are private."""
         folder = Path(tempfile.mkdtemp(prefix="dopt-read-only-"))
         folder.chmod(0o777)
         yield folder

@@ -24,6 +24,7 @@ from orchestrate.store import upgrade as migration
 from orchestrate.store.backends.file_locks import LaunchLocks
 from orchestrate.store.schema import OLDEST, SCHEMA_VERSION
 from orchestrate.store.upgrade import upgrade
+from tests.orchestrate.store.conftest import each_version
 from tests.orchestrate.store.databases import (
     backups,
     columns,
@@ -52,6 +53,7 @@ def test_there_are_statements_for_each_version_and_one_database() -> None:
     assert list(range(OLDEST, SCHEMA_VERSION)) == VERSIONS
 
 
+@each_version
 @pytest.mark.parametrize("side", [Store, Reader])
 def test_an_older_one_is_refused_with_the_command(old: str, side: type[Store | Reader]) -> None:
     with pytest.raises(SchemaVersionError, match="an older program") as caught:
@@ -60,6 +62,7 @@ def test_an_older_one_is_refused_with_the_command(old: str, side: type[Store | R
     assert old.rpartition("options=")[2].replace("sqlite:", "") in str(caught.value)
 
 
+@each_version
 def test_upgraded_equals_created(old: str, other_url: str) -> None:
     upgrade(old)
     Store.open(other_url).close()
@@ -69,6 +72,7 @@ def test_upgraded_equals_created(old: str, other_url: str) -> None:
     assert upgraded == created
 
 
+@each_version
 def test_every_row_stays_as_it_was(old: str, version: int) -> None:
     kept = _kept(old)
     before = contents(old, kept)
@@ -86,6 +90,7 @@ def _kept(url: str) -> dict[str, tuple[str, ...]]:
     return {name: names for name, names in columns(url).items() if name != "live_step"}
 
 
+@each_version
 def test_every_configuration_gets_its_label(old: str) -> None:
     upgrade(old)
     with Reader.open(old) as reader:
@@ -110,6 +115,7 @@ def test_the_label_of_a_class_that_is_not_known_stays(old: str) -> None:
     assert found[2] == "stored"
 
 
+@each_version
 def test_a_launch_goes_on_after_it(old: str) -> None:
     upgrade(old)
     with Store.open(old) as store:
@@ -236,6 +242,7 @@ def test_a_database_of_another_program_is_left_alone(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
+@each_version
 def test_the_backup_is_what_was_there(old: str) -> None:
     before, kept = structure(old), columns(old)
     rows = contents(old, kept)
