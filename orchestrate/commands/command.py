@@ -66,6 +66,15 @@ def say(text: str) -> None:
     tell(sys.stdout, f"{text}\n")
 
 
+def answer(arguments: argparse.Namespace, document: Any, text: str) -> ExitCode:
+    """Print the document with ``--json`` and the text without; return the code of a success."""
+    if arguments.json:
+        say_json(document)
+    else:
+        say(text)
+    return ExitCode.DONE
+
+
 def say_json(document: Any) -> None:
     """Print one JSON document; numbers that are not finite are null, bytes are base64."""
     say(json.dumps(jsonable(document), indent=2, allow_nan=False))

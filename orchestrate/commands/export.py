@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from orchestrate.commands.command import Command, add_filters, chosen, say, say_json
+from orchestrate.commands.command import Command, add_filters, answer, chosen
 from orchestrate.errors import ExitCode
 from orchestrate.export.exporting import FORMATS, KINDS, BundleExport, Export, export
 from orchestrate.program import UsageError, path
@@ -46,11 +46,7 @@ def _run_export(arguments: argparse.Namespace) -> ExitCode:
     out = _target(arguments)
     to = _to_bundle if arguments.kind == "bundle" else _to_file
     document = to(arguments, out)
-    if arguments.json:
-        say_json(document)
-    else:
-        say(_line(arguments.kind, out, document))
-    return ExitCode.DONE
+    return answer(arguments, document, _line(arguments.kind, out, document))
 
 
 def _target(arguments: argparse.Namespace) -> Path:

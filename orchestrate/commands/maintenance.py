@@ -14,9 +14,9 @@ from orchestrate.commands.command import (
     PROGRAM,
     Command,
     add_filters,
+    answer,
     chosen,
     plain,
-    say,
     say_json,
     show,
 )
@@ -45,10 +45,8 @@ def _add_merge_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_merge(arguments: argparse.Namespace) -> ExitCode:
     """Merge and print the counts; exit code 1 if trials that have an outcome were left out."""
     merged = _merge(arguments.db, arguments.other)
-    if arguments.json:
-        say_json({**asdict(merged), "changed": merged.changed})
-    else:
-        say("\n".join(_merge_lines(merged)))
+    document = {**asdict(merged), "changed": merged.changed}
+    answer(arguments, document, "\n".join(_merge_lines(merged)))
     refused = merged.conflicts or merged.incomplete or merged.contradictory
     return ExitCode.SOME_FAILED if refused else ExitCode.DONE
 
@@ -137,11 +135,7 @@ def _add_upgrade_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_upgrade(arguments: argparse.Namespace) -> ExitCode:
     """Upgrade the database in one transaction, after a backup."""
     done = upgrade(arguments.db, backup=not arguments.no_backup)
-    if arguments.json:
-        say_json({**asdict(done), "changed": done.changed})
-    else:
-        say(_upgrade_sentence(done))
-    return ExitCode.DONE
+    return answer(arguments, {**asdict(done), "changed": done.changed}, _upgrade_sentence(done))
 
 
 def _upgrade_sentence(done: Upgrade) -> str:
@@ -175,11 +169,8 @@ def _add_backup_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_backup(arguments: argparse.Namespace) -> ExitCode:
     """Write the file and print its size."""
     size = back_up(arguments.db, arguments.file)
-    if arguments.json:
-        say_json({"file": str(arguments.file), "bytes": size})
-    else:
-        say(f"{arguments.file}: {size:,} bytes")
-    return ExitCode.DONE
+    document = {"file": str(arguments.file), "bytes": size}
+    return answer(arguments, document, f"{arguments.file}: {size:,} bytes")
 
 
 BACKUP_COMMAND = Command(
@@ -206,11 +197,8 @@ def _run_retry(arguments: argparse.Namespace) -> ExitCode:
             count = store.retry(arguments.status, keys)
     else:
         count = len(keys)
-    if arguments.json:
-        say_json({"dry_run": arguments.dry_run, "trials": count, "keys": keys, "left": left})
-    else:
-        say(_retry_sentence(arguments, count, left))
-    return ExitCode.DONE
+    document = {"dry_run": arguments.dry_run, "trials": count, "keys": keys, "left": left}
+    return answer(arguments, document, _retry_sentence(arguments, count, left))
 
 
 def _trials(reader: Reader, arguments: argparse.Namespace) -> Sequence[ListedTrial]:
@@ -276,11 +264,8 @@ def _run_prune(arguments: argparse.Namespace) -> ExitCode:
     if arguments.yes and found.keys:
         with Store.open(arguments.db) as store:
             deleted = store.prune(found.keys)
-    if arguments.json:
-        say_json({**asdict(found), "dry_run": arguments.dry_run, "deleted": deleted})
-    else:
-        say(_prune_sentence(found, deleted, dry=arguments.dry_run))
-    return ExitCode.DONE
+    document = {**asdict(found), "dry_run": arguments.dry_run, "deleted": deleted}
+    return answer(arguments, document, _prune_sentence(found, deleted, dry=arguments.dry_run))
 
 
 def _found(reader: Reader, arguments: argparse.Namespace) -> Prunable:
@@ -324,11 +309,8 @@ PRUNE_COMMAND = Command("prune", "delete old or unwanted trials", _run_prune, _a
 def _run_vacuum(arguments: argparse.Namespace) -> ExitCode:
     """Vacuum the database and print its size before and after."""
     done = vacuum(arguments.db)
-    if arguments.json:
-        say_json(asdict(done))
-    else:
-        say(f"{done.safe_url}: {done.before:,} bytes before, {done.after:,} bytes now")
-    return ExitCode.DONE
+    sizes = f"{done.before:,} bytes before, {done.after:,} bytes now"
+    return answer(arguments, asdict(done), f"{done.safe_url}: {sizes}")
 
 
 VACUUM_COMMAND = Command("vacuum", "give the space of deleted rows back", _run_vacuum)

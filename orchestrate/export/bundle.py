@@ -23,6 +23,7 @@ import pyarrow.parquet
 
 from orchestrate.errors import without_password
 from orchestrate.export.exporting import BundleExport, ExportError, provenance
+from orchestrate.export.tables import gathered
 from orchestrate.files import whole_folder
 from orchestrate.store import ConfigRow, Reader
 from orchestrate.store.bundle import (
@@ -345,22 +346,10 @@ def _write_parquet(path: Path, schema: pa.Schema, batches: Iterable[pa.RecordBat
         use_dictionary=others,
         column_encoding=dict.fromkeys(split, "BYTE_STREAM_SPLIT") or None,
     ) as writer:
-        for table in _gathered(batches):
+        for table in gathered(batches, _GROUP_BYTES, "nbytes"):
             writer.write_table(table, row_group_size=max(1, table.num_rows))
             rows += table.num_rows
     return rows
-
-
-def _gathered(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
-    """Yield tables of at least ``_GROUP_BYTES`` but the last."""
-    waiting: list[pa.RecordBatch] = []
-    for batch in batches:
-        waiting.append(batch)
-        if sum(one.nbytes for one in waiting) >= _GROUP_BYTES:
-            yield pa.Table.from_batches(waiting)
-            waiting = []
-    if waiting:
-        yield pa.Table.from_batches(waiting)
 
 
 def _leaf(field: pa.Field) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -16,6 +15,7 @@ from orchestrate.errors import without_password
 from orchestrate.files import whole
 from orchestrate.queries import counts
 from orchestrate.store import ConfigRow, Reader
+from orchestrate.store.bundle import digest
 from orchestrate.store.records import now
 
 KINDS = ("curves", "trials", "trajectories", "assessments")
@@ -62,7 +62,7 @@ def export(reader: Reader, configs: Sequence[ConfigRow], wanted: Export) -> dict
     _expect_trials(reader, configs, wanted)
     with whole(wanted.manifest) as manifest, whole(wanted.out) as out:
         content = _write(reader, configs, wanted, out)
-        about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": _hash(out)}
+        about = {"file": wanted.out.name, "bytes": out.stat().st_size, "sha256": digest(out)}
         document = {
             "kind": wanted.kind,
             "format": wanted.format,
@@ -104,11 +104,6 @@ def _expect_trials(reader: Reader, configs: Sequence[ConfigRow], wanted: Export)
             f"No trial of these is done yet, so that there are no {wanted.kind} to export: run "
             f"the launch, or see status."
         )
-
-
-def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def provenance(

@@ -237,18 +237,21 @@ def write_parquet(path: Path, stream: Stream) -> int:
     """Write the rows, missing values null; return how many."""
     n = 0
     with pyarrow.parquet.ParquetWriter(path, stream.schema, compression="zstd") as writer:
-        for table in _gathered(stream.batches, 4 * ROWS):
+        for table in gathered(stream.batches, 4 * ROWS, "num_rows"):
             writer.write_table(table)
             n += table.num_rows
     return n
 
 
-def _gathered(batches: Iterable[pa.RecordBatch], size: int) -> Iterator[pa.Table]:
-    """Yield tables of at least ``size`` rows but the last: many small ones make a slow file."""
+def gathered(batches: Iterable[pa.RecordBatch], least: int, of: str) -> Iterator[pa.Table]:
+    """Yield tables with at least so many ``of`` (an attribute), except the last one.
+
+    Many small tables make a slow file.
+    """
     waiting: list[pa.RecordBatch] = []
     for batch in batches:
         waiting.append(batch)
-        if sum(one.num_rows for one in waiting) >= size:
+        if sum(getattr(one, of) for one in waiting) >= least:
             yield pa.Table.from_batches(waiting)
             waiting = []
     if waiting:

@@ -83,7 +83,7 @@ def arrow_schema(table: str) -> pa.Schema:
 def write_checksums(folder: Path) -> None:
     """Write the SHA-256 of all files of the folder, as ``sha256sum --check`` reads them."""
     files = sorted(path for path in folder.iterdir() if path.name != CHECKSUMS)
-    lines = [f"{_digest(path)}  {path.name}\n" for path in files]
+    lines = [f"{digest(path)}  {path.name}\n" for path in files]
     (folder / CHECKSUMS).write_text("".join(lines))
 
 
@@ -124,20 +124,21 @@ def _check(folder: Path) -> None:
 
 
 def _verify(folder: Path, expected: Mapping[str, str]) -> None:
-    for name, digest in expected.items():
+    for name, wanted in expected.items():
         path = folder / name
         if not path.is_file():
             raise StoreUnavailableError(
                 f"The file {path} of the bundle, listed in {CHECKSUMS}, is missing: {_RESTORE}."
             )
-        if _digest(path) != digest:
+        if digest(path) != wanted:
             raise StoreUnavailableError(
                 f"The file {path} of the bundle is damaged, its SHA-256 is not the one in "
                 f"{CHECKSUMS}: {_RESTORE}."
             )
 
 
-def _digest(path: Path) -> str:
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

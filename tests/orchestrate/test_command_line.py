@@ -36,7 +36,8 @@ Command = Callable[..., tuple[int, str, str]]
 
 OPTIONS = ROOT / "docs" / "example" / "conf"
 
-SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
+SHORT = ("env.horizon=5", "executor=inprocess")
+LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
 
 
 @pytest.mark.parametrize(
@@ -176,7 +177,7 @@ def test_the_policies_that_search_run_by_name(command_line: Command) -> None:
 
 
 def test_a_grid_runs_once_and_the_default_is_a_hundred_seeds(command_line: Command) -> None:
-    grid = ("-m", "env=glob(*)", "policy=random,periodic", *SHORT)
+    grid = ("-m", "env=glob(*)", "policy=random,periodic", *LOCAL)
     code, output, _ = command_line(*grid)
     assert code == 0, output
     assert "left out 100 trials: env=quadrotor policy=periodic" in output
@@ -393,7 +394,7 @@ def test_every_experiment_is_a_grid(command_line: Command) -> None:
     assert said["beyond"].startswith("learner.forgetting applies to learner=ekf only\n")
 
 
-LAUNCH = [str(ROOT / "orchestrate/launch.py"), "-m", "policy=random", "seed=0,1", *SHORT]
+LAUNCH = [str(ROOT / "orchestrate/launch.py"), "-m", "policy=random", "seed=0,1", *LOCAL]
 
 
 @pytest.mark.parametrize("worker", [False, True])

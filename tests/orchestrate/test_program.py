@@ -352,7 +352,7 @@ def test_no_row_of_the_database_holds_a_password_that_a_trial_said(
 
 
 @settings(
-    max_examples=6,
+    max_examples=3,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
     phases=[Phase.generate],  # a launch is too slow to look for a shorter password
 )

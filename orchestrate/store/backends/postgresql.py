@@ -216,7 +216,7 @@ class PostgreSQLBackend(Backend):
         )
 
     def dead(self, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
-        return _dead(connection, launches)
+        return dead(self._url, connection, launches)
 
     def token(self) -> str:
         return f"{self._session}-{super().token()}"
@@ -261,11 +261,7 @@ def _end_dead(connection: Connection) -> None:
 
 
 def dead(_: URL, connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
-    """Return the launches whose lease has expired, for a reader."""
-    return _dead(connection, launches)
-
-
-def _dead(connection: Connection, launches: Sequence[LaunchLife]) -> list[LaunchLife]:
+    """Return the launches whose lease has expired."""
     now = _clock(connection)
     return [one for one in launches if one.lease_until is None or one.lease_until < now]
 

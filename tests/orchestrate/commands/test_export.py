@@ -59,6 +59,7 @@ Run = Callable[..., Answer]
 FORMATS = ("csv", "parquet", "npz")
 NO_ROOM = """
 import resource, sys
+sys.dont_write_bytecode = True  # a file that is cut would stay
 from orchestrate.__main__ import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 sys.exit(main())

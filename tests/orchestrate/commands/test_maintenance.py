@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import create_engine
 from sqlalchemy.engine import make_url
 
 from orchestrate.commands.maintenance import trial_key
@@ -22,21 +21,14 @@ from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, WAITING, Answer, on_both
 from tests.orchestrate.standins import specification
 from tests.orchestrate.store.databases import execute, restored
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, everything, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, everything, result, run_all
 from tests.orchestrate.store.released import restore
 
 Run = Callable[..., Answer]
 
 
 def run_trials(url: str, *seeds: int, offset: int = 0) -> None:
-    with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        specs = [Spec(seed) for seed in seeds]
-        for claim, spec in zip(
-            store.claim(launch, store.register(launch, specs).todo), specs, strict=True
-        ):
-            store.commit(claim, result(spec.seed + offset), RUN)
-        store.end_launch(launch, "done")
+    run_all(url, *map(Spec, seeds), make=lambda one: result(one.seed + offset))
 
 
 @pytest.fixture
@@ -70,11 +62,6 @@ class TestUpgrade:
         }  # fmt: skip
         assert not list(_path(url).parent.glob("*backup*"))
 
-    def test_of_nothing(self, command: Run) -> None:
-        answer = command("upgrade")
-        assert answer.code == 2
-        assert "There is no results database" in answer.err
-
     def test_of_an_empty_file(self, command: Run, url: str) -> None:
         _path(url).parent.mkdir()
         _path(url).touch()
@@ -107,11 +94,6 @@ class TestMerge:
         assert "and 2 more" in answer.out
         assert len(command("merge", str(other), "--json").document["conflicts"]) == 12
 
-    def test_of_nothing(self, command: Run, other: Path) -> None:
-        answer = command("merge", str(other))
-        assert answer.code == 2
-        assert "There is no results database" in answer.err
-
 
 class TestDoctor:
     def test_finds_nothing_in_what_a_launch_wrote(self, command: Run, url: str) -> None:
@@ -126,10 +108,7 @@ class TestDoctor:
     def test_names_what_is_wrong(self, command: Run, url: str) -> None:
         restore(5, url)
         command("upgrade", "--no-backup")
-        engine = create_engine(url)
-        with engine.begin() as connection:
-            connection.exec_driver_sql("DELETE FROM step WHERE trial_id = 1 AND t = 7")
-        engine.dispose()
+        execute(url, "DELETE FROM step WHERE trial_id = 1 AND t = 7")
         answer = command("doctor")
         assert answer.code == 1
         first = "error: finished trials without one step for each t below their horizon: 1"
@@ -141,10 +120,7 @@ class TestDoctor:
     def test_what_it_advises_helps(self, command: Run, url: str, tmp_path: Path) -> None:
         restore(5, url)
         command("upgrade", "--no-backup")
-        engine = create_engine(url)
-        with engine.begin() as connection:
-            connection.exec_driver_sql("DELETE FROM trajectory WHERE trial_id = 1")
-        engine.dispose()
+        execute(url, "DELETE FROM trajectory WHERE trial_id = 1")
         new = f"sqlite:///{tmp_path}/new.db"
         assert len(merge(new, url).incomplete) == 1
         with Reader.open(new) as reader:
@@ -345,21 +321,6 @@ class TestVacuum:
         else:
             assert answer.code == 0
             assert "bytes before" in answer.out
-
-
-class TestWithoutADatabase:
-    @pytest.fixture
-    def url(self, sqlite_url: str) -> str:
-        return sqlite_url
-
-    @pytest.mark.parametrize("words", [["backup", "copy"], ["prune", "--yes"], ["vacuum"]])
-    def test_there_is_none_afterwards(self, command: Run, url: str, words: list[str]) -> None:
-        rule = ["--older-than", "1d"] if words[0] == "prune" else []
-        answer = command(*words, *rule)
-        assert answer.code == 2
-        assert "There is no results database" in answer.err
-        assert not Path(url.removeprefix("sqlite:///")).exists()
-        assert not Path("copy").exists()
 
 
 def statuses(url: str) -> dict[str, str]:

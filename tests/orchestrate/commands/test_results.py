@@ -37,7 +37,7 @@ from tests.orchestrate.commands.conftest import (
     on_both,
     run_now,
 )
-from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, Spec, result, run_all
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 
@@ -104,14 +104,29 @@ def test_a_bad_request_is_one_sentence(words: list[str], hint: str, capsys: Capt
     assert hint in sentence
 
 
+CHANGING = [
+    ["backup", "copy"],
+    ["prune", "--yes", "--older-than", "1d"],
+    ["vacuum"],
+    ["upgrade"],
+    ["doctor"],
+    ["work"],
+]
+
+
+@pytest.mark.parametrize("words", [*READING, *CHANGING], ids=lambda words: words[0])
+def test_no_database(
+    words: list[str], tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, sentence = refusal([*words, "--db", f"sqlite:///{tmp_path}/none.db"], capsys)
+    assert code == ExitCode.BAD_REQUEST
+    assert "There is no results database" in sentence
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("words", READING, ids=lambda words: words[0])
 class TestOnEveryDatabase:
-    def test_no_database(self, words: list[str], tmp_path: Path, capsys: Capture) -> None:
-        code, sentence = refusal([*words, "--db", f"sqlite:///{tmp_path}/none.db"], capsys)
-        assert code == ExitCode.BAD_REQUEST
-        assert "There is no results database" in sentence
-        assert list(tmp_path.iterdir()) == []
-
     def test_no_server(self, words: list[str], capsys: Capture) -> None:
         url = "postgresql://me:hunter2@127.0.0.1:1/db"
         code, sentence = refusal([*words, "--db", url], capsys)
@@ -165,17 +180,6 @@ def test_the_database_comes_from_the_environment(
     assert f"{sqlite_url} holds no trials yet" in capsys.readouterr().out
 
 
-def test_a_path_in_the_variable_is_answered_with_the_variable_and_the_url(
-    monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    monkeypatch.setenv("DOPT_DB", "mine/x.db")
-    assert main(["status"]) == 2
-    assert capsys.readouterr().err == (
-        "error: The database URL in the environment variable DOPT_DB cannot be read: "
-        "write it as sqlite:///mine/x.db.\n"
-    )
-
-
 def test_the_entry_point_is_the_same_program(monkeypatch: pytest.MonkeyPatch) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     module, _, function = project["scripts"]["dopt"].partition(":")
@@ -198,11 +202,7 @@ def test_an_option_is_not_abbreviated() -> None:
 
 
 def test_a_reader_that_has_seen_enough_ends_it_quietly(sqlite_url: str) -> None:
-    with Store.open(sqlite_url) as store:
-        launch = store.begin_launch(LAUNCH)
-        specs = [Spec(seed, horizon=2000) for seed in range(5)]
-        for claim in store.claim(launch, store.register(launch, specs).todo):
-            store.commit(claim, result(0, 2000), RUN)
+    run_all(sqlite_url, *(Spec(seed, horizon=2000) for seed in range(5)))
     program = [sys.executable, "-m", "orchestrate", "query", "SELECT * FROM v_curve", "--csv"]
     running = subprocess.Popen(
         [*program, "--db", sqlite_url], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE

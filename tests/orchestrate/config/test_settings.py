@@ -357,7 +357,7 @@ def test_a_setting_holds_for_the_grids_that_have_it(
     assert "did you mean 'iterations'? Choose one of iterations." in errors
 
 
-SHORT = ("env.horizon=5", "executor=local", "launch.workers=1")
+SHORT = ("env.horizon=5", "executor=inprocess")
 
 
 def test_a_setting_holds_for_the_choices_that_have_it(command_line: CommandLine) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.result import Assessment
-from orchestrate.store import LaunchRecord, Reader, RunRecord
+from orchestrate.store import LaunchRecord, Reader, RunRecord, Store
 
 Array = npt.NDArray[np.float64]
 
@@ -131,6 +131,20 @@ def diverged(at: int, seed: int = 0, value: float = np.nan) -> FakeResult:
 
 def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def run_all(
+    url: str,
+    *specs: Spec,
+    make: Callable[[Spec], FakeResult] = lambda one: result(one.seed, one.horizon),
+) -> None:
+    """Write the results of trials into a database, by one launch that ends."""
+    with Store.open(url) as store:
+        launch = store.begin_launch(LAUNCH)
+        claims = store.claim(launch, store.register(launch, specs).todo)
+        pairs = zip(claims, specs, strict=True)
+        store.commit_many([(claim, make(spec), RUN) for claim, spec in pairs])
+        store.end_launch(launch, "done", exit_code=0)
 
 
 ALL = (

@@ -10,14 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine
 from sqlalchemy.engine import make_url
 
 from orchestrate.store import Claim, Reader, Store, StoreError
 from orchestrate.store.doctor import Finding, examine
 from orchestrate.store.schema import STEP_VALUES
-from tests.orchestrate.store.databases import columns, contents
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result
+from tests.orchestrate.store.databases import columns, contents, execute
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, result, run_all
 
 Take = Callable[..., list[Claim]]
 
@@ -37,11 +36,8 @@ def grid(store: Store, launch: int, take: Take, url: str) -> str:
 
 
 def harm(url: str, *statements: str) -> None:
-    engine = create_engine(url)
-    with engine.begin() as connection:
-        for statement in statements:
-            connection.exec_driver_sql(statement)
-    engine.dispose()
+    for statement in statements:
+        execute(url, statement)
 
 
 def only(url: str) -> Finding:
@@ -144,11 +140,7 @@ def test_a_task_without_an_assessment(store: Store, take: Take, url: str) -> Non
 
 
 def test_nan_in_postgresql(postgresql_url: str) -> None:
-    with Store.open(postgresql_url) as store:
-        launch = store.begin_launch(LAUNCH)
-        (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
-        store.commit(claim, result(), RUN)
-        store.end_launch(launch, "done")
+    run_all(postgresql_url, Spec())
     for name in STEP_VALUES[1:]:
         harm(postgresql_url, f"UPDATE step SET {name} = 'NaN' WHERE t = 1")
         assert "not finite" in only(postgresql_url).sentence
@@ -180,12 +172,7 @@ def path(sqlite_url: str) -> Path:
 def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a SQLite database with forty long trials, in one file."""
     path = tmp_path_factory.mktemp("forty") / "results.db"
-    with Store.open(f"sqlite:///{path}") as store:
-        launch = store.begin_launch(LAUNCH)
-        specs = [Spec(seed, horizon=300) for seed in range(40)]
-        claims = store.claim(launch, store.register(launch, specs).todo)
-        store.commit_many([(claim, result(claim.trial_id, 300), RUN) for claim in claims])
-        store.end_launch(launch, "done")
+    run_all(f"sqlite:///{path}", *(Spec(seed, horizon=300) for seed in range(40)))
     connection = sqlite3.connect(path)
     connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     connection.close()
@@ -199,11 +186,9 @@ def file(forty: Path, path: Path) -> Path:
     return path
 
 
-def test_rows_that_refer_to_nothing(file: Path, sqlite_url: str) -> None:
-    connection = sqlite3.connect(file)
-    connection.execute("UPDATE trial SET error_id = 7 WHERE trial_id < 4")
-    connection.commit()
-    connection.close()
+@pytest.mark.usefixtures("file")
+def test_rows_that_refer_to_nothing(sqlite_url: str) -> None:
+    harm(sqlite_url, "UPDATE trial SET error_id = 7 WHERE trial_id < 4")
     found = only(sqlite_url)
     assert "missing rows: 3, in trial" in found.sentence
 

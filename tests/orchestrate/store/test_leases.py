@@ -100,7 +100,7 @@ def test_a_trial_in_compiled_code_does_not_silence_it(
     The trial is interrupted after some heartbeats in compiled code, and would last long without.
     """
     run_trial(trial("quadrotor", "d_optimal", env={"horizon": 3}))  # to load what is compiled
-    spec = trial("quadrotor", "d_optimal", env={"horizon": 5000}, model={"width": 64})
+    spec = trial("quadrotor", "d_optimal", env={"horizon": 5000}, model={"width": 32})
     store = open_store()
     launch = store.begin_launch(LAUNCH)
     heartbeat, advance = store.heartbeat, KernelTrial.advance
@@ -118,6 +118,7 @@ def test_a_trial_in_compiled_code_does_not_silence_it(
             if len(beats) == 3:
                 signal.pthread_kill(main, signal.SIGALRM)
 
+    monkeypatch.setattr("dopt.kernel.run.FIRST_STEPS", 10)
     monkeypatch.setattr(KernelTrial, "advance", compiled_advance)
     monkeypatch.setattr(store, "heartbeat", counted)
     with Heartbeat(store, launch, LEASE_SECONDS), running(take_what_is_free, url) as (_, pipe):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sqlalchemy import create_engine, text
+from sqlalchemy import text
 
 from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
@@ -30,7 +30,16 @@ from orchestrate.store.merge import Merged, merge
 from orchestrate.store.schema import metadata
 from tests.orchestrate.store.conftest import each_other
 from tests.orchestrate.store.databases import execute
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, assessed, diverged, everything, result
+from tests.orchestrate.store.fakes import (
+    LAUNCH,
+    RUN,
+    Spec,
+    assessed,
+    diverged,
+    everything,
+    result,
+    run_all,
+)
 from tests.orchestrate.store.processes import hear, kill, merge_and_tell, running
 
 KEY = Spec().config_key
@@ -53,6 +62,14 @@ def fill(url: str, *specs: Spec, offset: int = 0) -> None:
         store.end_launch(launch, "failed", exit_code=1)
 
 
+def outcomes(url: str) -> list[list[str]]:
+    """Return all that is in a database, without the trials that wait."""
+    found = everything(url)
+    found[0] = [row for row in found[0] if "'pending'" not in row]
+    found[3] = [row for row in found[3] if "'released'" not in row]
+    return found
+
+
 def seeds(*numbers: int, policy: str = "random") -> list[Spec]:
     return [Spec(seed, policy=policy) for seed in numbers]
 
@@ -62,10 +79,7 @@ def test_an_empty_database_becomes_a_copy(url: str, other: str) -> None:
     fill(other, *seeds(*range(9)), Spec(99))
     found = merge(url, other)
     assert found == Merged(added={"done": 5, "diverged": 2, "failed": 2}, launches=1)
-    mine, theirs = everything(url), everything(other)
-    theirs[0] = [row for row in theirs[0] if "'pending'" not in row]
-    theirs[3] = [row for row in theirs[3] if "'released'" not in row]
-    assert mine == theirs
+    assert everything(url) == outcomes(other)
 
 
 def test_again_changes_nothing(url: str, other: str) -> None:
@@ -85,13 +99,10 @@ def test_pages_of_few_steps_bring_the_same(
     monkeypatch.setattr(source, "PAGE_STEPS", steps)
     fill(other, *seeds(*range(9)), Spec(99))
     assert merge(url, other).added == {"done": 5, "diverged": 2, "failed": 2}
-    mine, theirs = everything(url), everything(other)
-    theirs[0] = [row for row in theirs[0] if "'pending'" not in row]
-    theirs[3] = [row for row in theirs[3] if "'released'" not in row]
-    assert mine == theirs
+    assert everything(url) == outcomes(other)
 
 
-def test_numbers_are_given_anew(url: str, other: str) -> None:
+def test_numbers_are_given_again(url: str, other: str) -> None:
     fill(url, *seeds(10, 11, 12), Spec(99))
     fill(other, *seeds(2, 1, 0, policy="uniform"), *seeds(0, 1), Spec(99))
     merge(url, other)
@@ -137,10 +148,7 @@ def test_any_other_number_is_a_conflict(tmp_path: Path, name: str) -> None:
     fill(url, *seeds(0), Spec(99))
     changed = getattr(result(0), name).copy()
     changed.flat[-1] = np.nextafter(changed.flat[-1], 2)
-    with Store.open(other) as store:
-        launch = store.begin_launch(LAUNCH)
-        (claim,) = store.claim(launch, store.register(launch, seeds(0)).todo)
-        store.commit(claim, replace(result(0), **{name: changed}), RUN)
+    run_all(other, Spec(0), make=lambda _: replace(result(0), **{name: changed}))
     assert len(merge(url, other).conflicts) == 1
 
 
@@ -224,10 +232,7 @@ def _launches(url: str) -> list[tuple[object, ...]]:
 )
 def test_only_whole_trials_come(url: str, other: str, damage: str) -> None:
     fill(other, *seeds(0), Spec(99))
-    engine = create_engine(other)
-    with engine.begin() as connection:
-        connection.execute(text(damage))
-    engine.dispose()
+    execute(other, damage)
     found = merge(url, other)
     assert [one.trial_key for one in found.incomplete] == [Spec(0).trial_key]
     with Reader.open(url) as reader:
@@ -246,21 +251,13 @@ def test_a_merge_that_was_killed_is_completed(
         assert len(reader.query("SELECT * FROM trial")) == 6
     found = merge(url, other)
     assert sum(found.added.values()) == 6
-    theirs = everything(other)
-    theirs[0] = [row for row in theirs[0] if "'pending'" not in row]
-    theirs[3] = [row for row in theirs[3] if "'released'" not in row]
-    assert everything(url) == theirs
+    assert everything(url) == outcomes(other)
 
 
 def test_memory_does_not_grow_with_the_rows(tmp_path: Path) -> None:
     url, other = (f"sqlite:///{tmp_path}/{i}.db" for i in range(2))
     horizon, count = 2_000, 100
-    with Store.open(other) as store:
-        launch = store.begin_launch(LAUNCH)
-        specs = [Spec(seed, horizon=horizon) for seed in range(count)]
-        sent = result(0, horizon)
-        for claim in store.claim(launch, store.register(launch, specs).todo):
-            store.commit(claim, sent, RUN)
+    run_all(other, *(Spec(seed, horizon=horizon) for seed in range(count)))
     with running(_merge_and_measure, url, other) as (_, pipe):
         added, kilobytes = hear(pipe)
     assert added == {"done": count}
@@ -286,13 +283,7 @@ def test_refuses_itself_and_nothing(url: str, other: str, store: Store) -> None:
 
 def assess(url: str, *several: Spec) -> None:
     """Run trials that are assessed."""
-    with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        for claim, spec in zip(
-            store.claim(launch, store.register(launch, several).todo), several, strict=True
-        ):
-            store.commit(claim, assessed(spec.seed), RUN)
-        store.end_launch(launch, "done")
+    run_all(url, *several, make=lambda one: assessed(one.seed))
 
 
 def test_assessments_come_with_their_trials(url: str, other: str) -> None:
@@ -306,12 +297,8 @@ def test_assessments_come_with_their_trials(url: str, other: str) -> None:
 @pytest.mark.parametrize("damage", ["DELETE FROM assessment WHERE t = 3", "DELETE FROM assessment"])
 def test_a_trial_that_lost_assessments_does_not_come(url: str, other: str, damage: str) -> None:
     assess(other, Spec(0), Spec(1))
-    engine = create_engine(other)
-    with engine.begin() as connection:
-        first = "(SELECT min(trial_id) FROM trial)"
-        joint = "AND" if "WHERE" in damage else "WHERE"
-        connection.execute(text(f"{damage} {joint} trial_id = {first}"))
-    engine.dispose()
+    joint = "AND" if "WHERE" in damage else "WHERE"
+    execute(other, f"{damage} {joint} trial_id = (SELECT min(trial_id) FROM trial)")
     found = merge(url, other)
     assert [one.trial_key for one in found.incomplete] == [Spec(0).trial_key]
     assert found.added == {"done": 1}
@@ -320,10 +307,7 @@ def test_a_trial_that_lost_assessments_does_not_come(url: str, other: str, damag
 def test_another_assessment_is_a_conflict(url: str, other: str) -> None:
     for where in (url, other):
         assess(where, Spec(0))
-    engine = create_engine(other)
-    with engine.begin() as connection:
-        connection.execute(text("UPDATE assessment SET value = 9 WHERE t = 3"))
-    engine.dispose()
+    execute(other, "UPDATE assessment SET value = 9 WHERE t = 3")
     assert [one.seed for one in merge(url, other).conflicts] == [0]
 
 
@@ -331,12 +315,7 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELEC
 
 
 def fill_strangers(url: str) -> None:
-    with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        specs = [Spec(0), Spec(1), Spec(2, policy="d_optimal")]
-        for claim in store.claim(launch, store.register(launch, specs).todo):
-            store.commit(claim, result(claim.trial_id), RUN)
-        store.end_launch(launch, "done", exit_code=0)
+    run_all(url, Spec(0), Spec(1), Spec(2, policy="d_optimal"))
 
 
 def test_a_table_that_is_a_view_is_refused(url: str) -> None:

@@ -28,7 +28,7 @@ from orchestrate.store import (
 from orchestrate.store.backends import sqlite_engine
 from orchestrate.store.backends.sqlite_engine import _is_read_only, read_address
 from orchestrate.store.doctor import examine
-from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result, run_all
 from tests.orchestrate.store.processes import (
     eight_open,
     hear,
@@ -369,11 +369,7 @@ def _check_prefix_and_complete(url: str, at_most: int) -> int:
 def sixty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a database with sixty trials."""
     folder = tmp_path_factory.mktemp("sixty")
-    with Store.open(f"sqlite:///{folder}/results.db") as store:
-        launch = store.begin_launch(LAUNCH)
-        claims = store.claim(launch, store.register(launch, [Spec(s) for s in range(60)]).todo)
-        store.commit_many([(claim, result(claim.trial_id), RUN) for claim in claims])
-        store.end_launch(launch, "done")
+    run_all(f"sqlite:///{folder}/results.db", *map(Spec, range(60)))
     return folder
 
 
@@ -467,11 +463,7 @@ class TestReadOnly:
 
     @pytest.fixture
     def filled(self, url: str, folder: Path) -> str:
-        with Store.open(url) as store:
-            launch = store.begin_launch(LAUNCH)
-            for claim in store.claim(launch, store.register(launch, [Spec(0), Spec(1)]).todo):
-                store.commit(claim, result(claim.trial_id), RUN)
-            store.end_launch(launch, "done")
+        run_all(url, Spec(0), Spec(1))
         for path in folder.rglob("*"):
             path.chmod(0o777 if path.is_dir() else 0o666)
         return url
