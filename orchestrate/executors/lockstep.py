@@ -2,7 +2,7 @@
 
 The torch path (:mod:`dopt.reference`) takes each step for the whole batch at once: of the paper's
 policies, open-loop ones and custom networks. Other trials are refused with a sentence. The numbers
-equal those of the kernel up to rounding.
+equal the results of the kernel up to rounding.
 """
 
 from __future__ import annotations

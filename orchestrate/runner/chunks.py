@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from tabulate import tabulate
 
-from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 from orchestrate.config import Grid
@@ -29,7 +29,6 @@ from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import LaunchError
 from orchestrate.executors.base import Task
 from orchestrate.executors.registry import executor_factory
-from orchestrate.runner.progress import aligned
 
 MAX_CHUNK_TRIALS = 200
 """Largest number of trials in a chunk, which bounds the loss when a worker dies."""
@@ -105,24 +104,17 @@ class Chunks:
             if queue:
                 trial = queue.popleft()
                 return [Task(trial.trial_key, trial)]
-        if self._batch:
-            return self._next_batch(self._batch)
-        limit = min(MAX_CHUNK_TRIALS, max(1, len(self._waiting) // (2 * self.slots)))
+        most = min(MAX_CHUNK_TRIALS, max(1, len(self._waiting) // (2 * self.slots)))
         chunk: list[Task] = []
         cost = 0.0
-        while self._waiting and len(chunk) < limit:
-            cost += self._costs.get(self._waiting[0].config_key, self._seconds)
-            if chunk and cost > self._seconds:
+        while self._waiting and len(chunk) < (self._batch or most):
+            key = self._waiting[0].config_key
+            cost += self._costs.get(key, self._seconds)
+            full = (
+                chunk[0].spec.config_key != key if self._batch and chunk else cost > self._seconds
+            )
+            if chunk and full:
                 break
-            trial = self._waiting.popleft()
-            chunk.append(Task(trial.trial_key, trial))
-        return chunk
-
-    def _next_batch(self, size: int) -> list[Task]:
-        """Return the next trials of one configuration."""
-        key = self._waiting[0].config_key
-        chunk: list[Task] = []
-        while self._waiting and len(chunk) < size and self._waiting[0].config_key == key:
             trial = self._waiting.popleft()
             chunk.append(Task(trial.trial_key, trial))
         return chunk
@@ -153,7 +145,12 @@ def check_memory(grid: Grid, settings: LaunchSettings, machine: int | None = Non
     configs = {trial.config_key: trial.config for trial in grid.trials}
     keys = sorted(configs, key=lambda key: configs[key].memory, reverse=True)
     largest = configs[keys[0]]
-    _check_worker(largest, settings)
+    name = f"a trial of env={largest.system.name} policy={largest.policy.name}"
+    if settings.memory_gib is not None and largest.memory > settings.memory_gib * BYTES_PER_GIB:
+        raise LaunchError(
+            f"{name} needs {_gib(largest.memory)} of memory, but launch.memory_gib allows "
+            f"{settings.memory_gib:g} GiB: raise it, or make {largest.largest_setting} smaller."
+        )
     factory = executor_factory(settings)
     at_once = factory.trials_at_once(settings)
     if at_once is None:
@@ -161,7 +158,7 @@ def check_memory(grid: Grid, settings: LaunchSettings, machine: int | None = Non
     available = memory_of_this_machine() if machine is None else machine
     if largest.memory > available:
         raise LaunchError(
-            f"{_name(largest)} needs {_gib(largest.memory)} of memory, but this machine has "
+            f"{name} needs {_gib(largest.memory)} of memory, but this machine has "
             f"{_gib(available)}: make {largest.largest_setting} smaller."
         )
     needs = [configs[key].memory for key in keys for _ in range(min(counts[key], at_once))]
@@ -183,24 +180,9 @@ def memory_of_this_machine() -> int:
         return physical
 
 
-def _check_worker(config: TrialConfig, settings: LaunchSettings) -> None:
-    if settings.memory_gib is not None and config.memory > settings.memory_gib * BYTES_PER_GIB:
-        raise LaunchError(
-            f"{_name(config)} needs {_gib(config.memory)} of memory, but launch.memory_gib allows "
-            f"{settings.memory_gib:g} GiB: raise it, or make {config.largest_setting} smaller."
-        )
-
-
-def _name(config: TrialConfig) -> str:
-    return f"a trial of env={config.system.name} policy={config.policy.name}"
-
-
 def _gib(count: int) -> str:
-    return (
-        f"{count / BYTES_PER_GIB:,.3g} GiB"
-        if count < 1000 * BYTES_PER_GIB
-        else f"{count >> 30:,} GiB"
-    )
+    gib = count / BYTES_PER_GIB
+    return f"{gib:,.3g} GiB" if gib < 1000 else f"{count >> 30:,} GiB"
 
 
 FinalLosses = Callable[[Sequence[str]], Mapping[str, float]]
@@ -304,7 +286,8 @@ class SeedPlan:
         used, total = sum(self._used.values()), len(self._grid.trials)
         share = f"{used:,} of {total:,} trials ({100 * used / total:.0f} %)"
         known = f"{len(self._known):,} of {len(self._seeds):,} means known"
-        return "\n".join([*aligned(lines), f"{share}, {known}"])
+        table = tabulate(lines, tablefmt="plain", disable_numparse=True)
+        return f"{table}\n{share}, {known}"
 
     def _look(self, n: int, relative: float, losses: Mapping[str, float]) -> None:
         """Look at the losses of the first n seeds of the configurations that are not known."""

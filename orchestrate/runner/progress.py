@@ -228,7 +228,7 @@ def undisturbed() -> Iterator[None]:
         if len(held) == MAX_HELD_SIGNALS:
             raise KeyboardInterrupt
 
-    # SIGUSR1 belongs to whoever uses it, but for a handler that is set as ours are.
+    # SIGUSR1 belongs to whoever uses it, except where a handler is set as ours are.
     used = [signal.SIGUSR1] if callable(signal.getsignal(signal.SIGUSR1)) else []
     before = {number: signal.signal(number, hold) for number in (*SIGNALS, *used)}
     try:
@@ -238,12 +238,3 @@ def undisturbed() -> Iterator[None]:
             signal.signal(number, handler)
         for one in held:
             signal.raise_signal(one)
-
-
-def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Return lines of cells as text with columns of equal width."""
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    return [
-        "  ".join(f"{cell:<{w}}" for cell, w in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    ]

@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TextIO
 
+from dopt.kernel import warm_up
+from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
@@ -39,6 +41,7 @@ POLL_OTHER_LAUNCHES_SECONDS = 1.0
 ANNOUNCE_AFTER_SECONDS = 1.0
 """Duration of a preparation after which a message explains the delay."""
 
+STOPPED = "stopped: committed trials are kept; run the same command again to continue"
 COMPILING = "compiling the kernel: this takes up to a minute, and later launches reuse it"
 
 Say = Callable[[str], None]
@@ -50,6 +53,10 @@ class Work:
 
     run: Run
     prepare: Prepare
+
+
+WORK = Work(run_trial, warm_up)
+"""Functions of a real launch."""
 
 
 @dataclass(frozen=True)
@@ -94,25 +101,23 @@ def launch_grid(
     StoreError, InfrastructureError
         If the database or the workers fail; nothing that was committed is lost.
     """
-    announce = warn or say
+    output = Output(say, warn or say, stream)
     if not settings.detach:
         executor_factory(settings).check(settings)
     job = make_job(settings)
-    if settings.detach or job is not None:
-        return recorded_launch(
-            settings, record, say, announce, lambda store: leave(store, grid, settings, job, say)
-        )
-    output = Output(say, announce, stream)
-    return recorded_launch(
-        settings, record, say, announce, lambda store: _run(store, grid, settings, work, output)
-    )
+
+    def body(store: RetryingStore) -> ExitCode:
+        if settings.detach or job is not None:
+            return leave(store, grid, settings, job, say)
+        return _run(store, grid, settings, work, output)
+
+    return recorded_launch(settings, record, output, body)
 
 
 def recorded_launch(
     settings: LaunchSettings,
     record: LaunchRecord,
-    say: Say,
-    warn: Say,
+    output: Output,
     body: Callable[[RetryingStore], ExitCode],
 ) -> ExitCode:
     """Run ``body`` as a launch that the database records, alive until it ends.
@@ -123,12 +128,16 @@ def recorded_launch(
         If the database or the workers fail; claims are released if that is possible.
     """
     opened = Store.open(settings.store_url, settings.lease, settings.patience)
-    with collected(settings, warn), opened as store:
+    with collected(settings, output.warn), opened as store:
         launch = store.begin_launch(record)
         try:
             with Heartbeat(store, launch, settings.lease):
-                patient = RetryingStore(store, launch, settings.patience, warn)
-                code = _interruptible(patient, body, say)
+                patient = RetryingStore(store, launch, settings.patience, output.warn)
+                try:
+                    code = body(patient)
+                except KeyboardInterrupt:
+                    output.say(STOPPED)
+                    code = ExitCode.INTERRUPTED
                 patient.end_launch(_STATES.get(code, "failed"), code)
         except BaseException as error:
             # Try once more to release the claims; the error itself is reported by the caller.
@@ -144,16 +153,6 @@ _STATES = {
     ExitCode.INTERRUPTED: "interrupted",
     ExitCode.UNFINISHED: "interrupted",
 }
-
-
-def _interruptible(
-    store: RetryingStore, body: Callable[[RetryingStore], ExitCode], say: Say
-) -> ExitCode:
-    try:
-        return body(store)
-    except KeyboardInterrupt:
-        say("stopped: committed trials are kept; run the same command again to continue")
-        return ExitCode.INTERRUPTED
 
 
 def _run(
@@ -221,17 +220,11 @@ def _run_stages(
 
 
 def prepare_workers(prepare: Prepare, warn: Say) -> None:
-    """Compile the kernel, or load it."""
-    with _announced_if_slow(COMPILING, warn):
-        prepare()
-
-
-@contextmanager
-def _announced_if_slow(text: str, say: Say) -> Iterator[None]:
-    timer = threading.Timer(ANNOUNCE_AFTER_SECONDS, say, [text])
+    """Compile the kernel, or load it; announce a compilation that takes long."""
+    timer = threading.Timer(ANNOUNCE_AFTER_SECONDS, warn, [COMPILING])
     timer.start()
     try:
-        yield
+        prepare()
     finally:
         timer.cancel()
 
@@ -369,36 +362,29 @@ MAX_LISTED_CAUSES = 3
 
 def registered(grid: Grid, state: Registration) -> str:
     """Return the counts of a grid that was registered for workers."""
-    lines = [*left_out(grid), f"{state.done + state.diverged:,} of {state.total:,} already done"]
-    if state.failed:
-        lines[-1] += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
-    if state.running_elsewhere:
-        lines[-1] += f", {state.running_elsewhere:,} running"
-    lines[-1] += f", {len(state.todo):,} registered"
-    return "\n".join(lines)
+    return f"{_counts(grid, state, 'running')}, {len(state.todo):,} registered"
 
 
-def left_out(grid: Grid) -> list[str]:
-    """Return a line for each reason to leave out trials, and one for repeated jobs."""
+def _counts(grid: Grid, state: Registration, running: str, heading: str = "") -> str:
+    """Return a line for each reason to leave out trials, and one with the counts by status."""
     lines = [f"left out {count:,} trials: {reason}" for reason, count in grid.left_out.items()]
     if grid.repeats:
         lines.append(f"{grid.repeats:,} of {grid.n_jobs:,} jobs name a trial of the grid again")
-    return lines
+    lines.append(f"{heading}{state.done + state.diverged:,} of {state.total:,} already done")
+    if state.failed:
+        lines[-1] += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
+    if state.running_elsewhere:
+        lines[-1] += f", {state.running_elsewhere:,} {running}"
+    return "\n".join(lines)
 
 
 def opening(
     grid: Grid, state: Registration, settings: LaunchSettings, url: str, heading: str = ""
 ) -> str:
     """Return the counts of trials to run, done, failed and left out, after the stage's heading."""
-    lines = left_out(grid)
-    counted = f"{state.done + state.diverged:,} of {state.total:,} already done"
-    if state.failed:
-        counted += f", {state.failed:,} failed before (launch.retry=failed runs them again)"
-    if state.running_elsewhere:
-        counted += f", {state.running_elsewhere:,} running in another launch"
+    counts = _counts(grid, state, "running in another launch", heading)
     todo = f"{len(state.todo):,} to run with executor={settings.executor}"
-    lines.append(f"{heading}{counted}, {todo if state.todo else 'nothing to run'} · {url}")
-    return "\n".join(lines)
+    return f"{counts}, {todo if state.todo else 'nothing to run'} · {url}"
 
 
 def closing(tally: Tally, failures: Counter[str], stop_requested: bool, seconds: float) -> str:

@@ -211,8 +211,7 @@ class ExplorationSaver:
     Parameters
     ----------
     url : str or None
-        Database, by default that of a launch (:func:`orchestrate.store.default_url`); it is made
-        if there is none.
+        Database, by default :func:`orchestrate.store.default_url`; it is made if it does not exist.
 
     Raises
     ------
@@ -364,10 +363,8 @@ def _content(root: Path, name: bytes) -> bytes:
 def _versions() -> dict[str, str]:
     versions = {"python": platform.python_version(), "dopt": __version__}
     for name in LIBRARIES:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return versions
 
 

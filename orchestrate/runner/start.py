@@ -12,8 +12,8 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 
-from dopt.kernel import warm_up
-from dopt.run import run_trial
+from tabulate import tabulate
+
 from dopt.spec.label import labels
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid, build_grid
@@ -24,8 +24,7 @@ from orchestrate.errors import ExitCode, LaunchError
 from orchestrate.executors.registry import executor_factory, make_job
 from orchestrate.program import ROOT, answered, say, tell
 from orchestrate.runner.chunks import check_memory
-from orchestrate.runner.progress import aligned
-from orchestrate.runner.run_grid import Work, launch_grid
+from orchestrate.runner.run_grid import WORK, Work, launch_grid
 from orchestrate.runner.saving import launch_record
 from orchestrate.store import (
     FINISHED,
@@ -36,8 +35,6 @@ from orchestrate.store import (
     SchemaVersionError,
     TrialRow,
 )
-
-WORK = Work(run_trial, warm_up)
 
 
 def checked(request: Request) -> tuple[Grid, LaunchSettings]:
@@ -123,7 +120,14 @@ def launch_trial(
         settings = dataclasses.replace(settings, executor="inprocess")
     before = _attempts(trial, settings.store_url)
     grid = Grid([trial], n_jobs=1, left_out={})
-    code = launch_grid(grid, settings, record, work, say=_ignore, stream=None, warn=_warn)
+    code = launch_grid(
+        grid,
+        settings,
+        record,
+        work,
+        say=lambda _: None,  # a single trial prints one line
+        warn=lambda text: tell(sys.stderr, f"{text}\n"),
+    )
     with Reader.open(settings.store_url) as reader:
         row = _row(reader, trial)
         if row is None:  # interrupted before it was registered
@@ -148,14 +152,6 @@ def _attempts(trial: TrialSpec, url: str) -> int:
 def _row(reader: Reader, trial: TrialSpec) -> TrialRow | None:
     rows = reader.trials(trial.config_key)
     return next((row for row in rows if row.seed == trial.seed), None)
-
-
-def _ignore(_: str) -> None:
-    """Ignore the messages of a grid: a single trial prints one line."""
-
-
-def _warn(text: str) -> None:
-    tell(sys.stderr, f"{text}\n")
 
 
 def _name(trial: TrialSpec) -> str:
@@ -215,7 +211,8 @@ def preview(grid: Grid, url: str, retry: str | None = None) -> str:
     total = sum(rows.values(), Counter[str]())
     plural = "" if total["trials"] == 1 else "s"
     end = f"{total['trials']:,} trial{plural}, {total['done']:,} done, {total['to run']:,} to run"
-    return "\n".join([*aligned(lines), *left_out, end])
+    table = tabulate(lines, tablefmt="plain", disable_numparse=True)
+    return "\n".join([table, *left_out, end])
 
 
 def _labels(configs: Sequence[TrialSpec]) -> list[str]:

@@ -14,13 +14,10 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from types import FrameType
 
 from dopt.errors import DoptError
-from dopt.kernel import warm_up
 from dopt.process import usable_cores
-from dopt.run import run_trial
 from dopt.spec.config import completed
 from dopt.spec.trial import TrialSpec, stored_trial
 from orchestrate.config.launch_settings import LaunchSettings, factor
@@ -28,6 +25,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.executors.base import Task
 from orchestrate.executors.registry import make_executor
 from orchestrate.fingerprint import differences, fingerprint
+from orchestrate.program import ROOT
 from orchestrate.runner.chunks import (
     BYTES_PER_GIB,
     MAX_CHUNK_TRIALS,
@@ -35,13 +33,17 @@ from orchestrate.runner.chunks import (
     memory_of_this_machine,
 )
 from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally
-from orchestrate.runner.run_grid import Output, Work, prepare_workers, recorded_launch, worked
+from orchestrate.runner.run_grid import (
+    WORK,
+    Output,
+    Work,
+    prepare_workers,
+    recorded_launch,
+    worked,
+)
 from orchestrate.runner.saving import RetryingStore, launch_record
 from orchestrate.runner.scheduler import SUSPECT_LOSSES, Scheduler
 from orchestrate.store import OpenConfig
-
-ROOT = Path(__file__).resolve().parents[2]
-WORK = Work(run_trial, warm_up)
 
 WARNINGS = (*SIGNALS, signal.SIGUSR1)
 """Signals before a preemption; batch systems send SIGUSR1 when asked for a warning."""
@@ -71,7 +73,7 @@ class WorkerSettings:
     processes
         Trials at once; None for one on each core that this process may use.
     timeout, memory_gib, retry_memory, lease
-        As those of a launch (:class:`orchestrate.config.launch_settings.LaunchSettings`).
+        As in :class:`orchestrate.config.launch_settings.LaunchSettings`.
 
     Raises
     ------
@@ -145,15 +147,14 @@ def run_worker(settings: WorkerSettings, output: Output, work: Work | None = Non
         return recorded_launch(
             launch,
             record,
-            output.say,
-            output.warn,
+            output,
             lambda store: _work(store, settings, launch, work or WORK, output, start),
         )
 
 
 @contextmanager
 def _signals_interrupt() -> Iterator[None]:
-    """Let a warning end the preparation, in which nothing is held, as Ctrl-C does."""
+    """Interrupt the preparation, in which no trial is claimed, at a warning, as Ctrl-C does."""
     repeated = Repetition()
 
     def interrupt(number: int, _: FrameType | None) -> None:
@@ -243,7 +244,7 @@ class Kind:
     Attributes
     ----------
     mean, longest
-        Measured wall time of its trials [s]; None while there is none.
+        Measured wall time of its trials [s]; None before the first one has ended.
     """
 
     config_id: int
@@ -273,7 +274,7 @@ class StoredChunks(Chunks):
     left : int
         Trials of the database without an outcome, as of the last look.
     left_here : int
-        Those of them that this worker can run, or could if another worker gave them back.
+        The ones among them that this worker can run, or could if another worker gave them back.
     """
 
     def __init__(

@@ -27,7 +27,14 @@ from tests.orchestrate.conftest import Launches
 from tests.orchestrate.executors.conftest import ALL, ON_RAY, WITH_PROCESSES
 from tests.orchestrate.executors.test_executors import drain, seed_of, tasks
 from tests.orchestrate.faults.laboratory import alive
-from tests.orchestrate.standins import BROKEN_SEED, deadly, exiting, malformed, quick
+from tests.orchestrate.standins import (
+    BROKEN_SEED,
+    deadly,
+    exiting,
+    malformed,
+    quick,
+    raising,
+)
 from tests.orchestrate.unruly import (
     deaf,
     empty,
@@ -75,6 +82,7 @@ PAIR = {"workers": 2}
         ("local", deadly, PAIR, ("killed", "WorkerLost", "killed by signal 9", 2), ""),
         ("local", malformed, {}, ("malformed", "InvalidResultError", "", 1), ""),
         ("local", empty, {}, ("malformed", "_NoResultError", "returned NoneType, but a Tr", 1), ""),
+        ("inprocess", raising, {}, ("exception", "ZeroDivisionError", "broken", 1), "in raising"),
         ("local", exiting, {}, LEFT, "in exiting"),
         ("inprocess", exiting, {}, LEFT, "in exiting"),
     ],

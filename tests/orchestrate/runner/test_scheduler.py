@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dopt.errors import SpecificationError, UnusableEnvironmentError
+from dopt.errors import UnusableEnvironmentError
 from dopt.spec.trial import TrialSpec
 from orchestrate.config import Grid
 from orchestrate.config.launch_settings import LaunchSettings
@@ -19,7 +19,7 @@ from orchestrate.errors import ExitCode, InfrastructureError
 from orchestrate.executors.base import Event, Executor, Task, WorkerLost, run_task
 from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.runner.scheduler import MAX_LONE_LOSSES, MAX_WORKER_LOSSES, SUSPECT_LOSSES
-from orchestrate.store import Claim, NoDatabaseError, Reader, Store, StoreUnavailableError
+from orchestrate.store import Claim, Store, StoreUnavailableError
 from orchestrate.store.records import utc_text
 from tests.orchestrate.conftest import RECORD, Launches
 from tests.orchestrate.losses import lose
@@ -61,15 +61,6 @@ def test_the_whole_grid_is_registered_before_the_first_trial_runs(launches: Laun
     assert seen == [4, 4, 4, 4]
 
 
-def test_an_exception_is_recorded_and_the_grid_goes_on(launches: Launches) -> None:
-    assert launches(raising) == ExitCode.SOME_FAILED
-    assert launches.statuses() == {0: "done", 1: "done", 2: "failed", 3: "done", 4: "done"}
-    assert "1 failed: ZeroDivisionError: the seed is broken" in launches.said[-1]
-    [(cause, text)] = launches.query("SELECT cause, traceback FROM v_failures")
-    assert cause == "exception"
-    assert "in raising" in text
-
-
 @pytest.mark.parametrize("executor", ["inprocess", "local"])
 def test_what_no_trial_can_run_on_ends_the_launch_and_fails_no_trial(
     launches: Launches, executor: str
@@ -102,30 +93,6 @@ def test_a_diverged_trial_is_a_result_that_is_kept(launches: Launches) -> None:
     assert launches.statuses()[BROKEN_SEED] == "done"
 
 
-def test_fail_fast_stops_at_the_first_failure(launches: Launches) -> None:
-    assert launches(raising, seeds=300, fail_fast=True) == ExitCode.SOME_FAILED
-    left = launches.query("SELECT count(*) FROM trial WHERE status = 'pending'")[0][0]
-    assert left > 50
-    assert "stopped at the first failure" in launches.said[-1]
-
-
-def test_rows_do_not_depend_on_the_executor(launches: Launches) -> None:
-    launches(quick)
-    here = launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t")
-    launches.url = launches.url.replace("results.db", "other.db")
-    launches(quick, executor="local", chunk_seconds=1e-9)
-    assert launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t") == here
-
-
-def test_the_trials_of_a_dead_launch_are_taken_over(launches: Launches) -> None:
-    with Store.open(launches.url) as store:
-        dead = store.begin_launch(RECORD)
-        store.register(dead, [specification(0)])
-        assert len(store.claim(dead, [specification(0).trial_key])) == 1
-    assert launches(quick) == ExitCode.DONE
-    assert set(launches.statuses().values()) == {"done"}
-
-
 def test_a_launch_waits_for_the_trials_of_a_living_one(launches: Launches) -> None:
     with Store.open(launches.url) as store:
         other = store.begin_launch(RECORD)
@@ -141,19 +108,6 @@ def test_a_launch_waits_for_the_trials_of_a_living_one(launches: Launches) -> No
     assert "1 running in another launch" in launches.said[0]
     assert launches.query("SELECT DISTINCT launch_id FROM trial") == [(2,)]
     assert set(launches.statuses().values()) == {"done"}
-
-
-def test_the_launch_is_written_down_with_its_end(launches: Launches) -> None:
-    launches(quick)
-    launches(raising, seeds=6, executor="local")
-    assert launches.query("SELECT state, host FROM launch") == [("done", "here"), ("done", "here")]
-
-
-def test_nothing_is_made_for_a_wrong_grid(launches: Launches) -> None:
-    with pytest.raises(SpecificationError):
-        specification(0, mass=-1)
-    with pytest.raises(NoDatabaseError):
-        Reader.open(launches.url)
 
 
 @pytest.mark.parametrize(("models", "prepared"), [(("in_torch",), 0), (("in_torch", "mlp"), 1)])
@@ -242,18 +196,23 @@ def has_broken(chunk: Sequence[Task]) -> bool:
 Launch = Callable[..., tuple[ExitCode, Scripted]]
 
 
+def loses_nodes(times: int, only: Callable[[int], bool] = lambda _: True) -> Fate:
+    """Return the fate of a trial that loses its node so often, or its process at other times."""
+
+    def fate(chunk: Sequence[Task], time: int) -> list[Event]:
+        if has_broken(chunk) and time <= times:
+            return [WorkerLost(keys(chunk), "lost its power", node_lost=only(time))]
+        return finish(chunk)
+
+    return fate
+
+
 def test_a_trial_whose_node_is_lost_runs_again_free_of_charge(
     scripted: Launch, launches: Launches
 ) -> None:
     losses = MAX_LONE_LOSSES - 1
     assert losses > SUSPECT_LOSSES
-
-    def fate(chunk: Sequence[Task], time: int) -> list[Event]:
-        if has_broken(chunk) and time <= losses:
-            return [WorkerLost(keys(chunk), "lost its power", node_lost=True)]
-        return finish(chunk)
-
-    assert scripted(fate)[0] == ExitCode.DONE
+    assert scripted(loses_nodes(losses))[0] == ExitCode.DONE
     assert set(launches.statuses().values()) == {"done"}
     outcomes = launches.query(
         "SELECT outcome, count(*) FROM attempt JOIN trial USING (trial_id) "
@@ -289,34 +248,25 @@ def test_times_are_those_of_the_clock_of_the_launch(
 def test_a_trial_that_takes_every_node_down_runs_last_and_is_given_up(
     scripted: Launch, launches: Launches
 ) -> None:
-    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
-        if has_broken(chunk):
-            return [WorkerLost(keys(chunk), "lost its power", node_lost=True)]
-        return finish(chunk)
-
-    code, executor = scripted(fate)
+    code, executor = scripted(loses_nodes(10**6))
     assert code == ExitCode.SOME_FAILED
     statuses = launches.statuses()
     assert statuses.pop(BROKEN_SEED) == "failed"
     assert set(statuses.values()) == {"done"}
     assert executor.given[-MAX_LONE_LOSSES + 1 :] == (MAX_LONE_LOSSES - 1) * [[BROKEN_SEED]]
-    [(cause, message)] = launches.query("SELECT cause, message FROM v_failures")
-    assert cause == "node lost"
-    assert message == (
-        f"node was lost {MAX_LONE_LOSSES} times while running only this trial "
-        "(last: lost its power)"
-    )
+    assert launches.query("SELECT cause, message FROM v_failures") == [
+        (
+            "node lost",
+            f"node was lost {MAX_LONE_LOSSES} times while running only this trial "
+            "(last: lost its power)",
+        )
+    ]
 
 
 def test_the_loss_of_nodes_does_not_count_against_the_attempts(
     scripted: Launch, launches: Launches
 ) -> None:
-    def fate(chunk: Sequence[Task], time: int) -> list[Event]:
-        if has_broken(chunk) and time <= MAX_LONE_LOSSES:
-            return [WorkerLost(keys(chunk), "gone", node_lost=time != 2)]
-        return finish(chunk)
-
-    assert scripted(fate)[0] == ExitCode.DONE
+    assert scripted(loses_nodes(MAX_LONE_LOSSES, lambda time: time != 2))[0] == ExitCode.DONE
     assert set(launches.statuses().values()) == {"done"}
 
 
@@ -336,13 +286,14 @@ def test_a_lost_chunk_is_split_and_only_the_one_to_blame_fails(
     assert set(Counter(launches.statuses().values()).items()) == {("done", 199), ("failed", 1)}
 
 
-def test_a_timeout_is_final(scripted: Launch, launches: Launches) -> None:
-    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
-        if has_broken(chunk):
-            return [WorkerLost(keys(chunk), "timeout after 5 s", cause="timeout", traceback="in C")]
-        return finish(chunk)
+def hangs(chunk: Sequence[Task], _: int) -> list[Event]:
+    if has_broken(chunk):
+        return [WorkerLost(keys(chunk), "timeout after 5 s", cause="timeout", traceback="in C")]
+    return finish(chunk)
 
-    code, executor = scripted(fate)
+
+def test_a_timeout_is_final(scripted: Launch, launches: Launches) -> None:
+    code, executor = scripted(hangs)
     assert code == ExitCode.SOME_FAILED
     assert executor.given.count([BROKEN_SEED]) == 1
     assert launches.query("SELECT cause, message, traceback FROM v_failures") == [
@@ -351,27 +302,26 @@ def test_a_timeout_is_final(scripted: Launch, launches: Launches) -> None:
     assert "1 failed: timeout after 5 s" in launches.said[-1]
 
 
-def test_fail_fast_heeds_every_cause(scripted: Launch, launches: Launches) -> None:
-    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
-        if has_broken(chunk):
-            return [WorkerLost(keys(chunk), "timeout after 5 s", cause="timeout")]
-        return finish(chunk)
-
-    assert scripted(fate, seeds=300, fail_fast=True)[0] == ExitCode.SOME_FAILED
-    assert "pending" in launches.statuses().values()
+@pytest.mark.parametrize("cause", ["timeout", "exception"])
+def test_fail_fast_heeds_every_cause(scripted: Launch, launches: Launches, cause: str) -> None:
+    settings = {"seeds": 100, "fail_fast": True}
+    code = scripted(hangs, **settings)[0] if cause == "timeout" else launches(raising, **settings)
+    assert code == ExitCode.SOME_FAILED
+    assert list(launches.statuses().values()).count("pending") > 20
     assert "stopped at the first failure" in launches.said[-1]
+
+
+def breaks(chunk: Sequence[Task], _: int) -> list[Event]:
+    if has_broken(chunk):
+        raise InfrastructureError("The workers are gone: run the same command again.")
+    return finish(chunk)
 
 
 def test_the_end_of_the_executor_frees_the_claims_at_once(
     scripted: Launch, launches: Launches
 ) -> None:
-    def fate(chunk: Sequence[Task], _: int) -> list[Event]:
-        if has_broken(chunk):
-            raise InfrastructureError("The workers are gone: run the same command again.")
-        return finish(chunk)
-
     with pytest.raises(InfrastructureError, match="workers are gone"):
-        scripted(fate, seeds=50)
+        scripted(breaks, seeds=50)
     statuses = Counter(launches.statuses().values())
     assert statuses["running"] == statuses["failed"] == 0
     assert statuses["pending"] > 0
@@ -382,12 +332,9 @@ def test_the_end_of_the_executor_frees_the_claims_at_once(
 def test_the_first_error_is_the_one_that_is_told(
     scripted: Launch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fate(_: Sequence[Task], __: int) -> list[Event]:
-        raise InfrastructureError("The workers are gone: run the same command again.")
-
     lose(monkeypatch, ["question"] * 9, ["end_launch"], transient=False)
     with pytest.raises(InfrastructureError, match="workers are gone"):
-        scripted(fate)
+        scripted(breaks)
 
 
 def test_a_full_disk_ends_the_launch_at_once_and_charges_nobody(
