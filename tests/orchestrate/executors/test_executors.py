@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from dopt.result import TrialResult
 from dopt.run import run_trial
@@ -38,6 +37,7 @@ from tests.paths import ROOT
 from tests.waiting import until
 
 Make = Callable[[Run], Executor]
+CommandLine = Callable[..., tuple[int, str, str]]
 
 for_all = pytest.mark.parametrize("executor", ALL, indirect=True)
 
@@ -60,6 +60,10 @@ def drain(executor: Executor) -> list[Event]:
 
     until(is_idle, lambda: f"there is only {events}")
     return events
+
+
+def done(events: Sequence[Event]) -> list[TaskDone]:
+    return [event for event in events if isinstance(event, TaskDone)]
 
 
 def report_threads(_: TrialSpec) -> TrialResult:
@@ -237,19 +241,18 @@ def test_a_worker_of_the_local_executor_loads_no_heavy_library() -> None:
     assert not loaded & {"torch", "pandas", "sqlalchemy", "hydra", "omegaconf", "matplotlib", "ray"}
 
 
-TRIALS = [trial("pendulum", "d_optimal", seed, env={"horizon": 8}) for seed in range(3)]
+def in_lockstep(*specs: TrialSpec) -> list[TaskDone]:
+    with LockstepExecutor("cpu", batch=len(specs)) as executor:
+        executor.submit([Task(spec.trial_key, spec) for spec in specs])
+        events = executor.wait(0.1)
+        assert executor.pending == 0
+    assert [event.key for event in done(events)] == [spec.trial_key for spec in specs]
+    return done(events)
 
 
 def test_a_chunk_is_run_as_one_batch() -> None:
-    with LockstepExecutor("cpu", batch=3) as executor:
-        executor.submit([Task(spec.trial_key, spec) for spec in TRIALS])
-        events = executor.wait(0.1)
-        assert executor.pending == 0
-    assert [event.key for event in events if isinstance(event, TaskDone)] == [
-        spec.trial_key for spec in TRIALS
-    ]
-    for event, spec in zip(events, TRIALS, strict=True):
-        assert isinstance(event, TaskDone)
+    specs = [trial("pendulum", "d_optimal", seed, env={"horizon": 8}) for seed in range(3)]
+    for event, spec in zip(in_lockstep(*specs), specs, strict=True):
         assert isinstance(event.outcome, TrialResult)
         alone = run_trial(spec, "reference")
         assert event.outcome.loss == pytest.approx(alone.loss, rel=1e-9)
@@ -257,11 +260,8 @@ def test_a_chunk_is_run_as_one_batch() -> None:
 
 
 def test_what_cannot_run_together_is_every_trials_trouble() -> None:
-    mixed = [TRIALS[0], trial("pendulum", "random", 1, env={"horizon": 8})]
-    with LockstepExecutor("cpu", batch=2) as executor:
-        executor.submit([Task(spec.trial_key, spec) for spec in mixed])
-        outcomes = [event.outcome for event in executor.wait(0.1) if isinstance(event, TaskDone)]
-    assert [isinstance(outcome, Failure) for outcome in outcomes] == [True, True]
+    mixed = (trial("pendulum", policy, env={"horizon": 8}) for policy in ("d_optimal", "random"))
+    assert all(isinstance(event.outcome, Failure) for event in in_lockstep(*mixed))
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "banana", "meta"])
@@ -272,7 +272,7 @@ def test_a_device_that_is_not_there_is_a_sentence(device: str) -> None:
 
 @pytest.mark.parametrize("grid", [["-m"], []])
 def test_a_launch_on_a_device_that_is_not_there_is_refused_and_leaves_nothing(
-    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path, grid: list[str]
+    command_line: CommandLine, tmp_path: Path, grid: list[str]
 ) -> None:
     code, _, errors = command_line(
         "env.horizon=5", *grid, "seed=0", "executor=lockstep", "executor.device=cuda:99"
@@ -282,21 +282,23 @@ def test_a_launch_on_a_device_that_is_not_there_is_refused_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_grid_runs_in_lockstep(
-    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("device", ["cpu", "cuda:0"])
+def test_a_grid_runs_in_lockstep(command_line: CommandLine, tmp_path: Path, device: str) -> None:
+    import torch  # not here for the workers, which import this module
+
+    if device != "cpu" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device on this machine")
     url = f"sqlite:///{tmp_path / 'results.db'}"
-    grid = ("-m", "env=pendulum", "policy=random,oracle", "seed=range(4)", "env.horizon=6")
-    code, _, errors = command_line(
-        *grid, "executor=lockstep", "executor.batch=3", f"store.url={url}"
-    )
+    grid = ("-m", "env=pendulum", "policy=random,d_optimal", "seed=range(4)", "env.horizon=6")
+    words = ("executor=lockstep", "executor.batch=3", f"executor.device={device}")
+    code, _, errors = command_line(*grid, *words, f"store.url={url}")
     assert code == 0, errors
     with Reader.open(url) as reader:
         assert [config.n_done for config in reader.configs()] == [4, 4]
 
 
 def test_lockstep_and_the_kernel_keep_their_trials_apart(
-    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
+    command_line: CommandLine, tmp_path: Path
 ) -> None:
     """Their numbers agree to rounding only: one must not be taken for the other."""
     url = f"sqlite:///{tmp_path / 'results.db'}"
@@ -309,21 +311,6 @@ def test_lockstep_and_the_kernel_keep_their_trials_apart(
             "reference",
         ]
 
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
-def test_a_grid_runs_on_a_gpu(
-    command_line: Callable[..., tuple[int, str, str]], tmp_path: Path
-) -> None:
-    url = f"sqlite:///{tmp_path / 'results.db'}"
-    grid = ("-m", "env=pendulum", "policy=random,d_optimal", "seed=range(4)", "env.horizon=6")
-    device = ("executor=lockstep", "executor.device=cuda:0")
-    code, _, errors = command_line(*grid, *device, f"store.url={url}")
-    assert code == 0, errors
-    with Reader.open(url) as reader:
-        assert [config.n_done for config in reader.configs()] == [4, 4]
-
-
-CommandLine = Callable[..., tuple[int, str, str]]
 
 LAUNCH = """
 import json, sys

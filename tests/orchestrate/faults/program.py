@@ -134,17 +134,22 @@ class ForkedWorker:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         self.returncode: int | None = None
+        # The interpreter ignores exceptions of its functions around a fork, an interrupt included.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         self.pid = os.fork()
-        if self.pid == 0:
-            try:
-                self._work(*descriptors)
+        try:
+            if self.pid == 0:
+                self._work(mask, *descriptors)
                 os._exit(0)
-            finally:
+        finally:
+            if self.pid == 0:
                 os._exit(1)
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
     @staticmethod
-    def _work(connection: int, crash_report: int, errors: int) -> None:
+    def _work(mask: set[int], connection: int, crash_report: int, errors: int) -> None:
         os.setpgid(0, 0)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for stream in (1, 2):
             os.dup2(crash_report, stream)
         kept = sorted({connection, crash_report, errors})

@@ -34,67 +34,50 @@ from tests.orchestrate.store.fakes import RUN
 TRIALS = [specification(seed) for seed in range(1000)]
 
 
-def sizes(chunks: Chunks) -> list[int]:
-    result = []
-    while len(chunks):
-        result.append(len(chunks.next()))
-    return result
+def chunks(trials: list[TrialSpec] = TRIALS, cost: float | None = None) -> Chunks:
+    """Return the queue of trials of which one has taken ``cost`` seconds."""
+    known = Chunks(trials, seconds=1.0, slots=2)
+    if cost is not None:
+        known.observe(TRIALS[0].config_key, cost)
+    return known
 
 
-def chunks(trials: list[TrialSpec] = TRIALS, slots: int = 2) -> Chunks:
-    return Chunks(trials, seconds=1.0, slots=slots)
+def given(queue: Chunks) -> list[list[TrialSpec]]:
+    """Return the trials of every chunk."""
+    found = []
+    while len(queue):
+        found.append([task.spec for task in queue.next()])
+    return found
 
 
-def test_a_trial_of_unknown_cost_goes_alone() -> None:
-    assert len(chunks().next()) == 1
-
-
-def test_a_chunk_holds_the_wanted_seconds() -> None:
-    known = chunks()
-    known.observe(TRIALS[0].config_key, 0.1)
-    assert len(known.next()) == 10
-
-
-def test_a_trial_longer_than_a_chunk_goes_alone() -> None:
-    known = chunks()
-    known.observe(TRIALS[0].config_key, 30.0)
-    assert len(known.next()) == 1
+@pytest.mark.parametrize(("cost", "size"), [(None, 1), (0.1, 10), (30.0, 1)])
+def test_a_chunk_holds_the_wanted_seconds(cost: float | None, size: int) -> None:
+    assert len(chunks(cost=cost).next()) == size
 
 
 def test_cheap_trials_are_bounded_and_get_fewer_towards_the_end() -> None:
-    known = chunks()
-    known.observe(TRIALS[0].config_key, 1e-6)
-    given = sizes(known)
-    assert sum(given) == len(TRIALS)
-    assert max(given) == MAX_CHUNK_TRIALS
-    assert given == sorted(given, reverse=True)
-    assert given[-1] == 1
+    sizes = [len(chunk) for chunk in given(chunks(cost=1e-6))]
+    assert sum(sizes) == len(TRIALS)
+    assert max(sizes) == MAX_CHUNK_TRIALS
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] == 1
 
 
 def test_the_order_is_kept_and_nothing_is_given_twice() -> None:
-    known = chunks(TRIALS[:50])
-    known.observe(TRIALS[0].config_key, 0.2)
-    seeds = []
-    while len(known):
-        seeds += [task.spec.seed for task in known.next()]
-    assert seeds == [*range(50)]
+    assert list(itertools.chain(*given(chunks(TRIALS[:50], 0.2)))) == TRIALS[:50]
 
 
 def test_a_lost_trial_comes_first_and_alone() -> None:
-    known = chunks(TRIALS[:50])
-    known.observe(TRIALS[0].config_key, 1e-3)
+    known = chunks(TRIALS[:50], 1e-3)
     known.add(TRIALS[50:52], alone=True)
     assert len(known) == 52
-    assert [[task.spec.seed for task in known.next()] for _ in range(2)] == [[50], [51]]
+    assert given(known)[:2] == [[TRIALS[50]], [TRIALS[51]]]
 
 
 def test_a_batch_holds_trials_of_one_configuration() -> None:
     kinds = [specification(0), specification(0, horizon=7)]
     mixed = [kind.with_seed(seed) for seed in range(5) for kind in kinds]
-    batches = Chunks(mixed, seconds=1.0, slots=1, batch=3)
-    taken = []
-    while len(batches):
-        taken.append([task.spec for task in batches.next()])
+    taken = given(Chunks(mixed, seconds=1.0, slots=1, batch=3))
     assert [len(batch) for batch in taken] == [3, 2, 3, 2]
     assert all(len({trial.config_key for trial in batch}) == 1 for batch in taken)
     assert {t.trial_key for batch in taken for t in batch} == {t.trial_key for t in mixed}
@@ -223,25 +206,27 @@ def test_a_trial_is_built_from_what_is_stored() -> None:
     assert trial_of(stored(), 1).trial_key == short_trial("random", 0).trial_key
 
 
-def test_a_class_that_is_not_here_is_named() -> None:
-    env = {"_target_": "systems_of_mine.Rocket", "source": "0" * 16}
-    with pytest.raises(DoptError, match=r"systems_of_mine\.Rocket.*PYTHONPATH"):
-        trial_of(stored(env=env), 1)
+ELSEWHERE = {"_target_": "systems_of_mine.Rocket", "source": "0" * 16}
+NEVER_RUN = {"_target_": "never_run.Rocket"}
+OTHER_VERSION = {"code_version": 10**6, "env": {"name": "pendulum", "horizon": 6}}
 
 
-@pytest.mark.parametrize("source", [{}, {"source": "0" * 16}])
-def test_a_file_that_is_not_the_stored_one_does_not_run(
-    source: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"env": ELSEWHERE}, r"systems_of_mine\.Rocket.*PYTHONPATH"),
+        ({"env": NEVER_RUN}, r"never_run\.Rocket"),
+        ({"env": {**NEVER_RUN, "source": "0" * 16}}, r"never_run\.Rocket"),
+        (OTHER_VERSION, "another version of the code"),
+    ],
+)
+def test_a_trial_that_cannot_be_the_stored_one_is_refused(
+    changes: dict[str, Any], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "never_run.py").write_text("raise SystemExit('it has run')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(DoptError, match=r"never_run\.Rocket"):
-        trial_of(stored(env={"_target_": "never_run.Rocket", **source}), 1)
-
-
-def test_a_configuration_of_another_version_is_refused() -> None:
-    with pytest.raises(DoptError, match="another version of the code"):
-        trial_of(stored(code_version=10**6, env={"name": "pendulum", "horizon": 6}), 1)
+    with pytest.raises(DoptError, match=sentence):
+        trial_of(stored(**changes), 1)
 
 
 def grid(seeds: int, width: int, form: str = "primal") -> Grid:
@@ -260,43 +245,42 @@ def launch(executor: str = "local", **settings: Any) -> LaunchSettings:
     return LaunchSettings(executor, "sqlite:///results.db", **settings)
 
 
-def test_what_fits_is_accepted() -> None:
-    check_memory(grid(100, 16), launch(workers=64), machine=2 * BYTES_PER_GIB)
-    check_memory(grid(100, 100), launch(workers=2), machine=4 * BYTES_PER_GIB)
-    check_memory(grid(2, 100), launch(workers=64), machine=4 * BYTES_PER_GIB)
-    check_memory(grid(100, 100), launch("inprocess"), machine=2 * BYTES_PER_GIB)
-
-
-def test_one_trial_that_does_not_fit_is_refused_with_what_decides() -> None:
-    with pytest.raises(LaunchError, match=r"policy=d_optimal needs 1\.6\d GiB .* has 1 GiB: make "):
-        check_memory(grid(1, 100), launch(), machine=BYTES_PER_GIB)
+@pytest.mark.parametrize(
+    ("seeds", "width", "settings", "gib"),
+    [
+        (100, 16, launch(workers=64), 2),
+        (100, 100, launch(workers=2), 4),
+        (2, 100, launch(workers=64), 4),
+        (100, 100, launch("inprocess"), 2),
+        # Of another machine nothing is known.
+        (9, 100, launch("ray", ray_address="ray://head:10001"), 1),
+        (9, 100, launch("lockstep", executor_options={"device": "cuda"}), 1),
+    ],
+)
+def test_what_fits_is_accepted(seeds: int, width: int, settings: LaunchSettings, gib: int) -> None:
+    check_memory(grid(seeds, width), settings, machine=gib * BYTES_PER_GIB)
 
 
 @pytest.mark.parametrize(
-    ("settings", "advice"),
+    ("seeds", "settings", "gib", "sentence"),
     [
-        (launch(workers=8), "8 trials at the same time need 13.* set launch.workers=4"),
-        (launch("ray", workers=8), "set launch.workers=4"),
-        (launch("lockstep", executor_options={"batch": 20}), "20 trials .* set executor.batch=4"),
+        (1, launch(), 1, r"policy=d_optimal needs 1\.6\d GiB .* has 1 GiB: make "),
+        (100, launch(workers=8), 8, "8 trials at the same time need 13.* set launch.workers=4"),
+        (100, launch("ray", workers=8), 8, "set launch.workers=4"),
+        (100, launch("lockstep", executor_options={"batch": 20}), 8, "20 .* executor.batch=4"),
+        (
+            1,
+            launch("ray", ray_address="ray://h:1", memory_gib=0.5),
+            None,
+            r"launch\.memory_gib allows 0\.5 GiB: raise it",
+        ),
     ],
 )
-def test_too_many_at_once_are_refused_with_how_many_fit(
-    settings: LaunchSettings, advice: str
+def test_what_does_not_fit_is_refused_with_what_decides(
+    seeds: int, settings: LaunchSettings, gib: int | None, sentence: str
 ) -> None:
-    with pytest.raises(LaunchError, match=advice):
-        check_memory(grid(100, 100), settings, machine=8 * BYTES_PER_GIB)
-
-
-def test_of_another_machine_nothing_is_known() -> None:
-    check_memory(grid(9, 100), launch("ray", ray_address="ray://head:10001"), machine=BYTES_PER_GIB)
-    check_memory(
-        grid(9, 100), launch("lockstep", executor_options={"device": "cuda"}), machine=BYTES_PER_GIB
-    )
-
-
-def test_the_limit_of_a_worker_holds_everywhere() -> None:
-    with pytest.raises(LaunchError, match=r"launch\.memory_gib allows 0\.5 GiB: raise it"):
-        check_memory(grid(1, 100), launch("ray", ray_address="ray://h:1", memory_gib=0.5))
+    with pytest.raises(LaunchError, match=sentence):
+        check_memory(grid(seeds, 100), settings, machine=gib and gib * BYTES_PER_GIB)
 
 
 def test_this_machine_has_memory() -> None:
