@@ -75,7 +75,9 @@ class Progress:
         self._live: Live | None = None
         if stream and stream.isatty():
             console = Console(file=stream)
-            self._live = Live(console=console, refresh_per_second=4, get_renderable=self._text)
+            self._live = Live(
+                console=console, refresh_per_second=4, get_renderable=lambda: Text(self.line())
+            )
 
     def __enter__(self) -> Self:
         if self._live:
@@ -116,9 +118,6 @@ class Progress:
         if tally.left and rate and known:
             words.append(f"{duration(tally.left / rate)} left")
         return " · ".join(words)
-
-    def _text(self) -> Text:
-        return Text(self.line())
 
     def _print(self) -> None:
         if self._stream:

@@ -99,7 +99,7 @@ class Scheduler:
 
     def _fill(self) -> None:
         self.chunks.slots = self.executor.slots
-        while not self.ending and self.executor.pending < self._window:
+        while not self.ending and self.executor.pending < 2 * self.executor.slots:
             self.chunks.pending = self.executor.pending
             tasks = self.chunks.next() if len(self.chunks) else []
             # A trial that was taken away and waits again may still run here: first its result.
@@ -120,10 +120,6 @@ class Scheduler:
         if self.retry_memory is None or task.key not in self._out_of_memory:
             return task
         return replace(task, memory_factor=self.retry_memory)
-
-    @property
-    def _window(self) -> int:
-        return 2 * self.executor.slots
 
     def _commit(self, events: Sequence[TaskDone]) -> None:
         results: list[tuple[Claim, TrialResult, RunRecord]] = []

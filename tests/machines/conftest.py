@@ -15,7 +15,8 @@ from tests.machines.lab import GRID, SEEDS, Lab, Outcome, environment
 from tests.paths import ROOT
 
 HERE = Path(__file__).parent
-SECONDS = 600
+SECONDS = 1800
+"""Above the patience of one wait, whose message says more."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import waiting
 from tests.paths import ROOT
 
 
@@ -97,13 +98,13 @@ class Process:
         for pid in _children(self._popen.pid):
             os.kill(pid, number)
 
-    def wait(self, seconds: float = 120.0) -> int:
+    def wait(self) -> int:
         """Return the exit code."""
         try:
-            return self._popen.wait(timeout=seconds)
+            return self._popen.wait(waiting.PATIENCE_SECONDS)
         except subprocess.TimeoutExpired:
             self.end()
-            raise AssertionError(f"no end within {seconds:.0f} s:\n{self.output}") from None
+            raise AssertionError(f"it does not end:\n{self.output}") from None
 
     @property
     def running(self) -> bool:
@@ -166,10 +167,10 @@ class Host:
         self._processes.append(process)
         return process
 
-    def run(self, *command: str, seconds: float = 60.0, **environment: str) -> str:
+    def run(self, *command: str, **environment: str) -> str:
         """Run a program to its end and return what it wrote."""
         process = self.start(*command, **environment)
-        code = process.wait(seconds)
+        code = process.wait()
         assert code == 0, f"{' '.join(command)} on {self.name}: {code}\n{process.output}"
         return process.output
 
@@ -273,13 +274,10 @@ class Network:
             host.power_off()
 
 
-def until(condition: Callable[[], object], seconds: float, what: Callable[[], str]) -> float:
+def until(condition: Callable[[], object], what: Callable[[], str]) -> float:
     """Wait until the condition holds and return how many seconds that took."""
     start = time.monotonic()
-    while not condition():
-        waited = time.monotonic() - start
-        assert waited < seconds, f"within {seconds:.0f} s there was no {what()}"
-        time.sleep(0.1)
+    waiting.until(condition, lambda: f"there was no {what()}")
     return time.monotonic() - start
 
 

@@ -239,7 +239,7 @@ class Lab:
     def until_done(self, launched: Process, count: int) -> None:
         """Wait until so many trials are done, or the launch has ended."""
         until(
-            lambda: self.done() >= count or not launched.running, 120.0,
+            lambda: self.done() >= count or not launched.running,
             lambda: f"{count} done trials:\n{launched.output}",
         )  # fmt: skip
         assert launched.running, launched.output
@@ -247,14 +247,14 @@ class Lab:
     def until_rows(self, launched: Process, table: str, condition: str) -> float:
         """Wait until there is such a row; return how many seconds that took."""
         return until(
-            lambda: self.count(table, condition) > 0, 60.0,
+            lambda: self.count(table, condition) > 0,
             lambda: f"{table} with {condition}:\n{launched.output}",
         )  # fmt: skip
 
     def until_head_lost(self, name: str) -> None:
         """Wait until the head of the cluster takes a worker for dead."""
         given = (self.address, self.host("head").address, self.host(name).address)
-        self.host("head").run(sys.executable, "-c", UNTIL_DEAD, *given, seconds=150.0)
+        self.host("head").run(sys.executable, "-c", UNTIL_DEAD, *given)
 
     def done(self) -> int:
         """Return how many trials are done, -1 while the server does not say."""
@@ -270,7 +270,7 @@ class Lab:
         host = self.host("db")
         words = ["psql", "-h", "/tmp", "-U", "postgres", "-Atc", sql]
         process = host.start(*words)
-        process.wait(30.0)
+        process.wait()
         return process.output.strip()
 
     def outcome(self) -> Outcome:

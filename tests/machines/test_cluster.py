@@ -40,7 +40,7 @@ def test_a_host_that_joins_in_mid_run_is_used(
     lab.until_done(launched, 2)
     lab.add_worker("w2", **{PAUSE: "1.5"})
     seconds = until(
-        lambda: lab.count("trial", "node = 'w2'") > 0 or not launched.running, 120.0,
+        lambda: lab.count("trial", "node = 'w2'") > 0 or not launched.running,
         lambda: f"trial on w2:\n{launched.output}",
     )  # fmt: skip
     measured("host added: first trial of it", seconds)
@@ -97,8 +97,8 @@ def test_a_host_that_lost_head_and_launch_ends_its_trial_in_vain(
         seconds = lab.until_rows(launched, "attempt", RELEASED)
         requeued = time.time()
         measured("cut from head and launch: its trials wait again", seconds)
-        until(lambda: seed in notes(lab, "w1", "finished"), 60.0, lambda: "end of it on w1")
-    assert launched.wait(200.0) == 0, launched.output
+        until(lambda: seed in notes(lab, "w1", "finished"), lambda: "end of it on w1")
+    assert launched.wait() == 0, launched.output
     assert notes(lab, "w1", "finished")[seed] > requeued
     assert seed in notes(lab, "w2", "finished")
     outcome = lab.outcome()
@@ -122,7 +122,7 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
     with lab.network.cut_between(lab.host("head"), lab.host("w1")):
         lab.until_head_lost("w1")
         let_go(home_of(lab, "w1"))
-        assert launched.wait(200.0) == 0, launched.output
+        assert launched.wait() == 0, launched.output
     outcome = lab.outcome()
     outcome.check_complete(undisturbed, seeds=4)
     assert outcome.attempts_of("done")[seed][4] == "w1"
@@ -132,7 +132,7 @@ def test_a_host_that_lost_only_the_head_goes_on_for_a_launch_elsewhere(
 def begun(lab: Lab, launched: Process, host: str) -> int:
     """Return the first trial of the host, once it has begun."""
     until(
-        lambda: notes(lab, host, "begun"), 90.0, lambda: f"trial on {host}:\n{launched.output}"
+        lambda: notes(lab, host, "begun"), lambda: f"trial on {host}:\n{launched.output}"
     )  # fmt: skip
     return next(iter(notes(lab, host, "begun")))
 
@@ -171,7 +171,7 @@ def test_without_its_head_a_launch_ends_and_a_new_cluster_completes_it(
         lab.network.power_off(lab.host("head"))
     else:
         lab.host("head").run("pkill", "-STOP", "gcs_server")  # its port still takes connections
-    until(lambda: lab.count("trial", "status = 'running'") == 0, 60.0, lambda: "free claim")
+    until(lambda: lab.count("trial", "status = 'running'") == 0, lambda: "free claim")
     measured(f"head, {fault}: claims free", time.monotonic() - start)
     assert launched.wait() == 75, launched.output
     measured(f"head, {fault}: exit 75", time.monotonic() - start)
@@ -207,7 +207,7 @@ def test_a_launch_waits_for_a_server_that_restarts(
     start = time.monotonic()
     lab.database.stop(mode)
     waits = "waiting for up to 30 s"
-    until(lambda: waits in launched.output, 20.0, lambda: f"'{waits}':\n{launched.output}")
+    until(lambda: waits in launched.output, lambda: f"'{waits}':\n{launched.output}")
     lab.database.start()
     before = lab.done()
     lab.until_done(launched, before + 1)

@@ -51,11 +51,8 @@ PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE
 
 def need_slurm() -> None:
     """Skip without SLURM, or fail where the machines are required."""
-    missing = [name for name in PROGRAMS if shutil.which(name) is None]
-    if not missing:
-        return
-    message = f"{' and '.join(missing)} not on PATH: install slurm-wlm"
-    unavailable(message)
+    if missing := [name for name in PROGRAMS if shutil.which(name) is None]:
+        unavailable(f"{' and '.join(missing)} not on PATH: install slurm-wlm")
 
 
 class Slurm:
@@ -76,7 +73,7 @@ class Slurm:
         self.start(self.controller, "slurmctld", "-D")
         for host in self.hosts:
             self.start(host, "slurmd", "-D", "-N", host.name)
-        until(self._ready, 30.0, lambda: f"idle nodes:\n{self.controller.logs()}")
+        until(self._ready, lambda: f"idle nodes:\n{self.controller.logs()}")
 
     def start(self, host: Host, *command: str, **environment: str) -> Process:
         """Start a program that knows the cluster."""
@@ -86,7 +83,7 @@ class Slurm:
     def ask(self, *command: str) -> str:
         """Run a command of SLURM and return what it says, errors included."""
         process = self.start(self.controller, *command)
-        process.wait(30.0)
+        process.wait()
         return process.output.strip()
 
     def launch(self, *words: str) -> Process:
@@ -167,7 +164,7 @@ def test_an_array_runs_a_grid_and_ends(slurm: Slurm, lab: Lab, undisturbed: Outc
     assert launched.wait() == 0, launched.output
     assert f"0 of {SEEDS} already done, {SEEDS} registered" in launched.output
     assert "job 1: 3 tasks of 1 processes for 30 minutes" in launched.output
-    until(lambda: not slurm.tasks(), 120.0, slurm.logs)
+    until(lambda: not slurm.tasks(), slurm.logs)
     lab.outcome().check_complete(undisturbed)
     # 28 minutes and some seconds, by what SLURM says of the end of the task
     argv = lab.ask("SELECT argv FROM launch WHERE argv LIKE '%--until%' LIMIT 1")
@@ -238,10 +235,10 @@ def test_a_task_whose_node_is_lost_runs_elsewhere(
     launched = slurm.launch(*GRID, f"seed=range({SEEDS})", "executor.time=30m",
                             "executor.tasks=1", "executor.cpus_per_task=1")  # fmt: skip
     assert launched.wait() == 0, launched.output
-    until(lambda: lab.done() > 0, 60.0, slurm.logs)
+    until(lambda: lab.done() > 0, slurm.logs)
     [name] = slurm.ask("squeue", "--noheader", "--states=RUNNING", "--format=%N").split()
     lab.network.power_off(lab.host(name))
-    until(lambda: not slurm.tasks(), 240.0, slurm.logs)
+    until(lambda: not slurm.tasks(), slurm.logs)
     lab.outcome().check_complete(undisturbed)
 
 

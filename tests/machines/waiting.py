@@ -1,4 +1,4 @@
-"""Policy whose trials take time but no processor, as those of a plant in real time do."""
+"""Policy whose trials take time but no processor, as the trials of a plant in real time do."""
 
 from __future__ import annotations
 

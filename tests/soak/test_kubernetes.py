@@ -83,7 +83,7 @@ class JobController:
     Attributes
     ----------
     words_of
-        Words that take the place of those of the manifest, by the name of the container.
+        Words in the place of the words of the manifest, by the name of the container.
     ended
         How often a pod ended with which exit code, evicted ones included.
     """

@@ -1,6 +1,6 @@
 # shellcheck shell=bash disable=SC2154 # workers, walltime and leave are set above
 
-# The number of a task, because that of the last one, SLURM_JOB_ID, means the whole array.
+# The number of a task; SLURM_JOB_ID of the last one means the whole array.
 task=${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID
 
 # The task has left before SLURM warns it of its end.

@@ -49,7 +49,7 @@ from tests.waiting import PATIENCE_SECONDS, until
 
 SEEDS = 6
 LIMIT = 5.0
-"""Time limit of trials [s], some thousand times that of a quick one."""
+"""Time limit of trials [s], some thousand times the duration of a quick one."""
 
 
 def failures(launches: Launches) -> list[tuple[object, ...]]:

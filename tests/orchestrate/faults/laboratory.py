@@ -410,7 +410,7 @@ def binaries() -> Path:
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If PostgreSQL is not installed.
     """
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
     on_path = shutil.which("initdb")
