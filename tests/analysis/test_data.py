@@ -14,7 +14,6 @@ import pandas as pd
 import pytest
 
 import analysis
-from analysis.cli import main
 from analysis.data.frames import STEP_COLUMNS
 from analysis.data.matching import Filter, defaults, nearness, newest
 from analysis.data.samples import learned_model, simulated_trial
@@ -308,22 +307,6 @@ def test_the_usual_value_stands_for_the_policy(stored: Reader) -> None:
     old, new = sorted(stored.configs(), key=lambda one: "fresh" in one.label)[0::2]
     assert defaults(old)[PATH] == "accumulated"
     assert nearness(old) > nearness(new)
-
-
-def test_stored_labels_name_what_is_not_usual(stored: Reader) -> None:
-    labels = sorted(config.label for config in stored.configs())
-    assert labels == [
-        "D-optimal, horizon 40",
-        "D-optimal, horizon 40, information=fresh",
-        "random, horizon 40",
-    ]
-
-
-def test_commands_take_the_condition(added: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare", "--db", added, "--group-by", PATH]) == 0
-    assert "information=fresh" in capsys.readouterr().out
-    assert main(["compare", "--db", added, "--where", f"{PATH}=accumulated"]) == 0
-    assert "random" in capsys.readouterr().out
 
 
 def test_a_stored_configuration_gives_back_its_trial(stored: Reader) -> None:

@@ -68,14 +68,6 @@ def test_band_of_three_numbers_by_hand() -> None:
     assert band.n == 3
 
 
-def test_each_step_has_its_own_band() -> None:
-    values = np.array([[1.0, 5.0], [3.0, 5.0]])
-    band = band_of(values)
-    assert band.centre.tolist() == [2.0, 5.0]
-    assert (band.high - band.low)[1] == 0.0
-    assert (band.high - band.low)[0] > 0
-
-
 def test_one_trial_has_a_mean_and_no_interval() -> None:
     band = band_of(np.array([[4.0, 2.0]]))
     assert band.centre.tolist() == [4.0, 2.0]
@@ -125,22 +117,6 @@ def test_the_bootstrap_draws_whole_trials_and_the_same_ones_each_time(
     assert first.low[2] == pytest.approx(2 * first.low[0])
     assert (first.low <= first.centre).all()
     assert (first.centre <= first.high).all()
-
-
-def test_the_bootstrap_of_a_curve_longer_than_a_batch_is_that_of_its_parts() -> None:
-    curves = np.random.default_rng(2).lognormal(size=(9, 7))
-    whole, part = band_of(curves, Statistic.IQM), band_of(curves[:, 3:5], Statistic.IQM)
-    np.testing.assert_allclose(whole.low[3:5], part.low)
-
-
-@pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
-def test_the_bootstrap_interval_covers_about_as_often_as_it_says(statistic: Statistic) -> None:
-    # Of a symmetric distribution, whose median and interquartile mean are both its centre.
-    repeats, n = 300, 40
-    experiments = np.random.default_rng(3).laplace(loc=1.0, size=(repeats, n))
-    bands = [band_of(one[:, None], statistic) for one in experiments]
-    covered = np.mean([found.low[0] <= 1.0 <= found.high[0] for found in bands])
-    assert 0.90 < covered < 0.99
 
 
 def test_names_are_those_of_the_captions() -> None:
@@ -263,13 +239,6 @@ def test_the_share_of_one_system_has_binomial_quantiles() -> None:
     assert found.high[0] == pytest.approx(quantiles[1], abs=1.01 / n)
 
 
-def test_it_covers_about_as_often_as_it_says() -> None:
-    repeats, truth = 400, np.mean(np.arange(4.0))
-    bands = [stratified_mean(runs(seed, (20, 20, 20, 20))) for seed in range(repeats)]
-    covered = np.mean([(one.low[0] <= truth) & (one.high[0] >= truth) for one in bands])
-    assert 0.90 < covered < 0.98
-
-
 def test_the_same_runs_give_the_same_interval_and_one_run_gives_none() -> None:
     np.testing.assert_array_equal(stratified_mean(runs(3)).low, stratified_mean(runs(3)).low)
     alone = stratified_mean([np.ones((5, 1)), np.array([[2.0]])])
@@ -303,11 +272,6 @@ def test_last_passage_by_hand() -> None:
     assert last_passage(np.array([[1.0, math.nan], [math.nan, 1.0]]), 2.0).tolist() == [INF, 2]
 
 
-def test_a_scale_moves_threshold_and_curve_alike() -> None:
-    curves = np.random.default_rng(0).lognormal(size=(20, 30))
-    np.testing.assert_array_equal(first_passage(curves, 0.7), first_passage(10 * curves, 7.0))
-
-
 def test_race_by_hand() -> None:
     found = compare_hitting_times(np.array([3.0, 5, INF, INF, 7]), np.array([4.0, 5, 8, INF, INF]))
     assert (found.n_pairs, found.reached, found.reached_reference) == (5, 3, 3)
@@ -328,13 +292,6 @@ def test_swapping_the_sides_swaps_the_race() -> None:
 def test_sign_test_of_a_textbook_case() -> None:
     assert sign_test(9, 1) == pytest.approx(2 * (1 + 10) / 2**10)
     assert sign_test(0, 0) == 1.0
-
-
-def test_the_sign_test_rejects_a_true_null_as_rarely_as_it_says() -> None:
-    draws = np.random.default_rng(2).exponential(size=(2000, 2, 41))
-    censored = np.where(draws > 1.0, INF, draws)
-    rejected = np.mean([compare_hitting_times(*pair).p_value < 0.05 for pair in censored])
-    assert rejected < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 2000)
 
 
 def test_a_median_past_the_horizon_is_censored() -> None:
@@ -525,14 +482,6 @@ def test_signed_rank_of_a_textbook_case() -> None:
     assert signed_rank(np.array([-1.0, 2, 3, 4, 5, 6])) == pytest.approx(2 * 2 / 64)
 
 
-def test_the_bootstrap_covers_the_mean_about_as_often_as_it_says() -> None:
-    repeats, n = 250, 30
-    draws = np.random.default_rng(1).normal(loc=-0.5, size=(repeats, n))
-    intervals = [interval_of_mean(values, np.random.default_rng(2)) for values in draws]
-    covered = np.mean([low <= -0.5 <= high for low, high in intervals])
-    assert 0.89 < covered < 0.985
-
-
 @pytest.mark.parametrize("family", ["normal", "exponential"])
 def test_the_interval_of_many_values_is_near_the_bootstrap(family: str) -> None:
     draw = getattr(np.random.default_rng(3), family)
@@ -559,15 +508,6 @@ def test_benjamini_hochberg_leaves_out_what_was_not_tested() -> None:
     assert benjamini_hochberg([]) == []
 
 
-@pytest.mark.parametrize("n", [3, 5, 8])
-def test_the_interval_of_few_pairs_covers_as_often_as_it_says(n: int) -> None:
-    repeats = 4000
-    draws = np.random.default_rng(n).normal(loc=-0.5, size=(repeats, n))
-    intervals = [interval_of_mean(values, rng()) for values in draws]
-    covered = np.mean([low <= -0.5 <= high for low, high in intervals])
-    assert covered == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / repeats))
-
-
 COSTS = arrays(
     float, st.tuples(st.integers(1, 12), st.integers(1, 3)), elements=st.integers(0, 5).map(float)
 )  # few values, so that ties are common
@@ -587,15 +527,6 @@ def test_a_choice_is_on_the_front_exactly_if_no_other_dominates_it(
     assert front.any()
     for choice, is_on in zip(costs, front, strict=True):
         assert is_on == (not any(dominates(other, choice) for other in costs))
-
-
-@given(COSTS)
-def test_every_choice_off_the_front_is_dominated_by_one_on_it(
-    costs: npt.NDArray[np.float64],
-) -> None:
-    front = on_front(costs)
-    for choice in costs[~front]:
-        assert any(dominates(member, choice) for member in costs[front])
 
 
 def test_a_front_by_hand() -> None:
