@@ -7,7 +7,7 @@ from orchestrate.program import run
 
 
 def program() -> None:
-    """Run the command line as a program of its own: ``dopt-analysis``."""
+    """Run the command line as the program ``dopt-analysis``."""
     collect_rarely()
     run("analysis.cli")
 

@@ -39,7 +39,7 @@ class Story:
     """A trial in k frames: ``steps`` done, (k,), states (T + 1, d), and losses (T,).
 
     ``truth``, (T + 1, r), and ``learned``, (k, T + 1, r), are accelerations at zero input along the
-    trajectory: the true ones, and those of the model at each frame.
+    trajectory: the true ones, and the model's at each frame.
     """
 
     title: str

@@ -116,7 +116,7 @@ def build(
 ) -> Iterator[Outcome]:
     """Write the named outputs and the page of all into a folder; say of each what happened.
 
-    ``workers`` outputs are written at a time, each in a process of its own if there are several.
+    ``workers`` outputs are written at a time, each in its own process if there are several.
     """
     make_folder(folder)
     planned = {name: _plan(name, reader, selection, options, folder, force) for name in names}
@@ -211,7 +211,7 @@ def versions() -> dict[str, str | None]:
 
 @functools.cache
 def git_state() -> dict[str, str | bool | None]:
-    """Return commit and dirty flag of the code; None outside a repository of its own.
+    """Return commit and dirty flag of the code; None if it is not in its own repository.
 
     A repository that merely holds an installed copy is another one; ``DOPT_COMMIT`` then gives the
     commit. As at the first call: code that changes later does not run in this process.
@@ -343,7 +343,7 @@ def fingerprint(content: Mapping[str, Any]) -> str:
 
 
 def is_current(folder: Path, name: str, endings: tuple[str, ...], mark: str) -> bool:
-    """Whether all files of an output exist and were made from the same content."""
+    """Return True if all files of an output exist and were made from the same content."""
     found = _facts(folder, name)
     whole_set = all((folder / f"{name}.{ending}").is_file() for ending in endings)
     return whole_set and found is not None and found.get("fingerprint") == mark

@@ -237,7 +237,7 @@ def _judged(rows: Sequence[Row], measure: str) -> list[str]:
 
 
 def _same_settings(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the rows by the reference of their own setting, without the first row's."""
+    """Group the rows by the reference under the same setting, without the report's reference."""
     groups: dict[str, list[Row]] = {}
     for row in rows[1:]:
         reference = str(row[f"{SAME}_reference"])

@@ -4,7 +4,7 @@ A database may hold the paper's grid beside other widths, bounds and learners. A
 policies under one setting of an environment: its env, model, learner and limits. A setting with the
 reference policy and a baseline goes before one with the reference alone, such as another width;
 then the one with most trials wins, then the one nearest to the defaults, which are the paper's
-setting. A policy that exists only with a model of its own (the oracle) is taken with that model, in
+setting. A policy that exists only with its own model (the oracle) is taken with that model, in
 the same env section and under the same limits. What was left out is said; a tie is an error.
 
 Configurations of older code are left out. Of several that differ in the state of a user's file
@@ -38,7 +38,7 @@ USUAL = {"model": "mlp", "learner": "adam_window"}
 """Names of what a launch takes by itself."""
 
 COLUMNS = tuple(name for name in CONFIG_COLUMNS if name not in ("env", "label"))
-"""Settings that have a column of their own."""
+"""Settings that have their own column."""
 
 Setting = tuple[str, ...]
 """JSON of the sections env, limits, model and learner; null for none."""
@@ -215,8 +215,8 @@ def nearness(config: ConfigRow) -> tuple[int, int, int]:
 def defaults(config: ConfigRow) -> dict[str, object]:
     """Return the defaults of what a configuration names, without its task, as dotted paths.
 
-    Of limits these are all settings but the name, so that none are nearer than any. There are none
-    where it holds a user's system or policy, which is not registered here.
+    Of limits, all settings except the name: a configuration without limits is nearer than one with
+    any. Empty if the system or the policy is a user's class, which is not registered here.
     """
     names = {key: {"name": section.get("name")} for key, section in _sections(config).items()}
     names.pop("task", None)
@@ -287,8 +287,8 @@ def latest(reader: Reader, configs: list[ConfigRow]) -> list[ConfigRow]:
 def newest(configs: list[ConfigRow]) -> list[ConfigRow]:
     """Return the configurations of the newest code version: other versions' numbers do not mix.
 
-    Of those with a task, whose assessments have a version of their own, the newest of these; and of
-    those that differ in the version of the criterion of their plans alone, the newest.
+    Configurations with a task: only the newest version of the assessments. Of configurations that
+    differ in the version of the plans' criterion alone, only the newest.
     """
     code = max((config.config.get("code_version", 0) for config in configs), default=0)
     assessment = max((_assessment_version(config) or 0 for config in configs), default=0)

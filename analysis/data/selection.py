@@ -72,7 +72,7 @@ def ranges(seeds: Iterable[int]) -> str:
 
 
 def is_possible(policy: ConfigRow, environment: ConfigRow) -> bool:
-    """Whether a policy's configuration makes sense with another environment's section."""
+    """Return True if a policy's configuration makes sense with another environment's section."""
     config = {key: value for key, value in policy.config.items() if key in _SECTIONS}
     try:
         stored_trial({**config, "env": environment.config["env"]})
@@ -220,7 +220,7 @@ class Selection:
         return self.only(one.config.env for one in references if one and one.final_losses())
 
     def simulated(self) -> Selection:
-        """Return the part without explorations, whose losses are errors on paths of their own."""
+        """Return the part without explorations, whose losses are errors along their own paths."""
         entries, stored = (
             tuple(one for one in part if not is_prequential(one.config.config))
             for part in (self.entries, self.stored)
@@ -360,8 +360,8 @@ Weight = Callable[[Entry], tuple[int, ...]]
 def one_world(entries: Sequence[Entry], name: str = "env") -> list[Entry]:
     """Return the entries of the env section with most trials; entries are of one environment.
 
-    ``name`` is that of another section by which they are told apart; of as many trials those
-    without such a section come first.
+    ``name`` is the section that is compared. With equal numbers of trials, entries without that
+    section come first.
     """
     totals: Counter[str] = Counter()
     for entry in entries:

@@ -70,7 +70,7 @@ class Panel:
         The environment, the policy, what sets the configuration apart from others of these, and the
         label of the state with its unit.
     enforced : bool
-        Whether inputs heed the limits.
+        True if inputs heed the limits.
     time : (T + 1,)
         Seconds.
     lines : (k, T + 1)

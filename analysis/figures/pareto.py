@@ -137,7 +137,7 @@ class Point:
 
     @property
     def known(self) -> bool:
-        """Whether it can be drawn."""
+        """True if the point can be drawn."""
         return bool(np.isfinite(self.us) and np.isfinite(self.loss.value))
 
 

@@ -172,7 +172,7 @@ def _rows(
     widths = _widths(configs)
     only = widths[0] if len(widths) == 1 else None
     tiles = [_tile(config, finals.get(config.config_key, np.empty(0))) for config in configs]
-    for kind in (False, True):  # prequential losses have a scale of their own
+    for kind in (False, True):  # prequential losses have another scale
         _shade([t for c, t in zip(configs, tiles, strict=True) if is_prequential(c.config) is kind])
     cells: dict[tuple[int | None, str], list[tuple[ConfigRow, Content]]] = {}
     for config, tile in zip(configs, tiles, strict=True):

@@ -117,7 +117,7 @@ def _plain(path: str, status: int, text: str) -> PlainTextResponse:
 
 
 def _is_own_form(headers: Headers) -> bool:
-    """Whether a browser says that a page of this server sent the form, or says nothing.
+    """Return True if the browser says that a page of this server sent the form, or says nothing.
 
     Under the referrer policy of these pages the origin of a form is "null". The token decides in
     any case.
@@ -128,7 +128,7 @@ def _is_own_form(headers: Headers) -> bool:
 
 
 def _is_visit(headers: Headers) -> bool:
-    """Whether the user followed a link to here, which shows a page and tells the site nothing."""
+    """Return True if the user followed a link, which shows a page and tells the site nothing."""
     return headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") in (
         "document",
         None,
@@ -136,7 +136,7 @@ def _is_visit(headers: Headers) -> bool:
 
 
 def is_own(hosts: list[str], listening: str) -> bool:
-    """Whether the Host header is one that a browser sends when it means this server.
+    """Return True if the Host header is one that a browser sends when it means this server.
 
     A name that somebody else may own is never accepted. An address is, since no name stands for
     it: any address where the server listens beyond this machine, else a loopback address.

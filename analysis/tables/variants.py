@@ -121,7 +121,7 @@ class VariantGroup:
 def variant_groups(reader: Reader, wanted: Filter) -> list[VariantGroup]:
     """Return the variants of every environment that has the reference policy and another.
 
-    Explorations are left out: their losses are errors on paths of their own.
+    Explorations are left out: each loss is an error on the path of that exploration.
 
     Raises
     ------

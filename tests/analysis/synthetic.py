@@ -65,7 +65,7 @@ def fake_result(spec: TrialSpec, diverged_at: int | None = None) -> TrialResult:
 
 
 def fake_results(specs: Sequence[TrialSpec], diverged: Mapping[str, int]) -> list[TrialResult]:
-    """Return results of trials; those of one system are simulated together, which takes less."""
+    """Return results of trials; trials of one system are simulated together, which is faster."""
     draws = [np.random.default_rng(_entropy(spec)) for spec in specs]
     inputs = [_inputs(s.system, s.policy.name, rng) for s, rng in zip(specs, draws, strict=True)]
     members: dict[System, list[int]] = defaultdict(list)

@@ -71,7 +71,7 @@ def test_a_request_narrows(url: str) -> None:
         assert results.matrix("cartpole", "d_optimal").values.shape == (5, 60)
 
 
-def test_a_matrix_is_that_of_the_figures(results: analysis.Results) -> None:
+def test_a_matrix_equals_the_figures(results: analysis.Results) -> None:
     matrix = results.matrix("cartpole", "random")
     assert matrix.seeds.tolist() == list(range(5))
     assert matrix.diverged.tolist() == [False, False, True, False, False]

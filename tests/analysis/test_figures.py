@@ -138,7 +138,7 @@ def varied(tmp_path_factory: pytest.TempPathFactory) -> str:
         specs += make_grid(envs, both[:1], seeds, policy={"regularization": ridge}, **SHORT)
     two = {"learning_rate": 0.1}, {"regularization": 0.01}  # differ in both: part of no line
     specs += make_grid(envs, both[:1], seeds, learner=two[0], policy=two[1], **SHORT)
-    specs += make_grid(envs, ("uniform",), seeds, **SHORT)  # has no line of its own
+    specs += make_grid(envs, ("uniform",), seeds, **SHORT)  # has no line
     specs = list({spec.trial_key: spec for spec in specs}.values())
     lost = [s for s in specs if s.policy.name == "random" and s.system.name == "arm"]
     slow = [s for s in lost if s.to_mapping()["learner"]["learning_rate"] == 1e-3 and s.seed == 0]
@@ -296,7 +296,7 @@ def test_unfinished_trials_are_noted(tmp_path: Path) -> None:
     assert part.notes == ("cartpole, width 32: 1 trials are not finished",)
 
 
-def test_other_forms_of_the_information_matrix_are_lines_of_their_own(tmp_path: Path) -> None:
+def test_other_forms_of_the_information_matrix_are_other_lines(tmp_path: Path) -> None:
     widths = (8, 16, 32)
     usual = [spec for width in widths for spec in wide(width, range(3))]
     dual = [s for width in widths for s in wide(width, range(3), policy={"form": "dual"})]
@@ -314,7 +314,7 @@ def test_other_forms_of_the_information_matrix_are_lines_of_their_own(tmp_path: 
     assert losses.widths.tolist() == list(widths)
 
 
-def test_the_exponent_is_that_of_the_upper_half() -> None:
+def test_the_exponent_is_fitted_to_the_upper_half() -> None:
     widths = np.array([8, 16, 32, 64, 128, 256])
     assert exponent(widths, 3.0 * widths**1.5) == pytest.approx(1.5)
     costs = np.where(widths < 64, 7.0, widths.astype(float) ** 2)
@@ -369,7 +369,7 @@ def points_of(url: str, rule: DivergenceRule = DivergenceRule.EXCLUDE) -> tuple[
 def test_a_point_is_a_configuration_of_an_environment_that_has_several(learners: str) -> None:
     points = points_of(learners)
     labels = [point.label for point in points if point.env == "pendulum"]
-    assert len(labels) == len(set(labels)) == 10  # the task and the other bound are none
+    assert len(labels) == len(set(labels)) == 10  # neither the task nor the other bound
     assert {point.env for point in points} == set(ENVS)
     assert "random, gauss_newton, refit_every=10" in labels
     words = {(one.policy_words, one.learner_words) for one in points if one.env == "pendulum"}
@@ -395,7 +395,7 @@ def test_time_counts_the_fits_of_some_steps_and_loss_is_a_geometric_mean(learner
     assert every_tenth.loss.low < every_tenth.loss.value < every_tenth.loss.high
 
 
-def test_the_front_is_that_of_each_environment(learners: str) -> None:
+def test_each_environment_has_its_front(learners: str) -> None:
     points = [one for one in points_of(learners) if one.env == "pendulum"]
     front = on_front(np.array([(one.us, one.loss.value) for one in points]))
     assert [one.on_front for one in points] == front.tolist()

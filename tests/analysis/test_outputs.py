@@ -34,7 +34,7 @@ from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 
 
-def test_the_commit_is_that_of_the_code_and_not_of_a_folder_around_it(
+def test_the_commit_belongs_to_the_code_and_not_to_a_folder_around_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such as the repository that holds the virtual environment of an installed copy."""
@@ -82,7 +82,7 @@ def make(reader: Reader, selection: Selection, target: Path, **options: int) -> 
     ]
 
 
-def test_the_names_are_those_of_the_registry() -> None:
+def test_the_names_equal_the_registry() -> None:
     assert tuple(plots()) == FIGURES
 
 

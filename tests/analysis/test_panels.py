@@ -101,7 +101,7 @@ def test_neighbours_share_one_axis() -> None:
     assert parts.upper[1] > 11
 
 
-def test_a_far_lower_curve_gets_a_part_of_its_own() -> None:
+def test_a_far_lower_curve_gets_its_own_part() -> None:
     low = band(10, *[1e-3] * 19)
     parts = axis_parts([band(*np.linspace(10, 1, 20)), low, band(*np.linspace(8, 2, 20))])
     assert parts.lower is not None
@@ -171,7 +171,7 @@ def test_values_of_a_setting_look_different() -> None:
     assert len({(style.colour, style.line) for style in styles}) == len(styles)
 
 
-def test_policies_of_the_user_have_colours_of_their_own() -> None:
+def test_policies_of_the_user_have_their_own_colours() -> None:
     """The same in every process, and all dark enough for a line."""
     names = ["my_policy", "curiosity", "staircase", "frontier", *(f"own_{n}" for n in range(40))]
     styles = [policy_style(name) for name in names]
@@ -355,7 +355,7 @@ def test_lines_are_the_states_of_the_first_seeds(railed: str) -> None:
     assert np.isnan(counted.lines[1, 21:]).all()  # it diverged
 
 
-def test_shares_are_those_of_all_trials(railed: str) -> None:
+def test_shares_are_means_over_all_trials(railed: str) -> None:
     counted, enforced, *_ = measured(railed)
     assert (counted.n, counted.n_diverged) == (len(SEEDS), 1)
     assert (enforced.n, enforced.n_diverged) == (len(SEEDS), 0)

@@ -66,7 +66,7 @@ def pendulum(reader: Reader) -> VariantGroup:
     return variant_groups(reader, Filter(("pendulum",)))[0]
 
 
-def test_every_variant_has_a_label_of_its_own(pendulum: VariantGroup) -> None:
+def test_every_variant_has_another_label(pendulum: VariantGroup) -> None:
     assert pendulum.reference.label == "D-optimal"
     assert [one.label for one in pendulum.variants[1:]] == [
         "D-optimal, adam",
@@ -122,7 +122,7 @@ def test_every_policy_is_also_compared_under_its_own_learner(
     assert "  - against D-optimal, adam, " in text
 
 
-def test_steps_until_the_loss_stays_at_that_of_random_inputs_are_counted(
+def test_steps_until_the_loss_stays_below_random_inputs_are_counted(
     reader: Reader, pendulum: VariantGroup
 ) -> None:
     table = tabulate_group(reader, pendulum).set_index("variant")
@@ -141,7 +141,7 @@ def test_steps_until_the_loss_stays_at_that_of_random_inputs_are_counted(
     assert table.loc["random", "reached"] <= 0.5
 
 
-def test_the_loss_to_reach_is_that_of_the_usual_random_inputs(tmp_path: Path) -> None:
+def test_the_loss_to_reach_comes_from_the_usual_random_inputs(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/random.db"
     near = {"learner": {"window": 50}}
     specs = make_grid(("pendulum",), ("d_optimal", "random"), SEEDS, **SHORT, **ONE_SAMPLE)
@@ -168,7 +168,7 @@ def test_without_random_inputs_there_is_no_loss_to_reach(tmp_path: Path) -> None
 def test_p_values_are_adjusted_over_the_whole_report(reader: Reader) -> None:
     table = adjust([tabulate_group(reader, group) for group in variant_groups(reader, Filter())])
     tested = table["loss_p"].dropna()
-    assert len(tested) == 9  # but for the two references
+    assert len(tested) == 9  # all except the two references
     expected = stats.false_discovery_control(tested)
     assert table["loss_p_adjusted"].dropna().to_list() == pytest.approx(expected)
 
@@ -496,7 +496,7 @@ def test_lost_episodes_are_counted_beside_every_mean(tmp_path: Path) -> None:
     assert table.loc["uniform", "control_p"] == pytest.approx(2 / 2**6)
 
 
-def test_the_true_model_has_a_row_of_its_own(tmp_path: Path) -> None:
+def test_the_true_model_has_a_row(tmp_path: Path) -> None:
     def truth(spec: TrialSpec, result: TrialResult) -> TrialResult:
         changed = {"true_model_success": float(spec.seed > 2)}
         if spec.seed == 1:

@@ -60,7 +60,7 @@ def test_the_setting_with_most_trials_of_the_reference_decides_for_all_policies(
     assert {entry.config_key for entry in chosen} == {usual.config_key, random.config_key}
 
 
-def test_the_oracle_comes_with_the_model_of_its_own() -> None:
+def test_the_oracle_comes_with_its_own_model() -> None:
     usual, oracle = config("pendulum", "d_optimal"), config("pendulum", "oracle")
     assert choice((usual, 5), (oracle, 9)) == [usual, oracle]
 
@@ -116,7 +116,7 @@ def test_policies_under_other_limits_are_never_mixed_in() -> None:
     assert choice((reference, 5), (oracle, 9)) == [reference]
 
 
-def test_of_learners_with_as_many_trials_that_of_a_launch_decides() -> None:
+def test_between_learners_with_equal_trials_the_usual_one_decides() -> None:
     learners = {name: {"learner": {"name": name}} for name in ("adam_window", "ekf", "adam_replay")}
     configs = {
         (policy, name): config("pendulum", policy, **learner)

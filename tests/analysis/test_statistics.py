@@ -83,7 +83,7 @@ def test_no_trial_gives_nan_without_a_warning() -> None:
 
 @pytest.mark.parametrize("n", [4, 20])
 def test_the_interval_covers_the_mean_of_normal_trials_as_often_as_it_says(n: int) -> None:
-    repeats = 20_000  # every column is an experiment of its own
+    repeats = 20_000  # every column is an experiment
     values = np.random.default_rng(n).normal(loc=3.0, scale=2.0, size=(n, repeats))
     band = band_of(values)
     covered = np.mean((band.low <= 3.0) & (band.high >= 3.0))
@@ -119,14 +119,14 @@ def test_the_bootstrap_draws_whole_trials_and_the_same_ones_each_time(
     assert (first.centre <= first.high).all()
 
 
-def test_names_are_those_of_the_captions() -> None:
+def test_names_stand_in_captions() -> None:
     assert Statistic.MEAN.band == "95 % t-interval of the mean"
     assert Statistic.IQM.band == "95 % bootstrap interval of the interquartile mean"
 
 
 @pytest.mark.parametrize("statistic", [Statistic.MEDIAN, Statistic.IQM])
 @pytest.mark.parametrize("n", [2, 3, 5, 20, 31])
-def test_the_bootstrap_is_that_of_scipy(statistic: Statistic, n: int) -> None:
+def test_the_bootstrap_equals_scipy(statistic: Statistic, n: int) -> None:
     values = np.exp(np.random.default_rng(n).normal(size=(n, 6)))
     values[:, 3] = 1.0
     values[: n // 2, 4] = 2.0  # ties
@@ -176,7 +176,7 @@ def test_few_runs_have_no_limits(n: int) -> None:
 
 @pytest.mark.parametrize("n", [FEWEST, 100])
 def test_limits_hold_the_share_as_often_as_they_say(n: int) -> None:
-    repeats = 20_000  # every column is an experiment of its own
+    repeats = 20_000  # every column is an experiment
     runs = np.random.default_rng(n).lognormal(size=(n, repeats))
     band = tolerance_band(runs, Statistic.MEDIAN)
     share = stats.lognorm.cdf(band.high, 1.0) - stats.lognorm.cdf(band.low, 1.0)
@@ -212,7 +212,7 @@ def test_every_system_counts_alike() -> None:
     assert stratified_mean(strata).centre == pytest.approx([(0.1 + 2.0) / 2])
 
 
-def test_the_interval_is_that_of_scipy() -> None:
+def test_the_interval_equals_scipy() -> None:
     strata = runs(0)
     found = stratified_mean(strata)
     one = [values[:, 0] for values in strata]
@@ -308,7 +308,7 @@ def test_race_of_no_pair_is_nan() -> None:
     assert math.isnan(found.p_value)
 
 
-def test_scores_are_those_of_the_stored_curves(reader: Reader) -> None:
+def test_scores_follow_from_the_stored_curves(reader: Reader) -> None:
     (entry,) = select(reader, Filter(("pendulum",), ("uniform",))).entries
     curves = np.array([curve("pendulum", "uniform", seed) for seed in SEEDS])
     arguments = (reader, entry, "loss", DivergenceRule.EXCLUDE)
@@ -425,7 +425,7 @@ def test_what_was_lost_is_the_worst_in_the_test_and_in_no_ratio() -> None:
     ours = np.array([1.0, 2.0, np.inf, 4.0, np.inf, np.nan, 1.0])
     theirs = np.array([2.0, 4.0, 1.0, 1.0, np.inf, 1.0, np.nan])
     found = compare(ours, theirs, rng())
-    assert found.n_pairs == 5  # but those of which nothing is known
+    assert found.n_pairs == 5  # without the two with a NaN
     assert without_ratio(ours, theirs) == 4
     assert found.ratio == pytest.approx(1.0)  # 1/2 · 1/2 · 4
     assert found.improvement == (2 + 0.5) / 5
@@ -539,7 +539,7 @@ def test_nothing_has_no_front_and_no_geometric_mean() -> None:
     assert np.isnan(geometric_mean(np.empty(0)).value)
 
 
-def test_the_interval_is_that_of_the_logarithms() -> None:
+def test_the_interval_comes_from_the_logarithms() -> None:
     found = geometric_mean(np.array([1.0, 10.0, 100.0]))
     half = 4.302652729911275 / np.sqrt(3)  # t quantile of 2 degrees of freedom
     assert found.value == pytest.approx(10.0)

@@ -65,7 +65,7 @@ def final(env: str, policy: str, seed: int) -> float:
     return float(fake_result(spec).loss[-1])
 
 
-def test_summary_is_that_of_the_trials(reader: Reader) -> None:
+def test_summary_follows_from_the_trials(reader: Reader) -> None:
     table = summarise(reader, select(reader, Filter()))
     row = table[(table.env == "pendulum") & (table.policy == "uniform")].iloc[0]
     losses = np.array([final("pendulum", "uniform", seed) for seed in SEEDS])
@@ -281,7 +281,7 @@ def test_only_trials_with_a_task_are_taken(reader: Reader, part: Selection) -> N
     assert not any("task" in entry.config.config for entry in whole.entries)
 
 
-def test_the_numbers_are_those_of_the_trials(reader: Reader, part: Selection) -> None:
+def test_the_numbers_follow_from_the_trials(reader: Reader, part: Selection) -> None:
     curves = measure_control(reader, part)
     curve = curve_of(curves, "pendulum", "uniform")
     entry = next(e for e in part.of("pendulum") if e.config.policy == "uniform")
@@ -335,7 +335,7 @@ def _value(rows: tuple[Assessment, ...], t: int, measure: str) -> float:
     return next(row.value for row in rows if (row.t, row.measure) == (t, measure))
 
 
-def test_wilson_intervals_are_those_of_the_textbook(reader: Reader, part: Selection) -> None:
+def test_wilson_intervals_equal_the_textbook(reader: Reader, part: Selection) -> None:
     curve = curve_of(measure_control(reader, part), "pendulum", "d_optimal")
     first, last = 0, -1
     assert (curve.success[first], curve.success[last]) == (0.0, 1.0)

@@ -48,7 +48,7 @@ def variants(url: str) -> None:
 
 
 def fail_one(url: str, spec: TrialSpec) -> None:
-    """Claim a trial in a launch of its own and fail it."""
+    """Claim a trial in a new launch and fail it."""
     with Store.open(url) as store:
         launch = begin(store)
         (claim,) = store.claim(launch, [spec.trial_key])

@@ -54,9 +54,7 @@ def test_the_grid_has_the_means_of_the_summary(client: TestClient, reader: Reade
 
 
 @pytest.mark.parametrize(("column", "rule"), [("loss", "exclude"), ("reachable_loss", "worst")])
-def test_curves_are_those_of_figure_1(
-    client: TestClient, reader: Reader, column: str, rule: str
-) -> None:
+def test_curves_equal_figure_1(client: TestClient, reader: Reader, column: str, rule: str) -> None:
     asked = f"env=cartpole&column={column}&diverged={rule}&x=seconds"
     found = client.get(f"/api/curves?{asked}").json()
     expected = measure_curves(
@@ -232,7 +230,7 @@ def test_a_trial_with_limits_shows_bounds_and_what_is_beyond(url: str, visit: Vi
     assert " of 17</dd>" in client.get(f"/trials/{second.trial_key}").text
 
 
-def test_a_database_may_come_later_and_be_made_anew(tmp_path: Path, visit: Visit) -> None:
+def test_a_database_may_come_later_and_be_made_again(tmp_path: Path, visit: Visit) -> None:
     url = f"sqlite:///{tmp_path}/results.db"
     client = visit(url)
     for path in ("/", "/trials", "/api/grid", "/api/curves"):
@@ -409,7 +407,7 @@ def test_its_curve_is_a_running_median_among_points(browser: Browser, sqlite_url
         assert not page.is_visible("[name=column]")
 
 
-def test_launches_and_failures_are_those_of_the_database(client: TestClient) -> None:
+def test_launches_and_failures_come_from_the_database(client: TestClient) -> None:
     found = client.get("/api/grid").json()
     assert [one["launch_id"] for one in found["launches"]] == [2, 1]
     failed, filled = found["launches"]

@@ -32,7 +32,7 @@ WIDE = """[...document.querySelectorAll('main .card:not(.scroll)')]
 
 @pytest.fixture
 def show(browser: Browser) -> Iterator[Callable[[str], Page]]:
-    """Return a function that serves a database of its own and gives a page of it."""
+    """Return a function that serves a new database and gives a page of it."""
     with ExitStack() as stack:
 
         def open_page(url: str) -> Page:

@@ -6,7 +6,7 @@ const PAINTS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7"];
 const TURN = Math.PI / 2;
 const charts = part("charts");
 
-/** A line of the policy's colour, or of its own among several. */
+/** A line in the policy's colour; each of several lines has another colour. */
 function line(found, label, values, place = 0, among = 1, more = {}) {
   const colour = among === 1 ? found.legend_entry.colour : PAINTS[place % PAINTS.length];
   return { label, values, colour, dash: [], line_width: 1, ...more };
@@ -21,7 +21,7 @@ function drawLoss(found) {
   draw(part("loss"), { x: found.t, lines, label, log: [false, true], range, title: (i) => `t = ${found.t[i]}` });
 }
 
-/** Draw quantities against time, those of bounds dashed. */
+/** Draw quantities against time, bounds dashed. */
 function drawTimes(name, found, items, first) {
   const x = found.t.map((t) => (t + first) * found.dt);
   const lines = items.map((one, i) => line(found, one.label, one.values, i, items.length));

@@ -13,7 +13,7 @@ import pytest
 from dopt.spec.trial import TrialSpec
 from orchestrate import __main__ as orchestrate
 from tests.analysis.synthetic import fake_results, fill, make_grid
-from tests.studies.trackers.wandb_file import OfflineRun, read_run
+from tests.studies.wandb_file import OfflineRun, read_run
 
 TASK = {"task": {"name": "control", "checkpoints": [10]}}
 SPECS = make_grid(("pendulum", "cartpole"), ("random",), range(2), env={"horizon": 20}, **TASK)

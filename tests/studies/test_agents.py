@@ -1,0 +1,284 @@
+"""Trials of the agents: what they are given, when they decide, how they are assessed."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt.control import Control
+from dopt.control.planning import costs
+from dopt.control.task import GOALS
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+from dopt.systems import Cartpole, Quadrotor
+from orchestrate import __main__ as orchestrate
+from orchestrate.runner import launch
+from studies.agents.policies import (
+    LIMIT,
+    ActiveExploration,
+    ActorFeedback,
+    ImaginingAgent,
+    Observation,
+    SoftActorCritic,
+    TaskAgent,
+    input_of,
+)
+from tests.dopt.test_assessment import SHORT
+from tests.dopt.trials import trial
+from tests.paths import ROOT
+
+SMALL: dict[str, dict[str, Any]] = {
+    "SoftActorCritic": {"hold": 3, "warm_up": 9, "units": 8, "batch": 4},
+    "ActiveExploration": {
+        **{"ensemble": 3, "units": 8, "warm_up": 10, "replan_every": 10, "fit_updates": 20},
+        **{"hold": 4, "lookahead": 6, "actors": 6, "episodes": 2, "batch": 8},
+    },
+}
+AGENTS = tuple(SMALL)
+
+
+def agent_trial(env: str, agent: str, seed: int = 0, /, **fields: Mapping[str, Any]) -> TrialSpec:
+    """Return a small trial of an agent; ``fields`` are the entries of sections that differ."""
+    target = {"_target_": f"studies.agents.policies.{agent}", **SMALL[agent]}
+    policy, task = target | dict(fields.pop("policy", {})), fields.pop("task", None)
+    sections = trial(env, "random", seed, **fields).to_mapping() | {"policy": policy}
+    return TrialSpec.from_mapping(sections | ({"task": task} if task else {}))
+
+
+def assessed(**task: object) -> TrialSpec:
+    return agent_trial("pendulum", "SoftActorCritic", 1, task={**SHORT, **task})
+
+
+def test_a_repetition_is_the_same() -> None:
+    spec = agent_trial("cartpole", "SoftActorCritic", 1)
+    np.testing.assert_array_equal(run_trial(spec).inputs, run_trial(spec).inputs)
+
+
+def test_an_input_is_held_between_two_decisions() -> None:
+    inputs = run_trial(agent_trial("arm", "SoftActorCritic")).inputs[1:]
+    assert np.all(np.linalg.norm(inputs, axis=1) <= 5.0 * (1 + 1e-12))
+    for start in range(0, 27, 3):
+        assert np.all(inputs[start : start + 3] == inputs[start])
+    assert len(np.unique(inputs[:, 0])) == 10
+
+
+@pytest.mark.parametrize("policy", AGENTS)
+@pytest.mark.parametrize("env", ["arm", "pendulum"])
+def test_with_the_full_energy_every_input_has_the_largest_norm(env: str, policy: str) -> None:
+    inputs = run_trial(agent_trial(env, policy, policy={"energy": "full"})).inputs
+    gamma = agent_trial(env, policy).system.gamma
+    np.testing.assert_allclose(np.linalg.norm(inputs, axis=1), gamma, rtol=1e-12)
+    assert len(np.unique(inputs[:, 0])) > 1
+
+
+def test_an_action_of_zero_has_an_input_of_the_full_energy() -> None:
+    np.testing.assert_array_equal(input_of(np.zeros((2, 3)), 5.0, "full"), [[5.0, 0.0, 0.0]] * 2)
+
+
+def test_the_transitions_follow_the_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: list[tuple[np.ndarray, ...]] = []
+    monkeypatch.setattr(
+        "studies.agents.policies.Agent.remember",
+        lambda _, *parts: kept.append(parts),
+    )
+    monkeypatch.setattr("studies.agents.policies.Agent.learn", lambda *_: None)
+    spec = agent_trial("pendulum", "SoftActorCritic")
+    result, goal = run_trial(spec), GOALS["pendulum"]
+    assert len(kept) == 9
+    for number, (before, action, reward, following) in enumerate(kept):
+        t = 1 + 3 * number
+        seen = np.array([np.cos(result.states[t, 0]), np.sin(result.states[t, 0])])
+        np.testing.assert_allclose(before[0, :2], seen)
+        np.testing.assert_allclose(2.0 * action[0], result.inputs[t])
+        reached, applied = result.states[t + 1 : t + 4], result.inputs[t : t + 3]
+        cost = costs(spec.system, goal, reached, applied)
+        assert reward.shape == (1,)
+        assert reward[0] == pytest.approx(-np.mean(cost))
+        np.testing.assert_allclose(following[0, 2], result.states[t + 3, 1] / 8.0)
+
+
+def test_its_own_feedback_is_assessed_beside_the_model() -> None:
+    spec = assessed()
+    result = run_trial(spec)
+    measured = {(row.t, row.measure): row.value for row in result.assessments}
+    for t in (0, 10, 30):
+        assert measured[t, "feedback_success"] in (0.0, 1.0)
+        assert measured[t, "feedback_cost"] > 0
+        assert (t, "control_success") in measured
+    assert measured[10, "feedback_cost"] != measured[30, "feedback_cost"]
+
+
+def test_it_works_for_the_goal_of_the_trial() -> None:
+    own, other = assessed(), assessed(goal=[1.0, 0.0])
+    changed = {"steps": 12, "settle_steps": 2, "lookahead": 3}
+    assert own.config.goal == dataclasses.replace(GOALS["pendulum"], **changed)
+    assert other.config.goal.goal == (1.0, 0.0)
+    without = agent_trial("pendulum", "SoftActorCritic").config.goal
+    assert without == GOALS["pendulum"]
+
+
+def test_the_agent_learns_to_hold_a_point() -> None:
+    """The set point is near rest, so that few samples are enough; the untrained agent misses it."""
+    goal = dataclasses.replace(
+        GOALS["pendulum"], goal=(0.3, 0.0), tolerances=(0.15, 1.0), steps=150, settle_steps=20
+    )
+    policy = SoftActorCritic(hold=5, warm_up=100, units=32, batch=64, discount=0.9, updates=2.0)
+    task = Control(**dataclasses.asdict(goal), checkpoints=())
+    given = agent_trial("pendulum", "SoftActorCritic", 3, env={"horizon": 1200})
+    config = dataclasses.replace(given.config, policy=policy, task=task)
+    result = run_trial(TrialSpec(config, 3))
+    cost = {r.t: r.value for r in result.assessments if r.measure == "feedback_cost"}
+    assert cost[1200] < 0.3 * cost[0]
+
+
+def test_the_law_of_the_agent_is_within_the_bound() -> None:
+    arm = agent_trial("arm", "SoftActorCritic")
+    agent = arm.policy.planner(arm.system, np.random.default_rng(0))  # type: ignore[attr-defined]
+    assert isinstance(agent, TaskAgent)
+    law = agent.feedback()
+    assert isinstance(law, ActorFeedback)
+    states = np.random.default_rng(1).normal(size=(50, 4)) * 5
+    inputs = np.array([law(x) for x in states])
+    assert np.all(np.linalg.norm(inputs, axis=1) <= arm.system.gamma * (1 + 1e-12))
+
+
+QUICK = SMALL["ActiveExploration"]
+
+
+def test_a_repetition_of_max_is_the_same() -> None:
+    spec = agent_trial("pendulum", "ActiveExploration", 1)
+    np.testing.assert_array_equal(run_trial(spec).inputs, run_trial(spec).inputs)
+
+
+def test_decisions_are_held_and_each_plan_begins_with_one() -> None:
+    inputs = run_trial(agent_trial("arm", "ActiveExploration")).inputs
+    assert np.all(np.linalg.norm(inputs, axis=1) <= 5.0 * (1 + 1e-12))
+    changes = 1 + np.flatnonzero(np.any(np.diff(inputs, axis=0) != 0, axis=1))
+    assert changes.tolist() == [1, 5, 9, 10, 14, 18, 20, 24, 28]
+
+
+def test_any_model_and_learner_go_with_it() -> None:
+    for learner in ("ekf", "gauss_newton"):
+        result = run_trial(agent_trial("pendulum", "ActiveExploration", learner={"name": learner}))
+        assert np.isfinite(result.loss).all()
+
+
+def test_imagined_steps_follow_the_system_with_the_networks_accelerations() -> None:
+    spec = agent_trial("cartpole", "ActiveExploration")
+    system = spec.system
+    agent = ImaginingAgent(ActiveExploration(**QUICK), system, np.random.default_rng(0))
+    rng = np.random.default_rng(1)
+    states, inputs = rng.normal(size=(6, 4)), rng.normal(size=(6, 1))
+    truth = system.learned(states)
+    same = np.broadcast_to(truth, (3, 6, 2))
+    following = agent._following(states, inputs, same, np.zeros_like(same))
+    for x, u, reached in zip(states, inputs, following, strict=True):
+        np.testing.assert_allclose(reached, x + system.dt * system.derivative(x, u), rtol=1e-12)
+
+
+def test_each_imagined_step_is_by_one_network() -> None:
+    system = agent_trial("pendulum", "ActiveExploration").system
+    agent = ImaginingAgent(ActiveExploration(**QUICK), system, np.random.default_rng(0))
+    mean = np.repeat(np.array([-1.0, 0.0, 1.0])[:, None, None], 300, axis=1)
+    states = np.zeros((300, 2))
+    rates = agent._following(states, np.zeros((300, 1)), mean, np.zeros_like(mean))[:, 1]
+    found, counts = np.unique(rates / system.dt, return_counts=True)
+    np.testing.assert_allclose(found, [-1.0, 0.0, 1.0])
+    assert counts.min() > 60
+
+
+def test_it_goes_where_the_networks_disagree() -> None:
+    """One step of the plan matters: two networks differ where the rate is positive alone."""
+    system = agent_trial("pendulum", "ActiveExploration").system
+    policy = ActiveExploration(**QUICK | {"episodes": 30, "learning_rate": 3e-3, "batch": 32})
+    agent = ImaginingAgent(policy, system, np.random.default_rng(0))
+
+    def predicted(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        apart = 5.0 * np.maximum(states[:, 1:], 0.0)
+        mean = np.stack([-apart, 0.0 * apart, apart])
+        return mean, np.full_like(mean, 1e-2)
+
+    agent._predicted = predicted  # type: ignore[method-assign]
+    for _ in range(policy.episodes):
+        agent._imagine(np.array([0.0, 0.0]))
+    action = agent._agent.actor()(agent._observation(np.array([0.0, 0.0])))
+    assert action[0] > 0.5
+
+
+def test_one_network_is_refused() -> None:
+    with pytest.raises(SpecificationError, match="at least 2 networks"):
+        ActiveExploration(ensemble=1)
+
+
+def test_a_run_longer_than_the_trial_is_refused() -> None:
+    with pytest.raises(IncompatibleError, match=r"policy\.lookahead is 50 steps"):
+        agent_trial("pendulum", "ActiveExploration", policy={"lookahead": 50})
+
+
+def test_an_angle_is_shown_by_cosine_and_sine_and_others_by_half_widths() -> None:
+    cartpole = Cartpole(grid_half_widths=(4.0, math.pi, 8.0))
+    state = np.array([0.5, 2.0, math.pi / 6 + 4 * math.pi, -4.0])
+    expected = [math.sqrt(3) / 2, 0.5, 0.5, 0.5, -0.5]
+    np.testing.assert_allclose(Observation(cartpole)(state), expected)
+
+
+def test_many_states_are_shown_row_by_row() -> None:
+    observation = Observation(Quadrotor())
+    states = np.random.default_rng(0).normal(size=(3, 5, 6))
+    shown = observation(states)
+    assert shown.shape == (3, 5, observation.size) == (3, 5, 7)
+    np.testing.assert_array_equal(shown[1, 2], observation(states[1, 2]))
+
+
+def test_nothing_large_is_shown() -> None:
+    states = np.array([[1e9, -1e9, 1.0, 0.0]])
+    shown = Observation(Cartpole())(states)
+    assert np.abs(shown).max() == LIMIT
+
+
+WORDS = ("env.horizon=20", "policy.warm_up=5", "policy.batch=4", "executor=inprocess")
+
+
+@pytest.mark.parametrize("policy", ["sac", "max_agent"])
+def test_an_agent_is_a_policy_of_a_launch(
+    policy: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT))
+    url = f"sqlite:///{tmp_path}/results.db"
+    more = ("policy.lookahead=6", "policy.fit_updates=5") if policy == "max_agent" else ()
+    words = ("--config-dir", str(ROOT / "studies/agents/conf"), "-m", f"policy={policy}", "seed=0")
+    monkeypatch.setattr("sys.argv", ["launch.py", *words, *WORDS, *more, f"store.url={url}"])
+    assert launch.main() == 0
+    capsys.readouterr()
+    assert orchestrate.main(["status", "--db", url]) == 0
+    assert policy in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("word", ["policy=beyond/sac", "experiment=flex_table1_agents"])
+def test_the_place_where_an_agent_was_names_the_study(
+    word: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["launch.py", "-m", word])
+    assert launch.main() == 2
+    assert "studies/agents/README.md" in capsys.readouterr().err
+
+
+def test_every_trial_of_the_experiment_is_possible(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = ["--config-dir", str(ROOT / "studies/agents/conf"), "-m", "seed=0"]
+    words += ["experiment=agents", "launch.dry_run=true"]
+    words.append(f"store.url=sqlite:///{tmp_path}/results.db")
+    monkeypatch.setattr("sys.argv", ["launch.py", *words])
+    assert launch.main() == 0
+    assert "8 trials, 0 done" in capsys.readouterr().out
