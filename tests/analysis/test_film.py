@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from analysis.errors import AnalysisError
 from analysis.film import Story, _stage, shoot, tell
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS
 from orchestrate.store import LaunchRecord, Reader, Store
 from tests.analysis.synthetic import make_spec
 from tests.orchestrate.store.fakes import RUN
@@ -87,18 +85,6 @@ def test_every_picture_shows_something_else(
         frames = {frame.convert("RGB").tobytes() for frame in ImageSequence.Iterator(film)}
     assert len(frames) == 4
     assert [path.name for path in target.parent.iterdir()] == ["film.gif"]
-
-
-def test_every_system_has_a_stage(story: Callable[..., Story]) -> None:
-    told = story("pendulum")
-    for env, system in SYSTEMS.items():
-        built = system()
-        states = np.tile(built.initial_state, (HORIZON + 1, 1)).astype(float)
-        truth = built.learned(states, np.arange(len(states)))
-        own = replace(told, system=built, states=states, truth=truth, learned=np.stack([truth] * 4))
-        figure, move = _stage(own)
-        move(3)
-        assert len(figure.axes) == 3 + len(built.learned_rows), env
 
 
 @pytest.mark.skipif(not shutil.which("ffmpeg"), reason="the program ffmpeg is not installed")

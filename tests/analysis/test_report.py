@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -55,10 +56,18 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> str:
     return address
 
 
-@pytest.fixture
-def reader(url: str) -> Iterator[Reader]:
-    with Reader.open(url) as opened:
-        yield opened
+def reported(folder: Path, specs: list[TrialSpec], **options: Any) -> tuple[str, pd.DataFrame]:
+    """Store trials and return the page and the table of their report."""
+    url, out = f"sqlite:///{folder}/results.db", folder / "out"
+    fill(url, specs, **options)
+    assert main(["report", "--db", url, "--out", str(out)]) == 0
+    return (out / "README.md").read_text(), pd.read_csv(out / "report.csv").set_index("variant")
+
+
+def logs_of(policy: str, seeds: Iterable[int] = SEEDS, **sections: Any) -> np.ndarray:
+    """Return the logarithms of the final losses of a policy in the pendulum."""
+    specs = [make_spec("pendulum", policy, seed, **SHORT, **sections) for seed in seeds]
+    return np.log([fake_result(spec).loss[-1] for spec in specs])
 
 
 @pytest.fixture
@@ -80,11 +89,7 @@ def test_every_variant_has_another_label(pendulum: VariantGroup) -> None:
 
 def test_ratios_are_paired_over_the_shared_seeds(reader: Reader, pendulum: VariantGroup) -> None:
     table = adjust([tabulate_group(reader, pendulum)]).set_index("variant")
-    finals = {
-        name: np.log([fake_result(make_spec("pendulum", name, s, **SHORT)).loss[-1] for s in SEEDS])
-        for name in ("d_optimal", "uniform")
-    }
-    difference = finals["uniform"] - finals["d_optimal"]
+    difference = logs_of("uniform") - logs_of("d_optimal")
     row = table.loc["uniform"]
     assert row["loss_ratio"] == pytest.approx(np.exp(difference.mean()))
     assert row["loss_p"] == pytest.approx(stats.wilcoxon(difference).pvalue)
@@ -99,16 +104,7 @@ def test_every_policy_is_also_compared_under_its_own_learner(
     reader: Reader, pendulum: VariantGroup
 ) -> None:
     table = adjust([tabulate_group(reader, pendulum)]).set_index("variant")
-    finals = {
-        name: np.log(
-            [
-                fake_result(make_spec("pendulum", name, s, **SHORT, **ONE_SAMPLE)).loss[-1]
-                for s in SEEDS
-            ]
-        )
-        for name in ("d_optimal", "random")
-    }
-    difference = finals["random"] - finals["d_optimal"]
+    difference = logs_of("random", **ONE_SAMPLE) - logs_of("d_optimal", **ONE_SAMPLE)
     row = table.loc["random, adam"]
     assert row["same_reference"] == "D-optimal, adam"
     assert row["same_loss_ratio"] == pytest.approx(np.exp(difference.mean()))
@@ -262,22 +258,13 @@ def test_missing_trials_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_variants_may_have_different_numbers_of_seeds(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/unequal.db"
     specs = make_grid(("pendulum",), ("d_optimal",), range(6), **SHORT)
-    fill(url, specs + make_grid(("pendulum",), ("random",), range(2, 5), **SHORT))
-    assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
-    notes = (tmp_path / "out/README.md").read_text().split("## Notes")[1]
+    specs += make_grid(("pendulum",), ("random",), range(2, 5), **SHORT)
+    text, table = reported(tmp_path, specs)
+    notes = text.split("## Notes")[1]
     assert "pendulum: 3 seeds: 1 variant, 6 seeds: 1 variant; a ratio is over" in notes
-    table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     assert table["n"].to_dict() == {"D-optimal": 6, "random": 3}
-    finals = [
-        [
-            np.log(fake_result(make_spec("pendulum", name, seed, **SHORT)).loss[-1])
-            for seed in (2, 3, 4)
-        ]
-        for name in ("random", "d_optimal")
-    ]
-    expected = np.exp(np.mean(np.subtract(*finals)))
+    expected = np.exp(np.mean(logs_of("random", (2, 3, 4)) - logs_of("d_optimal", (2, 3, 4))))
     assert table.loc["random", "loss_ratio"] == pytest.approx(expected)
 
 
@@ -363,19 +350,15 @@ def test_variants_of_one_name_are_told_apart_by_all_that_is_unusual(
 
 
 def test_what_the_models_are_good_for_has_a_section(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/control.db"
     task = {"task": {"name": "control", "checkpoints": [20]}}
     specs = make_grid(("pendulum",), ("d_optimal", "uniform"), SEEDS, **SHORT, **task)
     specs += make_grid(("pendulum",), ("random",), SEEDS, **SHORT)
-    fill(url, specs)
-    assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
-    text = (tmp_path / "out/README.md").read_text()
+    text, table = reported(tmp_path, specs)
     section = text.split("## Control with the learned model")[1].split("\n## ")[0]
     assert "success after 20" in section
     assert "| uniform" in section
     assert "| random" not in section  # was not assessed
-    table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
-    with Reader.open(url) as reader:
+    with Reader.open(f"sqlite:///{tmp_path}/results.db") as reader:
         costs = {
             one.config.policy: scores_at(reader, one, 20).by_seed
             for one in variant_groups(reader, Filter())[0].variants
@@ -405,16 +388,13 @@ def control_rows(text: str) -> list[dict[str, str]]:
 
 
 def test_costs_of_different_tasks_are_not_compared(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path}/tasks.db"
     specs = make_grid(("pendulum",), ("d_optimal", "uniform"), SEEDS, **SHORT, **control_task(20))
     specs += make_grid(("pendulum",), ("random",), SEEDS, **SHORT, **control_task(10, 30))
     weighed = control_task(20, input_weight=7.0)
     specs += make_grid(("pendulum",), ("periodic",), SEEDS, **SHORT, **weighed)
     # more trials of one policy, but fewer of the task
     specs += make_grid(("pendulum",), ("d_optimal",), range(8), **SHORT, **control_task(5))
-    fill(url, specs)
-    assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
-    text = (tmp_path / "out/README.md").read_text()
+    text, table = reported(tmp_path, specs)
     rows = control_rows(text)
     assert [name for name in rows[0] if name.startswith("success")] == [
         "success after 0",
@@ -428,7 +408,6 @@ def test_costs_of_different_tasks_are_not_compared(tmp_path: Path) -> None:
     assert "checkpoints = [10, 30] instead of [20]" in notes
     assert "control with periodic: assessed by another task" in notes
     assert "input_weight = 7.0 instead of" in notes
-    table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     assert table["control_ratio"].notna().to_dict() == {
         "D-optimal": False,
         "uniform": True,
@@ -478,19 +457,15 @@ def test_lost_episodes_are_counted_beside_every_mean(tmp_path: Path) -> None:
         )
         return replace(result, assessments=tuple(rows))
 
-    url = f"sqlite:///{tmp_path}/lost.db"
     task = control_task(20)
     specs = make_grid(("pendulum",), ("d_optimal", "uniform"), SEEDS, **SHORT, **task)
-    fill(url, specs, edit=crashed)
-    assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
-    text = (tmp_path / "out/README.md").read_text()
+    text, table = reported(tmp_path, specs, edit=crashed)
     rows = {row["variant"]: row for row in control_rows(text)}
     assert rows["uniform"]["cost after 20"].endswith("], 1 lost")
     assert rows["uniform"]["free run"].endswith(", 1 lost")
     assert "lost" not in rows["uniform"]["cost after 0"] + "".join(rows["D-optimal"].values())
     _, line = [line for line in text.split("## Control")[0].splitlines() if "| uniform" in line]
     assert line.split("|")[5].strip().endswith("], 1 lost")
-    table = pd.read_csv(tmp_path / "out/report.csv").set_index("variant")
     assert table.loc["uniform", "control_lost"] == 1
     assert math.isfinite(table.loc["uniform", "control"])
     assert table.loc["uniform", "control_p"] == pytest.approx(2 / 2**6)
@@ -506,12 +481,9 @@ def test_the_true_model_has_a_row(tmp_path: Path) -> None:
         )
         return replace(result, assessments=tuple(rows))
 
-    url = f"sqlite:///{tmp_path}/truth.db"
     task = control_task(20)
     specs = make_grid(("pendulum",), ("d_optimal", "uniform"), SEEDS, **SHORT, **task)
-    fill(url, specs, edit=truth)
-    assert main(["report", "--db", url, "--out", str(tmp_path / "out")]) == 0
-    row = control_rows((tmp_path / "out/README.md").read_text())[-1]
+    row = control_rows(reported(tmp_path, specs, edit=truth)[0])[-1]
     assert row["variant"] == "true model"
     for t in (0, 20, 40):
         assert row[f"success after {t}"].startswith("0.50 [0.")

@@ -279,8 +279,6 @@ def test_the_same_pages_over_postgresql(show: Callable[[str], Page], postgresql_
     page.wait_for_selector("#charts[data-drawn]")
 
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
-
 DESK: ViewportSize = {"width": 1400, "height": 900}
 BOXES = """(tiles) => tiles.map((tile) => {
   const { left, right, top, bottom } = tile.getBoundingClientRect();
