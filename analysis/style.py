@@ -158,6 +158,11 @@ def plus_minus(value: float, error: float) -> str:
     return f"{value:.{places}f} ± {error:.{places}f}"
 
 
+def percent_text(mean: float, error: float, n: int) -> str:
+    """Return a mean share in per cent ± 2 standard errors, alone for one trial, empty for none."""
+    return f"{plus_minus(100 * mean, 200 * error if n > 1 else 0.0)} %" if n else ""
+
+
 def steps_text(median: float, horizon: int) -> str:
     """Return a median number of steps, ``> horizon`` for one that is censored, a dash for NaN."""
     if math.isnan(median):

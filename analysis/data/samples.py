@@ -14,6 +14,7 @@ import numpy.typing as npt
 from analysis.data.selection import Entry
 from analysis.errors import AnalysisError
 from analysis.style import of_finished
+from dopt.assessment import Plane
 from dopt.limits import VIOLATIONS, limits_from
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
@@ -118,6 +119,13 @@ def violation_shares(reader: Reader, entry: Entry) -> dict[int, float]:
     }
     finished = [trial.seed for trial in entry.finished]
     return {seed: float(counted[seed].sum()) for seed in finished if len(counted.get(seed, ())) > 0}
+
+
+def coverages(reader: Reader, entry: Entry, plane: Plane) -> dict[int, float]:
+    """Return the share of the plane's cells that each trial visits, by seed; without diverged."""
+    key = entry.config.config_key
+    seeds = entry.final_losses()
+    return {seed: plane.coverage(reader.trajectory(key, seed).states) for seed in seeds}
 
 
 @dataclass(frozen=True)

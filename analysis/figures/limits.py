@@ -31,7 +31,7 @@ from analysis.data.selection import (
 )
 from analysis.figures.panels import GUIDE, Plot, legend_below, mathematical, sheet
 from analysis.stats.intervals import mean, standard_error
-from analysis.style import BLUE, GREY, but_diverged, environment_title, plus_minus
+from analysis.style import BLUE, GREY, but_diverged, environment_title, percent_text
 from dopt.policies import policy_title
 from dopt.spec.label import flatten
 from dopt.spec.trial import system_of
@@ -316,11 +316,9 @@ def _panel(axes: Axes, panel: Panel) -> None:
 
 def share_text(panel: Panel) -> str:
     """Return the share of steps beyond a bound in per cent ± 2 standard errors, and n."""
-    count = f"n = {but_diverged(panel.n, panel.n_diverged)}"
-    if not panel.n:
-        return f"share unknown ({count})"
-    error = panel.share_error if panel.n > 1 else 0.0
-    return f"{plus_minus(100 * panel.share, 200 * error)} % of steps beyond ({count})"
+    text = percent_text(panel.share, panel.share_error, panel.n)
+    beyond = f"{text} of steps beyond" if text else "share unknown"
+    return f"{beyond} (n = {but_diverged(panel.n, panel.n_diverged)})"
 
 
 def caption(panels: Panels) -> str:

@@ -15,6 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from analysis.data.matching import REFERENCE
+from analysis.data.samples import coverages
 from analysis.data.selection import Entry, Selection
 from analysis.errors import AnalysisError
 from analysis.figures.panels import (
@@ -28,7 +29,7 @@ from analysis.figures.panels import (
 )
 from analysis.stats.curves import DrawnPlane, median_seed
 from analysis.stats.intervals import mean, standard_error
-from analysis.style import BLACK, but_diverged, environment_title, plus_minus, policy_style
+from analysis.style import BLACK, but_diverged, environment_title, percent_text, policy_style
 from dopt.assessment import CELLS
 from dopt.spec.trial import system_of
 from orchestrate.store import Reader
@@ -110,7 +111,7 @@ def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Por
     if seed in status:
         points = plane.project(reader.trajectory(key, seed).states)
         points = points[np.isfinite(points).all(axis=1)]
-    shares = np.array([_share(reader, key, seed, plane) for seed in entry.final_losses()])
+    shares = np.array([*coverages(reader, entry, plane).values()])
     return Portrait(
         policy=entry.config.policy,
         line=plane.line(points) if len(points) else points,
@@ -121,10 +122,6 @@ def _portrait(reader: Reader, entry: Entry, seed: int, plane: DrawnPlane) -> Por
         n=len(shares),
         n_diverged=len(finished) - len(shares),
     )
-
-
-def _share(reader: Reader, key: str, seed: int, plane: DrawnPlane) -> float:
-    return plane.coverage(reader.trajectory(key, seed).states)
 
 
 def tabulate_portraits(portraits: Portraits) -> pd.DataFrame:
@@ -212,10 +209,8 @@ def count_text(portrait: Portrait) -> str:
 
 def coverage_text(portrait: Portrait) -> str:
     """Return the mean coverage in per cent ± 2 standard errors."""
-    if not portrait.n:
-        return "coverage unknown"
-    error = portrait.coverage_error if portrait.n > 1 else 0.0
-    return f"coverage {plus_minus(100 * portrait.coverage, 200 * error)} %"
+    text = percent_text(portrait.coverage, portrait.coverage_error, portrait.n)
+    return f"coverage {text or 'unknown'}"
 
 
 def _set_axes(axes: Axes, portraits: Portraits) -> None:

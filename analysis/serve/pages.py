@@ -29,7 +29,7 @@ from analysis.stats.curves import (
     periodogram,
     tabulate_curves,
 )
-from analysis.stats.intervals import mean, standard_error
+from analysis.stats.intervals import mean_columns
 from analysis.style import policy_style
 from dopt.errors import SpecificationError
 from dopt.spec.config import completed
@@ -205,8 +205,7 @@ def _tile(config: ConfigRow, losses: Array) -> Content:
         "n": config.n,
         "ended": config.n - config.n_pending - config.n_running,
         "counts": {status: count for status, count in counts.items() if count},
-        "loss": float(mean(losses)),
-        "loss_2se": 2 * float(standard_error(losses)),
+        **mean_columns("loss", losses),
         "n_used": len(losses),
     }
 

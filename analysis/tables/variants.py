@@ -18,7 +18,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from analysis.data.matching import Filter, difference, latest_sources, nearness, newest
-from analysis.data.samples import DivergenceRule, read_curves
+from analysis.data.samples import DivergenceRule, coverages, read_curves
 from analysis.data.selection import (
     Entry,
     Selection,
@@ -254,18 +254,12 @@ def _scores(
             "loss": final_losses(reader, one, "loss", rule).by_seed,
             "reachable_loss": final_losses(reader, one, "reachable_loss", rule).by_seed,
             "auc": mean_losses(reader, one, "loss", rule).by_seed,
-            "coverage": _coverages(reader, one, plane),
+            "coverage": coverages(reader, one, plane),
             "control": scores_at(reader, one, first).by_seed if one.label in assessed else {},
             "steps": lasting_steps(reader, one, "loss", rule, epsilon).by_seed,
         }
         for one in group.variants
     }
-
-
-def _coverages(reader: Reader, variant: Entry, plane: Plane) -> BySeed:
-    key = variant.config.config_key
-    seeds = variant.final_losses()
-    return {seed: plane.coverage(reader.trajectory(key, seed).states) for seed in seeds}
 
 
 def _variant_row(
