@@ -188,9 +188,9 @@ def check_launch(launch: Mapping[str, object]) -> None:
     """
     executor = launch["executor"]
     name = executor.get("name") if isinstance(executor, Mapping) else None
-    _check("launch", launch["launch"], _read(CONFIGURATION / "config.yaml").get("launch"))
+    _check("launch", launch["launch"], content_of(CONFIGURATION / "config.yaml").get("launch"))
     _check("store", launch["store"], dict.fromkeys(("url", "folder", "every")))
-    _check("executor", executor, _read(CONFIGURATION / "executor" / f"{name}.yaml"))
+    _check("executor", executor, content_of(CONFIGURATION / "executor" / f"{name}.yaml"))
 
 
 def _check(path: str, given: object, known: object) -> None:
@@ -202,7 +202,8 @@ def _check(path: str, given: object, known: object) -> None:
         _check(f"{path}.{key}", value, known[key])
 
 
-def _read(path: Path) -> dict[str, object]:
+@functools.cache
+def content_of(path: Path) -> Mapping[str, Any]:
     """Return the content of a file; empty for an option outside this folder."""
     content = OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else {}
     return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}

@@ -38,7 +38,6 @@ from tests.orchestrate.commands.conftest import (
     BAD,
     BUNDLE_FILES,
     DONE,
-    ODD,
     SECRET,
     Answer,
     on_both,
@@ -341,12 +340,6 @@ class TestRoundTrip:
                         )
                         for name in ("states", "inputs", "parameters"):
                             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
-
-    def test_the_odd_numbers_are_in_it(self, bundle: Path) -> None:
-        with opened(bundle) as reader:
-            found = reader.trajectory(Spec(20).config_key, 20)
-        np.testing.assert_array_equal(found.states[:4, 0], ODD)
-        assert np.signbit(found.states[0, 0])
 
     def test_a_bundle_of_a_bundle_is_the_same(self, bundle: Path, tmp_path: Path) -> None:
         again = tmp_path / "again"

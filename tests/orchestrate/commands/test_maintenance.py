@@ -21,7 +21,7 @@ from orchestrate.store.schema import SCHEMA_VERSION
 from tests.orchestrate.commands.conftest import BAD, BROKEN, DONE, RUNNING, WAITING, Answer, on_both
 from tests.orchestrate.standins import specification
 from tests.orchestrate.store.databases import execute, restored
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, everything, result, run_all
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, everything, result, run_all
 from tests.orchestrate.store.released import restore
 
 Run = Callable[..., Answer]
@@ -237,8 +237,7 @@ class TestPrune:
 
     def test_by_age(self, ended: int, store: Store, command: Run, url: str) -> None:
         moment = utc_text(datetime.now(UTC) - timedelta(days=100))
-        launch = store.begin_launch(LAUNCH)
-        (claim,) = store.claim(launch, store.register(launch, [Spec(99)]).todo)
+        launch, (claim,) = begin(store, Spec(99))
         store.commit(claim, result(99), RUN)
         execute(url, f"UPDATE attempt SET ended = '{moment}' WHERE trial_id = {claim.trial_id}")
         store.end_launch(launch, "done")

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.result import Assessment
-from orchestrate.store import LaunchRecord, Reader, RunRecord, Store
+from orchestrate.store import Claim, LaunchRecord, Reader, RunRecord, Store
 
 Array = npt.NDArray[np.float64]
 
@@ -133,6 +133,12 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def begin(store: Store, *specs: Spec) -> tuple[int, list[Claim]]:
+    """Begin a launch that registers and claims trials; return its number and the claims."""
+    launch = store.begin_launch(LAUNCH)
+    return launch, store.claim(launch, store.register(launch, specs).todo)
+
+
 def run_all(
     url: str,
     *specs: Spec,
@@ -140,8 +146,7 @@ def run_all(
 ) -> None:
     """Write the results of trials into a database, by one launch that ends."""
     with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        claims = store.claim(launch, store.register(launch, specs).todo)
+        launch, claims = begin(store, *specs)
         pairs = zip(claims, specs, strict=True)
         store.commit_many([(claim, make(spec), RUN) for claim, spec in pairs])
         store.end_launch(launch, "done", exit_code=0)

@@ -25,7 +25,7 @@ from orchestrate.store.merge import Source, merge
 from tests.dopt.trials import trial
 from tests.orchestrate.losses import lose
 from tests.orchestrate.store.databases import execute
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, diverged, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, diverged, result
 from tests.orchestrate.store.processes import hear, running
 from tests.waiting import PATIENCE_SECONDS, until
 
@@ -61,8 +61,7 @@ def test_the_lease_is_renewed_while_the_main_thread_does_nothing(
     url: str, open_store: Callable[..., Store], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mine, others = open_store(), open_store()
-    launch = mine.begin_launch(LAUNCH)
-    [claim] = mine.claim(launch, mine.register(launch, [Spec(0)]).todo)
+    launch, (claim,) = begin(mine, Spec(0))
     lose(monkeypatch, ["question", "answer"], ["heartbeat"])
     with Heartbeat(mine, launch, LEASE_SECONDS):
         wait_for_renewals(url)
@@ -72,8 +71,7 @@ def test_the_lease_is_renewed_while_the_main_thread_does_nothing(
 
 def test_without_it_the_trials_are_taken(open_store: Callable[..., Store]) -> None:
     mine, others = open_store(LEASE), open_store(LEASE)
-    launch = mine.begin_launch(LAUNCH)
-    [claim] = mine.claim(launch, mine.register(launch, [Spec(0)]).todo)
+    launch, (claim,) = begin(mine, Spec(0))
     with Heartbeat(mine, launch, LEASE):
         assert [thread.name for thread in threading.enumerate()].count("heartbeat") == 1
     assert "heartbeat" not in [thread.name for thread in threading.enumerate()]
@@ -209,12 +207,10 @@ def test_a_merge_uses_the_traceback_that_a_launch_has_inserted_meanwhile(
 ) -> None:
     other = f"sqlite:///{tmp_path}/other.db"
     with Store.open(other) as filled:
-        launch = filled.begin_launch(LAUNCH)
-        (failed,) = filled.claim(launch, filled.register(launch, [Spec(0)]).todo)
+        launch, (failed,) = begin(filled, Spec(0))
         filled.fail(failed, FAILURE, RUN)
         filled.end_launch(launch, "failed")
-    launch = one.begin_launch(LAUNCH)
-    (claim,) = one.claim(launch, one.register(launch, [Spec(1)]).todo)
+    launch, (claim,) = begin(one, Spec(1))
     read = Source.error
 
     def fail_meanwhile(source: Source, digest: str) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from tests.orchestrate.store.fakes import (
     RUN,
     Spec,
     assessed,
+    begin,
     diverged,
     everything,
     result,
@@ -49,8 +50,7 @@ FAILURE = Failure("ValueError", "no", "Traceback: no")
 def fill(url: str, *specs: Spec, offset: int = 0) -> None:
     """Run trials: of four, one diverges and one fails, and the last one of all stays pending."""
     with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        claims = store.claim(launch, store.register(launch, specs).todo)
+        launch, claims = begin(store, *specs)
         for spec, claim in zip(specs[:-1], claims, strict=False):
             number = spec.seed + offset
             if spec.seed % 4 == 1:
@@ -136,8 +136,7 @@ def test_equal_numbers_are_one_trial_and_others_a_conflict(url: str, other: str)
 def test_times_of_equal_trials_may_differ(url: str, other: str) -> None:
     fill(url, *seeds(0), Spec(99))
     with Store.open(other) as store:
-        launch = store.begin_launch(LAUNCH)
-        (claim,) = store.claim(launch, store.register(launch, seeds(0)).todo)
+        _, (claim,) = begin(store, *seeds(0))
         store.commit(claim, replace(result(0), plan_us=np.ones(7)), replace(RUN, node="there"))
     assert merge(url, other).identical == 1
 
@@ -154,15 +153,13 @@ def test_any_other_number_is_a_conflict(tmp_path: Path, name: str) -> None:
 
 def test_a_result_takes_the_place_of_a_failure_and_not_the_other_way(url: str, other: str) -> None:
     with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        failed, done, waits = store.claim(launch, store.register(launch, seeds(0, 4, 8)).todo)
+        launch, (failed, done, waits) = begin(store, *seeds(0, 4, 8))
         store.fail(failed, FAILURE, RUN)
         store.commit(done, result(4), RUN)
         store.release(launch, [waits.trial_key])
         store.end_launch(launch, "failed")
     with Store.open(other) as store:
-        launch = store.begin_launch(LAUNCH)
-        claims = store.claim(launch, store.register(launch, seeds(0, 4, 8)).todo)
+        launch, claims = begin(store, *seeds(0, 4, 8))
         store.commit(claims[0], result(0), RUN)
         for claim in claims[1:]:
             store.fail(claim, FAILURE, RUN)
@@ -209,8 +206,7 @@ def test_what_a_launch_runs_here_is_left_to_it(
 
 def test_what_runs_there_does_not_run_here(url: str, other: str) -> None:
     with Store.open(other) as store:
-        launch = store.begin_launch(LAUNCH)
-        one, two = store.claim(launch, store.register(launch, seeds(0, 3)).todo)
+        launch, (one, two) = begin(store, *seeds(0, 3))
         store.commit(one, result(0), RUN)
         assert merge(url, other).added == {"done": 1}
         assert _launches(url) == [("lost", None, None)]

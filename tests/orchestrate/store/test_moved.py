@@ -21,7 +21,7 @@ from orchestrate.store.maintenance import vacuum
 from orchestrate.store.merge import merge
 from orchestrate.store.upgrade import upgrade
 from tests.orchestrate.store.databases import file_of
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
 
 SPECS = [Spec(seed) for seed in range(4)]
 DONE = "SELECT seed FROM v_trial WHERE status = 'done' ORDER BY seed"
@@ -124,8 +124,7 @@ def test_what_it_holds_is_saved_and_nothing_else_is_written(
     change: Change, url: str, folder: Path, other: Path
 ) -> None:
     with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        claims = store.claim(launch, store.register(launch, SPECS).todo)
+        _, claims = begin(store, *SPECS)
         assert store.commit(claims[0], result(0), RUN)
         change(folder, other)
         before, others = content(folder), other.read_bytes()
@@ -154,8 +153,7 @@ def test_what_it_holds_is_saved_and_nothing_else_is_written(
 
 def test_a_second_launch_makes_a_new_database_that_stays_whole(url: str, folder: Path) -> None:
     with Store.open(url) as store:
-        launch = store.begin_launch(LAUNCH)
-        claims = store.claim(launch, store.register(launch, SPECS).todo)
+        _, claims = begin(store, *SPECS)
         assert store.commit(claims[0], result(0), RUN)
         renamed(folder, folder)
         with Store.open(url) as second:

@@ -430,13 +430,3 @@ def test_numbers_that_are_not_finite_become_none(numbers: list[float]) -> None:
 def test_times_are_utc_text_that_sorts() -> None:
     east = timezone(timedelta(hours=5, minutes=30))
     assert utc_text(datetime(2026, 1, 1, 5, 30, tzinfo=east)) == "2026-01-01T00:00:00.000000Z"
-
-
-def test_a_launch_keeps_its_provenance(store: Store, reader: Reader) -> None:
-    store.begin_launch(LAUNCH)
-    (row,) = reader.query("SELECT * FROM launch")
-    assert json.loads(row.argv) == list(LAUNCH.argv)
-    assert json.loads(row.overrides) == list(LAUNCH.overrides)
-    assert json.loads(row.versions) == dict(LAUNCH.versions)
-    assert (row.host, row.pid, row.git_commit) == ("here", 17, LAUNCH.git_commit)
-    assert (row.git_dirty, row.git_diff_hash, row.state) == (1, LAUNCH.git_diff_hash, "running")

@@ -25,7 +25,7 @@ from orchestrate.store.backends import base, file_locks, postgresql
 from orchestrate.store.backends.transient_errors import is_transient
 from orchestrate.store.records import Array
 from tests.orchestrate.store.databases import execute, file_of, schema_of
-from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, result
+from tests.orchestrate.store.fakes import LAUNCH, RUN, Spec, begin, result
 from tests.waiting import PATIENCE_SECONDS, until
 
 
@@ -38,8 +38,7 @@ def url(postgresql_url: str) -> str:
 def sleeper(url: str, open_store: Callable[..., Store]) -> tuple[Store, int, Claim]:
     """Return a launch that claimed a trial and shows no life since, as after SIGSTOP."""
     store = open_store()
-    launch = store.begin_launch(LAUNCH)
-    (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+    launch, (claim,) = begin(store, Spec())
     end_lease(url, launch)
     return store, launch, claim
 
@@ -123,8 +122,7 @@ def without_encoding(server: Engine) -> Iterator[str]:
 
 def test_a_database_without_an_encoding_is_read_and_written(without_encoding: str) -> None:
     with Store.open(without_encoding) as store:
-        launch = store.begin_launch(LAUNCH)
-        (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+        _, (claim,) = begin(store, Spec())
         assert store.commit(claim, result(), RUN)
     with Reader.open(without_encoding) as reader:
         assert [row.status for row in reader.trials(Spec().config_key)] == ["done"]
@@ -138,8 +136,7 @@ def test_a_sleeper_that_sends_its_steps_is_ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     late = open_store()
-    launch = late.begin_launch(LAUNCH)
-    sent, other = late.claim(launch, late.register(launch, [Spec(0), Spec(1)]).todo)
+    launch, (sent, other) = begin(late, Spec(0), Spec(1))
     sends, wakes = threading.Event(), threading.Event()
 
     def asleep(column: Array) -> Iterator[float | None]:

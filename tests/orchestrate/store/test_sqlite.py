@@ -28,7 +28,7 @@ from orchestrate.store import (
 from orchestrate.store.backends import sqlite_engine
 from orchestrate.store.backends.sqlite_engine import _is_read_only, read_address
 from orchestrate.store.doctor import examine
-from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, result, run_all
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, result, run_all
 from tests.orchestrate.store.processes import (
     eight_open,
     hear,
@@ -187,8 +187,7 @@ def test_a_group_may_share_a_database(tmp_path: Path) -> None:
 
 
 def test_two_names_of_one_file_share_their_locks(store: Store, path: Path) -> None:
-    launch = store.begin_launch(LAUNCH)
-    (claim,) = store.claim(launch, store.register(launch, [Spec()]).todo)
+    _, (claim,) = begin(store, Spec())
     link = path.parent.parent / "link.db"
     link.symlink_to(path)
     with Store.open(f"sqlite:///{link}") as other:
@@ -534,8 +533,7 @@ def test_a_long_reader_holds_up_nobody_and_the_log_shrinks_afterwards(
     wal = path.with_name("results.db-wal")
     specs = [Spec(seed, horizon=300) for seed in range(120)]
     with Store.open(url) as store, Reader.open(url) as reader:
-        launch = store.begin_launch(LAUNCH)
-        claims = store.claim(launch, store.register(launch, specs).todo)
+        _, claims = begin(store, *specs)
         assert store.commit(claims[0], result(0, 300), RUN)
         with reader.moment() as moment:
             assert len(moment.rows("SELECT * FROM step")) == 300
