@@ -2,37 +2,22 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine, text
 
 from orchestrate.store import Claim, Reader, Store
+from tests.orchestrate.store.databases import new_schema
 from tests.orchestrate.store.fakes import LAUNCH, Spec
 from tests.orchestrate.store.released import VERSIONS, restore
 
 
 @pytest.fixture
-def another_postgresql_url(postgresql_url: str, server: Engine, drop: Callable[[str], None]) -> str:
-    """Return the URL of one more new schema."""
-    schema = f"test_{uuid.uuid4().hex}"
-    with server.begin() as connection:
-        connection.execute(text(f"CREATE SCHEMA {schema}"))
-    drop(schema)
-    return f"{postgresql_url.rpartition('%3D')[0]}%3D{schema}"
-
-
-@pytest.fixture
-def drop(request: pytest.FixtureRequest) -> Iterator[Callable[[str], None]]:
-    """Return a function that has a schema of the server dropped after the test."""
-    names: list[str] = []
-    yield names.append
-    for name in names:
-        if "/" not in name:
-            with request.getfixturevalue("server").begin() as connection:
-                connection.execute(text(f'DROP SCHEMA IF EXISTS "{name}" CASCADE'))
+def another_postgresql_url(request: pytest.FixtureRequest) -> Iterator[str]:
+    """URL of one more new schema."""
+    with new_schema(request) as url:
+        yield url
 
 
 @pytest.fixture

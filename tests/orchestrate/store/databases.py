@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import re
 import subprocess
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from sqlalchemy import Connection, create_engine, text
 from sqlalchemy.engine import make_url
 
@@ -31,6 +35,18 @@ def execute(url: str, sql: str) -> list[tuple[object, ...]]:
         rows = [tuple(row) for row in done] if done.returns_rows else []
     engine.dispose()
     return rows
+
+
+@contextmanager
+def new_schema(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Yield the URL of a new schema on the server, which is dropped afterwards."""
+    server, url = (request.getfixturevalue(name) for name in ("server", "server_url"))
+    schema = f"test_{uuid.uuid4().hex}"
+    with server.begin() as connection:
+        connection.execute(text(f"CREATE SCHEMA {schema}"))
+    yield f"{url}?options=-csearch_path%3D{schema}"
+    with server.begin() as connection:
+        connection.execute(text(f"DROP SCHEMA IF EXISTS {schema} CASCADE"))
 
 
 def restored(copy: Path, url: str) -> str:

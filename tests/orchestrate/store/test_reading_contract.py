@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,44 +23,61 @@ from orchestrate.store import (
     StoreUnavailableError,
 )
 from orchestrate.store.schema import SCHEMA_VERSION
-from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, diverged, result
+from tests.orchestrate.store.databases import new_schema
+from tests.orchestrate.store.fakes import HORIZON, LAUNCH, RUN, Spec, begin, diverged, result
 
 Take = Callable[..., list[Claim]]
 KEY = Spec().config_key
 
 
-@pytest.fixture
-def grid(store: Store, launch: int, take: Take) -> list[Spec]:
+def fill_grid(store: Store) -> None:
     """Of policy random: two done, one diverged, one failed; of policy d_optimal: one waits."""
-    specs = [Spec(seed) for seed in (2, 0, 1, 3)]
-    done, other, bad, failed = take(*specs)
+    launch, (done, other, bad, failed) = begin(store, *map(Spec, (2, 0, 1, 3)))
     store.commit(done, result(2), RUN)
     store.commit(other, result(0), RUN)
     store.commit(bad, diverged(3, seed=1), RUN)
     store.fail(failed, Failure("ValueError", "no", "Traceback"), RUN)
-    waiting = Spec(0, policy="d_optimal", width=None)
-    store.register(launch, [waiting])
-    return [*specs, waiting]
+    store.register(launch, [Spec(0, policy="d_optimal", width=None)])
 
 
-@pytest.mark.usefixtures("grid")
+@pytest.fixture
+def grid(store: Store) -> None:
+    fill_grid(store)
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def shown(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Reader]:
+    """Read the grid in a database that all tests of this module share."""
+    with ExitStack() as stack:
+        if request.param == "sqlite":
+            url = f"sqlite:///{tmp_path_factory.mktemp('shown')}/results.db"
+        else:
+            url = stack.enter_context(new_schema(request))
+        with Store.open(url) as store:
+            fill_grid(store)
+            yield stack.enter_context(Reader.open(url))
+
+
 class TestReader:
-    def test_counts_the_trials_of_each_config(self, reader: Reader) -> None:
-        first, second = reader.configs()
+    def test_counts_the_trials_of_each_config(self, shown: Reader) -> None:
+        first, second = shown.configs()
         assert (first.policy, first.width, first.n, first.n_pending) == ("d_optimal", None, 1, 1)
         assert (second.policy, second.config_key, second.n) == ("random", KEY, 4)
         assert (second.n_done, second.n_diverged, second.n_failed) == (2, 1, 1)
         assert (second.horizon, second.dt, second.gamma) == (HORIZON, 0.01, 1.5)
         assert second.config == Spec().columns()
 
-    def test_sorts_curves_by_seed(self, reader: Reader) -> None:
-        curves = reader.curves(KEY)
+    def test_sorts_curves_by_seed(self, shown: Reader) -> None:
+        curves = shown.curves(KEY)
         np.testing.assert_array_equal(curves.seeds, np.array([0, 1, 2]), strict=True)
         np.testing.assert_array_equal(curves.t, np.arange(HORIZON), strict=True)
         np.testing.assert_array_equal(curves.diverged, [False, True, False], strict=False)
         expected = [result(0).loss, diverged(3, seed=1).loss, result(2).loss]
         np.testing.assert_array_equal(curves.values, expected)
 
+    @pytest.mark.usefixtures("grid")
     @pytest.mark.parametrize(
         "damage", ["DELETE FROM step WHERE t = 2", "UPDATE step SET t = 99 WHERE t = 2"]
     )
@@ -72,42 +90,41 @@ class TestReader:
         with pytest.raises(StoreUnavailableError, match=r"18 steps instead of 21.*doctor"):
             reader.curves(KEY)
 
-    def test_has_no_curves_of_trials_that_wait(self, reader: Reader) -> None:
-        curves = reader.curves(Spec(policy="d_optimal", width=None).config_key)
+    def test_has_no_curves_of_trials_that_wait(self, shown: Reader) -> None:
+        curves = shown.curves(Spec(policy="d_optimal", width=None).config_key)
         assert curves.values.shape == (0, HORIZON)
 
-    def test_lists_trials_by_seed(self, reader: Reader) -> None:
-        rows = reader.trials(KEY)
+    def test_lists_trials_by_seed(self, shown: Reader) -> None:
+        rows = shown.trials(KEY)
         assert [row.seed for row in rows] == [0, 1, 2, 3]
         assert [row.status for row in rows] == ["done", "diverged", "done", "failed"]
         assert rows[0].trial_key == Spec(0).trial_key
-        assert reader.trials("0" * 64) == []
+        assert shown.trials("0" * 64) == []
 
-    def test_names_the_nearest_column(self, reader: Reader) -> None:
+    def test_names_the_nearest_column(self, shown: Reader) -> None:
         with pytest.raises(QueryError, match="did you mean 'reachable_loss'"):
-            reader.curves(KEY, "reachable")
+            shown.curves(KEY, "reachable")
 
-    def test_says_what_is_not_there(self, reader: Reader) -> None:
+    def test_says_what_is_not_there(self, shown: Reader) -> None:
         with pytest.raises(QueryError, match="not in the database"):
-            reader.curves("0" * 64)
+            shown.curves("0" * 64)
         with pytest.raises(QueryError, match="no trajectory of seed 3"):
-            reader.trajectory(KEY, 3)
+            shown.trajectory(KEY, 3)
 
-    def test_answers_questions_in_sql(self, reader: Reader) -> None:
-        (row,) = reader.query(
+    def test_answers_questions_in_sql(self, shown: Reader) -> None:
+        (row,) = shown.query(
             "SELECT policy, n_pending FROM v_progress WHERE env LIKE 'pend%'"
             " AND policy = 'd_optimal' AND env <> ':x'"
         )
         assert (row.policy, row[1]) == ("d_optimal", 1)
         with pytest.raises(QueryError, match="nowhere"):
-            reader.query("SELECT * FROM nowhere")
+            shown.query("SELECT * FROM nowhere")
 
 
-@pytest.mark.usefixtures("grid")
 class TestViews:
-    def test_statistics_of_curves(self, reader: Reader) -> None:
-        losses = reader.curves(KEY).values
-        rows = reader.query(
+    def test_statistics_of_curves(self, shown: Reader) -> None:
+        losses = shown.curves(KEY).values
+        rows = shown.query(
             "SELECT t, n, n_finite, mean, standard_error FROM v_curve_stats "
             "WHERE policy = 'random' ORDER BY t"
         )
@@ -119,19 +136,19 @@ class TestViews:
             assert math.isclose(row.standard_error, expected, rel_tol=1e-9)
         assert len(rows) == HORIZON
 
-    def test_curve(self, reader: Reader) -> None:
-        rows = reader.query(
+    def test_curve(self, shown: Reader) -> None:
+        rows = shown.query(
             "SELECT env, policy, width, seed, t, loss FROM v_curve WHERE seed = 2 ORDER BY t"
         )
         assert [tuple(row) for row in rows] == [
             ("pendulum", "random", 16, 2, t, loss) for t, loss in enumerate(result(2).loss)
         ]
 
-    def test_trial_and_progress_and_failures(self, reader: Reader) -> None:
-        assert len(reader.query("SELECT * FROM v_trial")) == 5
-        (row,) = reader.query("SELECT * FROM v_progress WHERE policy = 'random'")
+    def test_trial_and_progress_and_failures(self, shown: Reader) -> None:
+        assert len(shown.query("SELECT * FROM v_trial")) == 5
+        (row,) = shown.query("SELECT * FROM v_progress WHERE policy = 'random'")
         assert (row.n, row.n_done, row.n_diverged, row.n_failed, row.n_running) == (4, 2, 1, 1, 0)
-        (failure,) = reader.query("SELECT seed, type, status FROM v_failures")
+        (failure,) = shown.query("SELECT seed, type, status FROM v_failures")
         assert tuple(failure) == (3, "ValueError", "failed")
 
     def test_one_seed_has_no_standard_error(self, store: Store, take: Take, reader: Reader) -> None:
