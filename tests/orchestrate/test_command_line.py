@@ -313,7 +313,7 @@ def test_a_defect_of_the_program_is_not_taken_for_failed_trials(
     assert "report it" in errors.splitlines()[-1]
     assert "secret" not in errors
     with Reader.open(url) as reader:
-        assert reader.query("SELECT state, exit_code FROM launch")[0] == ("failed", 70)
+        assert reader.rows("SELECT state, exit_code FROM launch")[0] == ("failed", 70)
 
 
 def test_a_single_trial_that_is_interrupted_before_its_start_says_so(
@@ -417,7 +417,7 @@ def test_a_grid_goes_on_when_its_output_is_closed(tmp_path: Path, worker: bool) 
         assert "rror" not in process.stderr.read()
     assert process.returncode == 0
     with Reader.open(url) as reader:
-        rows = reader.query("SELECT count(*) FROM trial WHERE status = 'done'")
+        rows = reader.rows("SELECT count(*) FROM trial WHERE status = 'done'")
         assert [tuple(row) for row in rows] == [(2,)]
 
 

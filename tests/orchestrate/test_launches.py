@@ -106,7 +106,7 @@ def launched(folder: Path, executor: str, trials: Grid) -> str:
 def rows(url: str) -> list[tuple[object, ...]]:
     with Reader.open(url) as reader:
         sql = "SELECT seed, t, measure, value FROM v_assessment ORDER BY seed, t, measure"
-        return [tuple(row) for row in reader.query(sql)]
+        return [tuple(row) for row in reader.rows(sql)]
 
 
 def test_the_rows_do_not_depend_on_the_executor(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def launch_share(command_line: Launch, tmp_path: Path) -> Callable[..., str]:
 
 def trials(url: str) -> list[tuple[object, ...]]:
     with Reader.open(url) as reader:
-        return sorted(map(tuple, reader.query("SELECT trial_key, final_loss, status FROM trial")))
+        return sorted(map(tuple, reader.rows("SELECT trial_key, final_loss, status FROM trial")))
 
 
 def test_merged_shares_are_the_rows_of_one_database(

@@ -324,7 +324,7 @@ class TestVacuum:
 
 def statuses(url: str) -> dict[str, str]:
     with Reader.open(url) as reader:
-        return {row[0]: row[1] for row in reader.query("SELECT trial_key, status FROM trial")}
+        return {row[0]: row[1] for row in reader.rows("SELECT trial_key, status FROM trial")}
 
 
 @on_both

@@ -146,7 +146,7 @@ def test_a_refused_job_leaves_the_grid_registered(
     assert (given, errors.count("\n")) == (code, 1)
     assert f"sbatch takes no job ({reason}), but the grid is registered" in errors
     with Reader.open(f"sqlite:///{cluster}/results/results.db") as reader:
-        assert reader.query("SELECT count(*) FROM trial WHERE status = 'pending'")[0][0] == 10
+        assert reader.rows("SELECT count(*) FROM trial WHERE status = 'pending'")[0][0] == 10
 
 
 def test_a_folder_that_cannot_be_made_is_named(command_line: CommandLine, cluster: Path) -> None:

@@ -75,7 +75,7 @@ def launched_here(url: str) -> int:
 def done(url: str) -> int:
     try:
         with Reader.open(url) as reader:
-            return int(reader.query("SELECT count(*) FROM trial WHERE status = 'done'")[0][0])
+            return int(reader.rows("SELECT count(*) FROM trial WHERE status = 'done'")[0][0])
     except (NoDatabaseError, StoreError):
         return 0
 

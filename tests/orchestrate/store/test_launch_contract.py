@@ -32,9 +32,9 @@ class TestRegistration:
     def test_again_changes_nothing(self, store: Store, launch: int, reader: Reader) -> None:
         specs = [Spec(seed, policy=policy) for policy in ("a", "b") for seed in range(3)]
         first = store.register(launch, iter(specs))
-        rows = reader.query("SELECT * FROM trial ORDER BY trial_id")
+        rows = reader.rows("SELECT * FROM trial ORDER BY trial_id")
         assert store.register(launch, specs) == first
-        assert reader.query("SELECT * FROM trial ORDER BY trial_id") == rows
+        assert reader.rows("SELECT * FROM trial ORDER BY trial_id") == rows
 
     def test_counts_every_status(self, store: Store, launch: int, take: Take) -> None:
         specs = [Spec(seed) for seed in range(5)]
@@ -52,7 +52,7 @@ class TestRegistration:
     def test_takes_numpy_integers(self, store: Store, launch: int, reader: Reader) -> None:
         spec = Spec(np.int64(3), width=np.int64(8))  # type: ignore[arg-type]
         store.register(launch, [spec])
-        (row,) = reader.query("SELECT seed, width FROM v_trial WHERE seed = 3 AND width = 8")
+        (row,) = reader.rows("SELECT seed, width FROM v_trial WHERE seed = 3 AND width = 8")
         assert tuple(row) == (3, 8)
 
     def test_of_an_empty_grid(self, store: Store, launch: int) -> None:
@@ -69,7 +69,7 @@ class TestRegistration:
         message = r"policy is of the class __main__\.Held of a notebook, .*: put it into a file"
         with pytest.raises(SpecificationError, match=message):
             store.register(launch, [Spec(1), Typed(1)])
-        assert reader.query("SELECT * FROM trial") == []
+        assert reader.rows("SELECT * FROM trial") == []
 
     def test_refuses_a_configuration_without_its_columns(self, store: Store, launch: int) -> None:
         class Incomplete(Spec):
@@ -111,9 +111,9 @@ class TestClaims:
     ) -> None:
         take(Spec())
         store.end_launch(launch, "interrupted")
-        (row,) = reader.query("SELECT state, ended IS NOT NULL FROM launch")
+        (row,) = reader.rows("SELECT state, ended IS NOT NULL FROM launch")
         assert tuple(row) == ("interrupted", True)
-        (row,) = reader.query(
+        (row,) = reader.rows(
             "SELECT r.status, a.outcome FROM trial r JOIN attempt a USING (trial_id)"
         )
         assert tuple(row) == ("pending", "released")
@@ -141,7 +141,7 @@ class TestRecovery:
         store.fail(failed, FAILURE, RUN)
         store.end_launch(launch, "done")
         assert store.recover() == 0
-        assert [tuple(r) for r in reader.query("SELECT status FROM trial ORDER BY seed")] == [
+        assert [tuple(r) for r in reader.rows("SELECT status FROM trial ORDER BY seed")] == [
             ("done",),
             ("failed",),
         ]
@@ -167,9 +167,9 @@ class TestRetry:
         kept = tuple(row for row in assessed().assessments if row.t == 0)
         store.commit(claim, replace(diverged(2), assessments=kept), RUN)
         store.retry("diverged")
-        assert reader.query("SELECT * FROM assessment") == []
-        assert reader.query("SELECT * FROM step") == []
-        assert reader.query("SELECT * FROM trajectory") == []
+        assert reader.rows("SELECT * FROM assessment") == []
+        assert reader.rows("SELECT * FROM step") == []
+        assert reader.rows("SELECT * FROM trajectory") == []
         (again,) = take(Spec())
         assert store.commit(again, result(), RUN)
         (row,) = reader.trials(Spec().config_key)

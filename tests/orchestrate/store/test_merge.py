@@ -111,7 +111,7 @@ def test_numbers_are_given_again(url: str, other: str) -> None:
         uniform = Spec(policy="uniform").config_key
         np.testing.assert_array_equal(reader.curves(uniform).values[0], result(0).loss)
         np.testing.assert_array_equal(reader.trajectory(KEY, 0).states, result(0).states)
-        failures = reader.query("SELECT seed, policy FROM v_failures ORDER BY seed")
+        failures = reader.rows("SELECT seed, policy FROM v_failures ORDER BY seed")
         assert [tuple(row) for row in failures] == [(2, "uniform"), (10, "random")]
     with Store.open(url) as store:
         fresh = store.begin_launch(LAUNCH)
@@ -170,7 +170,7 @@ def test_a_result_takes_the_place_of_a_failure_and_not_the_other_way(url: str, o
         rows = reader.trials(KEY)
         assert [row.status for row in rows] == ["done", "done", "failed"]
         assert [row.error_type for row in rows] == [None, None, "ValueError"]
-        attempts = reader.query(
+        attempts = reader.rows(
             "SELECT seed, a.attempt, outcome FROM attempt a JOIN trial r ON r.trial_id = a.trial_id"
             " ORDER BY seed, a.attempt"
         )
@@ -220,7 +220,7 @@ def test_what_runs_there_does_not_run_here(url: str, other: str) -> None:
 
 def _launches(url: str) -> list[tuple[object, ...]]:
     with Reader.open(url) as reader:
-        return [tuple(row) for row in reader.query("SELECT state, ended, exit_code FROM launch")]
+        return [tuple(row) for row in reader.rows("SELECT state, ended, exit_code FROM launch")]
 
 
 @pytest.mark.parametrize(
@@ -232,7 +232,7 @@ def test_only_whole_trials_come(url: str, other: str, damage: str) -> None:
     found = merge(url, other)
     assert [one.trial_key for one in found.incomplete] == [Spec(0).trial_key]
     with Reader.open(url) as reader:
-        assert reader.query("SELECT * FROM trial") == []
+        assert reader.rows("SELECT * FROM trial") == []
 
 
 def test_a_merge_that_was_killed_is_completed(
@@ -244,7 +244,7 @@ def test_a_merge_that_was_killed_is_completed(
         assert hear(pipe) == "in the middle"
         kill(process)
     with Reader.open(url) as reader:
-        assert len(reader.query("SELECT * FROM trial")) == 6
+        assert len(reader.rows("SELECT * FROM trial")) == 6
     found = merge(url, other)
     assert sum(found.added.values()) == 6
     assert everything(url) == outcomes(other)

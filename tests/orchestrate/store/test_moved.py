@@ -116,7 +116,7 @@ def saved_in(error: BaseException) -> Path:
 
 def done(path: Path) -> list[int]:
     with Reader.open(f"sqlite:///{path}") as reader:
-        return [row.seed for row in reader.query(DONE)]
+        return [row.seed for row in reader.rows(DONE)]
 
 
 @pytest.mark.parametrize("change", CHANGES)

@@ -75,7 +75,7 @@ class TestCommit:
         errors = reader.assessments(Spec().config_key, "error").values
         assert np.isnan(errors[:, 2]).all()
         assert np.isfinite(errors[:, :2]).all()
-        assert reader.query("SELECT count(*) FROM assessment WHERE value IS NULL") == [(2,)]
+        assert reader.rows("SELECT count(*) FROM assessment WHERE value IS NULL") == [(2,)]
         assert reader.measures(Spec().config_key) == ["cost", "error"]
         assert reader.assessments(Spec().config_key, "nothing").values.shape == (0, 0)
 
@@ -93,7 +93,7 @@ class TestCommit:
         sent = replace(assessed(), assessments=(*assessed().assessments, row))
         with pytest.raises(InvalidResultError, match=words):
             store.commit(claim, sent, RUN)
-        assert reader.query("SELECT * FROM assessment") == []
+        assert reader.rows("SELECT * FROM assessment") == []
 
     def test_writes_no_assessment_without_its_claim(
         self, store: Store, launch: int, take: Take, reader: Reader
@@ -101,7 +101,7 @@ class TestCommit:
         (claim,) = take(Spec())
         store.release(launch)
         assert not store.commit(claim, assessed(), RUN)
-        assert reader.query("SELECT * FROM assessment") == []
+        assert reader.rows("SELECT * FROM assessment") == []
 
     @pytest.mark.parametrize("horizon", [1, 99, 100, 101, 250])
     def test_numbers_the_steps(
@@ -110,7 +110,7 @@ class TestCommit:
         (claim,) = take(Spec(horizon=horizon))
         sent = result(horizon=horizon)
         store.commit(claim, sent, RUN)
-        rows = reader.query("SELECT t, evaluate_us FROM step ORDER BY t")
+        rows = reader.rows("SELECT t, evaluate_us FROM step ORDER BY t")
         assert [row.t for row in rows] == list(range(horizon))
         assert [row.evaluate_us for row in rows] == sent.evaluate_us.tolist()
 
@@ -132,8 +132,8 @@ class TestCommit:
         assert (row.final_loss, row.best_loss) == (sent.final_loss, sent.best_loss)
         assert (row.wall_seconds, row.cpu_seconds) == (RUN.wall_seconds, RUN.cpu_seconds)
         assert (row.peak_memory_bytes, row.node, row.launch) == (2**33, "here", launch)
-        assert reader.query("SELECT owner FROM trial")[0].owner is None
-        (attempt,) = reader.query("SELECT outcome, pid, started, launch_id FROM attempt")
+        assert reader.rows("SELECT owner FROM trial")[0].owner is None
+        (attempt,) = reader.rows("SELECT outcome, pid, started, launch_id FROM attempt")
         assert tuple(attempt) == ("done", 18, "2126-01-31T12:00:00.000250Z", launch)
 
     @pytest.mark.parametrize("fate", ["done", "failed", "released", "lost", "saved"])
@@ -156,9 +156,9 @@ class TestCommit:
             store.release(launch)
             assert store.save(launch, Spec(), result(), RUN)
         store.end_launch(launch, "lost" if fate == "lost" else "done")
-        for row in reader.query("SELECT claimed, started, ended FROM attempt"):
+        for row in reader.rows("SELECT claimed, started, ended FROM attempt"):
             assert row.claimed <= (row.started or row.claimed) <= row.ended
-        (row,) = reader.query("SELECT started, ended FROM launch")
+        (row,) = reader.rows("SELECT started, ended FROM launch")
         assert row.started <= row.ended
 
     def test_keeps_a_divergence_as_null(self, store: Store, take: Take, reader: Reader) -> None:
@@ -179,7 +179,7 @@ class TestCommit:
         sent = replace(diverged(3), diverged_at=np.int64(3), n_steps=np.int32(3))  # type: ignore[arg-type]
         run = replace(RUN, pid=np.int64(1), peak_memory_bytes=np.int64(5))  # type: ignore[arg-type]
         assert store.commit(claim, sent, run)
-        (row,) = reader.query("SELECT seed FROM trial WHERE diverged_at = 3 AND n_steps = 3")
+        (row,) = reader.rows("SELECT seed FROM trial WHERE diverged_at = 3 AND n_steps = 3")
         assert row.seed == 0
 
     def test_of_many_is_one_for_each(self, store: Store, take: Take, reader: Reader) -> None:
@@ -208,7 +208,7 @@ class TestFence:
         owner = launch if again == "same launch" else store.begin_launch(LAUNCH)
         (claim,) = store.claim(owner, [late.trial_key])
         assert not store.commit(late, result(1), RUN)
-        assert reader.query("SELECT * FROM step") == []
+        assert reader.rows("SELECT * FROM step") == []
         assert store.commit(claim, result(2), RUN)
         np.testing.assert_array_equal(reader.curves(Spec().config_key).values[0], result(2).loss)
 
@@ -218,7 +218,7 @@ class TestFence:
         (late,) = take(Spec())
         store.release(launch)
         assert not store.fail(late, Failure("E", "m", "t"), RUN)
-        assert reader.query("SELECT * FROM error") == []
+        assert reader.rows("SELECT * FROM error") == []
         assert reader.trials(Spec().config_key)[0].status == "pending"
 
     def test_refuses_a_claim_of_somebody_else(self, store: Store, take: Take) -> None:
@@ -267,8 +267,8 @@ class TestFailure:
     ) -> None:
         for claim in take(*(Spec(seed) for seed in range(3))):
             assert store.fail(claim, Failure("ValueError", "no", "Traceback", "timeout"), RUN)
-        assert len(reader.query("SELECT * FROM error")) == 1
-        rows = reader.query("SELECT seed, cause, type, message, traceback FROM v_failures")
+        assert len(reader.rows("SELECT * FROM error")) == 1
+        rows = reader.rows("SELECT seed, cause, type, message, traceback FROM v_failures")
         assert sorted(tuple(row) for row in rows) == [
             (seed, "timeout", "ValueError", "no", "Traceback") for seed in range(3)
         ]
@@ -283,16 +283,16 @@ class TestFailure:
         store.retry("failed")
         (again,) = take(Spec())
         store.commit(again, result(), RUN)
-        rows = reader.query("SELECT attempt, outcome FROM attempt ORDER BY attempt")
+        rows = reader.rows("SELECT attempt, outcome FROM attempt ORDER BY attempt")
         assert [tuple(row) for row in rows] == [(1, "failed"), (2, "done")]
-        assert reader.query("SELECT status FROM v_failures")[0].status == "done"
+        assert reader.rows("SELECT status FROM v_failures")[0].status == "done"
         assert reader.trials(Spec().config_key)[0].error_type is None
 
     def test_may_say_what_no_database_takes(self, store: Store, take: Take, reader: Reader) -> None:
         (claim,) = take(Spec())
         text = "a zero \0 and the name of a file, \udcff"
         assert store.fail(claim, Failure("OSError", text, f"Traceback\n{text}"), RUN)
-        (row,) = reader.query("SELECT message, traceback FROM v_failures")
+        (row,) = reader.rows("SELECT message, traceback FROM v_failures")
         assert row.message == r"a zero \x00 and the name of a file, \udcff"
         assert row.traceback == f"Traceback\n{row.message}"
 

@@ -61,9 +61,9 @@ def test_claims_are_free_after_the_lease(
     late, launch, claim = sleeper
     assert store.recover() == 1
     assert not late.commit(claim, result(), RUN)
-    assert reader.query("SELECT state FROM launch")[0].state == "lost"
+    assert reader.rows("SELECT state FROM launch")[0].state == "lost"
     late.heartbeat(launch)
-    assert reader.query("SELECT state, ended FROM launch")[0].state == "running"
+    assert reader.rows("SELECT state, ended FROM launch")[0].state == "running"
 
 
 def test_a_heartbeat_renews_the_lease(store: Store, sleeper: tuple[Store, int, Claim]) -> None:
@@ -161,7 +161,7 @@ def test_a_sleeper_that_sends_its_steps_is_ended(
     assert freed == 2
     assert not late.commit(sent, result(), RUN)
     assert not late.commit(other, result(1), RUN)
-    rows = reader.query("SELECT outcome FROM attempt")
+    rows = reader.rows("SELECT outcome FROM attempt")
     assert [tuple(row) for row in rows] == [("lost",), ("lost",)]
 
 

@@ -42,7 +42,7 @@ def _recover_from_the_dead(store: Store, url: str, but: int = 0) -> int:
 
 def _is_whole(reader: Reader) -> bool:
     """Return True if each finished trial has all of its rows, and every other one no row."""
-    rows = reader.query(
+    rows = reader.rows(
         "SELECT r.status IN ('done', 'diverged') AS finished, "
         "(SELECT count(*) FROM step s WHERE s.trial_id = r.trial_id) AS steps, "
         "(SELECT count(*) FROM trajectory p WHERE p.trial_id = r.trial_id) AS arrays FROM trial r"
@@ -67,7 +67,7 @@ def test_two_launches_share_a_grid(url: str) -> None:
     assert sum(shares) == n
     with Reader.open(url) as reader:
         assert _is_whole(reader)
-        assert len(reader.query("SELECT * FROM attempt")) == n
+        assert len(reader.rows("SELECT * FROM attempt")) == n
 
 
 def test_death_in_a_commit_leaves_no_partial_curve(store: Store, reader: Reader, url: str) -> None:
@@ -77,7 +77,7 @@ def test_death_in_a_commit_leaves_no_partial_curve(store: Store, reader: Reader,
     assert _is_whole(reader)
     assert _recover_from_the_dead(store, url) == 1
     assert [row.status for row in reader.trials(KEY)] == ["done", "pending"]
-    (attempt,) = reader.query("SELECT outcome FROM attempt a WHERE outcome <> 'done'")
+    (attempt,) = reader.rows("SELECT outcome FROM attempt a WHERE outcome <> 'done'")
     assert attempt.outcome == "lost"
     launch = store.begin_launch(LAUNCH)
     (claim,) = store.claim(launch, [Spec(1).trial_key])

@@ -124,7 +124,7 @@ class TestReader:
 class TestViews:
     def test_statistics_of_curves(self, shown: Reader) -> None:
         losses = shown.curves(KEY).values
-        rows = shown.query(
+        rows = shown.rows(
             "SELECT t, n, n_finite, mean, standard_error FROM v_curve_stats "
             "WHERE policy = 'random' ORDER BY t"
         )
@@ -137,7 +137,7 @@ class TestViews:
         assert len(rows) == HORIZON
 
     def test_curve(self, shown: Reader) -> None:
-        rows = shown.query(
+        rows = shown.rows(
             "SELECT env, policy, width, seed, t, loss FROM v_curve WHERE seed = 2 ORDER BY t"
         )
         assert [tuple(row) for row in rows] == [
@@ -145,16 +145,16 @@ class TestViews:
         ]
 
     def test_trial_and_progress_and_failures(self, shown: Reader) -> None:
-        assert len(shown.query("SELECT * FROM v_trial")) == 5
-        (row,) = shown.query("SELECT * FROM v_progress WHERE policy = 'random'")
+        assert len(shown.rows("SELECT * FROM v_trial")) == 5
+        (row,) = shown.rows("SELECT * FROM v_progress WHERE policy = 'random'")
         assert (row.n, row.n_done, row.n_diverged, row.n_failed, row.n_running) == (4, 2, 1, 1, 0)
-        (failure,) = shown.query("SELECT seed, type, status FROM v_failures")
+        (failure,) = shown.rows("SELECT seed, type, status FROM v_failures")
         assert tuple(failure) == (3, "ValueError", "failed")
 
     def test_one_seed_has_no_standard_error(self, store: Store, take: Take, reader: Reader) -> None:
         (claim,) = take(Spec(0, policy="uniform"))
         store.commit(claim, result(), RUN)
-        (row,) = reader.query(
+        (row,) = reader.rows(
             "SELECT n_finite, standard_error FROM v_curve_stats WHERE policy='uniform' AND t=0"
         )
         assert tuple(row) == (1, None)
@@ -166,7 +166,7 @@ class TestViews:
             loss = result().loss.copy()
             loss[2] = 1e200
             store.commit(claim, replace(result(), loss=loss), RUN)
-        rows = reader.query(
+        rows = reader.rows(
             "SELECT mean, standard_error FROM v_curve_stats WHERE policy = 'uniform' ORDER BY t"
         )
         assert math.isclose(rows[2].mean, 1e200)
@@ -175,7 +175,7 @@ class TestViews:
     def test_equal_curves_have_no_error(self, store: Store, take: Take, reader: Reader) -> None:
         for claim in take(*(Spec(seed, policy="uniform") for seed in range(3))):
             store.commit(claim, result(5), RUN)
-        rows = reader.query("SELECT standard_error FROM v_curve_stats WHERE policy = 'uniform'")
+        rows = reader.rows("SELECT standard_error FROM v_curve_stats WHERE policy = 'uniform'")
         np.testing.assert_allclose([row[0] for row in rows], 0.0, atol=1e-8)
 
 

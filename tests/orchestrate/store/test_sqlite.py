@@ -128,7 +128,7 @@ def test_a_closed_store_counts_as_dead(store: Store, url: str) -> None:
         assert store.recover() == 0
     assert store.recover() == 1
     with Reader.open(url) as reader:
-        assert reader.query("SELECT state FROM launch")[0].state == "lost"
+        assert reader.rows("SELECT state FROM launch")[0].state == "lost"
 
 
 def test_locks_of_launches_that_ended_are_cleared_away(store: Store, path: Path) -> None:
@@ -253,7 +253,7 @@ def test_a_full_disk_loses_nothing_committed(
         driver.execute(f"PRAGMA max_page_count = {pages}")
     with pytest.raises(StoreUnavailableError, match="disk is full"):
         store.commit(two, result(horizon=5_000), RUN)
-    assert len(reader.query("SELECT * FROM trajectory")) == 1
+    assert len(reader.rows("SELECT * FROM trajectory")) == 1
     with store._backend.engine.connect() as connection:
         connection.connection.driver_connection.execute("PRAGMA max_page_count = 1000000")  # type: ignore[union-attr]
     assert store.commit(two, result(horizon=5_000), RUN)
@@ -347,9 +347,9 @@ def _check_prefix_and_complete(url: str, at_most: int) -> int:
     """Return how many trials were left, always the first ones, whole; run the others."""
     with Store.open(url) as store, Reader.open(url) as reader:
         assert [one for one in examine(url) if one.severity == "error"] == []
-        done = len(reader.query("SELECT * FROM trial WHERE status = 'done'"))
+        done = len(reader.rows("SELECT * FROM trial WHERE status = 'done'"))
         assert done <= at_most
-        assert len(reader.query("SELECT * FROM step")) == done * HORIZON
+        assert len(reader.rows("SELECT * FROM step")) == done * HORIZON
         if done:
             assert reader.curves(KEY).seeds.tolist() == list(range(done))
         store.recover()
@@ -543,7 +543,7 @@ def test_a_long_reader_holds_up_nobody_and_the_log_shrinks_afterwards(
             assert wal.stat().st_size > 4 * limit
         _commit(store, claims[-2:])
         assert wal.stat().st_size <= limit + 2 * 300 * 100
-        assert len(reader.query("SELECT * FROM step")) == 120 * 300
+        assert len(reader.rows("SELECT * FROM step")) == 120 * 300
 
 
 def _commit(store: Store, claims: list[Claim]) -> None:

@@ -94,8 +94,8 @@ def _kept(url: str) -> dict[str, tuple[str, ...]]:
 def test_every_configuration_gets_its_label(old: str) -> None:
     upgrade(old)
     with Reader.open(old) as reader:
-        found = [row[0] for row in reader.query("SELECT label FROM config ORDER BY config_id")]
-        shown = {row[0] for row in reader.query("SELECT label FROM v_curve_stats")}
+        found = [row[0] for row in reader.rows("SELECT label FROM config ORDER BY config_id")]
+        shown = {row[0] for row in reader.rows("SELECT label FROM v_curve_stats")}
     assert found == [
         "random, adam, horizon 25, depth 1, width 2",
         "random, adam, γ=30, horizon 25, state_limit=5, depth 1, width 2",
@@ -110,7 +110,7 @@ def test_the_label_of_a_class_that_is_not_known_stays(old: str) -> None:
     execute(old, f"UPDATE config SET config_json = {gone}")
     upgrade(old)
     with Reader.open(old) as reader:
-        found = [row[0] for row in reader.query("SELECT label FROM config ORDER BY config_id")]
+        found = [row[0] for row in reader.rows("SELECT label FROM config ORDER BY config_id")]
     assert found[0] == "random, adam, horizon 25, depth 1, width 2"
     assert found[2] == "stored"
 
@@ -125,7 +125,7 @@ def test_a_launch_goes_on_after_it(old: str) -> None:
         assert store.register(launch, [Spec()]).todo == [Spec().trial_key]
         store.end_launch(launch, "done", exit_code=0)
     with Reader.open(old) as reader:
-        assert reader.query("SELECT exit_code FROM launch ORDER BY launch_id")[3][0] == 0
+        assert reader.rows("SELECT exit_code FROM launch ORDER BY launch_id")[3][0] == 0
 
 
 def test_again_there_is_nothing_to_do(old: str) -> None:
@@ -179,7 +179,7 @@ def test_of_two_at_once_one_finds_nothing_to_do(old: str) -> None:
         pipes = [stack.enter_context(running(upgrade_and_tell, old, barrier))[1] for _ in range(2)]
         assert sorted(hear(pipe) for pipe in pipes) == ["nothing to do", "upgraded"]
     with Reader.open(old) as reader:
-        assert len(reader.query("SELECT * FROM step")) == 125
+        assert len(reader.rows("SELECT * FROM step")) == 125
 
 
 def test_death_in_the_middle_changes_nothing(old: str) -> None:
