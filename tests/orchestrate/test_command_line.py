@@ -394,18 +394,19 @@ def test_every_experiment_is_a_grid(command_line: Command) -> None:
     assert said["beyond"].startswith("learner.forgetting applies to learner=ekf only\n")
 
 
-LAUNCH = [str(ROOT / "orchestrate/launch.py"), "-m", "policy=random", "seed=0,1", *LOCAL]
+GRID = ("-m", "policy=random", "seed=0,1", *SHORT)
 
 
 @pytest.mark.parametrize("worker", [False, True])
-def test_a_grid_goes_on_when_its_output_is_closed(tmp_path: Path, worker: bool) -> None:
+def test_a_grid_goes_on_when_its_output_is_closed(
+    command_line: Command, tmp_path: Path, worker: bool
+) -> None:
     """As by ``| head``."""
     url = f"sqlite:///{tmp_path}/results/results.db"
-    words = LAUNCH
+    words = [str(ROOT / "orchestrate/launch.py"), *GRID]
     if worker:
-        leave = [sys.executable, *LAUNCH, "launch.detach=true"]
-        subprocess.run(leave, cwd=tmp_path, check=True, capture_output=True)
-        words = ["-m", "orchestrate", "work", "--db", url]
+        assert command_line(*GRID, "launch.detach=true")[0] == 0
+        words = ["-m", "orchestrate", "work", "--processes", "1", "--db", url]
     with subprocess.Popen(
         [sys.executable, *words], cwd=tmp_path, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
