@@ -46,15 +46,15 @@ _PLOTS = {
     "figure2_phase_pendulum": ("phase_portraits", "phase_plot", "pendulum"),
     "figure2_phase_cartpole": ("phase_portraits", "phase_plot", "cartpole"),
     "figure2_spectrum": ("input_spectrum", "spectrum_plot", "cartpole"),
-    "figure4_width": ("width", "cost_plot"),
-    "figure4_width_loss": ("width", "loss_against_width_plot"),
-    "figure5_control": ("control", "control_plot"),
-    "figure6_pareto": ("pareto", "pareto_plot"),
-    "figure7_profiles": ("profiles", "profiles_plot"),
-    "figure8_sensitivity": ("sensitivity", "sensitivity_plot"),
-    "figure9_limits": ("limits", "limits_plot"),
+    "figure4_width": ("width", "COST"),
+    "figure4_width_loss": ("width", "LOSS_AGAINST_WIDTH"),
+    "figure5_control": ("control", "CONTROL"),
+    "figure6_pareto": ("pareto", "PARETO"),
+    "figure7_profiles": ("profiles", "PROFILES"),
+    "figure8_sensitivity": ("sensitivity", "SENSITIVITY"),
+    "figure9_limits": ("limits", "LIMITS"),
 }
-"""Module, function and what it shows of each figure, in the order of the page."""
+"""Module, name and subject of each figure, in the order of the page."""
 
 FIGURES = tuple(_PLOTS)
 
@@ -78,10 +78,11 @@ T = TypeVar("T")
 @functools.cache
 def plots() -> dict[str, Plot[Any]]:
     """Return all figures by name, in their order; Matplotlib is loaded by the first call."""
-    return {
-        name: getattr(importlib.import_module(f"analysis.figures.{module}"), make)(name, *shown)
-        for name, (module, make, *shown) in _PLOTS.items()
-    }
+    found = {}
+    for name, (module, kind, *shown) in _PLOTS.items():
+        plot = getattr(importlib.import_module(f"analysis.figures.{module}"), kind)
+        found[name] = plot(*shown) if shown else plot
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +167,7 @@ def _write_output(reader: Reader, task: Task) -> None:
 def _draw(reader: Reader, task: Task) -> dict[str, str]:
     from analysis.figures.panels import styled
 
-    plot, folder = plots()[task.name], task.folder
+    name, plot, folder = task.name, plots()[task.name], task.folder
     with styled():
         drawing = plot.make(reader, task.selection, task.options)
         caption = drawing.caption
@@ -174,9 +175,9 @@ def _draw(reader: Reader, task: Task) -> dict[str, str]:
             warning = partial_warning(task.selection)
             caption = f"{warning} {caption}"
             drawing.figure.suptitle(warning, fontsize=8, color="#b00020", weight="bold")
-        write_pictures(drawing.figure, folder, plot.name, plot.title, task.mark)
-    write_table(drawing.table, folder, plot.name)
-    write_text(caption + "\n", folder / f"{plot.name}.txt")
+        write_pictures(drawing.figure, folder, name, plot.title, task.mark)
+    write_table(drawing.table, folder, name)
+    write_text(caption + "\n", folder / f"{name}.txt")
     return plot.words(task.options) | {"caption": caption}
 
 

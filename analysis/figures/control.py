@@ -38,21 +38,6 @@ TRUTH = {**GUIDE, "lw": 0.6}
 Curves = tuple[ControlCurve, ...]
 
 
-def control_plot(name: str) -> Plot[Curves]:
-    """Return success and cost of control against explored steps, a column for each task."""
-    return Plot(
-        name=name,
-        title="Control with the learned model",
-        statistic="share of successful episodes; geometric mean of the cost by the true model's",
-        band="95 % Wilson interval of the share; 95 % t-interval of the mean logarithm",
-        part=lambda selection, _: control_part(selection),
-        measure=lambda reader, selection, _: measure_control(reader, selection),
-        tabulate=tabulate_control,
-        draw=draw_control,
-        caption=caption_control,
-    )
-
-
 def draw_control(curves: Curves) -> Figure:
     """Draw the share of successes above the relative cost, one column for each environment."""
     environments = list(dict.fromkeys(curve.env for curve in curves))
@@ -133,3 +118,16 @@ def _lost(curves: Curves) -> str:
         "Lost: episodes, after any number of steps, without a finite cost of their own or of the "
         "true model's; they are in the success rate and in no mean of costs. "
     )
+
+
+CONTROL: Plot[Curves] = Plot(
+    title="Control with the learned model",
+    statistic="share of successful episodes; geometric mean of the cost by the true model's",
+    band="95 % Wilson interval of the share; 95 % t-interval of the mean logarithm",
+    part=lambda selection, _: control_part(selection),
+    measure=lambda reader, selection, _: measure_control(reader, selection),
+    tabulate=tabulate_control,
+    draw=draw_control,
+    caption=caption_control,
+)
+"""Success and cost of control against explored steps, a column for each task."""

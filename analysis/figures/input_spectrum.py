@@ -124,10 +124,9 @@ def tabulate_spectra(spectra: InputSpectra) -> pd.DataFrame:
     )
 
 
-def spectrum_plot(name: str, env: str) -> Plot[InputSpectra]:
+def spectrum_plot(env: str) -> Plot[InputSpectra]:
     """Return the spectra of one environment's inputs."""
     return Plot(
-        name=name,
         title=f"Spectral density of the inputs, {environment_title(env)}",
         statistic="mean over trials of the one-sided periodogram (boxcar, no detrending)",
         band="10 % to 90 % quantiles over trials of the D-optimal density",

@@ -235,21 +235,6 @@ def _table(panel: Panel) -> pd.DataFrame:
     return pd.DataFrame(columns | lines)
 
 
-def limits_plot(name: str) -> Plot[Panels]:
-    """Return the bounded states of trials with limits."""
-    return Plot(
-        name=name,
-        title="States with limits, counted only and enforced",
-        statistic="states of single trials; mean over trials of the share of steps beyond a bound",
-        band="± 2 standard errors of the mean share (printed)",
-        part=lambda selection, _: limits_part(selection),
-        measure=lambda reader, selection, _: measure_panels(reader, selection),
-        tabulate=tabulate_panels,
-        draw=draw,
-        caption=caption,
-    )
-
-
 def draw(panels: Panels) -> Figure:
     """Draw a row for each configuration and bounded state, a column for limits of either kind."""
     rows = rows_of(panels)
@@ -337,3 +322,16 @@ def caption(panels: Panels) -> str:
         f"not wrapped. Percentage: steps after which any state is beyond a bound, mean over n "
         f"trials ± 2 standard errors; of a trial that diverged, the steps before."
     )
+
+
+LIMITS: Plot[Panels] = Plot(
+    title="States with limits, counted only and enforced",
+    statistic="states of single trials; mean over trials of the share of steps beyond a bound",
+    band="± 2 standard errors of the mean share (printed)",
+    part=lambda selection, _: limits_part(selection),
+    measure=lambda reader, selection, _: measure_panels(reader, selection),
+    tabulate=tabulate_panels,
+    draw=draw,
+    caption=caption,
+)
+"""Bounded states of trials with limits."""

@@ -51,10 +51,9 @@ _SPREADS = {Spread.BAND: "bands", Spread.ERRORBAR: f"bars at {BARS} steps"}
 Numbers = tuple[str, PlotOptions, tuple[LossCurve, ...]]
 
 
-def loss_plot(name: str, column: str) -> Plot[Numbers]:
+def loss_plot(column: str) -> Plot[Numbers]:
     """Return the figure of one column of losses."""
     return Plot(
-        name=name,
         title=f"Loss curves ({column})",
         statistic=f"{{centre}} over trials of {column} at every step",
         band="{interval}",

@@ -120,7 +120,6 @@ class Plot(Generic[N]):
     stand for what the options ask for.
     """
 
-    name: str
     title: str
     statistic: str
     band: str

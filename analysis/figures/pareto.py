@@ -277,25 +277,6 @@ def _row(point: Point) -> Mapping[str, object]:
 Numbers = tuple[DivergenceRule, Points]
 
 
-def pareto_plot(name: str) -> Plot[Numbers]:
-    """Return final loss against the time of a step, with the Pareto front."""
-    return Plot(
-        name=name,
-        title="Final loss against the time of a step",
-        statistic="geometric mean over trials of the final loss; median over trials of the mean "
-        "microseconds of planning and learning in a step",
-        band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
-        part=lambda selection, _: pareto_part(selection),
-        measure=lambda reader, selection, options: (
-            options.rule,
-            measure_points(reader, selection, options.rule),
-        ),
-        tabulate=lambda numbers: tabulate_points(numbers[1]),
-        draw=lambda numbers: draw(numbers[1]),
-        caption=caption,
-    )
-
-
 def draw(points: Points) -> Figure:
     """Draw a panel for each environment, with a legend of policies and learners below all."""
     environments = list(dict.fromkeys(point.env for point in points))
@@ -472,3 +453,20 @@ def _missing(points: Points) -> str:
     lost = [f"{environment_title(one.env)}, {one.label} ({one.counts})"
             for one in points if not one.known]  # fmt: skip
     return f"No point, as no trial has a positive final loss: {'; '.join(lost)}. " if lost else ""
+
+
+PARETO: Plot[Numbers] = Plot(
+    title="Final loss against the time of a step",
+    statistic="geometric mean over trials of the final loss; median over trials of the mean "
+    "microseconds of planning and learning in a step",
+    band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
+    part=lambda selection, _: pareto_part(selection),
+    measure=lambda reader, selection, options: (
+        options.rule,
+        measure_points(reader, selection, options.rule),
+    ),
+    tabulate=lambda numbers: tabulate_points(numbers[1]),
+    draw=lambda numbers: draw(numbers[1]),
+    caption=caption,
+)
+"""Final loss against the time of a step, with the Pareto front."""

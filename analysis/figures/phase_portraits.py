@@ -147,10 +147,9 @@ def tabulate_portraits(portraits: Portraits) -> pd.DataFrame:
     )
 
 
-def phase_plot(name: str, env: str) -> Plot[Portraits]:
+def phase_plot(env: str) -> Plot[Portraits]:
     """Return the phase portraits of one environment."""
     return Plot(
-        name=name,
         title=f"Phase portraits, {environment_title(env)}",
         statistic=f"one trajectory per policy: {SEED_RULE}; coverage: mean over trials",
         band="± 2 standard errors of the mean coverage (printed)",

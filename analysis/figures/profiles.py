@@ -138,22 +138,6 @@ def _rows(profile: Profile) -> pd.DataFrame:
 Profiles = tuple[Profile, ...]
 
 
-def profiles_plot(name: str) -> Plot[Profiles]:
-    """Return the share of runs within a factor of the reference, against that factor."""
-    return Plot(
-        name=name,
-        title="Performance profiles",
-        statistic="mean over environments of the share of trials whose final loss is within a "
-        "factor of the reference's geometric mean",
-        band="95 % percentile bootstrap, stratified by environment, pointwise",
-        part=lambda selection, _: profiles_part(selection),
-        measure=lambda _, selection, __: measure_profiles(selection),
-        tabulate=tabulate_profiles,
-        draw=draw,
-        caption=caption,
-    )
-
-
 def draw(profiles: Profiles) -> Figure:
     """Draw one panel; the higher a line, the more runs are as good."""
     figure, [[axes]] = sheet(1, 1, HEIGHT, width=TEXT_WIDTH * 0.75)
@@ -195,3 +179,17 @@ def caption(profiles: Profiles) -> str:
         f"{f' In fewer environments: {partial}.' if partial else ''} "
         f"Runs: {count_text(counts)}."
     )
+
+
+PROFILES: Plot[Profiles] = Plot(
+    title="Performance profiles",
+    statistic="mean over environments of the share of trials whose final loss is within a "
+    "factor of the reference's geometric mean",
+    band="95 % percentile bootstrap, stratified by environment, pointwise",
+    part=lambda selection, _: profiles_part(selection),
+    measure=lambda _, selection, __: measure_profiles(selection),
+    tabulate=tabulate_profiles,
+    draw=draw,
+    caption=caption,
+)
+"""Share of runs within a factor of the reference, against that factor."""

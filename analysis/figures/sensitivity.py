@@ -189,21 +189,6 @@ def _rows(line: Line) -> Iterator[dict[str, object]]:
 Lines = tuple[Line, ...]
 
 
-def sensitivity_plot(name: str) -> Plot[Lines]:
-    """Return final loss against λ, the learning rate and the window."""
-    return Plot(
-        name=name,
-        title="Final loss against single settings",
-        statistic="geometric mean over trials of the loss after the last step",
-        band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
-        part=lambda selection, _: sensitivity_part(selection),
-        measure=lambda reader, selection, options: measure_lines(reader, selection, options.rule),
-        tabulate=tabulate_lines,
-        draw=draw,
-        caption=caption,
-    )
-
-
 def draw(lines: Lines) -> Figure:
     """Draw a row for each environment, a column for each setting, a line for each policy."""
     environments, settings, policies = (
@@ -272,3 +257,16 @@ def _counts(lines: Sequence[Line]) -> str:
             words = [] if math.isnan(value) else [value_label(line.setting, value)]
             found[", ".join([policy_title(line.policy), *words])] = scores.describe()
     return count_text(found)
+
+
+SENSITIVITY: Plot[Lines] = Plot(
+    title="Final loss against single settings",
+    statistic="geometric mean over trials of the loss after the last step",
+    band=f"95 % interval of the mean logarithm (BCa bootstrap, {STUDENT_RANGE} trials)",
+    part=lambda selection, _: sensitivity_part(selection),
+    measure=lambda reader, selection, options: measure_lines(reader, selection, options.rule),
+    tabulate=tabulate_lines,
+    draw=draw,
+    caption=caption,
+)
+"""Final loss against λ, the learning rate and the window."""

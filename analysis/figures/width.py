@@ -233,36 +233,6 @@ def tabulate_losses(numbers: WidthLosses) -> pd.DataFrame:
     )
 
 
-def cost_plot(name: str) -> Plot[WidthCosts]:
-    """Return the cost of a step against width."""
-    return Plot(
-        name=name,
-        title="Planning cost against width",
-        statistic="median over steps and trials of the microseconds of each part of a step",
-        band="10 % to 90 % quantiles over steps and trials",
-        part=lambda selection, _: width_part(selection),
-        measure=lambda reader, selection, _: measure_costs(reader, selection),
-        tabulate=tabulate_costs,
-        draw=draw_costs,
-        caption=caption_costs,
-    )
-
-
-def loss_against_width_plot(name: str) -> Plot[WidthLosses]:
-    """Return the final loss against width."""
-    return Plot(
-        name=name,
-        title="Final loss against width",
-        statistic="mean over trials of the loss after the last step",
-        band="± 2 standard errors of the mean",
-        part=lambda selection, _: width_part(selection),
-        measure=lambda reader, selection, options: measure_losses(reader, selection, options.rule),
-        tabulate=tabulate_losses,
-        draw=draw_losses,
-        caption=caption_losses,
-    )
-
-
 def draw_costs(numbers: WidthCosts) -> Figure:
     """Draw every part of a step on logarithmic axes, with the time that a step may take."""
     figure, axes = _axes(HEIGHT, numbers.costs[0].widths)
@@ -347,3 +317,29 @@ def caption_losses(numbers: WidthLosses) -> str:
         f"{environment_title(numbers.env)}: mean over trials ± 2 standard errors. "
         f"Trials by width: {_counts(numbers)}."
     )
+
+
+COST: Plot[WidthCosts] = Plot(
+    title="Planning cost against width",
+    statistic="median over steps and trials of the microseconds of each part of a step",
+    band="10 % to 90 % quantiles over steps and trials",
+    part=lambda selection, _: width_part(selection),
+    measure=lambda reader, selection, _: measure_costs(reader, selection),
+    tabulate=tabulate_costs,
+    draw=draw_costs,
+    caption=caption_costs,
+)
+"""Cost of a step against width."""
+
+
+LOSS_AGAINST_WIDTH: Plot[WidthLosses] = Plot(
+    title="Final loss against width",
+    statistic="mean over trials of the loss after the last step",
+    band="± 2 standard errors of the mean",
+    part=lambda selection, _: width_part(selection),
+    measure=lambda reader, selection, options: measure_losses(reader, selection, options.rule),
+    tabulate=tabulate_losses,
+    draw=draw_losses,
+    caption=caption_losses,
+)
+"""Final loss against width."""

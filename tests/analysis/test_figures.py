@@ -18,10 +18,10 @@ from analysis.figures import pareto as figure6
 from analysis.figures import profiles as figure7
 from analysis.figures import sensitivity as figure8
 from analysis.figures.pareto import (
+    PARETO,
     Point,
     measure_points,
     pareto_part,
-    pareto_plot,
     policies_of,
     policy_colours,
 )
@@ -31,10 +31,10 @@ from analysis.figures.profiles import (
     tabulate_profiles,
 )
 from analysis.figures.sensitivity import (
+    SENSITIVITY,
     Line,
     measure_lines,
     sensitivity_part,
-    sensitivity_plot,
 )
 from analysis.figures.width import (
     exponent,
@@ -192,7 +192,7 @@ def test_two_values_are_too_few(reader: Reader, tmp_path: Path) -> None:
         fill(address, make_grid(("arm",), ("random",), range(2), learner=learner, **SHORT))
     with Reader.open(address) as few:
         assert sensitivity_part(select(few, Filter())).entries == ()
-    plot = sensitivity_plot("name")
+    plot = SENSITIVITY
     part = plot.part(select(reader, Filter()), PlotOptions())
     assert {entry.config.policy for entry in part.entries} == {"random"}
     table = plot.make(reader, part, PlotOptions()).table
@@ -409,7 +409,7 @@ def test_diverged_trials_are_counted_and_said(learners: str) -> None:
     [none] = [one for one in points if (one.env, one.label) == ("quadrotor", "random, adam")]
     assert not none.known
     assert not none.on_front
-    words = pareto_plot("name").caption((DivergenceRule.EXCLUDE, points))
+    words = PARETO.caption((DivergenceRule.EXCLUDE, points))
     assert "No point, as no trial has a positive final loss: quadrotor, random, adam (0/3" in words
     assert "random, adam: 2/3, 1 diverged" in words
     lent = points_of(learners, DivergenceRule.WORST)
@@ -462,7 +462,7 @@ def test_policies_of_one_colour_are_told_apart() -> None:
 
 
 def test_the_paper_s_grid_has_one_too(reader: Reader) -> None:
-    plot = pareto_plot("figure6_pareto")
+    plot = PARETO
     drawing = plot.make(reader, plot.part(select(reader, Filter()), PlotOptions()), PlotOptions())
     assert len(drawing.figure.axes) == 3
     assert "D-optimal, width 64" in set(drawing.table["label"])

@@ -130,7 +130,7 @@ def test_a_line_that_cannot_be_is_explained(folder: Path) -> None:
 
 
 def test_all_portraits_have_the_same_axes(reader: Reader) -> None:
-    plot = phase_plot("phase", "pendulum")
+    plot = phase_plot("pendulum")
     panels = plot.make(
         reader, plot.part(select(reader, Filter()), PlotOptions()), PlotOptions()
     ).figure.axes[:5]
@@ -149,7 +149,7 @@ def test_a_long_title_is_broken_between_counts() -> None:
 
 def test_a_caption_names_only_what_is_drawn(reader: Reader) -> None:
     alone = select(reader, Filter(("cartpole",), ("d_optimal",)))
-    curves, spectrum = loss_plot("figure1", "loss"), spectrum_plot("spectrum", "cartpole")
+    curves, spectrum = loss_plot("loss"), spectrum_plot("cartpole")
     assert "slanted strokes" not in curves.make(reader, alone, PlotOptions()).caption
     assert "in grey" not in spectrum.make(reader, alone, PlotOptions()).caption
     grey = select(reader, Filter(("cartpole",), ("d_optimal", "random")))
