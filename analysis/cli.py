@@ -13,6 +13,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -232,7 +233,7 @@ def _plot_options(options: argparse.Namespace) -> PlotOptions:
         "color_by": ("color_by", None),
         "band": ("band", BandKind),
     }
-    found = {
+    found: dict[str, Any] = {
         field: kind(getattr(options, name)) if kind else getattr(options, name)
         for field, (name, kind) in given.items()
         if name in options

@@ -305,12 +305,12 @@ def control_section(table: pd.DataFrame) -> str:
 
 def _part(env: str, table: Sequence[Row]) -> str:
     """Return two tables of an environment, a row for each variant, columns by explored steps."""
-    rows: dict[str, dict[int, Row]] = {}
+    rows: dict[str, dict[Any, Row]] = {}
     for row in table:
         rows.setdefault(row["variant"], {})[row["t"]] = row
     steps = sorted({row["t"] for row in table})
 
-    def after(t: int, text: Callable[[Row], object]) -> Callable[[Row], object]:
+    def after(t: int, text: Callable[[Row], object]) -> Callable[[Mapping[Any, Row]], object]:
         return lambda row: text(row[t]) if t in row else "–"
 
     success: Columns = (

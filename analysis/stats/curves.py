@@ -209,7 +209,6 @@ def tabulate_curves(curves: Iterable[LossCurve]) -> pd.DataFrame:
     return pd.concat(map(pd.DataFrame, tables), ignore_index=True)
 
 
-Array = npt.NDArray[np.float64]
 QUANTILES = (0.1, 0.9)
 
 
