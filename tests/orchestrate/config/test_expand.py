@@ -126,7 +126,7 @@ def test_each_override_is_read_as_hydra_reads_it(sample: Sample, override: str) 
     same(sample, [override])
 
 
-@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(arguments=command_lines())
 def test_any_mixture_expands_as_by_hydra(sample: Sample, arguments: list[str]) -> None:
     same(sample, arguments)
