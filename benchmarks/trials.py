@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.rows import fixed_seconds
-from dopt.kernel.information.primal import PENDING_ROWS
+from dopt.kernel.linear_algebra import PENDING_ROWS
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec

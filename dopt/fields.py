@@ -292,8 +292,8 @@ def _wrong_type(path: str, value: object, expected: str) -> SpecificationError:
     )
 
 
-PLAN_IN_NUMPY = "dopt.kernel.absent_steps.plan"
-LEARN_IN_NUMPY = "dopt.kernel.absent_steps.learn"
+PLAN_IN_NUMPY = "dopt.kernel.loop.plan_in_numpy"
+LEARN_IN_NUMPY = "dopt.kernel.loop.learn_in_numpy"
 IN_NUMPY = (PLAN_IN_NUMPY, LEARN_IN_NUMPY)
 """Kernel functions of parts that the interpreter runs: they do nothing."""
 

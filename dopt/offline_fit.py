@@ -172,9 +172,9 @@ def fit_offline(
 
     θ₀ are the initial parameters of the trial, from which the fit of a network starts: damped
     Gauss-Newton (Levenberg-Marquardt) steps until the objective stays the same
-    (:mod:`dopt.kernel.offline_fit`). Each network of an ensemble is fitted by itself, from its own
-    θ₀. A model that is linear in its parameters is solved for. Policy and learner of the trial make
-    no difference.
+    (:mod:`dopt.kernel.learners.gauss_newton`). Each network of an ensemble is fitted by itself,
+    from its own θ₀. A model that is linear in its parameters is solved for. Policy and learner of
+    the trial make no difference.
 
     Parameters
     ----------
@@ -296,9 +296,9 @@ def _fit_networks(
 def _fit_network(
     spec: TrialSpec, points: Array, accelerations: Array, initial: Array, ridge: float, most: int
 ) -> tuple[Array, int, bool]:
-    from dopt.kernel.model_from_spec import network_of
-    from dopt.kernel.offline_fit import Problem, fit
+    from dopt.kernel.learners.gauss_newton import Problem, fit
     from dopt.kernel.pointers import compiled_for, kind_of
+    from dopt.kernel.state_from_spec import network_of
 
     network, features = (
         network_of(spec.system, spec.model),

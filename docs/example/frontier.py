@@ -8,8 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.fields import parameter
-from dopt.kernel.policies.prediction import input_columns, predicted_state
-from dopt.kernel.structs import Trial
+from dopt.kernel.plugin import Trial, input_columns, predicted_state
 from dopt.policies.base import Array, CompiledPolicy, CustomPolicy, Planner
 from dopt.systems import System
 from dopt.trial_view import TrialView

@@ -8,9 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from dopt.fields import parameter
-from dopt.kernel.information.update import model_rows
-from dopt.kernel.learners.samples import sampled_point
-from dopt.kernel.structs import Trial
+from dopt.kernel.plugin import Trial, model_rows, sampled_point
 from dopt.learning.base import Array, CompiledLearner, CustomLearner, Updater
 from dopt.systems import System
 from dopt.trial_view import TrialView

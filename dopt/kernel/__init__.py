@@ -32,7 +32,7 @@ def warm_up(everything: bool = False) -> None:
     cache.check_environment()
     if PLAIN or cache.is_complete(MARKS[everything]):
         return
-    from dopt.kernel.compilation import compile_missing
+    from dopt.kernel.cache import compile_missing
     from dopt.kernel.warming import kernel_parts
 
     parts = kernel_parts(everything)

@@ -1,10 +1,9 @@
-"""Cache of compiled code: where it is, what may be done with it, and messages while it is filled.
+"""Disk cache of compiled code: its folder, its files, and the processes that fill it.
 
-Each state of the sources, the libraries and Numba's settings has a folder, which all checkouts
-share. A file begins with a digest of the rest: what a loss of power or a full disk has left damaged
-is dropped, and compiled again. No two signatures share a file, and a file is replaced as a whole,
-so that locks only save work. This module does not import Numba, which takes a second: a launch that
-only wants to know whether there is anything to compile does not pay for it.
+Each part of the kernel is compiled by itself and called through a pointer, so that any process can
+put it into the cache, from which the others load it in seconds. The process that needs a part loads
+it, too: in the process that compiles a part the linker may take a function that it calls from an
+earlier compilation, which can round differently.
 """
 
 from __future__ import annotations
@@ -17,8 +16,10 @@ import logging
 import os
 import pwd
 import shutil
+import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +27,8 @@ from pathlib import Path
 import llvmlite.binding
 
 from dopt.errors import UnusableEnvironmentError, given_path
+from dopt.kernel.plain import PLAIN
+from dopt.process import usable_cores
 
 CACHE_VARIABLE = "DOPT_CACHE"
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -103,7 +106,7 @@ def _cache_folder() -> Path:
 
 
 def _roots() -> list[Path]:
-    """Return the folders in which the cache may be: the one given, or that of each home."""
+    """Return the folders in which the cache may be: the one given, or one in each home."""
     given = os.environ.get(CACHE_VARIABLE) or os.environ.get("XDG_CACHE_HOME")
     if given:
         return [given_path(given, CACHE_VARIABLE).absolute()]
@@ -147,7 +150,7 @@ _log = logging.getLogger("dopt.kernel")
 
 
 def read(name: str) -> bytes | None:
-    """Return the content of a file of the cache; None where there is none, or it was damaged."""
+    """Return the content of a file of the cache; None if it is missing or damaged."""
     try:
         stored = (CACHE_FOLDER / name).read_bytes()
     except OSError:
@@ -206,7 +209,7 @@ def one_compiler_at_a_time(what: str) -> Iterator[None]:
     """Let one process at a time put ``what`` into the cache; once it is there, all read freely.
 
     ``what`` is the name of a function, and what tells its signature from its others after a hyphen.
-    The message goes to the logger ``dopt.kernel``. Its level is that of a warning, which Python
+    The message goes to the logger ``dopt.kernel``. Its level is warning, which Python
     shows on standard error where a program has set up no logging: somebody waits for it.
     """
     name, _, _ = what.partition("-")
@@ -259,3 +262,77 @@ def missing(names: Sequence[str]) -> list[str]:
         for name in marks.keys() & {stem, stem.rpartition("-")[0]}:
             marks[name].append(stem)
     return [name for name in names if not marks[name] or not all(map(is_complete, marks[name]))]
+
+
+ENDS = ("first", "last")
+"""Ends of the list of parts, at which the two processes begin."""
+
+SECONDS_BETWEEN_MESSAGES = {True: 1.0, False: 30.0}
+"""On a terminal, where each message takes the place of the one before, and elsewhere."""
+
+_PROGRAM = "dopt.kernel.warming"
+
+
+def compile_missing(names: Sequence[str]) -> None:
+    """Compile the parts that the cache does not hold, in one process on each of two cores.
+
+    What they could not compile is left to the process that needs it.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of parts of the package, keys of :func:`dopt.kernel.warming.kernel_parts`.
+    """
+    needed = [] if PLAIN else missing(names)
+    if not needed or not can_be_filled():
+        return
+    start, next_message, spoke, over = time.perf_counter(), 0.0, False, False
+    running = [_started(end, needed) for end in ENDS[: usable_cores()]]
+    try:
+        while not over:
+            over = all(process.poll() is not None for process in running)
+            seconds = time.perf_counter() - start
+            if spoke if over else seconds >= next_message:
+                next_message = seconds + SECONDS_BETWEEN_MESSAGES[_on_terminal()]
+                there = len(needed) - len(missing(needed))
+                state = f"{there} of {len(needed)} parts, {seconds:.0f} s"
+                spoke = _said(f"compiling the kernel, {for_whom()}: {state}", last=over)
+            time.sleep(0.0 if over else 0.1)
+    finally:
+        for process in running:
+            process.kill()  # where the wait was broken off; one that has ended stays as it is
+            process.wait()
+
+
+def _said(text: str, *, last: bool) -> bool:
+    """Say it, unless another process does on the same standard error, as workers of a launch."""
+    try:
+        fcntl.lockf(sys.stderr, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if last:
+            fcntl.lockf(sys.stderr, fcntl.LOCK_UN)
+    except BlockingIOError:
+        return False
+    except (OSError, TypeError, ValueError):  # no file, as in a notebook
+        pass
+    if _on_terminal():
+        sys.stderr.write(f"{text}\x1b[K{chr(10) if last else chr(13)}")
+        sys.stderr.flush()
+    else:
+        _log.warning(text)
+    return True
+
+
+def _on_terminal() -> bool:
+    """Return whether messages go to a terminal, and to no handler of the program."""
+    return not _log.hasHandlers() and sys.stderr is not None and sys.stderr.isatty()
+
+
+def _started(end: str, names: Sequence[str]) -> subprocess.Popen[bytes]:
+    place = str(Path(__file__).resolve().parents[2])
+    paths = os.pathsep.join(filter(None, (place, os.environ.get("PYTHONPATH"))))
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", _PROGRAM, end, *names],  # no module of the working folder
+        env=os.environ | {"PYTHONPATH": paths, CACHE_VARIABLE: str(CACHE_FOLDER.parents[1])},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )

@@ -24,9 +24,8 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 
 from dopt.errors import SpecificationError
 from dopt.kernel.cache import errors_of_the_system, one_compiler_at_a_time
-from dopt.kernel.compiler import compilable
+from dopt.kernel.compiler import compilable, stored
 from dopt.kernel.plain import PLAIN
-from dopt.kernel.stored_code import stored
 from dopt.systems import elementary
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox, unknown_accelerations
@@ -68,7 +67,7 @@ def _magnitude(x: NumbaType) -> NumbaType:
 
 
 @overload(elementary.sign, strict=False)
-def _sign(x: NumbaType) -> NumbaType:  # noqa: ARG001  # the signature is that of the function
+def _sign(x: NumbaType) -> NumbaType:  # noqa: ARG001  # the function's signature
     return lambda x: math.nan if math.isnan(x.real) else float((x.real > 0) - (x.real < 0))
 
 
@@ -205,7 +204,7 @@ def _compiled_for(
 ) -> CompiledFunction:
     """Compile ``into`` under a name of its own.
 
-    Numba tells functions of one name apart by a number that starts anew in each process. Two of
+    Numba tells functions of one name apart by a number that restarts in each process. Two of
     them that were cached by different processes, or one cached and one compiled here, would share a
     symbol, and a call of one could run the other. One equation may serve several numbers of states.
     """

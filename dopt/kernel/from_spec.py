@@ -1,4 +1,4 @@
-"""Translation of a trial's specification to the structures of a trial and its constants."""
+"""Translation of a trial's specification to the structures of the trial."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import functools
 import numpy as np
 
 from dopt.algorithm import Form, Integrator, Score, switch_step
+from dopt.kernel import information
 from dopt.kernel import structs as args
 from dopt.kernel.equations import compiled_equations
-from dopt.kernel.evaluation_points import evaluation_points
-from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
-from dopt.kernel.model_from_spec import network_of, network_of_trial
+from dopt.kernel.evaluation import evaluation_points
 from dopt.kernel.state_from_spec import (
     empty_record,
     empty_scratch,
@@ -19,6 +18,8 @@ from dopt.kernel.state_from_spec import (
     held_form,
     initial_state,
     n_learned_parameters,
+    network_of,
+    network_of_trial,
     regularization_of,
 )
 from dopt.limits import Limits
@@ -34,19 +35,24 @@ from dopt.policies import (
 from dopt.policies.held_candidates import HeldCandidates
 from dopt.policies.search import score_code
 from dopt.policies.task_states import box_states, domain_box, task_states
-from dopt.randomness import Draws
+from dopt.randomness import Draws, draw
 from dopt.spec.compatibility import is_fresh
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import delay, differentiated
+from dopt.types import Array
 
-MODULES = {Form.PRIMAL: primal_network, Form.DUAL: dual, Form.SKETCH: sketch}
+FORMS_OF_NETWORKS = {
+    Form.PRIMAL: information.NETWORK,
+    Form.DUAL: information.DUAL,
+    Form.SKETCH: information.SKETCH,
+}
 
 
 @functools.lru_cache(maxsize=64)
 def constants(config: TrialConfig) -> tuple[args.Plant, args.Network, args.Algorithm]:
-    """Return what the trials of a configuration share, but for their evaluation points."""
+    """Return what the trials of a configuration share, without their evaluation points."""
     network = network_of(config.system, config.model)
     return plant_of(config.system), network, algorithm_of(config)
 
@@ -110,15 +116,15 @@ def algorithm_of(config: TrialConfig) -> args.Algorithm:
 def information_of(config: TrialConfig) -> args.Information:
     """Return the functions for the form that holds M, which are compiled when a trial runs."""
     if not isinstance(config.policy, InformationPolicy):
-        return args.Information(absent.add_rows, absent.planning_forms)
+        return information.ABSENT
     network = isinstance(config.model, MLP)
-    module = MODULES[Form(form_of(config))] if network else primal_linear
+    form = FORMS_OF_NETWORKS[Form(form_of(config))] if network else information.OF_OTHER_MODELS
     if is_fresh(config.policy):
-        module = fresh  # which goes with the primal form
+        form = information.FRESH  # which goes with the primal form
     searches = isinstance(config.policy, (Search, ICEM))
     return args.Information(
-        absent.add_rows if config.learner.updates_information else module.add_rows,
-        absent.planning_forms if searches else module.planning_forms,
+        (information.ABSENT if config.learner.updates_information else form).add_rows,
+        (information.ABSENT if searches else form).planning_forms,
     )
 
 
@@ -188,3 +194,37 @@ def randomness_of(spec: TrialSpec, draws: Draws) -> args.Randomness:
     """Return the numbers that a trial has drawn; draws of parameters are of the learned ones."""
     drawn = args.Randomness(*(getattr(draws, name) for name in args.Randomness._fields))
     return drawn._replace(parameters=drawn.parameters[: n_learned_parameters(spec.config)])
+
+
+class KernelState:
+    """Observations and learned parameters of a trial in the compiled kernel.
+
+    Attributes
+    ----------
+    trial : Trial
+        Arguments of the compiled functions.
+    state, record : State, Record
+        Its arrays that they write in place.
+    """
+
+    def __init__(self, spec: TrialSpec) -> None:
+        draws = draw(spec)
+        self.spec, self.trial = spec, trial_of(spec, draws)
+        self.state, self.record = self.trial.state, self.trial.record
+        n_fixed = spec.model.n_fixed_parameters(spec.system)
+        self._fixed = draws.weights[len(draws.weights) - n_fixed :]
+
+    @property
+    def parameters(self) -> Array:
+        """Parameters of the model, (q,), of all members, and those that stay as they were drawn."""
+        if self.state.members.parameters.shape[0] > 0:
+            return self.state.members.parameters.flatten()
+        return np.concatenate([self.state.theta, self._fixed])
+
+    @property
+    def states(self) -> Array:
+        """States x_0 ... x_T, (T + 1, d); NaN where the trial has not come yet.
+
+        Of a simulation they are the true ones.
+        """
+        return self.record.true_states

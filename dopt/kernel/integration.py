@@ -1,8 +1,4 @@
-"""One time step of the truth or of a model with a held input, in compiled code.
-
-Either is taken in stages: one for the Euler map, four for the method of Runge and Kutta. Twin of
-:mod:`dopt.systems.base`.
-"""
+"""Steps of the true system and of the model, and what is observed of them, in compiled code."""
 
 from __future__ import annotations
 
@@ -10,10 +6,9 @@ import numpy as np
 
 from dopt.algorithm import RUNGE_KUTTA_SHARES, RUNGE_KUTTA_WEIGHTS, Integrator
 from dopt.kernel.compiler import compiled, copy_into
-from dopt.kernel.model import model_accelerations
-from dopt.kernel.points import model_point, plant_point
-from dopt.kernel.structs import Network, Plant
-from dopt.types import Vector
+from dopt.kernel.model import model_accelerations, model_point, plant_point, sampled_state
+from dopt.kernel.structs import Network, Plant, Trial
+from dopt.types import Matrix, Vector
 
 
 @compiled
@@ -86,3 +81,102 @@ def next_model_state(
         )
         write_rate(plant, following, u, accelerations, rate)
         add_stage(plant, stage, dt, x, rate, total, following)
+
+
+@compiled
+def observe_euler(trial: Trial, t: int, dt: float, target: Vector) -> None:
+    """Write the accelerations observed from x_t to x_{t+1}, (r,), after dt seconds."""
+    write_difference(trial, t, dt, np.empty(trial.record.states.shape[1]), target)
+
+
+@compiled
+def observe_runge_kutta(trial: Trial, t: int, dt: float, target: Vector) -> None:
+    """Write the accelerations observed in the middle of the step, (r,), after dt seconds.
+
+    What the model's own step differs from the acceleration that it has there is added to them: a
+    model whose error at them is 0 predicts x_{t+1}.
+    """
+    plant, network, theta = trial.plant, trial.network, trial.state.theta
+    x, u = trial.record.states[t], trial.state.estimate.inputs[t]
+    value, flow, end = np.empty(target.shape[0]), np.empty(x.shape[0]), np.empty(x.shape[0])
+    write_difference(trial, t, dt, flow, target)
+    at = sampled_state(plant, trial.record.states, t)
+    model_accelerations(plant, network, theta, model_point(network, at, u), value)
+    next_model_state(plant, network, theta, x, u, dt, end)
+    for k in range(target.shape[0]):
+        row = plant.learned_rows[k]
+        target[k] -= (end[row] - x[row]) / dt - (flow[row] + value[k])
+
+
+@compiled
+def write_difference(trial: Trial, t: int, dt: float, flow: Vector, target: Vector) -> None:
+    """Write the known part of dx/dt at the sampled state, (d,), and what is observed beside it."""
+    plant, states = trial.plant, trial.record.states
+    x, following = states[t], states[t + 1]
+    at = sampled_state(plant, states, t)
+    plant.known(at, trial.state.estimate.inputs[t], plant.parameters, flow)
+    for k in range(target.shape[0]):
+        row = plant.learned_rows[k]
+        target[k] = (following[row] - x[row]) / dt - flow[row]
+
+
+@compiled
+def predicted_state(plant: Plant, network: Network, theta: Vector, x: Vector) -> Vector:
+    """Return x̄, (d,), the state that follows without input: x + dt f_θ(x, 0) by the Euler map."""
+    following = np.empty(x.shape[0])
+    next_model_state(plant, network, theta, x, np.zeros(plant.n_inputs), plant.dt, following)
+    return following
+
+
+@compiled
+def input_columns(plant: Plant, x: Vector) -> Matrix:
+    """Return the rows of Bᵀ = dt (∂known/∂u)ᵀ, (m, d), at a state; the known part is affine."""
+    base, u = np.empty(x.shape[0]), np.zeros(plant.n_inputs)
+    plant.known(x, u, plant.parameters, base)
+    columns = np.empty((plant.n_inputs, x.shape[0]))
+    for j in range(plant.n_inputs):
+        u[j] = 1.0
+        plant.known(x, u, plant.parameters, columns[j])
+        u[j] = 0.0
+        for i in range(x.shape[0]):
+            columns[j, i] = plant.dt * (columns[j, i] - base[i])
+    return columns
+
+
+@compiled
+def learned_columns(plant: Plant, network: Network, theta: Vector, x: Vector) -> Matrix:
+    """Return the rows of Bᵀ = dt (∂f_θ/∂u)ᵀ, (m, d), at a state.
+
+    What a model has learned of the inputs is taken as its secant between -γ and γ along each axis,
+    exact for one that is affine in them.
+    """
+    columns = input_columns(plant, x)
+    if network.n_inputs_read == 0:
+        return columns
+    r, gamma = plant.learned_rows.shape[0], plant.gamma
+    ahead, behind, u = np.empty(r), np.empty(r), np.zeros(plant.n_inputs)
+    for j in range(plant.n_inputs):
+        u[j] = gamma
+        model_accelerations(plant, network, theta, model_point(network, x, u), ahead)
+        u[j] = -gamma
+        model_accelerations(plant, network, theta, model_point(network, x, u), behind)
+        u[j] = 0.0
+        for k in range(r):
+            slope = (ahead[k] - behind[k]) / (2.0 * gamma)
+            columns[j, plant.learned_rows[k]] += plant.dt * slope
+    return columns
+
+
+@compiled
+def point_columns(network: Network, columns: Matrix) -> Matrix:
+    """Return the columns of B as rows, (m, d), with zeros behind them, (m, d + m), for inputs.
+
+    They are the change of the next point by the input, on which the one after it does not depend.
+    """
+    m, d = columns.shape
+    if network.n_inputs_read == 0:
+        return columns
+    out = np.zeros((m, d + m))
+    for j in range(m):
+        copy_into(columns[j], out[j, :d])
+    return out

@@ -12,12 +12,10 @@ import numpy as np
 
 from dopt.algorithm import NEWEST_ERRORS, TIE_MARGIN
 from dopt.kernel.compiler import compiled
-from dopt.kernel.integration import add_stage, n_stages, write_rate
+from dopt.kernel.integration import add_stage, n_stages, predicted_state, write_rate
+from dopt.kernel.learners.adam import sampled_point
 from dopt.kernel.learners.joint_kalman import acceleration_variances, state_variances
-from dopt.kernel.learners.samples import sampled_point
-from dopt.kernel.model import model_accelerations
-from dopt.kernel.points import model_point
-from dopt.kernel.policies.prediction import predicted_state
+from dopt.kernel.model import model_accelerations, model_point
 from dopt.kernel.sensors import has_sensors
 from dopt.kernel.structs import Limits, Trial
 from dopt.types import Matrix, Vector
@@ -145,7 +143,7 @@ def estimate_bounds(trial: Trial, t: int, x: Vector) -> Vector:
 def note_error(trial: Trial, t: int, target: Vector) -> None:
     """Take the error of the accelerations observed at step t, (r,), before they are learned.
 
-    Of estimated states there is none: the filter knows how uncertain they are.
+    Estimated states need no such bound: the filter knows how uncertain they are.
     """
     error, value = trial.state.prediction, np.empty(target.shape[0])
     error.last_input[:] = trial.record.inputs[t]
@@ -167,7 +165,7 @@ def largest_excess(
 
     It is the largest over the errors of the prediction, none or one of ±``errors``, of the smallest
     over the backup inputs. It may stop at ``best``. The errors are of accelerations, (r,), with
-    those of an estimated state behind them, (r + d,).
+    followed by the bounds of an estimated state, (r + d,).
     """
     largest, kept = -np.inf, 0  # the backup input that has kept the states within bounds
     for case in range(1 + 2 * errors.shape[0]):

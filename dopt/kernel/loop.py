@@ -1,9 +1,10 @@
 """Algorithm 1 in compiled code: plan, act, observe, learn, update M, evaluate.
 
-:func:`plan_input` and :func:`take_in` are the steps that an exploration of a plant
-(:class:`dopt.explorer.Explorer`) consists of; a trial puts between them the simulated system, or a
-black box that is stepped by the interpreter (:mod:`dopt.kernel.stepped_trial`). Where a policy or a
-learner of a user's own is written in numpy, the interpreter calls it between compiled steps.
+An exploration of a plant (:class:`dopt.explorer.Explorer`) consists of :func:`plan_input` and
+:func:`take_in`; a trial puts between them the simulated system, or a black box that the interpreter
+steps (:mod:`dopt.kernel.steps`). Where a policy or a learner is written in numpy, the interpreter
+calls it between compiled steps, and the model answers its questions with the parameters of the
+moment (of an ensemble: of its first member).
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel.checks import within
 from dopt.kernel.compiler import called_from_python, compiled, copy_into, monotonic_microseconds
 from dopt.kernel.evaluation import (
     Buffers,
@@ -20,15 +20,74 @@ from dopt.kernel.evaluation import (
     follow_truth,
     model_error,
 )
-from dopt.kernel.held_trial import HeldTrial, trial_in
-from dopt.kernel.integration import next_true_state
-from dopt.kernel.learners.samples import sampled_point
-from dopt.kernel.members import learn_members, members_or_one
-from dopt.kernel.model import model_accelerations
-from dopt.kernel.points import sampled_state
+from dopt.kernel.held import HeldTrial, trial_in
+from dopt.kernel.integration import input_columns, next_model_state, next_true_state
+from dopt.kernel.learners.adam import sampled_point
+from dopt.kernel.model import (
+    gradients_along_inputs,
+    model_accelerations,
+    parameter_gradients,
+    rows_at,
+    sampled_state,
+    within,
+)
 from dopt.kernel.sensors import has_sensors, measure, output_error
-from dopt.kernel.structs import Evaluation, Plant, Steps, Trial
-from dopt.types import Matrix, Vector
+from dopt.kernel.structs import Evaluation, Learn, Plant, State, Steps, Trial
+from dopt.types import Matrix, Stack, Vector
+
+
+@compiled
+def plan_in_numpy(trial: Trial, t: int, u: Vector) -> None:
+    """Leave u_t as a plan in numpy has chosen it."""
+
+
+@compiled
+def learn_in_numpy(trial: Trial, t: int, target: Vector) -> None:
+    """Leave the parameters as an update in numpy has returned them."""
+
+
+@compiled
+def keep_input(trial: Trial, t: int, u: Vector) -> None:
+    """Leave u_t as the policy chose it."""
+
+
+@compiled
+def note_nothing(trial: Trial, t: int, target: Vector) -> None:
+    """Remember nothing of the model's errors."""
+
+
+@compiled
+def keep_state(trial: Trial, t: int, dt: float) -> None:
+    """Leave x_{t+1} as it is known."""
+
+
+@compiled
+def members_or_one(state: State) -> Matrix:
+    """Return the parameters whose mean prediction is evaluated, (E, q), as a view."""
+    if state.members.parameters.shape[0] > 0:
+        return state.members.parameters
+    return state.theta.reshape(1, state.theta.shape[0])
+
+
+@compiled
+def learn_members(trial: Trial, learn: Learn, t: int, target: Vector) -> None:
+    """Let the member whose turn it is learn, and then the first one, whose M stays.
+
+    θ and θ₀ of the state belong to the first member before and after.
+    """
+    state = trial.state
+    members, priors = state.members.parameters, state.members.priors
+    if members.shape[0] > 0:
+        turn = 1 + t % (members.shape[0] - 1)
+        copy_into(members[turn], state.theta)
+        copy_into(priors[turn], state.prior)
+        learn(trial, t, target)
+        copy_into(state.theta, members[turn])
+        copy_into(members[0], state.theta)
+        copy_into(priors[0], state.prior)
+    learn(trial, t, target)
+    if members.shape[0] > 0:
+        copy_into(state.theta, members[0])
 
 
 @compiled
@@ -172,7 +231,7 @@ def learn_next(held: HeldTrial, t: int, target: Vector) -> bool:
 def evaluate(trial: Trial, points: Evaluation, t: int, thetas: Matrix, buffers: Buffers) -> bool:
     """Write the errors of the model after step t, and return whether that over the grid is finite.
 
-    Parameters (members, q) and buffers are those of the whole trial.
+    Parameters (members, q) and buffers belong to the whole trial.
     """
     plant, network, record, bounds = trial.plant, trial.network, trial.record, points.bounds
     start = monotonic_microseconds()
@@ -214,3 +273,51 @@ def advance(held: HeldTrial, points: Evaluation, first: int, last: int) -> int:
         if not evaluate(trial, points, t, thetas, buffers):
             return t
     return last
+
+
+@called_from_python
+def write_accelerations(held: HeldTrial, points: Matrix, out: Matrix) -> None:
+    """Write a_θ, (N, r), at points, (N, ·)."""
+    trial = trial_in(held)
+    for n in range(points.shape[0]):
+        model_accelerations(trial.plant, trial.network, trial.state.theta, points[n], out[n])
+
+
+@called_from_python
+def write_jacobian(held: HeldTrial, point: Matrix, out: Matrix) -> None:
+    """Write ∂a_θ/∂θ, (r, q), at a point, (1, ·)."""
+    trial = trial_in(held)
+    rows = rows_at(trial.plant, trial.network, trial.state.theta, point)
+    for k in range(rows.shape[0]):
+        copy_into(rows[k], out[k])
+
+
+@called_from_python
+def write_jacobian_change(held: HeldTrial, point: Vector, directions: Matrix, out: Stack) -> None:
+    """Write the derivative of ∂a_θ/∂θ along directions, (k, ·), of a point, (k, r, q)."""
+    trial = trial_in(held)
+    plant, network, theta = trial.plant, trial.network, trial.state.theta
+    for i in range(out.shape[1]):
+        if network.kind == ModelKind.MLP:
+            rows = gradients_along_inputs(plant, network, theta, point, directions, i)
+        else:
+            rows = parameter_gradients(plant, network, theta, point, directions, i)
+        for j in range(directions.shape[0]):
+            copy_into(rows[1 + j], out[j, i])
+
+
+@called_from_python
+def write_following(held: HeldTrial, x: Vector, inputs: Matrix, out: Matrix) -> None:
+    """Write the states, (N, d), that the model predicts after a state under inputs, (N, m)."""
+    trial = trial_in(held)
+    plant, theta = trial.plant, trial.state.theta
+    for n in range(inputs.shape[0]):
+        next_model_state(plant, trial.network, theta, x, inputs[n], plant.dt, out[n])
+
+
+@called_from_python
+def write_input_matrix(held: HeldTrial, x: Vector, out: Matrix) -> None:
+    """Write Bᵀ = dt (∂known/∂u)ᵀ, (m, d), at a state."""
+    columns = input_columns(trial_in(held).plant, x)
+    for j in range(columns.shape[0]):
+        copy_into(columns[j], out[j])

@@ -1,24 +1,100 @@
-"""Accelerations of every model at points, rows of their Jacobian, and the change of these rows.
+"""Models in compiled code: points, accelerations, rows of J, and the change of these rows.
+
+A point is what learned accelerations and their model depend on: a state, (d,), or a state and an
+input, (d + m,).
 
 Where a model is linear in its parameters the rows of J are the regressors Ψ(x). For the linear form
 of physics their change along a direction is taken by a complex step through the system's own
-equations, for random features by their derivative (:mod:`dopt.kernel.random_features`). Those of a
-grey box are in :mod:`dopt.kernel.grey_box`.
+equations, for random features and grey boxes by :mod:`dopt.kernel.model_kinds`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import ModelKind
-from dopt.kernel import gaussian_process, grey_box, random_features
+from dopt.algorithm import Integrator, ModelKind
+from dopt.kernel import model_kinds
 from dopt.kernel import network as nn
-from dopt.kernel import network_backward as backward
-from dopt.kernel import network_tangents as tangents
+from dopt.kernel import network_gradients as backward
+from dopt.kernel import network_gradients as tangents
 from dopt.kernel.compiler import compiled, copy_into
-from dopt.kernel.state_structs import Linearization
-from dopt.kernel.structs import Network, Plant
+from dopt.kernel.structs import Linearization, Network, Plant
 from dopt.types import Matrix, Stack, Vector
+
+
+@compiled
+def within(x: Vector, limit: float) -> bool:
+    """Return True if every entry is finite and within the limit."""
+    inside = True
+    for i in range(x.shape[0]):
+        inside = inside and abs(x[i]) <= limit
+    return inside
+
+
+@compiled
+def plant_point(plant: Plant, x: Vector, u: Vector) -> Vector:
+    """Return what the true accelerations depend on at a state and an input."""
+    return joined(x, u, plant.n_inputs_read)
+
+
+@compiled
+def model_point(network: Network, x: Vector, u: Vector) -> Vector:
+    """Return what the model depends on at a state and an input."""
+    return joined(x, u, network.n_inputs_read)
+
+
+@compiled
+def sampled_state(plant: Plant, states: Matrix, t: int) -> Vector:
+    """Return where the accelerations of step t are observed, given the states x_0 ... x_T."""
+    return state_between(plant, states[t], states[t + 1])
+
+
+@compiled
+def state_between(plant: Plant, x: Vector, following: Vector) -> Vector:
+    """Return where the accelerations of a step are observed: at its start, or in its middle.
+
+    See :meth:`dopt.systems.base.System.sampled_states`.
+    """
+    if plant.integrator == Integrator.EULER:
+        return x
+    middle: Vector = 0.5 * (x + following)
+    return middle
+
+
+@compiled
+def joined(x: Vector, u: Vector, n_inputs_read: int) -> Vector:
+    """Return a state, or a copy with the input behind it."""
+    if n_inputs_read == 0:
+        return x
+    d = x.shape[0]
+    point = np.empty(d + n_inputs_read)
+    copy_into(x, point[:d])
+    copy_into(u, point[d:])
+    return point
+
+
+@compiled
+def n_next_points(network: Network) -> int:
+    """Return how many points stand for a state whose input is not chosen yet: 1 or 2 m."""
+    return max(1, 2 * network.n_inputs_read)
+
+
+@compiled
+def next_points(network: Network, x: Vector, gamma: float) -> Matrix:
+    """Return points that stand for a state whose input is not chosen yet.
+
+    These are the state itself, (1, d), or for a model that reads inputs the state under ±γ along
+    each axis, (2 m, d + m). The mean of JᵀJ over them is that over the sphere ‖u‖ = γ where J is
+    affine in u.
+    """
+    d, m = x.shape[0], network.n_inputs_read
+    points = np.zeros((n_next_points(network), d + m))
+    points[:, :d] = x
+    for j in range(m):
+        points[2 * j, d + j] = gamma
+        points[2 * j + 1, d + j] = -gamma
+    return points
+
 
 STEP = 1e-30
 
@@ -34,7 +110,7 @@ def regressors(plant: Plant, network: Network, x: Vector, rows: Matrix, offset: 
         offset[:] = np.nan
         return
     if network.kind in (ModelKind.RANDOM_FEATURES, ModelKind.LINEAR_STATE):
-        random_features.write_rows(network, x, rows)
+        model_kinds.write_feature_rows(network, x, rows)
         offset[:] = 0.0
         return
     plant.accelerations(x, plant.linear_form[0], offset)
@@ -51,9 +127,9 @@ def parameter_rows(
 ) -> None:
     """Write J, (r, q), and a_θ, (r,), at a point, for any model but a network."""
     if network.kind == ModelKind.GREY_BOX:
-        constants = grey_box.constants_with(plant, network, theta)
+        constants = model_kinds.constants_with(plant, network, theta)
         plant.accelerations(x, constants, value)
-        grey_box.write_constant_rows(plant, x, constants, network.unknown, rows)
+        model_kinds.write_constant_rows(plant, x, constants, network.unknown, rows)
         return
     regressors(plant, network, x, rows, value)
     add_linear(rows, theta, value)
@@ -72,11 +148,11 @@ def row_along(
     """Write the derivative of row ``component`` of J, (q,), along a direction of the state."""
     if network.kind == ModelKind.GREY_BOX:
         rows = np.empty((plant.learned_rows.shape[0], out.shape[0]))
-        grey_box.write_rows_along(plant, network, theta, x, direction, rows)
+        model_kinds.write_rows_along(plant, network, theta, x, direction, rows)
         copy_into(rows[component], out)
         return
     if network.kind in (ModelKind.RANDOM_FEATURES, ModelKind.LINEAR_STATE):
-        random_features.write_row_along(network, x, direction, component, out)
+        model_kinds.write_feature_row_along(network, x, direction, component, out)
         return
     z = np.empty(x.shape[0], np.complex128)
     for i in range(x.shape[0]):
@@ -109,10 +185,10 @@ def model_accelerations(
 ) -> None:
     """Write a_θ, (r,), at a point x."""
     if network.kind == ModelKind.GAUSSIAN_PROCESS:
-        gaussian_process.write_mean(network, theta, x, out)
+        model_kinds.write_mean(network, theta, x, out)
         return
     if network.kind == ModelKind.GREY_BOX:
-        plant.accelerations(x, grey_box.constants_with(plant, network, theta), out)
+        plant.accelerations(x, model_kinds.constants_with(plant, network, theta), out)
         return
     if network.kind != ModelKind.MLP:
         rows = np.empty((out.shape[0], theta.shape[0]))
@@ -151,7 +227,7 @@ def accelerations_at(
     """Write a_θ, (r, N), at points, (N, ·)."""
     N, r = states.shape[0], outputs.shape[0]
     if network.kind == ModelKind.GREY_BOX:
-        grey_box.write_values(plant, network, theta, states.T, outputs)
+        model_kinds.write_values(plant, network, theta, states.T, outputs)
         return
     if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)

@@ -1,9 +1,15 @@
-"""The model in compiled code: values and gradients, for batches and single states.
+"""Networks in compiled code: values and gradients, for batches and single states.
 
-In the backward passes δ is the derivative of an
-output with respect to the pre-activations of a layer, and h the activations. The output layer has
-the last hidden layer for its inputs, and with it the inputs of the system where they multiply it
-(:mod:`dopt.kernel.output_layer`).
+In the backward passes δ is the derivative of an output with respect to the pre-activations of a
+layer, and h the activations.
+
+Output layer: its inputs are the last hidden layer h; where inputs of the system multiply it
+(:class:`dopt.models.AffineMLP`), they are (h, h u₁, ..., h u_m, u) with u the last features.
+
+tanh x = -e/(2 + e), e = exp(-2|x|) - 1, with the sign of x; the compiler turns it into vector
+instructions in both precisions. exp is 2^k (1 + p(r)) with r = -2|x| - k ln 2, |r| ≤ ln 2 / 2, and
+p the Taylor polynomial of exp(r) - 1. The relative error is a few units in the last place
+everywhere; NaN stays NaN.
 """
 
 from __future__ import annotations
@@ -11,17 +17,153 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 
 from dopt.algorithm import FeatureKind
-from dopt.kernel.compiler import compiled, contracted, copy_into, vectorized
-from dopt.kernel.output_layer import (
-    output_inputs,
-    output_inputs_at,
-    sum_over_factors,
-)
+from dopt.kernel.compiler import compiled, contracted, copy_into, power_of_two, vectorized
 from dopt.kernel.structs import Network
-from dopt.kernel.tanh import tanh
-from dopt.types import Matrix, Real, Vector
+from dopt.types import Matrix, NumbaType, Real, Scalar, Vector
+
+# Double precision. Adding 1.5 * 2^52 leaves the nearest integer in the low bits; the high part of
+# ln 2 ends in zeros, so that its product with k is exact.
+LOG2_E = 1.4426950408889634
+LN2_HIGH = 6.93147180369123816490e-01
+LN2_LOW = 1.90821492927058770002e-10
+ROUND = 6755399441055744.0
+SATURATION = 20.0
+C = tuple(1.0 / math.factorial(n) for n in range(14))
+
+# The same in single precision.
+LOG2_E_SINGLE = np.float32(LOG2_E)
+LN2_HIGH_SINGLE = np.float32(0.693359375)
+LN2_LOW_SINGLE = np.float32(-2.12194440e-4)
+ROUND_SINGLE = np.float32(12582912.0)
+SATURATION_SINGLE = np.float32(10.0)
+C_SINGLE = tuple(np.float32(c) for c in C[:9])
+ZERO, ONE, TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
+
+
+def tanh(x: Scalar) -> Scalar:
+    """Return tanh x in the precision of x."""
+    return _tanh_single(x) if isinstance(x, np.float32) else _tanh_double(x)
+
+
+@overload(tanh, strict=False)
+def _tanh(x: NumbaType) -> NumbaType:
+    if x == types.float32:
+        return lambda x: _tanh_single(x)
+    return lambda x: _tanh_double(x)
+
+
+@contracted
+def _tanh_double(x: float) -> float:
+    size = abs(x)
+    size = SATURATION if size > SATURATION else size
+    y = -2.0 * size
+    shifted = y * LOG2_E + ROUND
+    k = shifted - ROUND
+    r = (y - k * LN2_HIGH) - k * LN2_LOW
+    p = C[13]
+    for n in (12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2):
+        p = p * r + C[n]
+    p = p * r * r + r
+    power: float = power_of_two(shifted)
+    e: float = power * p + (power - 1.0)
+    value = -e / (2.0 + e)
+    return value if x >= 0.0 else -value
+
+
+@contracted
+def _tanh_single(x: np.float32) -> np.float32:
+    size = abs(x)
+    size = SATURATION_SINGLE if size > SATURATION_SINGLE else size
+    y = -TWO * size
+    shifted = y * LOG2_E_SINGLE + ROUND_SINGLE
+    k = shifted - ROUND_SINGLE
+    r = (y - k * LN2_HIGH_SINGLE) - k * LN2_LOW_SINGLE
+    p = C_SINGLE[8]
+    for n in (7, 6, 5, 4, 3, 2):
+        p = p * r + C_SINGLE[n]
+    p = p * r * r + r
+    power: np.float32 = power_of_two(shifted)
+    e: np.float32 = power * p + (power - ONE)
+    value: np.float32 = -e / (TWO + e)
+    return value if x >= ZERO else -value
+
+
+@compiled
+def output_inputs(network: Network, hidden: Real, inputs: Real) -> Real:
+    """Return the inputs of the output layer, (·, n), for the last hidden layer, (w, n).
+
+    ``inputs`` (p, n) are the features.
+    """
+    m = network.n_factors
+    if m == 0:
+        return hidden
+    w, n = hidden.shape
+    first = inputs.shape[0] - m
+    out = np.empty(((1 + m) * w + m, n), hidden.dtype)
+    for i in range(w):
+        for s in range(n):
+            out[i, s] = hidden[i, s]
+    for j in range(m):
+        for s in range(n):
+            u = inputs[first + j, s]
+            out[(1 + m) * w + j, s] = u
+            for i in range(w):
+                out[(1 + j) * w + i, s] = hidden[i, s] * u
+    return out
+
+
+@compiled
+def sum_over_factors(m: int, slopes: Matrix, inputs: Matrix, out: Matrix) -> None:
+    """Write derivatives by the last hidden layer, (w, n), given those by :func:`output_inputs`."""
+    w, n = out.shape
+    first = inputs.shape[0] - m
+    for i in range(w):
+        for s in range(n):
+            out[i, s] = slopes[i, s]
+        for j in range(m):
+            for s in range(n):
+                out[i, s] += inputs[first + j, s] * slopes[(1 + j) * w + i, s]
+
+
+@compiled
+def output_inputs_at(network: Network, hidden: Vector, phi: Vector) -> Vector:
+    """Return the inputs of the output layer at one point, given its last hidden layer, (w,)."""
+    if network.n_factors == 0:
+        return hidden
+    return output_inputs(network, hidden.reshape(-1, 1), phi.reshape(-1, 1))[:, 0].copy()
+
+
+@contracted
+def output_slope(network: Network, W: Matrix, phi: Vector, component: int, i: int) -> float:
+    """Return the derivative of output k by unit i of the last hidden layer; W is its weights."""
+    m, w = network.n_factors, network.sizes[1]
+    slope: float = W[component, i]
+    for j in range(m):
+        slope += phi[phi.shape[0] - m + j] * W[component, (1 + j) * w + i]
+    return slope
+
+
+@compiled
+def output_inputs_along(
+    network: Network, hidden: Vector, hidden_dot: Vector, phi: Vector, phi_dot: Vector
+) -> Vector:
+    """Return the derivative of :func:`output_inputs_at` along a direction."""
+    m, w = network.n_factors, hidden.shape[0]
+    if m == 0:
+        return hidden_dot
+    first = phi.shape[0] - m
+    out = np.empty((1 + m) * w + m)
+    copy_into(hidden_dot, out[:w])
+    for j in range(m):
+        u, u_dot = phi[first + j], phi_dot[first + j]
+        out[(1 + m) * w + j] = u_dot
+        for i in range(w):
+            out[(1 + j) * w + i] = hidden_dot[i] * u + hidden[i] * u_dot
+    return out
 
 
 @compiled

@@ -21,7 +21,7 @@ _executable = CPUContext.get_executable
 
 
 def leave_callees_out() -> None:
-    """Leave what another function's compilation asks for, from now on, to be optimized in it.
+    """Skip separate optimisation of functions compiled only as callees.
 
     There is no machine code of it either: Python must not call such a function in this process.
     """
@@ -31,7 +31,7 @@ def leave_callees_out() -> None:
 
 
 def _is_callee() -> bool:
-    """Tell whether what is compiled now was asked for by the compilation of another function."""
+    """Return True if the compilation of another function asked for the present one."""
     return len(ConfigStack()) > 1
 
 

@@ -1,36 +1,137 @@
-"""Compilation of the loop and of the parts of a trial that it calls through function pointers.
+"""Compilation of the loop and of the functions that it calls through pointers.
 
 The loop is compiled once for all systems, models, policies and learners; a policy, a learner or a
-form of the information matrix is compiled when a trial first needs it.
+form of the information matrix is compiled when a trial first needs it. Functions in a user's file
+are kept in the cache by the content of that file.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
-from collections.abc import Callable, Hashable, Sequence
+import inspect
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from enum import Enum
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple, cast
 
 import numba
+import numpy as np
 from numba import float64, int64, types
 from numba.core.errors import NumbaError
 
 from dopt.algorithm import Integrator
 from dopt.errors import SpecificationError
-from dopt.kernel import absent_steps, held_trial, limits, loop, model_queries, observation, sensors
-from dopt.kernel.cache import one_compiler_at_a_time
-from dopt.kernel.compilation import compile_missing
+from dopt.kernel import integration, limits, loop, sensors
+from dopt.kernel.cache import (
+    COMPILED_SOURCES,
+    compile_missing,
+    errors_of_the_system,
+    one_compiler_at_a_time,
+)
+from dopt.kernel.compiler import StoredCode, compilable
 from dopt.kernel.equations import ACCELERATIONS, COMPLEX_ACCELERATIONS, KNOWN
-from dopt.kernel.held_trial import HeldTrial
-from dopt.kernel.layout import layout_of
+from dopt.kernel.held import FIELDS, HeldTrial, HeldTrialType, hold, pointer_to
 from dopt.kernel.plain import PLAIN
-from dopt.kernel.state_structs import State
-from dopt.kernel.struct_pointers import pointer_to
-from dopt.kernel.structs import Evaluation, Information, Network, Plant, Steps, Trial
-from dopt.kernel.user_code import compiled_own
+from dopt.kernel.structs import Evaluation, Information, Network, Plant, State, Steps, Trial
 from dopt.learning.base import CompiledLearner, Learner
 from dopt.policies.base import CompiledPolicy, Policy
 from dopt.types import CompiledFunction, NumbaType
+
+
+def layout_of(value: object) -> Hashable:
+    """Return what the type of an argument for Numba depends on, which takes longer to find out."""
+    if isinstance(value, tuple):
+        return (type(value), *map(layout_of, value))
+    if isinstance(value, np.ndarray):
+        return value.dtype.char, value.ndim, value.flags.num
+    return type(value) if isinstance(value, (int, float)) else value
+
+
+LIBRARIES = ("numpy", "math", "cmath", "builtins")
+"""Modules whose functions change only with an installation."""
+
+_SOURCES = tuple(f"dopt.{source.removesuffix('.py')}" for source in COMPILED_SOURCES)
+
+
+def compiled_own(function: Callable[..., None], signature: NumbaType) -> CompiledFunction:
+    """Return a function from a user's file, compiled for a signature or read from the cache."""
+    compiled = _dispatcher(function)
+    digest = content_digest(function)
+    if digest is None:
+        with errors_of_the_system():
+            compiled.compile(signature)
+        return compiled
+    kind = hashlib.sha256(f"{digest}{signature}".encode()).hexdigest()[:16]
+    with one_compiler_at_a_time(f"{function.__module__}.{function.__qualname__}-{kind}"):
+        compiled.compile(signature)
+    return compiled
+
+
+@functools.cache
+def _dispatcher(function: Callable[..., None]) -> CompiledFunction:
+    compiled = numba.njit(error_model="numpy", fastmath=False)(compilable(function))
+    digest = content_digest(function)
+    if digest is not None:
+        compiled._cache = StoredCode(function, f"own/{digest}")
+    return compiled
+
+
+@functools.cache
+def content_digest(function: Callable[..., None]) -> str | None:
+    """Return a digest of all that the machine code of a function depends on.
+
+    That is its file, the constants that it and its helpers read, and this package. It is None, and
+    the function compiles in every process, where it has no file or uses anything else.
+    """
+    try:
+        digest = hashlib.sha256(Path(inspect.getfile(function)).read_bytes())
+    except (OSError, TypeError):  # typed into an interpreter or a notebook
+        return None
+    for name, value in sorted(_globals_of(function, set())):
+        content = _content(value, function.__module__)
+        if content is None:
+            return None
+        digest.update(f"{name} {content}".encode())
+    return digest.hexdigest()[:16]
+
+
+def _globals_of(function: Callable[..., Any], seen: set[str]) -> Iterator[tuple[str, Any]]:
+    """Yield the names and values that a function and its helpers in the same file read."""
+    for name in _names_read(function.__code__):
+        if name in function.__globals__ and name not in seen:
+            seen.add(name)
+            value = function.__globals__[name]
+            yield name, value
+            helper = getattr(value, "py_func", value)  # also one that the user has compiled
+            if isinstance(helper, FunctionType) and helper.__module__ == function.__module__:
+                yield from _globals_of(helper, seen)
+
+
+def _names_read(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names_read(constant)
+
+
+def _content(value: Any, own: str) -> str | None:
+    """Return text that changes with a value in compiled code, None where it cannot be told."""
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}{hashlib.sha256(value.tobytes()).hexdigest()}"
+    if isinstance(value, (bool, int, float, complex, str, Enum)):
+        return repr(value)
+    if isinstance(value, tuple):
+        parts = [_content(part, own) for part in value]
+        return None if None in parts else f"{parts}"
+    if not (isinstance(value, ModuleType) or callable(value)):
+        return None
+    module = str(getattr(value, "__name__" if isinstance(value, ModuleType) else "__module__", ""))
+    if module == own or module.startswith(_SOURCES) or module.partition(".")[0] in LIBRARIES:
+        return module
+    return None
 
 
 class Compiled(NamedTuple):
@@ -55,9 +156,8 @@ def compiled_trial(policy: Policy, learner: Learner, trial: Trial, points: Evalu
     kinds = layout_of((trial, points, *other_steps(trial).values()))
     key = (kinds, _source(policy), _source(learner))
     if key not in _trials:
-        steps = _compiled_parts(policy, learner, trial, [held_trial.hold, loop.advance])
-        hold, advance = compiled_step(trial, held_trial.hold), compiled_loop(trial, points)
-        _trials[key] = Compiled(hold, advance, steps)
+        steps = _compiled_parts(policy, learner, trial, [hold, loop.advance])
+        _trials[key] = Compiled(compiled_step(trial, hold), compiled_loop(trial, points), steps)
     return _trials[key]
 
 
@@ -76,17 +176,17 @@ def compiled_steps(
     return CompiledSteps(hold, plan_input, take_in, steps)
 
 
-STEPS = (held_trial.hold, loop.plan_next, loop.take_in_next)
+STEPS = (hold, loop.plan_next, loop.take_in_next)
 """Functions of steps one by one, which do not depend on the policy and the learner."""
 
 
 OTHER_STEPS = {
-    "limit_input": (absent_steps.limit_input, limits.limit_input),
-    "note_error": (absent_steps.note_error, limits.note_error),
-    "estimate_state": (absent_steps.estimate_state, sensors.estimate_state),
-    "observe": (observation.observe_euler, observation.observe_runge_kutta),
+    "limit_input": (loop.keep_input, limits.limit_input),
+    "note_error": (loop.note_nothing, limits.note_error),
+    "estimate_state": (loop.keep_state, sensors.estimate_state),
+    "observe": (integration.observe_euler, integration.observe_runge_kutta),
 }
-"""Functions of a trial's steps but for its policy's and its learner's: the usual and the other."""
+"""Functions of a trial's steps beside its policy and learner: the usual one, and the other."""
 
 
 def other_steps(trial: Trial) -> dict[str, CompiledFunction]:
@@ -102,11 +202,11 @@ def other_steps(trial: Trial) -> dict[str, CompiledFunction]:
 def _compiled_parts(
     policy: Policy, learner: Learner, trial: Trial, callers: list[CompiledFunction]
 ) -> Steps:
-    """Compile what a trial needs but for the callers."""
+    """Compile what a trial needs; the callers are compiled by whoever calls this."""
     others, kinds = other_steps(trial), step_kinds(trial)
     compile_missing(_names(policy, learner, [*trial.information, *others.values(), *callers]))
-    for function in trial.information:
-        compile_form(trial, function)
+    for name, function in trial.information._asdict().items():
+        compile_form(trial, name, function)
     for name, function in others.items():
         compiled_at(path_of(function), getattr(kinds, name))
     plan, learn = function_of(policy, kinds.plan), function_of(learner, kinds.learn)
@@ -127,10 +227,10 @@ def _source(part: Policy | Learner) -> str | Callable[..., None]:
     return part.learn if isinstance(part, CompiledLearner) else part.kernel_function
 
 
-def compile_form(trial: Trial, function: CompiledFunction) -> None:
-    """Compile one of the functions of a form in which a trial may hold M."""
+def compile_form(trial: Trial, name: str, function: CompiledFunction) -> None:
+    """Compile a function of a form of M; ``name`` is its field in :class:`Information`."""
     kinds = _information_signatures(trial.plant, trial.network, trial.state)
-    compiled_for(path_of(function), function, kinds[function.__name__].args)
+    compiled_for(path_of(function), function, kinds[name].args)
 
 
 def path_of(function: CompiledFunction) -> str:
@@ -177,7 +277,7 @@ def compiled_step(trial: Trial, step: CompiledFunction) -> Callable[..., Any]:
     """Compile one of :data:`STEPS` or :data:`BETWEEN`."""
     held = held_kind(trial)
     given = tuple(held.field_dict.values())
-    kinds = given if step is held_trial.hold else (held, *_FURTHER_ARGUMENTS[step])
+    kinds = given if step is hold else (held, *_FURTHER_ARGUMENTS[step])
     return compiled_for(path_of(step), step, kinds)
 
 
@@ -188,11 +288,11 @@ _FURTHER_ARGUMENTS: dict[CompiledFunction, tuple[NumbaType, ...]] = {
     loop.act_next: (int64,),
     loop.observe_next: (int64, float64, _ROW),
     loop.learn_next: (int64, _ROW),
-    model_queries.write_accelerations: (_MATRIX, _MATRIX),
-    model_queries.write_jacobian: (_MATRIX, _MATRIX),
-    model_queries.write_jacobian_change: (_ROW, _MATRIX, _STACK),
-    model_queries.write_following: (_ROW, _MATRIX, _MATRIX),
-    model_queries.write_input_matrix: (_ROW, _MATRIX),
+    loop.write_accelerations: (_MATRIX, _MATRIX),
+    loop.write_jacobian: (_MATRIX, _MATRIX),
+    loop.write_jacobian_change: (_ROW, _MATRIX, _STACK),
+    loop.write_following: (_ROW, _MATRIX, _MATRIX),
+    loop.write_input_matrix: (_ROW, _MATRIX),
 }
 
 BETWEEN = tuple(step for step in _FURTHER_ARGUMENTS if step not in STEPS)
@@ -203,7 +303,7 @@ def held_kind(trial: Trial) -> NumbaType:
     """Return the type of a trial that is held with pointers to its policy and learner."""
     steps = types.NamedTuple([*map(pointer, step_kinds(trial))], Steps)
     whole = (kind_of(trial), steps)
-    return held_trial.HeldTrialType(list(zip(held_trial.FIELDS, whole, strict=True)))
+    return HeldTrialType(list(zip(FIELDS, whole, strict=True)))
 
 
 def function_of(part: Policy | Learner, signature: NumbaType) -> CompiledFunction:
@@ -237,7 +337,7 @@ def compiled_at(path: str, signature: NumbaType) -> CompiledFunction:
 def _own(
     part: Policy | Learner, function: Callable[..., None], signature: NumbaType
 ) -> CompiledFunction:
-    """Compile the function of a user's own policy or learner."""
+    """Compile the function of a policy or a learner in a user's file."""
     if PLAIN:
         return cast(Callable[..., Any], function)
     try:
@@ -252,7 +352,7 @@ def _own(
 
 
 def kind_of(value: object) -> NumbaType:
-    """Return the type of an argument for numba; of a compiled function, that of a pointer to it."""
+    """Return the type of an argument for numba; for a compiled function, of a pointer to it."""
     if not isinstance(value, tuple):
         return numba.typeof(value)
     layout = layout_of(value)
@@ -285,7 +385,7 @@ def pointer(signature: NumbaType) -> NumbaType:
 def compiled_for(
     name: str, function: CompiledFunction, kinds: tuple[NumbaType, ...]
 ) -> Callable[..., Any]:
-    """Return the machine code of a function for types of arguments; compile it unless it is."""
+    """Return the machine code of a function for types of arguments; compiling it on first use."""
     if PLAIN:
         return cast(Callable[..., Any], function)
     if (name, kinds) not in _done:

@@ -9,19 +9,18 @@ import numpy as np
 
 from dopt.control.task import Feedback
 from dopt.errors import SpecificationError
-from dopt.kernel.evaluation_points import points_of_trial
-from dopt.kernel.from_spec import shared_points
-from dopt.kernel.held_trial import HeldTrial
+from dopt.kernel.evaluation import points_of_trial
+from dopt.kernel.from_spec import KernelState, shared_points
+from dopt.kernel.held import HeldTrial
 from dopt.kernel.pointers import Compiled, compiled_trial
-from dopt.kernel.stepped_trial import SteppedTrial, is_stepped
-from dopt.kernel.trial_state import KernelState
+from dopt.kernel.steps import SteppedTrial, is_stepped
 from dopt.policies.base import CompiledPolicy, check_norms
 from dopt.result import TrialResult
 from dopt.spec.trial import TrialSpec
 from dopt.types import Array
 
 FIRST_STEPS = 300
-"""Steps of a trial before it is known what a step costs; those of the paper have no more."""
+"""Steps of a trial before it is known what a step costs; trials of the paper have no more."""
 
 PIECE_SECONDS = 1.0
 """Interval at which compiled code comes back to the interpreter, which can then heed a signal."""
@@ -82,7 +81,7 @@ class KernelTrial(KernelState):
 
 
 def _check_inputs(spec: TrialSpec, inputs: Array, first: int, last: int) -> None:
-    """Refuse inputs of a user's own compiled policy that are larger than γ."""
+    """Refuse inputs larger than γ from a compiled policy in a user's file."""
     if isinstance(spec.policy, CompiledPolicy):
         check_norms(spec.policy.name, inputs[first:last], first, spec.system.gamma)
 

@@ -1,16 +1,26 @@
-"""Translation of a trial's specification to what its steps write: first state, empty record."""
+"""Translation of a trial's specification to its network and what its steps write."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dopt.algorithm import Form
-from dopt.kernel import state_structs as args
-from dopt.kernel.information.primal import PENDING_ROWS, SMALL
-from dopt.kernel.model_from_spec import members_of
-from dopt.kernel.structs import Network
+from dopt.algorithm import FeatureKind, Form, ModelKind
+from dopt.errors import SpecificationError
+from dopt.kernel import structs as args
+from dopt.kernel.linear_algebra import PENDING_ROWS, SMALL
+from dopt.kernel.structs import Members, Network
 from dopt.learning import GaussNewton, JointKalman, Learner
-from dopt.models import MLP, GaussianProcess
+from dopt.models import (
+    MLP,
+    MODELS,
+    RFF,
+    AffineMLP,
+    GaussianProcess,
+    GreyBox,
+    Linear,
+    LinearState,
+)
+from dopt.models.base import Model
 from dopt.policies import ICEM, DOptimal, InformationPolicy
 from dopt.policies.d_optimal import count_sketch
 from dopt.spec.compatibility import Information, held_information, is_fresh
@@ -19,6 +29,74 @@ from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import BlackBox
 from dopt.types import Matrix, Vector
+
+KINDS: dict[type[Model], ModelKind] = {
+    MLP: ModelKind.MLP,
+    Linear: ModelKind.LINEAR,
+    RFF: ModelKind.RANDOM_FEATURES,
+    GaussianProcess: ModelKind.GAUSSIAN_PROCESS,
+    LinearState: ModelKind.LINEAR_STATE,
+    GreyBox: ModelKind.GREY_BOX,
+}
+"""Models that the kernel evaluates, and classes derived from them."""
+
+FEATURE_KINDS = {"identity": FeatureKind.IDENTITY, "cos": FeatureKind.COS, "sin": FeatureKind.SIN}
+
+
+def network_of(system: System, model: Model) -> args.Network:
+    """Return the architecture of a model on a system."""
+    kinds = [kind for one, kind in KINDS.items() if isinstance(model, one)]
+    if not kinds:
+        raise SpecificationError(
+            f"model '{model.name}' says that it is compiled, but the kernel knows "
+            f"{', '.join(name for name, one in MODELS.items() if one.compiled)} alone: set "
+            f"compiled = False in its class."
+        )
+    features = model.features(system)
+    sizes: tuple[int, ...] = (len(features), 1, system.n_learned)
+    inputs = sizes[:-1]
+    if isinstance(model, MLP):
+        sizes, inputs = model.layer_sizes(system), model.layer_inputs(system)
+    lengths = [(n_in + 1) * n_out for n_in, n_out in zip(inputs, sizes[1:], strict=True)]
+    n_read = model.n_inputs_read(system)
+    unknown = model.names(system) if isinstance(model, GreyBox) else ()
+    return args.Network(
+        int(kinds[0]),
+        np.array(sizes),
+        np.array(inputs),
+        np.cumsum([0, *lengths[:-1]]),
+        n_read,
+        n_read if isinstance(model, AffineMLP) else 0,
+        np.array([system.physical.index(name) for name in unknown], dtype=np.int64),
+        np.array([FEATURE_KINDS[feature.kind] for feature in features]),
+        np.array([feature.index for feature in features]),
+        np.array(model.feature_scales(system)),
+        args.Waves(np.zeros((0, 0)), np.zeros(0), 1.0),
+        _process(system, model),
+    )
+
+
+def _process(system: System, model: Model) -> args.Process:
+    if isinstance(model, GaussianProcess):
+        return args.Process(model.lengthscale, model.amplitude, model.noise_variance(system))
+    return args.Process(1.0, 1.0, 1.0)
+
+
+def network_of_trial(spec: TrialSpec, network: args.Network, weights: Vector) -> args.Network:
+    """Return the architecture with the random features that a trial has drawn in its weights."""
+    if not isinstance(spec.model, RFF):
+        return network
+    D, p = spec.model.n_features, len(spec.system.features)
+    frequencies, phases = weights[-D * (p + 1) : -D].reshape(D, p), weights[-D:]
+    waves = args.Waves(frequencies.copy(), phases.copy(), spec.model.scale)
+    return network._replace(waves=waves)
+
+
+def members_of(model: Model, weights: Vector) -> Members:
+    """Return the networks of an ensemble with the parameters that a trial has drawn for them."""
+    count = model.n_members if model.n_members > 1 else 0
+    drawn = weights.reshape(count, -1) if count else np.zeros((0, 0))
+    return Members(drawn.copy(), drawn.copy())
 
 
 def initial_state(spec: TrialSpec, weights: Vector, record: args.Record) -> args.State:
@@ -73,14 +151,14 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, Matrix, args
 
 
 def _needs_inverse(config: TrialConfig) -> bool:
-    """Tell whether the policy or the learner reads M⁻¹: a learner that fits M anew may not."""
+    """Return True if the policy or the learner reads M⁻¹; a learner that refits M may not."""
     policy = config.policy
     reads = isinstance(policy, InformationPolicy) and not isinstance(policy, ICEM)
     return held_form(config) is not None and (reads or not _is_fitted(config.learner))
 
 
 def _is_fitted(learner: Learner) -> bool:
-    """Tell whether a learner makes M anew at each step."""
+    """Return True if a learner refits M at each step."""
     return isinstance(learner, GaussNewton) and learner.refit_every == 1
 
 
@@ -187,6 +265,6 @@ def held_form(config: TrialConfig) -> Information | None:
 
 
 def form_of(config: TrialConfig) -> int:
-    """Return the form of the information matrix, PRIMAL where there is none."""
+    """Return the form of the information matrix, PRIMAL where no M is held."""
     held = held_form(config)
     return int(Form[held.form.upper()] if held else Form.PRIMAL)

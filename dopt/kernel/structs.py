@@ -1,11 +1,8 @@
-"""Structures that compiled functions receive, by name: constants, and all that a trial works on.
+"""Structures of a trial in compiled code: first what its steps write, then what they read.
 
-What they write into is in :mod:`dopt.kernel.state_structs`.
-
-Legend of sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters,
-w units in each hidden layer, L hidden layers, N evaluation points, D random features. A point is
-what a model depends on: a state, (d,), or a state and an input, (d + m,)
-(:mod:`dopt.kernel.points`).
+Sizes: T steps, d states, m inputs, r learned accelerations, p features, q parameters, w units in
+each hidden layer, L hidden layers, N evaluation points, D random features. A point is what a model
+depends on: a state, (d,), or a state and an input, (d + m,) (:mod:`dopt.kernel.model`).
 """
 
 from __future__ import annotations
@@ -13,17 +10,157 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from dopt.kernel.state_structs import Record, Scratch, State
 from dopt.types import (
     Accelerations,
+    Buckets,
     ComplexAccelerations,
     Integers,
     Known,
     Matrix,
+    Signs,
     Singles,
     Stack,
     Vector,
 )
+
+
+class Covariance(NamedTuple):
+    """M⁻¹ = A - VᵀV (:mod:`dopt.kernel.information`); all empty where nothing needs it."""
+
+    upper: Matrix  # (q, q), A in the upper triangle
+    pending: Matrix  # (PENDING_ROWS, q), V in the first n_pending rows
+    n_pending: Integers  # (1,)
+
+
+class Dual(NamedTuple):
+    """Rows of the Gram matrix and its factor (:mod:`dopt.kernel.information`).
+
+    Empty in other forms.
+    """
+
+    features: Matrix  # (T, p) at the states seen
+    hidden: Stack  # (L, T, w)
+    deltas: Stack  # (r, L, T, w)
+    factor: Matrix  # (r T, r T), C in the lower triangle
+    n_states: Integers  # (1,)
+    regularization: float  # λ of M₀ = λI
+
+
+class Sketch(NamedTuple):
+    """Random projection of the parameters (:mod:`dopt.kernel.information`).
+
+    Empty in other forms.
+    """
+
+    buckets: Buckets  # (q,)
+    signs: Signs  # (q,)
+    size: int
+
+
+class Visited(NamedTuple):
+    """States visited, for fresh information (:mod:`dopt.kernel.information`).
+
+    Empty where information is accumulated.
+    """
+
+    features: Matrix  # (p, T) at the states, of which n_states are filled
+    n_states: Integers  # (1,)
+    refresh_every: int  # steps
+    regularization: float  # λ of M₀ = λI
+
+
+class Posterior(NamedTuple):
+    """Samples of a Gaussian process (:mod:`dopt.kernel.learners.kalman`).
+
+    Empty in other models.
+    """
+
+    factor: Matrix  # (T, T), L in the lower triangle
+    solved: Matrix  # (T, r), z
+    n_samples: Integers  # (1,)
+
+
+class Linearization(NamedTuple):
+    """Passes of the network at one state for one component, and along m directions."""
+
+    phi: Vector  # (p,)
+    hidden: Matrix  # (L, w)
+    deltas: Matrix  # (L, w)
+    phi_dots: Matrix  # (m, p)
+    hidden_dots: Stack  # (m, L, w)
+    deltas_dots: Stack  # (m, L, w)
+
+
+class Members(NamedTuple):
+    """Networks of an ensemble (:mod:`dopt.kernel.loop`); empty in other models."""
+
+    parameters: Matrix  # (E, q)
+    priors: Matrix  # (E, q) before the first step
+
+
+class PredictionError(NamedTuple):
+    """Errors of the model and last input, kept for the limits; empty in trials without limits."""
+
+    scale: Vector  # (r,) mean of e²/(1 + h) over the newest samples
+    variances: Matrix  # (2, r), h = g M⁻¹ gᵀ at the present and at the predicted state
+    last_input: Vector  # (m,) planned or applied
+
+
+class Estimate(NamedTuple):
+    """Outputs and filters that estimate states; all but the inputs empty where states are known."""
+
+    starts: Matrix  # (T, d) states from which steps restart; NaN where they follow one another
+    outputs: Matrix  # (T, n) measured after each step
+    durations: Vector  # (T,) of the steps
+    inputs: Matrix  # (T, m) that go with the accelerations: those applied, or these filtered
+    filtered: Matrix  # (3, d) measured states and their differences, filtered, and as measured last
+    filtered_input: Vector  # (m,)
+    covariance: Matrix  # (d, d) of the state, given the parameters
+    sensitivity: Matrix  # (d, q) of the estimated state to the parameters
+    noise_variance: Vector  # (1,) ρ of the accelerations, which a fit may change
+
+
+class State(NamedTuple):
+    """Everything that changes from step to step; written in place."""
+
+    theta: Vector  # (q,) parameters; of an ensemble: of its first member
+    prior: Vector  # (q,) parameters before the first step
+    members: Members
+    moment_1: Vector  # (q,) of Adam
+    moment_2: Vector  # (q,)
+    covariance: Covariance
+    factor: Matrix  # (q, q), the Cholesky factor of M of a learner that leaves it in place of M⁻¹
+    dual: Dual
+    sketch: Sketch
+    visited: Visited
+    posterior: Posterior
+    prediction: PredictionError
+    estimate: Estimate
+    window_features: Matrix  # (p, window) newest samples, a ring
+    window_targets: Matrix  # (r, window)
+    policy_memory: Vector  # memory of a compiled policy in a user's file
+    learner_memory: Vector  # memory of a compiled learner in a user's file
+
+
+class Scratch(NamedTuple):
+    """Memory that a learning step overwrites."""
+
+    hidden: Matrix  # (L, room) flat activations of a batch
+    deltas: Matrix  # (3, room) flat δ of a batch
+    gradient: Vector  # (q,)
+
+
+class Record(NamedTuple):
+    """Results of a trial, step by step."""
+
+    states: Matrix  # (T + 1, d) known, or estimated
+    true_states: Matrix  # (T + 1, d) of a simulation; the same array where all are known
+    inputs: Matrix  # (T, m)
+    loss: Vector  # (T,)
+    reachable_loss: Vector  # (T,)
+    plan_us: Vector  # (T,)
+    learn_us: Vector  # (T,)
+    evaluate_us: Vector  # (T,)
 
 
 class Plant(NamedTuple):
@@ -45,7 +182,7 @@ class Plant(NamedTuple):
 
 
 class Waves(NamedTuple):
-    """Random features (:mod:`dopt.kernel.random_features`); empty in other models."""
+    """Random features (:mod:`dopt.kernel.model_kinds`); empty in other models."""
 
     frequencies: Matrix  # (D, p), Ω
     phases: Vector  # (D,), b
@@ -53,7 +190,7 @@ class Waves(NamedTuple):
 
 
 class Process(NamedTuple):
-    """Gaussian process (:mod:`dopt.kernel.gaussian_process`); ones in other models."""
+    """Gaussian process (:mod:`dopt.kernel.model_kinds`); ones in other models."""
 
     lengthscale: float  # ℓ
     amplitude: float  # s
@@ -102,7 +239,7 @@ class Algorithm(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Bounds of states and inputs, infinite where there are none (:mod:`dopt.kernel.limits`)."""
+    """Bounds of states and inputs, infinite where unbounded (:mod:`dopt.kernel.limits`)."""
 
     enforced: bool
     lower: Vector  # (d,)

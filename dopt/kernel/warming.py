@@ -6,14 +6,13 @@ END says at which end of the list the process begins: first or last.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from functools import partial
-from types import ModuleType
 from typing import NamedTuple
 
-from dopt.kernel import absent_steps, cache
+from dopt.kernel import cache, loop
 from dopt.kernel.equations import compiled_equations, name_of_equations
-from dopt.kernel.information import absent, dual, fresh, primal_linear, primal_network, sketch
+from dopt.kernel.information import FORMS, NETWORK
 from dopt.kernel.loop import advance, evaluate_next
 from dopt.kernel.outermost_code import leave_callees_out
 from dopt.kernel.pointers import (
@@ -29,6 +28,7 @@ from dopt.kernel.pointers import (
     step_kinds,
 )
 from dopt.kernel.run import KernelTrial
+from dopt.kernel.structs import Information
 from dopt.learning import LEARNERS, Adam
 from dopt.policies import POLICIES, DOptimal
 from dopt.process import collect_rarely
@@ -37,23 +37,23 @@ from dopt.systems import SYSTEMS
 
 
 class Choices(NamedTuple):
-    """Paths of the functions of policies and learners, and modules of forms of M, to compile."""
+    """Paths of the functions of policies and learners, and forms of M, to compile."""
 
     plans: list[str]
     learns: list[str]
-    forms: list[ModuleType]
+    forms: Sequence[Information]
 
 
 def choices(everything: bool) -> Choices:
     """Return what a trial of the paper needs, or all that the package holds."""
     if not everything:
-        return Choices([DOptimal.kernel_function], [Adam.kernel_function], [primal_network])
+        return Choices([DOptimal.kernel_function], [Adam.kernel_function], [NETWORK])
     plans = {policy.kernel_function for policy in POLICIES.values() if policy.compiled}
     learns = {learner.kernel_function for learner in LEARNERS.values() if learner.compiled}
     return Choices(
-        sorted(plans | {path_of(absent_steps.plan)}),
-        sorted(learns | {path_of(absent_steps.learn)}),
-        [absent, primal_network, primal_linear, dual, sketch, fresh],
+        sorted(plans | {path_of(loop.plan_in_numpy)}),
+        sorted(learns | {path_of(loop.learn_in_numpy)}),
+        FORMS,
     )
 
 
@@ -68,7 +68,7 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
         for function in choices[: 2 if everything else 1]
     }
     systems = [system() for system in SYSTEMS.values()]
-    forms = [one for form in chosen.forms for one in (form.add_rows, form.planning_forms)]
+    forms = [pair for form in chosen.forms for pair in form._asdict().items()]
     steps, whole = (*STEPS, *BETWEEN) if everything else STEPS[:1], (trial.trial, trial.points)
     evaluation = {path_of(evaluate_next): partial(compiled_evaluation, *whole)}
     return {
@@ -78,7 +78,7 @@ def kernel_parts(everything: bool) -> dict[str, Callable[[], object]]:
         **{path_of(one): partial(compiled_at, path_of(one), others[one]) for one in others},
         **{path: partial(compiled_at, path, kinds.learn) for path in chosen.learns},
         **{name_of_equations(system): partial(compiled_equations, system) for system in systems},
-        **{path_of(form): partial(compile_form, trial.trial, form) for form in forms},
+        **{path_of(form): partial(compile_form, trial.trial, name, form) for name, form in forms},
         **{path: partial(compiled_at, path, kinds.plan) for path in chosen.plans},
     }
 

@@ -93,7 +93,7 @@ class AdamReplay(AdamRule):
 
     name: ClassVar[str] = "adam_replay"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.replay.learn"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.adam.learn_from_replay"
     reads_inputs: ClassVar[bool] = True
 
     learning_rate: float = parameter(3e-3, bound="positive")

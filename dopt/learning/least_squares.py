@@ -58,7 +58,7 @@ class RecursiveLeastSquares(Learner):
 
     name: ClassVar[str] = "recursive_least_squares"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.least_squares.learn"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.learn_recursively"
     reads_inputs: ClassVar[bool] = True
     updates_information: ClassVar[bool] = True
     structure: ClassVar[str] = "least_squares"
@@ -76,7 +76,7 @@ class Conditioning(Learner):
     name: ClassVar[str] = "conditioning"
     structure: ClassVar[str] = "conditioning"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.learners.conditioning.learn"
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.kalman.condition"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -71,7 +71,7 @@ class OpenLoop(Policy):
     """
 
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.policies.open_loop.plan"
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.plan_drawn"
     reads_inputs: ClassVar[bool] = True
     exceeds: ClassVar[bool] = False
 

@@ -48,7 +48,7 @@ class DOptimal(InformationPolicy):
 
     name: ClassVar[str] = "d_optimal"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.policies.d_optimal.plan"
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.plan_d_optimal"
     reads_inputs: ClassVar[bool] = True
 
     form: str = parameter("auto", choices=("auto", "primal", "dual", "sketch"))
@@ -344,7 +344,7 @@ class Uniform(ClosedLoop):
 
     name: ClassVar[str] = "uniform"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.policies.uniform.plan"
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.plan_uniform"
     reads_inputs: ClassVar[bool] = True
 
     iterations: int = parameter(8, "steps", "positive")

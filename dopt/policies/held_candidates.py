@@ -61,7 +61,7 @@ class GaussianProcessEntropy(HeldCandidates):
 
     name: ClassVar[str] = "gaussian_process"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.policies.gaussian_process.plan"
+    kernel_function: ClassVar[str] = "dopt.kernel.policies.plan_held_candidates"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -153,7 +153,7 @@ class Episodic(ICEM):
 
     name: ClassVar[str] = "episodic"
     compiled: ClassVar[bool] = True
-    kernel_function: ClassVar[str] = "dopt.kernel.search.episodes.plan"
+    kernel_function: ClassVar[str] = "dopt.kernel.search.sampling.plan_episodes"
 
     lookahead: int = parameter(50, "steps", "positive")
     replan_every: int = parameter(50, "steps", "positive")

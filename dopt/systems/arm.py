@@ -165,7 +165,7 @@ class Chain(System):
     Learned: all φ̈ᵢ at τ = 0. Known: H⁻¹ times the torques.
 
     The evaluation box has 2n axes, too many for a full grid: its points are a low-discrepancy set
-    of ``grid_points`` states. The attributes of the class are those of the default number of links.
+    of ``grid_points`` states. The attributes of the class belong to the default number of links.
 
     Parameters
     ----------

@@ -228,7 +228,7 @@ class System(Validated):
     def accelerations(state: Scalar, parameters: Scalar) -> Sequence[Scalar]:
         """Return the learned accelerations: r scalars.
 
-        ``state`` holds the d scalars of x, and those of u after them if the system reads inputs.
+        ``state`` holds the d scalars of x, followed by the scalars of u if the system reads inputs.
         """
 
     @property
@@ -267,8 +267,8 @@ class System(Validated):
     def history(self) -> Array:
         """Physical parameters of each step, (T, number of them); one row for one that stays.
 
-        They are those of the learned accelerations. The known part, which a policy and a model are
-        given, is that of :attr:`parameters` at all times.
+        They enter the learned accelerations. The known part, which a policy and a model are given,
+        takes :attr:`parameters` at all times.
         """
         return np.array([self.parameters])
 

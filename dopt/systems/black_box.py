@@ -43,13 +43,13 @@ class Episode(Protocol):
     def step(self, inputs: Array) -> Array:
         """Apply what is possible of an input (m,), and return what was applied, (m,).
 
-        The state is NaN once the run is over. Where a run begins anew before the step, in another
+        The state is NaN once the run is over. Where a run restarts before the step, in another
         state than the last one, an attribute ``new_start`` holds that state, (d,), until the next.
         """
 
 
 def new_start(episode: Episode) -> Array | None:
-    """Return where the last step of a run began, (d,), if the run had begun anew; else None."""
+    """Return where the last step of a run began, (d,), if the run had restarted; else None."""
     start: Array | None = getattr(episode, "new_start", None)
     return start
 
@@ -66,7 +66,7 @@ class BlackBox(System):
     one that diverged.
 
     The interpreter steps it between the compiled steps of a trial, for which ``known`` is compiled;
-    with ``compiled = False`` the steps are those of the reference. Where ``measured`` is true it is
+    with ``compiled = False`` the reference takes the steps. Where ``measured`` is true it is
     explored by what somebody tells of it (:class:`dopt.Explorer`), and no episode of it is begun.
 
     Where the truth at a state of one's choice is unknown, the loss is the root mean square error
@@ -109,7 +109,7 @@ class BlackBox(System):
         """Start a run; the seed decides about all that is random in it."""
 
     def try_out(self) -> None:
-        """Raise SpecificationError if runs of it cannot be those of trials: begin one in vain."""
+        """Raise SpecificationError if its runs cannot serve trials: begin one and discard it."""
         self.episode(0)
 
     def true_accelerations(self, states: Array, inputs: Array) -> Array | None:  # noqa: ARG002  # of most, nothing is known
@@ -181,7 +181,7 @@ def transitions(
     """Run an episode under inputs (T, m).
 
     Returned are states (T, d), applied inputs (T, m), accelerations (T, r) and which there are: not
-    those of steps before which or after which the run had ended or begun anew.
+    the steps before which or after which the run had ended or restarted.
     """
     episode = system.episode(seed)
     states = np.empty((len(inputs) + 1, system.n_states))

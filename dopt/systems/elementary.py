@@ -1,7 +1,7 @@
 """Elementary functions over floats, complex numbers, arrays and tensors alike.
 
 The equations of a system are written once over these; the compiled kernel replaces each by the
-machine's own (:mod:`dopt.kernel.equations`). A complex argument is that of a complex step, which
+machine's own (:mod:`dopt.kernel.equations`). A complex argument belongs to a complex step, which
 takes derivatives: what is not smooth, :func:`magnitude`, :func:`sign` and :func:`where`, follows
 the real part.
 """
@@ -46,7 +46,7 @@ def magnitude(x: Scalar) -> Scalar:
 
 
 def sign(x: Scalar) -> Scalar:
-    """Sign of a real quantity, -1, 0 or 1; of a complex one, that of its real part.
+    """Sign of a real quantity, -1, 0 or 1; of a complex one, the sign of its real part.
 
     Its derivative is 0. Dry friction is ``-c * sign(v)``. ``numpy.sign`` of a complex number is
     x / |x|, from which a complex step takes another derivative.

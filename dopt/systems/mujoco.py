@@ -56,7 +56,7 @@ class MuJoCo(BlackBox):
     start : tuple of float
         Positions of the joints about which a trial starts, (n,).
     rate_unit : float
-        Unit of the velocities in that of the engine, chosen so that the accelerations are of a size
+        Unit of the velocities in the engine's unit, chosen so that the accelerations are of a size
         that a network learns (:data:`dopt.spec.custom_system.LARGEST`).
 
     Parameters
@@ -123,7 +123,7 @@ class Run:
 
     @property
     def state(self) -> Array:
-        """State, (2 n,); NaN once the engine has begun anew because numbers exploded."""
+        """State, (2 n,); NaN once the engine has restarted because numbers exploded."""
         if any(warning.number for warning in self._warnings):
             return np.full(2 * len(self._velocities), np.nan)
         return np.concatenate([self._positions, self._velocities / self._rate_unit])

@@ -133,13 +133,13 @@ class DriftingPendulum(Pendulum):
 
     Notes
     -----
-    Reasons for the default values beside those of env=pendulum:
+    Reasons for the default values beside the reasons of env=pendulum:
 
     - friction: b/I grows from 0.5 1/s to 1.5 1/s. A model of the first second is then wrong by
       4.5 rad/s² (root mean square over the grid), 40 % of the accelerations themselves.
     - time: constant of 5 s: the friction is where it tends to, to 2 %, at the end of the
       horizon.
-    - horizon: 20 s, twice that of env=pendulum.
+    - horizon: 20 s, twice as long as in env=pendulum.
     """
 
     name: ClassVar[str] = "drifting_pendulum"
@@ -166,7 +166,7 @@ class UnbalancedDisk(System):
 
     dω/dt = -ω₀² sin y - b ω - c tanh(ω / ω_c) + k u. Learned: dω/dt at u = 0. Known: k u.
 
-    The numbers are those of the laboratory's disk that exercises of system identification simulate.
+    The numbers describe the laboratory's disk that exercises of system identification simulate.
     There ω_c is 0.001 rad/s, which asks for steps far below dt; at 0.1 rad/s the friction turns
     sign as fast as the Euler map can follow.
 
@@ -187,7 +187,7 @@ class UnbalancedDisk(System):
     -----
     Reasons for the default values:
 
-    - gravity, friction, dry_friction, motor_gain: those of the laboratory's disk.
+    - gravity, friction, dry_friction, motor_gain: of the laboratory's disk.
     - gamma: 3 V is 66 % of the voltage that holds the weight level: swinging up takes a few
       swings.
     - dt: 0.01 s: the Euler map follows the dry friction where it turns sign (dt c / ω_c = 0.6).
@@ -281,7 +281,7 @@ class CoupledPendulums(System):
     The evaluation box has an axis for each rate, and its points are a low-discrepancy set, whose
     projection on every axis is a regular partition: the loss of the linear model is the Euclidean
     norm of the error of the frictions times the root mean square of that partition
-    (:mod:`dopt.assessment`). The attributes of the class are those of the default number of
+    (:mod:`dopt.assessment`). The attributes of the class belong to the default number of
     pendulums.
 
     Parameters
@@ -296,7 +296,7 @@ class CoupledPendulums(System):
         True viscous friction of every pendulum by the moment of inertia [1/s]; a model learns it
         for each.
     initial_state, grid_half_widths : tuple of float
-        Of all 2n states and n rates, or those of one pendulum, which then hold for all.
+        Of all 2n states and n rates, or of one pendulum, which then hold for all.
 
     Notes
     -----

@@ -170,13 +170,13 @@ class MovingStar(System):
 
     Notes
     -----
-    The default values are those of its released code, with α = 100 and dt = 0.01 there and dt/α the
+    The default values come from its released code, with α = 100 and dt = 0.01 there and dt/α the
     same here:
 
     - gamma: an input moves the mass by 5 mm in a step; the star moves by 5.7 mm, and its force
       by 0.1 mm.
     - period: 1,000 steps, the horizon.
-    - noise: that of a force of 1e-4 N.
+    - noise: of a force of 1e-4 N.
     - core: theirs is a barrier of this width.
     """
 

@@ -55,7 +55,7 @@ def compiled_text(
     arguments: Mapping[str, Sequence[str]],
     constants: Mapping[str, float] | None = None,
 ) -> Equation:
-    """Return a function whose values are those of expressions, in their order.
+    """Return a function that gives the values of expressions, in their order.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def compiled_text(
     Raises
     ------
     SpecificationError
-        If a text is no such expression, uses a name that is none of the quantities, or has a part
+        If a text is no such expression, uses a name that is not a quantity, or has a part
         such as ``u / m`` with m = 0.
     """
     names = [name for group in arguments.values() for name in group]
@@ -266,7 +266,7 @@ class Plant:
         Cutoff of the filter of these states and their differences [Hz], with a learner that does
         not estimate states.
     limit : float
-        Largest magnitude of a state that can be a measurement, but for angles; what is beyond is
+        Largest magnitude of a state that can be a measurement, except for angles; what is beyond is
         left out.
     integrator : {"euler", "rk4"}
         How the model's accelerations are compared with two states: as that at the first one, or

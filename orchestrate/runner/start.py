@@ -42,7 +42,7 @@ def checked(request: Request) -> tuple[Grid, LaunchSettings]:
     grid = build_grid(request.combinations, single=request.single)
     settings = LaunchSettings.from_mapping(request.launch)
     check_launch(request.launch)
-    from dopt.kernel import cache  # refuses a path of the cache that cannot be meant
+    from dopt.kernel import cache
 
     path = executor_factory(settings).path
     if path != "kernel":

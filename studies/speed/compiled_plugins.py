@@ -14,12 +14,15 @@ import numpy as np
 
 from benchmarks.rows import Row
 from benchmarks.trials import cartpole, cost, run_in_turn
-from dopt.kernel.information.primal import quadratic_forms
-from dopt.kernel.learners.adam import adam_step
-from dopt.kernel.learners.samples import store_sample
 from dopt.kernel.model import linearization_at, network_gradients
-from dopt.kernel.policies.prediction import input_columns, predicted_state
-from dopt.kernel.structs import Trial
+from dopt.kernel.plugin import (
+    Trial,
+    adam_step,
+    input_columns,
+    predicted_state,
+    quadratic_forms,
+    store_sample,
+)
 from dopt.learning import AdamWindow
 from dopt.learning.base import CompiledLearner
 from dopt.policies import InformationPolicy

@@ -8,10 +8,9 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from dopt.kernel.compiler import compiled
-from dopt.kernel.stored_code import StoredCode
+from dopt.kernel.compiler import StoredCode, compiled
+from dopt.kernel.pointers import content_digest
 from dopt.kernel.structs import Trial
-from dopt.kernel.user_code import content_digest
 from dopt.learning.base import Array, CustomLearner, Updater
 from dopt.policies.base import CustomPolicy, Planner
 from dopt.systems import System

@@ -9,7 +9,7 @@ import numpy as np
 
 from dopt import run_trial
 from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
-from dopt.kernel.learners.prediction_errors import run_filter
+from dopt.kernel.learners.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from tests.dopt.kernel.calls import call
 from tests.dopt.test_sensors import ANGLE, sensed

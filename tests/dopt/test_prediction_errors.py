@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dopt.kernel.learners.prediction_errors import run_filter
+from dopt.kernel.learners.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
 from dopt.spec.trial import TrialSpec

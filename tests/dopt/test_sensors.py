@@ -10,8 +10,8 @@ import pytest
 
 from dopt.errors import IncompatibleError, ScaleWarning, SpecificationError
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.state_structs import Record
-from dopt.kernel.stepped_trial import SteppedTrial
+from dopt.kernel.steps import SteppedTrial
+from dopt.kernel.structs import Record
 from dopt.randomness import draw
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec

@@ -1,4 +1,4 @@
-"""Adam on the newest samples in compiled code (:mod:`dopt.learning.adam`).
+"""Adam in compiled code (:mod:`dopt.learning.adam`): newest samples, or a replay buffer.
 
 Its numbers are the learning rate, β₁, β₂ and ε.
 """
@@ -9,11 +9,32 @@ import numpy as np
 
 from dopt.algorithm import ModelKind
 from dopt.kernel.compiler import compiled, contracted
-from dopt.kernel.grey_box import write_normal_equations
-from dopt.kernel.learners.samples import sampled_point, store_sample
-from dopt.kernel.network import loss_gradient
-from dopt.kernel.structs import Trial
+from dopt.kernel.model import model_point, sampled_state
+from dopt.kernel.model_kinds import write_normal_equations
+from dopt.kernel.network import features_at, loss_gradient
+from dopt.kernel.structs import Network, Trial
 from dopt.types import Matrix, Vector
+
+
+@compiled
+def sampled_point(trial: Trial, t: int) -> Vector:
+    """Return where the accelerations of step t were observed: a state, or a state and u_t."""
+    state = sampled_state(trial.plant, trial.record.states, t)
+    return model_point(trial.network, state, trial.state.estimate.inputs[t])
+
+
+@compiled
+def store_sample(
+    network: Network, features: Matrix, targets: Matrix, t: int, x: Vector, target: Vector
+) -> None:
+    """Put the features of a point and the accelerations observed there, (r,), into a ring."""
+    slot = t % features.shape[1]
+    phi = np.empty(network.feature_kinds.shape[0])
+    features_at(network, x, phi)
+    for i in range(phi.shape[0]):
+        features[i, slot] = phi[i]
+    for k in range(target.shape[0]):
+        targets[k, slot] = target[k]
 
 
 @compiled
@@ -60,3 +81,23 @@ def adam_update(
 def _sum_of_weights(beta: float, n: int) -> float:
     """Return the sum of the weights that a moment of decay β gives to n gradients."""
     return float(1.0 - beta**n)
+
+
+@compiled
+def learn_from_replay(trial: Trial, t: int, target: Vector) -> None:
+    """Take Adam's steps of time t, one for each row of places in the buffer, (steps, batch)."""
+    state, places = trial.state, trial.randomness.replay[t]
+    seen, observed = state.window_features, state.window_targets
+    store_sample(trial.network, seen, observed, t, sampled_point(trial, t), target)
+    steps, batch = places.shape
+    features = np.empty((seen.shape[0], batch))
+    targets = np.empty((observed.shape[0], batch))
+    for s in range(steps):
+        for j in range(batch):
+            place = places[s, j]
+            for i in range(features.shape[0]):
+                features[i, j] = seen[i, place]
+            for k in range(targets.shape[0]):
+                targets[k, j] = observed[k, place]
+        step = t * steps + s
+        adam_step(trial, step, features, targets)

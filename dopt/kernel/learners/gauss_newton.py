@@ -1,21 +1,41 @@
-"""Gauss-Newton steps on all samples in compiled code (:mod:`dopt.learning.least_squares`).
+"""Fits of a network to many samples in compiled code: in a trial, and to given samples.
 
-Its numbers are λ, ρ, the steps from one fit to the next and the Gauss-Newton steps of a fit.
+In a trial (:mod:`dopt.learning.least_squares`) the numbers are λ, ρ, the steps from one fit to the
+next and the Gauss-Newton steps of a fit. To given samples (:mod:`dopt.offline_fit`) a network is
+fitted by the method of Levenberg and Marquardt:
+
+======  =====================================================================  =========
+symbol  meaning                                                                shape
+======  =====================================================================  =========
+θ, θ₀   parameters of the network, and the initial ones                        q
+e       y - a_θ(x), observed less modelled accelerations                       r × N
+F       ‖e‖² + ρ‖θ - θ₀‖², which is minimised
+δ       step: (JᵀJ + (ρ + μ) I) δ = Jᵀe + ρ (θ₀ - θ)                            q
+κ       correction for curvature: (JᵀJ + (ρ + μ) I) κ = -½ Jᵀa'', with a'' the  q
+        second derivative of a_θ(x) along δ
+ρ, μ    ridge, and the damping that is adapted from step to step
+======  =====================================================================  =========
+
+References: K. Madsen, H. Nielsen and O. Tingleff, "Methods for non-linear least squares problems"
+(2004), algorithm 3.16, for the damping; M. Transtrum and J. Sethna, "Improvements to the
+Levenberg-Marquardt algorithm for nonlinear least-squares minimization" (2012, arXiv:1201.5885), for
+the correction, the geodesic acceleration. With it a fit takes a third of the steps.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from dopt.algorithm import NO_GROWTH, SMALLEST_SHARE, ModelKind
-from dopt.kernel import grey_box
-from dopt.kernel.compiler import compiled, squared
-from dopt.kernel.information.cholesky import factorize, solve, write_inverse
-from dopt.kernel.information.normal_equations import errors_of, normal_equations
+from dopt.kernel import model_kinds
+from dopt.kernel.compiler import called_from_python, compiled, squared
+from dopt.kernel.learners.adam import sampled_point, store_sample
 from dopt.kernel.learners.kalman import filter_sample
-from dopt.kernel.learners.samples import sampled_point, store_sample
-from dopt.kernel.state_structs import State
-from dopt.kernel.structs import Network, Plant, Trial
+from dopt.kernel.linear_algebra import factorize, solve, write_inverse
+from dopt.kernel.normal_equations import errors_of, normal_equations, write_products
+from dopt.kernel.structs import Network, Plant, State, Trial
 from dopt.types import Matrix, Vector
 
 
@@ -78,8 +98,8 @@ def take_step(
     if network.kind == ModelKind.MLP:
         squares = normal_equations(network, theta, features, targets, normal, step)
     else:
-        grey_box.write_normal_equations(plant, network, theta, features, targets, normal, step)
-        squares = grey_box.squared_error(plant, network, theta, features, targets)
+        model_kinds.write_normal_equations(plant, network, theta, features, targets, normal, step)
+        squares = model_kinds.squared_error(plant, network, theta, features, targets)
     squares += ridge * squared_distance(theta, prior)
     for i in range(q):
         normal[i, i] += ridge
@@ -94,7 +114,7 @@ def take_step(
         if network.kind == ModelKind.MLP:
             after = errors_of(network, theta, features, targets)[0]
         else:
-            after = grey_box.squared_error(plant, network, theta, features, targets)
+            after = model_kinds.squared_error(plant, network, theta, features, targets)
         if after + ridge * squared_distance(theta, prior) <= squares * NO_GROWTH:
             return True
         share *= 0.5
@@ -117,3 +137,127 @@ def _scale(upper: Matrix, factor: float) -> None:
     for i in range(upper.shape[0]):
         for j in range(i, upper.shape[0]):
             upper[i, j] *= factor
+
+
+FIRST_DAMPING = 1e-3
+"""First μ, in units of the largest entry of the diagonal of JᵀJ + ρI."""
+
+LARGEST_CORRECTION = 0.75
+"""Largest ‖κ‖, in units of ‖δ‖, of a step that is tried."""
+
+PROBE = 0.1
+"""Part of δ over which the second derivative is taken by central differences."""
+
+SMALL_FALL = 1e-7
+"""Fall of F in a step, in units of F, that counts as none."""
+
+SMALL_STEP = 1e-3
+"""Length of a step, in units of ‖θ‖, that counts as none."""
+
+ROUNDING = 1e-12
+"""Length of a step, in units of ‖θ‖, below which rounding hides any fall of F."""
+
+
+class Problem(NamedTuple):
+    """Network, prior and samples of a fit."""
+
+    network: Network
+    prior: Vector  # (q,) θ₀
+    ridge: float  # ρ
+    features: Matrix  # (p, N)
+    targets: Matrix  # (r, N) accelerations
+
+
+@called_from_python
+def fit(problem: Problem, theta: Vector, max_steps: int) -> tuple[int, bool]:
+    """Fit θ, (q,), in place; return the number of steps and whether the fit has converged.
+
+    Converged: F fell by less than ``SMALL_FALL`` in a step that was shorter than ``SMALL_STEP``, or
+    a step was so short that rounding hides any fall. A step after which F would not be smaller is
+    counted and not taken.
+    """
+    q = theta.shape[0]
+    normal, factor = np.empty((q, q)), np.empty((q, q))
+    slope, step, candidate = np.empty(q), np.empty(q), np.empty(q)
+    value = _linearize(problem, theta, normal, slope)
+    damping, growth = FIRST_DAMPING * np.diag(normal).max(), 2.0
+    for done in range(1, max_steps + 1):
+        fall = -1.0
+        if _write_step(problem, theta, normal, slope, damping, factor, step, candidate):
+            fall = value - _objective(problem, candidate)
+        size = np.sqrt(np.dot(step, step) / np.dot(theta, theta))
+        if fall > 0.0:
+            theta[:] = candidate
+            if fall <= SMALL_FALL * value and size <= SMALL_STEP:
+                return done, True
+            foreseen = np.dot(step, slope) + damping * np.dot(step, step)
+            excess = 2.0 * fall / foreseen - 1.0
+            damping *= max(1.0 / 3.0, 1.0 - excess * squared(excess))
+            growth = 2.0
+            value = _linearize(problem, theta, normal, slope)
+        elif size <= ROUNDING:
+            return done, True
+        else:
+            damping *= growth
+            growth *= 2.0
+    return max_steps, False
+
+
+@compiled
+def _linearize(problem: Problem, theta: Vector, normal: Matrix, slope: Vector) -> float:
+    """Write JᵀJ + ρI, (q, q), and Jᵀe + ρ(θ₀ - θ), (q,); return F."""
+    network, prior, ridge, features, targets = problem
+    squares = normal_equations(network, theta, features, targets, normal, slope)
+    for i in range(theta.shape[0]):
+        normal[i, i] += ridge
+        slope[i] += ridge * (prior[i] - theta[i])
+    return squares + ridge * squared_distance(theta, prior)
+
+
+@compiled
+def _objective(problem: Problem, theta: Vector) -> float:
+    squares = errors_of(problem.network, theta, problem.features, problem.targets)[0]
+    return squares + problem.ridge * squared_distance(theta, problem.prior)
+
+
+@compiled
+def _write_step(
+    problem: Problem,
+    theta: Vector,
+    normal: Matrix,
+    slope: Vector,
+    damping: float,
+    factor: Matrix,
+    step: Vector,
+    candidate: Vector,
+) -> bool:
+    """Write δ, (q,), and θ + δ + κ, (q,); tell whether the step is worth a try.
+
+    It is not where the factor of JᵀJ + (ρ + μ) I, (q, q), which is overwritten, is not definite, or
+    where the correction is so long that the samples are not described by it.
+    """
+    factor[:], step[:] = normal, slope
+    for i in range(step.shape[0]):
+        factor[i, i] += damping
+    if not factorize(factor):
+        return False
+    solve(factor, step)
+    correction = candidate
+    _write_curvature(problem, theta, step, correction)
+    solve(factor, correction)
+    longest = LARGEST_CORRECTION * np.sqrt(np.dot(step, step))
+    short = bool(0.5 * np.sqrt(np.dot(correction, correction)) <= longest)
+    for i in range(step.shape[0]):
+        candidate[i] = theta[i] + step[i] + 0.5 * correction[i]
+    return short
+
+
+@compiled
+def _write_curvature(problem: Problem, theta: Vector, step: Vector, out: Vector) -> None:
+    """Write -Jᵀa'', (q,), of the second derivative of the model along a step."""
+    network, _, _, features, targets = problem
+    _, errors, hidden = errors_of(network, theta, features, targets)
+    _, ahead, _ = errors_of(network, theta + PROBE * step, features, targets)
+    _, behind, _ = errors_of(network, theta - PROBE * step, features, targets)
+    bend = (ahead - 2.0 * errors + behind) / (PROBE * PROBE)
+    write_products(network, theta, features, hidden, bend, out)

@@ -2,18 +2,26 @@
 
 Its numbers are λ, the ρ of the beginning, ζ, the steps from one fit to the next, the Gauss-Newton
 steps of a fit, and whether it estimates ρ.
+
+A fit goes by the errors of predictions of all that was measured. The filter over the state alone,
+at parameters θ, leaves the innovations e, whose variances are s; their derivatives by θ, with the
+gains held, are -C Ψ. A fit takes damped Gauss-Newton steps to the minimum of
+Σ (e²/s + log s) + λ ‖θ - θ₀‖².
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from dopt.algorithm import MOST_NOISE_FACTORS, NO_GROWTH, NOISE_FACTORS, SMALLEST_SHARE
 from dopt.kernel.compiler import compiled
-from dopt.kernel.information.primal import inner, quadratic_forms
-from dopt.kernel.information.update import filter_step, model_rows
-from dopt.kernel.learners.prediction_errors import fit
-from dopt.kernel.learners.samples import sampled_point
-from dopt.kernel.learners.state_filter import (
+from dopt.kernel.integration import next_model_state
+from dopt.kernel.learners.adam import sampled_point
+from dopt.kernel.learners.gauss_newton import squared_distance
+from dopt.kernel.learners.kalman import filter_step, model_rows
+from dopt.kernel.linear_algebra import factorize, inner, quadratic_forms, solve, write_inverse
+from dopt.kernel.model import model_point, state_between
+from dopt.kernel.sensors import (
     begin,
     correct_covariance,
     correct_sensitivity,
@@ -23,9 +31,8 @@ from dopt.kernel.learners.state_filter import (
     output_sensitivity,
     state_jacobian,
 )
-from dopt.kernel.points import model_point
 from dopt.kernel.structs import Trial
-from dopt.types import Vector
+from dopt.types import Matrix, Vector
 
 
 @compiled
@@ -106,3 +113,113 @@ def state_variances(trial: Trial, t: int) -> Vector:
     spread = quadratic_forms(trial.state.covariance, psi, psi)
     variances: Vector = np.diag(estimate.covariance) + np.diag(spread)
     return variances
+
+
+@compiled
+def fit(trial: Trial, n: int, regularization: float, steps: int, fits_noise: bool) -> None:
+    """Fit θ, and ρ if asked to, to what was measured in n steps; rewrite M⁻¹, x̂_n, P and Ψ.
+
+    θ is NaN afterwards, which ends the trial as diverged, where rounding has left M indefinite.
+    """
+    state = trial.state
+    theta, prior, q = state.theta, state.prior, state.theta.shape[0]
+    n_errors = n * trial.sensors.output_matrix.shape[0]
+    rows, errors, step = np.empty((n_errors, q)), np.empty(n_errors), np.empty(q)
+    normal, definite = np.empty((q, q)), True
+    for turn in range(steps + 1):
+        if turn == steps and fits_noise:
+            _fit_noise(trial, n)
+        before = run_filter(trial, n, rows, errors)
+        before += regularization * squared_distance(theta, prior)
+        normal[:] = np.dot(rows.T, rows)
+        for i in range(q):
+            normal[i, i] += regularization
+        definite = definite and factorize(normal)
+        if not definite:
+            break
+        if turn < steps:
+            step[:] = np.dot(errors, rows) + regularization * (prior - theta)
+            solve(normal, step)
+            _take_step(trial, n, regularization, before, step)
+    if not (definite and write_inverse(normal, state.covariance.upper)):
+        theta[:] = np.nan
+    state.covariance.n_pending[0] = 0
+
+
+@compiled
+def _fit_noise(trial: Trial, n: int) -> None:
+    """Move ρ by factors as long as the errors of n steps become likelier, at the present θ."""
+    noise, none = trial.state.estimate.noise_variance, np.empty((0, trial.state.theta.shape[0]))
+    lowest = run_filter(trial, n, none, np.empty(0))
+    for factor in NOISE_FACTORS:
+        for _ in range(MOST_NOISE_FACTORS):
+            held = noise[0]
+            noise[0] = held * factor
+            found = run_filter(trial, n, none, np.empty(0))
+            if not found < lowest:
+                noise[0] = held
+                break
+            lowest = found
+
+
+@compiled
+def _take_step(trial: Trial, n: int, regularization: float, before: float, step: Vector) -> None:
+    """Move θ along a step, (q,), as far as the objective does not grow from ``before``."""
+    theta, prior, share = trial.state.theta, trial.state.prior, 1.0
+    start, none = theta.copy(), np.empty((0, theta.shape[0]))
+    while share >= SMALLEST_SHARE:
+        theta[:] = start + share * step
+        after = run_filter(trial, n, none, np.empty(0))
+        after += regularization * squared_distance(theta, prior)
+        if after <= before + (NO_GROWTH - 1.0) * abs(before):
+            return
+        share *= 0.5
+    theta[:] = start
+
+
+@compiled
+def run_filter(trial: Trial, n: int, rows: Matrix, errors: Vector) -> float:
+    """Filter what was measured in n steps at the present θ and ρ; return Σ (e²/s + log s).
+
+    Writes C Ψ/√s, (n outputs, q), and e/√s, if there is room for them, and then also x̂_n, P and Ψ.
+    """
+    plant, network, theta = trial.plant, trial.network, trial.state.theta
+    sensors, estimate, with_rows = trial.sensors, trial.state.estimate, rows.shape[0] > 0
+    n_measured, r = sensors.output_matrix.shape[0], plant.learned_rows.shape[0]
+    x = trial.record.states[0].copy()
+    d, noise, following = x.shape[0], estimate.noise_variance[0] * np.eye(r), np.empty(x.shape[0])
+    P, sensitivity = np.zeros((d, d)), np.zeros((d, theta.shape[0]))
+    row, total = np.empty(theta.shape[0]), 0.0
+    for t in range(n):
+        u, dt = trial.record.inputs[t], estimate.durations[t]
+        if begin(trial, t, P, sensitivity):
+            x[:] = estimate.starts[t]
+        A = state_jacobian(plant, network, theta, x, u, dt)
+        next_model_state(plant, network, theta, x, u, dt, following)
+        if with_rows:
+            point = model_point(network, state_between(plant, x, following), u)
+            J = model_rows(plant, network, theta, point, np.empty(r))
+            move_sensitivity(A, J, plant.learned_rows, dt, sensitivity)
+        move_covariance(A, noise, plant.learned_rows, dt, P)
+        x[:] = following
+        for i in range(n_measured):
+            output = sensors.output_matrix[i]
+            gain = covariances(P, output)
+            error = estimate.outputs[t, i] - inner(output, x)
+            variance = inner(output, gain) + sensors.variances[i]
+            gain /= variance
+            total += error * error / variance + np.log(variance)
+            correct_covariance(P, gain, variance)
+            if with_rows:
+                scale = 1.0 / np.sqrt(variance)
+                output_sensitivity(sensitivity, output, row)
+                rows[t * n_measured + i] = scale * row
+                errors[t * n_measured + i] = scale * error
+                correct_sensitivity(gain, row, sensitivity)
+            for j in range(d):
+                x[j] += gain[j] * error
+    if with_rows:
+        trial.record.states[n] = x
+        estimate.covariance[:] = P
+        estimate.sensitivity[:] = sensitivity
+    return total

@@ -1,22 +1,107 @@
-"""The extended Kalman filter in compiled code (:mod:`dopt.learning.least_squares`).
+"""Recursive learners in compiled code (:mod:`dopt.learning.least_squares`).
 
-Its numbers are ρ, f, the count of diagonal entries of M renewed at a step, what each gets back,
-and ζ.
+Recursive least squares; the extended Kalman filter, whose numbers are ρ, the forgetting factor f,
+the count of diagonal entries of M renewed at a step, what each gets back, and ζ; and conditioning
+of a Gaussian process:
+
+======  =====================================================  =====
+symbol  meaning                                                shape
+======  =====================================================  =====
+L       Cholesky factor of K + σ²/dt I of n samples            n × n
+z       L⁻¹ Y, with Y the observed accelerations               n × r
+α       L⁻ᵀ z, weights of the posterior mean                   n × r
+======  =====================================================  =====
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from dopt.kernel.compiler import compiled
-from dopt.kernel.information.cholesky import factorize, solve_columns
-from dopt.kernel.information.forgetting import forget
-from dopt.kernel.information.primal import quadratic_forms
-from dopt.kernel.information.update import filter_step, model_rows
-from dopt.kernel.learners.samples import sampled_point
-from dopt.kernel.state_structs import Covariance
-from dopt.kernel.structs import Trial
+from dopt.algorithm import ModelKind
+from dopt.kernel.compiler import compiled, vectorized
+from dopt.kernel.learners.adam import sampled_point
+from dopt.kernel.linear_algebra import (
+    add_multiple,
+    append_row,
+    factorize,
+    inner,
+    quadratic_forms,
+    rank_update,
+    solve_columns,
+    solve_lower,
+    solve_lower_transposed,
+)
+from dopt.kernel.model import network_jacobian, parameter_rows, sampled_state
+from dopt.kernel.model_kinds import mean_weights, sample_features, write_kernel
+from dopt.kernel.network import features_at
+from dopt.kernel.structs import Covariance, Network, Plant, Posterior, Trial
 from dopt.types import Matrix, Vector
+
+
+@compiled
+def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
+    """Return J, (r, q), at a point, and write a_θ, (r,), there."""
+    if network.kind != ModelKind.MLP:
+        rows = np.empty((value.shape[0], theta.shape[0]))
+        parameter_rows(plant, network, theta, x, rows, value)
+        return rows
+    return network_jacobian(network, theta, x, value)
+
+
+@compiled
+def filter_step(covariance: Covariance, theta: Vector, rows: Matrix, residuals: Vector) -> None:
+    """Add JᵀJ to M for J, (r, q), and correct θ by the residuals, (r,), which are overwritten."""
+    scratch = np.empty(rows.shape)
+    rank_update(covariance, rows, residuals, scratch)
+    for k in range(residuals.shape[0]):
+        for i in range(theta.shape[0]):
+            theta[i] += residuals[k] * scratch[k, i]
+
+
+@vectorized
+def forget(covariance: Covariance, forgetting: float, t: int, renewed: int, renewal: float) -> None:
+    """Turn M⁻¹ into (f M + D)⁻¹ at step t (:class:`dopt.learning.ExtendedKalman`).
+
+    D has the entry ``renewal`` at the ``renewed`` diagonal places whose turn it is.
+    """
+    upper, pending = covariance.upper, covariance.pending
+    q = upper.shape[0]
+    for i in range(q):
+        row = upper[i, i:]
+        for j in range(row.shape[0]):
+            row[j] /= forgetting
+    for k in range(covariance.n_pending[0]):
+        for j in range(q):
+            pending[k, j] /= np.sqrt(forgetting)
+    column = np.empty(q)
+    for n in range(renewed):
+        i = (t * renewed + n) % q
+        _read_column(covariance, i, column)
+        factor = np.sqrt(renewal / (1.0 + renewal * column[i]))
+        for j in range(q):
+            column[j] *= factor
+        append_row(covariance, column)
+
+
+@vectorized
+def _read_column(covariance: Covariance, i: int, out: Vector) -> None:
+    """Write column i of M⁻¹, (q,)."""
+    upper, pending = covariance.upper, covariance.pending
+    for j in range(out.shape[0]):
+        out[j] = upper[min(i, j), max(i, j)]
+    for k in range(covariance.n_pending[0]):
+        add_multiple(out, -pending[k, i], pending[k])
+
+
+@compiled
+def learn_recursively(trial: Trial, t: int, target: Vector) -> None:
+    """Take the least-squares step on the observed accelerations, (r,), and update M."""
+    theta, covariance = trial.state.theta, trial.state.covariance
+    residuals = np.empty(target.shape[0])
+    rows = model_rows(trial.plant, trial.network, theta, sampled_point(trial, t), residuals)
+    for k in range(target.shape[0]):
+        residuals[k] = target[k] - residuals[k]
+    filter_step(covariance, theta, rows, residuals)
 
 
 @compiled
@@ -83,3 +168,37 @@ def whiten(
         return
     solve_columns(L, rows)
     solve_columns(L, residuals.reshape(-1, 1))
+
+
+@compiled
+def condition(trial: Trial, t: int, target: Vector) -> None:
+    """Add the sample of step t, whose accelerations are (r,): a row of L and of z, and all of α."""
+    network, posterior, r = trial.network, trial.state.posterior, target.shape[0]
+    n = posterior.n_samples[0]
+    phi = sample_features(network, trial.state.theta, r)
+    features_at(network, sampled_state(trial.plant, trial.record.states, t), phi[n])
+    write_kernel(network, phi[n], phi[:n], posterior.factor[n, :n])
+    _grow(network, posterior, target)
+    alpha = mean_weights(network, trial.state.theta, r)
+    columns = np.empty((r, n + 1))
+    columns[:] = posterior.solved[: n + 1].T
+    solve_lower_transposed(posterior.factor, n + 1, columns)
+    alpha[: n + 1] = columns.T
+
+
+@compiled
+def _grow(network: Network, posterior: Posterior, target: Vector) -> None:
+    """Turn row n of L, which holds the kernel with the n samples, into itself; add a row to z."""
+    n, process = posterior.n_samples[0], network.process
+    solve_lower(posterior.factor, n, posterior.factor[n : n + 1])
+    row = posterior.factor[n, :n]
+    # The variance of a new observation is at least the variance of its noise.
+    rest = process.amplitude * process.amplitude + process.noise_variance - inner(row, row)
+    deviation = np.sqrt(max(rest, process.noise_variance))
+    posterior.factor[n, n] = deviation
+    for k in range(target.shape[0]):
+        known = 0.0
+        for i in range(n):
+            known += row[i] * posterior.solved[i, k]
+        posterior.solved[n, k] = (target[k] - known) / deviation
+    posterior.n_samples[0] = n + 1

@@ -1,7 +1,9 @@
-"""Rows of J along a path of the learned model and their products with M⁻¹, in compiled code.
+"""Paths of a search in compiled code: states, rows of J, their products with M⁻¹, and scores.
 
-Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, C candidates, R rows of a state, n rows
-along a path.
+Sizes beside :mod:`dopt.kernel.structs`: H steps of a plan, C candidates, R rows of a state, n rows
+along a path; P paths that advance together, K inputs of a path, n states of a path that are kept.
+The model is evaluated at all paths at once, which costs less than one after the other. The largest
+eigenvalue of M⁻¹ is taken from a block Krylov space.
 """
 
 from __future__ import annotations
@@ -10,14 +12,65 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import Score
-from dopt.kernel.compiler import compiled, vectorized
-from dopt.kernel.information.primal import add_multiple, inner, multiply_rows
-from dopt.kernel.model import rows_at
-from dopt.kernel.points import n_next_points
-from dopt.kernel.state_structs import Covariance
-from dopt.kernel.structs import Network, Plant, Search
-from dopt.types import Matrix, Vector
+from dopt.algorithm import INVARIANT, Score
+from dopt.kernel.compiler import compiled, squared, vectorized
+from dopt.kernel.linear_algebra import add_multiple, inner, multiply_rows
+from dopt.kernel.model import (
+    accelerations_at,
+    euler_step,
+    n_next_points,
+    next_points,
+    rows_at,
+    within,
+)
+from dopt.kernel.structs import Covariance, Network, Plant, Search
+from dopt.types import Booleans, Matrix, Stack, Vector
+
+
+@compiled
+def krylov_space(covariance: Covariance, starts: Matrix, size: int) -> tuple[Matrix, Matrix]:
+    """Return an orthonormal basis Q, (K, q), and Q M⁻¹ Qᵀ, (K, K).
+
+    Row j ≥ b is M⁻¹ times row j - b, orthogonalised, with b the number of starts. Rows that add
+    nothing are zero.
+    """
+    b, q = starts.shape
+    K = min(size, q)
+    basis, images = np.zeros((K, q)), np.zeros((K, q))
+    for j in range(K):
+        row = basis[j]
+        for i in range(q):
+            row[i] = starts[j, i] if j < b else images[j - b, i]
+        _orthogonalize(basis, j)
+        multiply_rows(covariance, basis[j : j + 1], images[j : j + 1])
+    return basis, np.dot(basis, images.T)
+
+
+@compiled
+def _orthogonalize(basis: Matrix, j: int) -> None:
+    """Make row j orthogonal to those before it and of norm 1 (Gram-Schmidt, twice)."""
+    row = basis[j]
+    before = np.sqrt(inner(row, row))
+    for _ in range(2):
+        for i in range(j):
+            add_multiple(row, -inner(basis[i], row), basis[i])
+    after = np.sqrt(inner(row, row))
+    keep = after > INVARIANT * before
+    for i in range(row.shape[0]):
+        row[i] = row[i] / after if keep else 0.0
+
+
+@compiled
+def largest_eigenvalue(projected: Matrix, basis: Matrix, removed: Matrix) -> float:
+    """Return the largest eigenvalue of M⁻¹ - WᵀW in the space, W = ``removed``, (r, q)."""
+    W, K = np.dot(removed, basis.T), projected.shape[0]
+    left = projected.copy()
+    for k in range(W.shape[0]):
+        for i in range(K):
+            add_multiple(left[i], -W[k, i], W[k])
+    largest: float = np.linalg.eigvalsh(left)[K - 1]
+    return largest
+
 
 FEW_ROWS = 40
 """Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
@@ -39,7 +92,7 @@ class Path(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Place of the rows of one path among those of all."""
+    """Place of the rows of one path among the rows of all paths."""
 
     shared: int  # R b
     offset: int  # by which the rows after these are moved
@@ -92,7 +145,7 @@ def rows_of_state(plant: Plant, network: Network) -> int:
 def rows_of_points(plant: Plant, network: Network, theta: Vector, points: Matrix) -> Matrix:
     """Return the rows of J at the points of states, one state after the other.
 
-    Where several points stand for a state (:mod:`dopt.kernel.points`) their rows are weighted so
+    Where several points stand for a state (:mod:`dopt.kernel.model`) their rows are weighted so
     that the sum of their JᵀJ is the mean.
     """
     rows: Matrix = rows_at(plant, network, theta, points)
@@ -149,7 +202,7 @@ def log_determinant(path: Path, place: Place, first: int, last: int, block: int)
     """Extend the factor L by rows ``first`` to ``last`` of a path; return the growth of log det.
 
     Only rows of the same block of so many are taken together: all of them for the determinant of
-    the whole path, r for those of its states one by one.
+    the whole path, r for its states one by one.
     """
     L = path.factor
     total = 0.0
@@ -176,3 +229,107 @@ def whitened(path: Path, place: Place) -> Matrix:
         for j in range(row.shape[0]):
             row[j] /= path.factor[i, i]
     return out
+
+
+class Paths(NamedTuple):
+    """Paths at their present step; written in place."""
+
+    states: Matrix  # (P, d)
+    inside: Booleans  # (P,), whether all states so far are within bounds
+    points: Matrix  # (P, ·), what the model depends on: the states, or states and inputs
+    outputs: Matrix  # (r, P), a_θ there
+    value: Vector  # (r,), of one path
+    flow: Vector  # (d,)
+    following: Vector  # (d,)
+
+
+@compiled
+def paths_from(plant: Plant, network: Network, starts: Matrix) -> Paths:
+    """Return paths that start at states, (P, d)."""
+    (P, d), r = starts.shape, plant.learned_rows.shape[0]
+    states = starts.copy()
+    return Paths(
+        states,
+        np.ones(P, np.bool_),
+        states if network.n_inputs_read == 0 else np.empty((P, d + network.n_inputs_read)),
+        np.empty((r, P)),
+        np.empty(r),
+        np.empty(d),
+        np.empty(d),
+    )
+
+
+@compiled
+def advance_paths(
+    plant: Plant, network: Network, theta: Vector, paths: Paths, inputs: Stack, k: int
+) -> None:
+    """Take every path one step x + dt f_θ(x, u) further under its k-th input of (P, K, m)."""
+    P, d = paths.states.shape
+    if network.n_inputs_read > 0:
+        paths.points[:, :d] = paths.states
+        paths.points[:, d:] = inputs[:, k]
+    accelerations_at(plant, network, theta, paths.points, paths.outputs)
+    for p in range(P):
+        for j in range(paths.value.shape[0]):
+            paths.value[j] = paths.outputs[j, p]
+        euler_step(plant, paths.states[p], inputs[p, k], paths.value, paths.flow, paths.following)
+        paths.inside[p] = paths.inside[p] and within(paths.following, plant.state_limit)
+        for j in range(d):
+            paths.states[p, j] = paths.following[j]
+
+
+@compiled
+def keep_points(plant: Plant, network: Network, paths: Paths, i: int, n: int, kept: Matrix) -> None:
+    """Write the points of the present states as the i-th of n of every path.
+
+    They are :func:`dopt.kernel.model.next_points`, path by path.
+    """
+    per_state = n_next_points(network)
+    for p in range(paths.states.shape[0]):
+        place = per_state * (p * n + i)
+        points = next_points(network, paths.states[p], plant.gamma)
+        kept[place : place + per_state] = points
+
+
+class ScoreContext(NamedTuple):
+    """Arrays that a score needs beside the path; empty where it needs none."""
+
+    probes: Matrix  # (n, q), J at the task's states or the basis of the Krylov space
+    projected: Matrix  # (K, K), M⁻¹ in the Krylov space
+
+
+@vectorized
+def score_of_path(score: int, path: Path, place: Place, context: ScoreContext) -> float:
+    """Return the score of a whole path whose factor is known, if it is not a determinant."""
+    n, total = path.factor.shape[0], 0.0
+    if score == Score.TRACE:
+        for i in range(n):
+            at = row_at(place, i)
+            total += inner(path.products[at], path.rows[at])
+        return total
+    white = whitened(path, place)
+    if score == Score.E:
+        return -largest_eigenvalue(context.projected, context.probes, white)
+    for i in range(n):
+        if score == Score.A:
+            total += inner(white[i], white[i])
+        for j in range(context.probes.shape[0]):
+            total += squared(inner(white[i], context.probes[j]))
+    return total
+
+
+@compiled
+def score_context(
+    plant: Plant, network: Network, search: Search, theta: Vector, covariance: Covariance
+) -> ScoreContext:
+    """Return what the score needs at these parameters and this M⁻¹."""
+    if search.score == Score.E:
+        basis, projected = krylov_space(covariance, search.starts, search.subspace)
+        return ScoreContext(basis, projected)
+    n = search.task_states.shape[0] if search.score == Score.TASK else 0
+    per_state = n_next_points(network)
+    points = np.empty((n * per_state, search.task_states.shape[1] + network.n_inputs_read))
+    for s in range(n):
+        at = next_points(network, search.task_states[s], plant.gamma)
+        points[s * per_state : (s + 1) * per_state] = at
+    return ScoreContext(rows_of_points(plant, network, theta, points), np.empty((0, 0)))

@@ -13,20 +13,23 @@ import numpy as np
 
 from dopt.algorithm import TIE_MARGIN, Score
 from dopt.kernel.compiler import compiled, monotonic_microseconds
-from dopt.kernel.points import n_next_points
+from dopt.kernel.model import n_next_points
 from dopt.kernel.search.path import (
     Path,
     Place,
+    ScoreContext,
     add_rows,
+    advance_paths,
+    keep_points,
     log_determinant,
     new_path,
+    paths_from,
     rows_of_state,
+    score_context,
+    score_of_path,
     switch_of,
 )
-from dopt.kernel.search.paths import advance_paths, keep_points, paths_from
-from dopt.kernel.search.scores import ScoreContext, score_context, score_of_path
-from dopt.kernel.state_structs import Covariance
-from dopt.kernel.structs import Network, Plant, Search, Trial
+from dopt.kernel.structs import Covariance, Network, Plant, Search, Trial
 from dopt.types import Booleans, Integers, Matrix, Vector
 
 
@@ -86,7 +89,7 @@ def _order(candidates: Matrix, tie: Vector) -> Integers:
 
 @compiled
 def _all_values(problem: Problem) -> Matrix:
-    """Return the scores of all plans by their two candidates, (C, C); -∞ where there is none."""
+    """Return the scores of plans by their two candidates, (C, C); -∞ for pairs without a plan."""
     C, switch = problem.search.candidates.shape[0], switch_of(problem.search)
     values, candidates = np.full((C, C), -np.inf), np.arange(C)
     first = candidates if switch > 0 else candidates[:1]
@@ -147,7 +150,7 @@ def _best_hold(values: Matrix, done: Booleans) -> int:
 
 @compiled
 def _late(problem: Problem) -> bool:
-    """Tell whether the time of this step is spent."""
+    """Return True if the time of this step is spent."""
     late: bool = problem.search.budget_us > 0.0 and monotonic_microseconds() >= problem.end
     return late
 
@@ -237,7 +240,7 @@ def _shared_rows(problem: Problem) -> int:
 
 @compiled
 def _block(problem: Problem) -> int:
-    """Return how many rows are taken together: those of a state, or of the whole path."""
+    """Return how many rows are taken together: the rows of a state, or of the whole path."""
     if problem.search.score == Score.SUM:
         return rows_of_state(problem.plant, problem.network)
     n: int = problem.path.factor.shape[0]

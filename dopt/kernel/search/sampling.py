@@ -1,7 +1,15 @@
-"""Sampling planner in compiled code (:mod:`dopt.policies.icem`).
+"""Sampling planners in compiled code (:mod:`dopt.policies.icem`): at each step, or in episodes.
 
-Legend beside :mod:`dopt.kernel.structs`: H steps of a plan, K inputs of it, P plans, n states of
-its path whose rows count, g + s directions of :mod:`dopt.kernel.search.posterior`.
+Sizes beside :mod:`dopt.kernel.structs`: H steps of a plan, K inputs of it, P plans, n states of its
+path whose rows count, g + s directions. The numbers of the episodic planner end with the steps k
+from one search to the next.
+
+Accelerations at many states are predicted along draws of the parameters, which have the covariance
+M⁻¹ = U Uᵀ with U upper triangular, the inverse of the transposed Cholesky factor of M. For a
+matrix Z, (q, s), of standard normal numbers divided by √s, W = U Z has E[(J W)(J W)ᵀ] = J M⁻¹ Jᵀ:
+the covariance of accelerations from s numbers for each row of J. For the rows of a matrix G the
+products with any other row are made exact: Z = [Q, (I - Q Qᵀ) Ω / √s] with an orthonormal basis Q
+of the rows of G U.
 """
 
 from __future__ import annotations
@@ -10,15 +18,145 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, Score
-from dopt.kernel.compiler import compiled, squared, vectorized
-from dopt.kernel.information.primal import add_multiple, inner
-from dopt.kernel.model import rows_at
-from dopt.kernel.points import n_next_points, next_points
-from dopt.kernel.search.paths import advance_paths, keep_points, paths_from
-from dopt.kernel.search.posterior import Directions, changes_along, directions
-from dopt.kernel.structs import Trial
+from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, ModelKind, Score
+from dopt.kernel import network as nn
+from dopt.kernel.compiler import compiled, contracted, squared, vectorized
+from dopt.kernel.linear_algebra import (
+    add_multiple,
+    factorize,
+    inner,
+    solve_columns,
+    solve_transposed_columns,
+)
+from dopt.kernel.model import n_next_points, next_points, parameter_rows, rows_at, write_features
+from dopt.kernel.network import output_inputs
+from dopt.kernel.network_gradients import batch_back_signals
+from dopt.kernel.search.path import advance_paths, keep_points, paths_from
+from dopt.kernel.structs import Covariance, Network, Plant, State, Trial
 from dopt.types import Booleans, Integers, Matrix, Stack, Vector
+
+
+class Directions(NamedTuple):
+    """Directions W of the parameters along which the model is differentiated."""
+
+    rows: Matrix  # Wᵀ, (g + s, q), the g exact ones first
+    exact: Matrix  # R with Gᵀ = U⁻ᵀ Q R, (g, rows of G)
+
+
+class Root(NamedTuple):
+    """A root of M⁻¹ = U Uᵀ by a Cholesky factor, (q, q).
+
+    The factor of M, whose inverse is Uᵀ, or the factor of M⁻¹ with rows and columns in reverse
+    order, which is U in reverse order.
+    """
+
+    factor: Matrix
+    of_inverse: bool
+
+
+@compiled
+def directions(state: State, normals: Matrix, chosen: Matrix) -> tuple[bool, Directions]:
+    """Return W for standard normal numbers Ω, (q, s), and the rows of G, (·, q).
+
+    False is returned where rounding has left M⁻¹ indefinite.
+    """
+    q, s = normals.shape
+    g = min(q, chosen.shape[0])
+    found = Directions(np.empty((g + s, q)), np.empty((g, chosen.shape[0])))
+    root = Root(state.factor, state.factor.shape[0] == 0)
+    if root.of_inverse:
+        root = Root(np.empty((q, q)), True)
+        _write_reversed(state.covariance, root.factor)
+        if not factorize(root.factor):
+            return False, found
+    Z, random = np.empty((q, g + s)), normals / np.sqrt(s)
+    if g > 0:
+        Q, R = np.linalg.qr(_transposed_products(root, chosen.T.copy()))
+        basis = Q.copy()
+        random -= np.dot(basis, np.dot(basis.T, random))
+        Z[:, :g] = basis
+        found.exact[:] = R
+    Z[:, g:] = random
+    found.rows[:] = _products(root, Z).T
+    return True, found
+
+
+@compiled
+def _transposed_products(root: Root, columns: Matrix) -> Matrix:
+    """Return Uᵀ times columns, (q, k)."""
+    if root.of_inverse:
+        reversed_products: Matrix = np.dot(root.factor.T, columns[::-1].copy())
+        return reversed_products[::-1].copy()
+    solve_columns(root.factor, columns)
+    return columns
+
+
+@compiled
+def _products(root: Root, columns: Matrix) -> Matrix:
+    """Return U times columns, (q, k)."""
+    if root.of_inverse:
+        reversed_products: Matrix = np.dot(root.factor, columns[::-1].copy())
+        return reversed_products[::-1].copy()
+    solve_transposed_columns(root.factor, columns)
+    return columns
+
+
+@compiled
+def _write_reversed(covariance: Covariance, out: Matrix) -> None:
+    """Write M⁻¹ with its rows and columns in reverse order, (q, q)."""
+    q = out.shape[0]
+    for i in range(q):
+        for j in range(i, q):
+            value = covariance.upper[i, j]
+            for n in range(covariance.n_pending[0]):
+                value -= covariance.pending[n, i] * covariance.pending[n, j]
+            out[q - 1 - i, q - 1 - j] = value
+            out[q - 1 - j, q - 1 - i] = value
+
+
+@compiled
+def changes_along(
+    plant: Plant, network: Network, theta: Vector, states: Matrix, along: Matrix, out: Stack
+) -> None:
+    """Write J W, (r, s, N), at points, (N, ·), for directions Wᵀ, (s, q)."""
+    N, r = states.shape[0], out.shape[0]
+    if network.kind != ModelKind.MLP:
+        rows, value = np.empty((r, theta.shape[0])), np.empty(r)
+        for n in range(N):
+            parameter_rows(plant, network, theta, states[n], rows, value)
+            for k in range(r):
+                out[k, :, n] = np.dot(along, rows[k])
+        return
+    depth, width = network.offsets.shape[0] - 1, network.sizes[1]
+    features, outputs = np.empty((network.feature_kinds.shape[0], N)), np.empty((r, N))
+    hidden = np.empty((depth, width * N))
+    write_features(network, states, features)
+    nn.forward(network, theta, features, hidden, outputs)
+    signals = batch_back_signals(network, theta, features, hidden, r)
+    last = nn.units_by_points(hidden[depth - 1], width, N)
+    top = output_inputs(network, last, features)
+    change = np.empty((width, N))
+    for j in range(along.shape[0]):
+        dW, db = nn.layer(network, along[j], depth)
+        np.dot(dW, top, outputs)
+        for k in range(r):
+            for n in range(N):
+                out[k, j, n] = outputs[k, n] + db[k]
+        for index in range(depth):
+            dW, db = nn.layer(network, along[j], index)
+            below = features if index == 0 else nn.units_by_points(hidden[index - 1], width, N)
+            np.dot(dW, below[: dW.shape[1]], change)
+            for k in range(r):
+                _add_products(signals[k * depth + index], change, db, out[k, j])
+
+
+@contracted
+def _add_products(signal: Matrix, change: Matrix, shift: Vector, out: Vector) -> None:
+    """Add the sum over the units of δ (change + shift), (N,)."""
+    for i in range(signal.shape[0]):
+        delta, row, b = signal[i], change[i], shift[i]
+        for n in range(out.shape[0]):
+            out[n] += delta[n] * (row[n] + b)
 
 
 class Settings(NamedTuple):
@@ -70,7 +208,7 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
         for p in range(settings.plans):
             inputs[E + p] = mean + spread * normals[iteration, p]
             _scale_inputs(inputs[E + p], gamma)
-        # The elites of the step before are scored anew, by what is known now; there are none first.
+        # The elites of the step before are scored again with the present model; step 1 has none.
         first = 0 if iteration == 0 and t > 1 else E
         _score(trial, settings, t, draws, inputs[first:], values[first:])
         best = largest_places(rounded(values), E)
@@ -82,7 +220,7 @@ def plan(trial: Trial, t: int, u: Vector) -> None:
 
 @compiled
 def _refit(mean: Matrix, spread: Matrix, elites: Stack) -> None:
-    """Move mean and spread, (K, m), to those of the elites, (E, K, m), but for a share kept."""
+    """Move mean and spread, (K, m), towards the elites, (E, K, m); a share is kept."""
     for k in range(mean.shape[0]):
         for j in range(mean.shape[1]):
             values = elites[:, k, j]
@@ -184,7 +322,8 @@ def _score(
 def _paths(trial: Trial, settings: Settings, t: int, inputs: Stack) -> tuple[Booleans, Matrix]:
     """Return which paths stay in bounds, and the points of their states that count, path by path.
 
-    They are (P n, d), or those of :func:`next_points` one state after the other, (2 m P n, d + m).
+    They are (P n, d), or what :func:`next_points` gives for one state after the other,
+    (2 m P n, d + m).
     """
     plant, network, theta = trial.plant, trial.network, trial.state.theta
     P, d, stride = inputs.shape[0], trial.record.states.shape[1], settings.stride
@@ -248,3 +387,28 @@ def score_of_rows(score: int, rows: Matrix, exact: Matrix, r: int, factor: Matri
         share = 1.0 - (i // r) / (N // r)
         total += share * inner(products[i], products[i])
     return total
+
+
+@compiled
+def plan_episodes(trial: Trial, t: int, u: Vector) -> None:
+    """Write the next input of the best plan, (m,); NaN where a search finds M indefinite."""
+    numbers = trial.algorithm.policy
+    settings, every = settings_of(numbers), int(numbers[numbers.shape[0] - 1])
+    hold, K = settings.hold, (settings.steps + settings.hold - 1) // settings.hold + 1
+    memory = trial.state.policy_memory.reshape(1 + settings.elites, K, u.shape[0])
+    last = max(1, t - t % every)
+    if last < t:
+        u[:] = memory[1, t // hold - last // hold]  # of the best elite
+        return
+    # The search itself drops the input whose time ends at this step.
+    ended = t // hold - max(1, t - every) // hold
+    _drop(memory, max(0, ended - (1 if t % hold == 0 else 0)))
+    plan(trial, t, u)
+
+
+@compiled
+def _drop(memory: Stack, count: int) -> None:
+    """Drop the first inputs of every plan, whose time has ended, and repeat the last."""
+    final = memory.shape[1] - 1
+    for k in range(final):
+        memory[:, k] = memory[:, min(k + count, final)]

@@ -7,9 +7,8 @@ from typing import Any
 
 from numba.core.dispatcher import Dispatcher
 
-from dopt.kernel.numpy_parts import NumpyParts
 from dopt.kernel.pointers import compiled_for, kind_of, path_of
-from dopt.kernel.steps import KernelSteps
+from dopt.kernel.steps import KernelSteps, NumpyParts
 from dopt.spec.trial import TrialSpec
 from dopt.trial_view import TrialView
 from dopt.types import Array, CompiledFunction

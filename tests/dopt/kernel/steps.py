@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import float64, int64
 
-from dopt.kernel.held_trial import HeldTrial, trial_in
+from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.loop import advance
 from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
 from dopt.kernel.run import KernelTrial

@@ -22,7 +22,7 @@ from numba import float64, void
 from numba.core.dispatcher import Dispatcher
 
 from dopt.errors import UnusableEnvironmentError
-from dopt.kernel import cache, compilation, equations, user_code, warm_up
+from dopt.kernel import cache, equations, pointers, warm_up
 from dopt.systems import SYSTEMS
 from tests.paths import ROOT
 
@@ -61,9 +61,9 @@ def triple(tmp_path: Path) -> FunctionType:
 
 def found(function: FunctionType) -> bool:
     """Return whether a new process finds the code of a function, which gives the right number."""
-    user_code._dispatcher.cache_clear()
+    pointers._dispatcher.cache_clear()
     cache._intact.clear()
-    compiled = user_code.compiled_own(function, SIGNATURE)
+    compiled = pointers.compiled_own(function, SIGNATURE)
     out = np.zeros(1)
     compiled(2.0, out)
     assert out[0] == 6.0
@@ -356,8 +356,8 @@ class Compilers:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, minutes: float) -> None:
         self.seconds, self._end = 0.0, 60 * minutes
         clock = SimpleNamespace(perf_counter=lambda: self.seconds, sleep=lambda _: None)
-        monkeypatch.setattr(compilation, "time", clock)
-        monkeypatch.setattr(compilation, "_started", lambda *_: self)
+        monkeypatch.setattr(cache, "time", clock)
+        monkeypatch.setattr(cache, "_started", lambda *_: self)
 
     def poll(self) -> int | None:
         self.seconds += 0.5
@@ -375,7 +375,7 @@ class TestReports:
         self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         Compilers(monkeypatch, minutes=5)
-        compilation.compile_missing(["loop", "plan"])
+        cache.compile_missing(["loop", "plan"])
         assert len(caplog.messages) <= 12
         assert caplog.messages[0] == "compiling the kernel, once per machine: 0 of 2 parts, 0 s"
         assert caplog.messages[-1].endswith("0 of 2 parts, 300 s")
@@ -385,8 +385,8 @@ class TestReports:
     ) -> None:
         Compilers(monkeypatch, minutes=5)
         monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-        monkeypatch.setattr(compilation._log, "propagate", False)
-        compilation.compile_missing(["loop", "plan"])
+        monkeypatch.setattr(cache._log, "propagate", False)
+        cache.compile_missing(["loop", "plan"])
         shown = capsys.readouterr().err
         assert shown.count("\n") == 1
         assert shown.count("\r") > 100
@@ -408,9 +408,9 @@ class TestReports:
             other.stdout.readline()
             patched.setattr(sys, "stderr", log)
             Compilers(patched, minutes=1)
-            compilation.compile_missing(["loop"])
+            cache.compile_missing(["loop"])
             assert not caplog.messages
             other.communicate()
             Compilers(patched, minutes=1)
-            compilation.compile_missing(["loop"])
+            cache.compile_missing(["loop"])
             assert caplog.messages

@@ -18,8 +18,7 @@ from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
 from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
 from dopt.kernel.compiler import compiled, contracted, squared, vectorized
-from dopt.kernel.from_spec import MODULES
-from dopt.kernel.information import absent, fresh, primal_linear
+from dopt.kernel.information import FORMS
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.warming import choices, kernel_parts
 from dopt.learning import LEARNERS
@@ -105,7 +104,7 @@ def test_everything_is_what_any_shipped_choice_calls() -> None:
     learns = {one.kernel_function for one in LEARNERS.values() if one.compiled}
     assert plans | {PLAN_IN_NUMPY} == set(chosen.plans)
     assert learns | {LEARN_IN_NUMPY} == set(chosen.learns)
-    assert {*MODULES.values(), primal_linear, absent, fresh} == set(chosen.forms)
+    assert chosen.forms == FORMS
     few = choices(everything=False)
     assert set(few.plans) < set(chosen.plans)
 
@@ -113,15 +112,15 @@ def test_everything_is_what_any_shipped_choice_calls() -> None:
 def test_a_trial_loads_what_other_processes_compile(tmp_path: Path) -> None:
     """Where a trial compiles a part itself, its numbers can differ from those of later trials."""
     program = (
-        "from dopt.kernel.compilation import compile_missing\n"
-        "from dopt.kernel.information import absent\n"
+        "from dopt.kernel.cache import compile_missing\n"
+        "from dopt.kernel.information import add_nothing\n"
         "from dopt.kernel.pointers import compile_form\n"
         "from dopt.kernel.run import KernelTrial\n"
         "from dopt.spec.trial import TrialSpec\n"
-        "compile_missing(['dopt.kernel.information.absent.add_rows'])\n"
+        "compile_missing(['dopt.kernel.information.add_nothing'])\n"
         "trial = KernelTrial(TrialSpec.from_names('pendulum', 'random')).trial\n"
-        "compile_form(trial, absent.add_rows)\n"
-        "stats = absent.add_rows.stats\n"
+        "compile_form(trial, 'add_rows', add_nothing)\n"
+        "stats = add_nothing.stats\n"
         "print(sum(stats.cache_hits.values()), sum(stats.cache_misses.values()))\n"
     )
     done = subprocess.run(
@@ -142,15 +141,15 @@ def test_a_trial_asks_for_each_part_that_it_calls(monkeypatch: pytest.MonkeyPatc
     KernelTrial(TrialSpec.from_names("pendulum", "d_optimal")).advance(1)
     assert set(asked) == {
         "dopt.kernel.loop.advance",
-        "dopt.kernel.held_trial.hold",
-        "dopt.kernel.absent_steps.limit_input",
-        "dopt.kernel.absent_steps.note_error",
-        "dopt.kernel.absent_steps.estimate_state",
-        "dopt.kernel.observation.observe_euler",
-        "dopt.kernel.policies.d_optimal.plan",
+        "dopt.kernel.held.hold",
+        "dopt.kernel.loop.keep_input",
+        "dopt.kernel.loop.note_nothing",
+        "dopt.kernel.loop.keep_state",
+        "dopt.kernel.integration.observe_euler",
+        "dopt.kernel.policies.plan_d_optimal",
         "dopt.kernel.learners.adam.learn",
-        "dopt.kernel.information.primal_network.add_rows",
-        "dopt.kernel.information.primal_network.planning_forms",
+        "dopt.kernel.information.add_network_rows",
+        "dopt.kernel.information.network_forms",
     }
     assert set(asked) <= {*kernel_parts(everything=True)}
 
@@ -172,7 +171,7 @@ def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
     program = (
         "import numpy as np\n"
         "from dopt.kernel.equations import compiled_equations\n"
-        "from dopt.kernel.tanh import tanh\n"
+        "from dopt.kernel.network import tanh\n"
         "from dopt.systems import SYSTEMS\n"
         "function = compiled_equations(SYSTEMS['pendulum']()).accelerations\n"
         "out = np.empty(1)\n"

@@ -11,7 +11,7 @@ import torch
 from torch.func import jacrev, vmap
 
 from dopt.errors import IncompatibleError
-from dopt.kernel.information.primal import dense
+from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
 from dopt.learning import LEARNERS
 from dopt.policies import POLICIES, InformationPolicy

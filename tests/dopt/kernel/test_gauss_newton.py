@@ -10,8 +10,7 @@ import torch
 from torch.func import jacrev, vmap
 
 from dopt.errors import IncompatibleError
-from dopt.kernel.information.cholesky import BLOCK
-from dopt.kernel.information.primal import dense
+from dopt.kernel.linear_algebra import BLOCK, dense
 from dopt.kernel.run import KernelTrial
 from dopt.policies import InformationPolicy
 from dopt.run import run_trial

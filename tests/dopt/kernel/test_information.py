@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from dopt.kernel.information.primal import dense
+from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
 from dopt.spec.trial import TrialSpec
 from tests.close import assert_close

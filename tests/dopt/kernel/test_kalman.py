@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from torch.func import jacrev
 
 from dopt.errors import IncompatibleError
-from dopt.kernel.information.primal import PENDING_ROWS, dense
-from dopt.kernel.information.update import filter_step
-from dopt.kernel.learners.kalman import whiten
+from dopt.kernel.learners.kalman import filter_step, whiten
+from dopt.kernel.linear_algebra import PENDING_ROWS, dense
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.state_structs import Covariance
+from dopt.kernel.structs import Covariance
 from dopt.learning import ExtendedKalman
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dopt.kernel.information.primal import dense
+from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
 from dopt.policies import Search
 from dopt.run import run_trial

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from dopt.kernel.information.primal import dense
+from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
 from dopt.policies import Search, TaskOptimal
 from dopt.policies.task_states import task_states

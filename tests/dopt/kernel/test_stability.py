@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dopt.kernel.information.primal import dense, rank_update, restore
+from dopt.kernel.linear_algebra import dense, rank_update, restore
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.state_structs import Covariance
+from dopt.kernel.structs import Covariance
 from tests.dopt.kernel.calls import interpreted
 from tests.dopt.kernel.steps import run
 from tests.dopt.kernel.test_information import jacobians

@@ -9,10 +9,9 @@ import pytest
 from numba.core.errors import TypingError
 
 from dopt.kernel import pointers
-from dopt.kernel.held_trial import HeldTrial, trial_in
+from dopt.kernel.held import HeldTrial, pointer_to, trial_in
 from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.struct_pointers import pointer_to
 from dopt.spec.trial import TrialSpec
 from dopt.types import Vector
 from tests.dopt.newcomers import kept

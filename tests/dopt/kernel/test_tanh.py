@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from dopt.kernel.tanh import tanh
+from dopt.kernel.network import tanh
 
 
 def test_tanh_is_right_to_a_few_units_in_the_last_place() -> None:

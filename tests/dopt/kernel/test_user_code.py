@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dopt.kernel.user_code import content_digest
+from dopt.kernel.pointers import content_digest
 from tests.paths import ROOT
 
 MODULE = """
 import math
 import numpy as np
-from dopt.kernel.information.primal import inner
+from dopt.kernel.linear_algebra import inner
 
 FACTOR = {factor}
 TABLE = np.array([1.0, 2.0])
@@ -31,7 +31,7 @@ def plan(x, out):
 PROGRAM = """
 import numpy as np, sys
 from numba import float64, void
-from dopt.kernel.user_code import compiled_own
+from dopt.kernel.pointers import compiled_own
 from own import plan
 compiled = compiled_own(plan, void(float64, float64[::1]))
 out = np.zeros(1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.kernel.stepped_trial import SteppedTrial
+from dopt.kernel.steps import SteppedTrial
 from dopt.policies.held_candidates import DisagreementPlan
 from dopt.run import run_trial
 from tests.dopt.trials import trial

@@ -17,8 +17,8 @@ import numpy as np
 
 from dopt.kernel import network as nn
 from dopt.kernel.compiler import compiled, contracted, squared
-from dopt.kernel.network_backward import batch_back_signals
-from dopt.kernel.output_layer import output_inputs
+from dopt.kernel.network import output_inputs
+from dopt.kernel.network_gradients import batch_back_signals
 from dopt.kernel.structs import Network
 from dopt.types import Matrix, Stack, Vector
 

@@ -1,0 +1,201 @@
+"""Policies without a search, in compiled code (:mod:`dopt.policies`).
+
+D-optimal exploration (Algorithm 2): ``algorithm.policy[0]`` is 1 if all learned components count at
+each step, 0 if one is drawn. For a model that reads inputs the input of the next sample is drawn as
+well: uniformly on the sphere, or from the ball for a model that is not affine in the inputs, whose
+planned inputs have drawn norms. Uniform exploration: the number is the count of ascent steps.
+
+Predictive entropy of held candidates: C candidates, H steps for which one is held, n samples taken,
+L their Cholesky factor (:mod:`dopt.kernel.learners.kalman`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dopt.algorithm import TIE_MARGIN
+from dopt.kernel.compiler import compilable, compiled, squared
+from dopt.kernel.integration import learned_columns, point_columns, predicted_state
+from dopt.kernel.linear_algebra import factorize, inner, solve_lower
+from dopt.kernel.model import euler_step, model_point
+from dopt.kernel.model_kinds import (
+    mean_weights,
+    sample_features,
+    write_combination,
+    write_kernel,
+    write_mean,
+)
+from dopt.kernel.network import features_at
+from dopt.kernel.structs import Network, Trial
+from dopt.sphere import sphere_maximizer
+from dopt.types import Matrix, Vector
+
+
+@compiled
+def plan_drawn(trial: Trial, t: int, u: Vector) -> None:
+    """Write the input u_t, (m,), as it was drawn."""
+    for j in range(u.shape[0]):
+        u[j] = trial.randomness.inputs[t, j]
+
+
+compilable(sphere_maximizer)
+
+
+@compiled
+def plan_d_optimal(trial: Trial, t: int, u: Vector) -> None:
+    """Write the maximiser of (g + D B u)ᵀ M⁻¹ (g + D B u), or its sum, on a sphere, (m,)."""
+    plant, network, state = trial.plant, trial.network, trial.state
+    all_components = trial.algorithm.policy[0] != 0.0
+    component, tie = trial.randomness.components[t], trial.randomness.ties[t]
+    center = predicted_state(plant, network, state.theta, trial.record.states[t])
+    columns = point_columns(network, learned_columns(plant, network, state.theta, center))
+    radii: Vector = plant.gamma * trial.randomness.radii[t]
+    m, bar = columns.shape[0], model_point(network, center, on_sphere(tie, radii[1]))
+    S = np.zeros((1 if m == 1 else 1 + m, 1 + m))
+    for k in range(plant.learned_rows.shape[0]):
+        if all_components or k == component:
+            forms = trial.information.planning_forms(plant, network, state, bar, columns, k)
+            for i in range(S.shape[0]):
+                for j in range(S.shape[1]):
+                    S[i, j] += forms[i, j]
+    if m == 1:
+        up = S[0, 1] > 0.0 or (S[0, 1] == 0.0 and tie[0] > 0.0)
+        u[0] = radii[0] if up else -radii[0]
+        return
+    Q, v = np.empty((m, m)), np.empty(m)
+    for i in range(m):
+        v[i] = -S[0, 1 + i]
+        for j in range(m):
+            Q[i, j] = S[1 + i, 1 + j]
+    chosen = sphere_maximizer(Q, v, radii[0], tie)
+    for i in range(m):
+        u[i] = chosen[i]
+
+
+@compiled
+def on_sphere(direction: Vector, radius: float) -> Vector:
+    """Return the vector of a norm along a direction, (m,)."""
+    scaled: Vector = direction * (radius / np.sqrt(inner(direction, direction)))
+    return scaled
+
+
+@compiled
+def plan_uniform(trial: Trial, t: int, u: Vector) -> None:
+    """Write the best end point of gradient ascents of Σ_{s≤t} ‖x(u) - x_s‖ on the sphere."""
+    plant, states, steps = trial.plant, trial.record.states, int(trial.algorithm.policy[0])
+    x = states[t]
+    center = predicted_state(plant, trial.network, trial.state.theta, x)
+    columns = learned_columns(plant, trial.network, trial.state.theta, x)
+    m = columns.shape[0]
+    best_value = -1.0
+    tried, gradient = np.empty(m), np.empty(m)
+    for start in range(2 * m):
+        for j in range(m):
+            tried[j] = 0.0
+        tried[start // 2] = plant.gamma if start % 2 == 0 else -plant.gamma
+        for _ in range(steps if m > 1 else 0):
+            _distances(center, columns, tried, states, t, gradient)
+            norm = 0.0
+            for j in range(m):
+                norm += gradient[j] * gradient[j]
+            if norm == 0.0:
+                break
+            for j in range(m):
+                tried[j] = gradient[j] * (plant.gamma / np.sqrt(norm))
+        value = _distances(center, columns, tried, states, t, gradient)
+        if value > best_value * (1.0 + TIE_MARGIN):
+            best_value = value
+            for j in range(m):
+                u[j] = tried[j]
+
+
+@compiled
+def _distances(
+    center: Vector, columns: Matrix, u: Vector, states: Matrix, t: int, gradient: Vector
+) -> float:
+    """Return Σ_{s≤t} ‖x(u) - x_s‖ and write its gradient B Σ (x(u) - x_s)/‖x(u) - x_s‖, (m,)."""
+    m, d = columns.shape
+    point, direction = np.empty(d), np.zeros(d)
+    for i in range(d):
+        point[i] = center[i]
+        for j in range(m):
+            point[i] += u[j] * columns[j, i]
+    total = 0.0
+    for s in range(t + 1):
+        square = 0.0
+        for i in range(d):
+            square += squared(point[i] - states[s, i])
+        if square > 0.0:
+            norm = np.sqrt(square)
+            total += norm
+            for i in range(d):
+                direction[i] += (point[i] - states[s, i]) / norm
+    for j in range(m):
+        gradient[j] = 0.0
+        for i in range(d):
+            gradient[j] += columns[j, i] * direction[i]
+    return total
+
+
+@compiled
+def plan_held_candidates(trial: Trial, t: int, u: Vector) -> None:
+    """Write the candidate of the largest entropy, (m,); of equal ones the first."""
+    search, posterior = trial.algorithm.search, trial.state.posterior
+    C, H, n = search.candidates.shape[0], search.steps, posterior.n_samples[0]
+    visited = np.empty((C * H, trial.network.sizes[0]))
+    rows = np.empty((C * H, n))
+    _write_paths(trial, t, visited, rows)
+    solve_lower(posterior.factor, n, rows)
+    best = -np.inf
+    u[:] = search.candidates[0]
+    for c in range(C):
+        own = slice(c * H, (c + 1) * H)
+        value = _entropy(trial.network, visited[own], rows[own])
+        if value > best:
+            best = value
+            u[:] = search.candidates[c]
+
+
+@compiled
+def _write_paths(trial: Trial, t: int, visited: Matrix, rows: Matrix) -> None:
+    """Write the features of the states that the candidates lead to, (C H, p), path by path.
+
+    Their kernel with the samples, (C H, n), is written as well.
+    """
+    plant, network, search = trial.plant, trial.network, trial.algorithm.search
+    theta, n, r = trial.state.theta, rows.shape[1], plant.learned_rows.shape[0]
+    phi, alpha = sample_features(network, theta, r)[:n], mean_weights(network, theta, r)[:n]
+    first, value = np.empty(r), np.empty(r)
+    d = trial.record.states.shape[1]
+    x, flow, following = np.empty(d), np.empty(d), np.empty(d)
+    write_mean(network, theta, trial.record.states[t], first)
+    for c in range(search.candidates.shape[0]):
+        x[:] = trial.record.states[t]
+        value[:] = first
+        for i in range(c * search.steps, (c + 1) * search.steps):
+            euler_step(plant, x, search.candidates[c], value, flow, following)
+            x[:] = following
+            features_at(network, x, visited[i])
+            write_kernel(network, visited[i], phi, rows[i])
+            write_combination(rows[i], alpha, value)
+
+
+@compiled
+def _entropy(network: Network, phi: Matrix, whitened: Matrix) -> float:
+    """Return log det of the covariance of observations at features (H, p), given L⁻¹k, (H, n).
+
+    It is -∞ where rounding has left the covariance indefinite.
+    """
+    H = phi.shape[0]
+    covariance = np.empty((H, H))
+    for i in range(H):
+        write_kernel(network, phi[i], phi, covariance[i])
+        for j in range(H):
+            covariance[i, j] -= inner(whitened[i], whitened[j])
+        covariance[i, i] += network.process.noise_variance
+    if not factorize(covariance):
+        return -np.inf
+    total = 0.0
+    for i in range(H):
+        total += 2.0 * np.log(covariance[i, i])
+    return total

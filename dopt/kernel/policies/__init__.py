@@ -1,1 +1,0 @@
-"""Compiled functions that choose the next input, one file for each policy."""
