@@ -7,9 +7,9 @@ import pytest
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.cpu import CPUContext
 
-from dopt.kernel import outermost_code
+from dopt.kernel import warming
 from dopt.kernel.compiler import compiled, contracted
-from dopt.kernel.outermost_code import leave_callees_out
+from dopt.kernel.warming import leave_callees_out
 from dopt.types import CompiledFunction, Vector
 
 
@@ -63,8 +63,8 @@ def test_callees_are_optimized_where_they_may_round_otherwise(
         optimized.append(library.name)
         whole(library)
 
-    whole = outermost_code._optimize
-    monkeypatch.setattr(outermost_code, "_optimize", optimize)
+    whole = warming._optimize
+    monkeypatch.setattr(warming, "_optimize", optimize)
 
     @compiled
     def first(a: float, b: float, c: float) -> float:
