@@ -9,7 +9,7 @@ Random features: combinations W ψ(x) of D given functions of the state. Random 
 The learned parameters are the entries of W, row by row: row k of J has ψ at the places k D to
 (k + 1) D and zeros elsewhere.
 
-Grey box (:mod:`dopt.models.grey_box`): its features are the point itself, so that learners keep
+Grey box (:mod:`dopt.models.linear`): its features are the point itself, so that learners keep
 points of samples.
 
 ======  ==================================================================  =====

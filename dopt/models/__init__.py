@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dopt.models.base import Model
-from dopt.models.grey_box import GreyBox
-from dopt.models.linear import RFF, GaussianProcess, Linear, LinearState
+from dopt.models.linear import RFF, GaussianProcess, GreyBox, Linear, LinearState
 from dopt.models.networks import MLP, AffineMLP, BlackBoxMLP, Ensemble
 
 MODELS: dict[str, type[Model]] = {

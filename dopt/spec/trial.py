@@ -252,7 +252,7 @@ def _model(section: Part) -> Model:
     """Return a registered model, or a network of the user's own, for which torch is loaded."""
     if isinstance(section, Validated) or TARGET not in section:
         return build("model", MODELS, section)
-    from dopt.reference.module import Module
+    from dopt.reference.models import Module
 
     return Module.from_section(section)
 
