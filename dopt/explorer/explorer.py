@@ -17,14 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.journal import FORMAT, Event, Journal, foreign
-from dopt.explorer.saving import SavedExplored
-from dopt.explorer.state import (
-    PunctualPlanner,
-    difference,
+from dopt.explorer.arguments import (
     finite,
     instance,
-    may_remember_plans,
     measured,
     numbers,
     safe_input,
@@ -32,6 +27,9 @@ from dopt.explorer.state import (
     whole,
     within,
 )
+from dopt.explorer.journal import FORMAT, Event, Journal, foreign
+from dopt.explorer.saving import SavedExplored
+from dopt.explorer.state import PunctualPlanner, difference, may_remember_plans
 from dopt.learning import Learner
 from dopt.models import Model
 from dopt.policies import Policy

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from dopt.errors import ExplorationError, SpecificationError, given_path
-from dopt.explorer.state import finite, seconds, within
+from dopt.explorer.arguments import finite, seconds, within
 
 FORMAT = 2
 """Version of the lines."""

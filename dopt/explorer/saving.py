@@ -15,7 +15,8 @@ import numpy.typing as npt
 from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
-from dopt.explorer.state import ExplorerState, reals, whole
+from dopt.explorer.arguments import reals, whole
+from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
 from dopt.spec.trial import PrequentialTrial, TrialSpec

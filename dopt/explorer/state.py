@@ -1,6 +1,4 @@
-"""Checks of arguments, and the state of an exploration.
-
-The state changes by events alone: live, or as a journal replays them.
+"""State of an exploration, which changes by events alone: live, or as a journal replays them.
 
 ======================  =====================================================================
 event                   meaning
@@ -19,157 +17,21 @@ event                   meaning
 
 from __future__ import annotations
 
-import dataclasses
 import logging
-import math
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as TooLate
-from types import UnionType
 from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from dopt.errors import ExplorationError, SpecificationError
+from dopt.errors import ExplorationError
 from dopt.explorer.journal import Event, is_event
-from dopt.fields import LARGEST_WHOLE
 from dopt.models import MLP
-from dopt.policies.base import ROUNDING
-from dopt.registry import section_of
 from dopt.spec.custom_system import warn_of_sizes
 from dopt.spec.trial import TrialSpec
-from dopt.systems.base import System
-from dopt.systems.black_box import BlackBox
 from dopt.types import Array
-
-
-def instance(what: str, given: object, kinds: type | UnionType, expected: str) -> None:
-    """Raise SpecificationError unless something is of one of some kinds."""
-    if not isinstance(given, kinds):
-        shown = f"the class {given.__name__}" if isinstance(given, type) else repr(given)
-        raise SpecificationError(f"{what} is {shown}, but {expected} is expected: give one.")
-
-
-def whole(what: str, given: object, lower: int = -LARGEST_WHOLE, upper: int = LARGEST_WHOLE) -> int:
-    """Return a whole number within bounds, or raise SpecificationError."""
-    if not _is_real(given, "iu") or not lower <= int(given) <= upper:  # type: ignore[call-overload]
-        raise SpecificationError(
-            f"{what} is {given!r}, but a whole number"
-            f"{f' from {lower} to {upper:,}' if lower > 0 else ''} is expected: correct it."
-        )
-    return int(given)  # type: ignore[call-overload,no-any-return]
-
-
-def reals(what: str, given: npt.ArrayLike) -> Array:
-    """Return an array of real numbers, or raise SpecificationError."""
-    values = _array(given)
-    if values.dtype.kind not in "fiu":
-        raise SpecificationError(
-            f"{what} of the type {values.dtype} were given, but an array of real numbers is "
-            f"expected: correct them."
-        )
-    return values.astype(np.float64)
-
-
-def numbers(what: str, given: npt.ArrayLike, size: int) -> Array:
-    """Return so many real numbers, or raise SpecificationError."""
-    values = _array(given)
-    if values.shape != (size,) or values.dtype.kind not in "fiu":
-        raise SpecificationError(
-            f"{what} has the shape {values.shape} and the type {values.dtype}, but {size} real "
-            f"{'number is' if size == 1 else 'numbers are'} expected: correct it."
-        )
-    return values.astype(np.float64)
-
-
-def finite(what: str, given: npt.ArrayLike, size: int) -> Array:
-    """Return so many finite numbers, or raise SpecificationError."""
-    values = numbers(what, given, size)
-    if not np.isfinite(values).all():
-        raise SpecificationError(
-            f"{what} is {values.tolist()}, but finite numbers are expected: correct it."
-        )
-    return values
-
-
-def safe_input(spec: TrialSpec, fallback: npt.ArrayLike | None) -> Array:
-    """Return the fallback, (m,), 0 unless it is given, or raise SpecificationError."""
-    m, gamma = spec.system.n_inputs, spec.system.gamma
-    u = np.zeros(m) if fallback is None else finite("fallback", fallback, m)
-    if np.linalg.norm(u) > gamma * (1 + ROUNDING):
-        raise SpecificationError(
-            f"fallback is {u.tolist()}, but its norm has to be at most {gamma:g}: lower it."
-        )
-    return u
-
-
-def within(what: str, given: float, upper: float) -> float:
-    """Return a real number above 0 and below a bound."""
-    if not _is_real(given) or not 0.0 < given < upper:
-        raise SpecificationError(
-            f"{what} is {given!r}, but a number above 0"
-            f"{f' and below {upper:g}' if upper < math.inf else ''} is expected: correct it."
-        )
-    return float(given)
-
-
-def seconds(given: float | None) -> float | None:
-    """Return a time in seconds, or raise SpecificationError."""
-    if given is not None and not (_is_real(given) and math.isfinite(given)):
-        raise SpecificationError(
-            f"time is {given!r}, but a finite number of seconds is expected: correct it, or leave "
-            f"it out."
-        )
-    return None if given is None else float(given)
-
-
-def _is_real(given: object, kinds: str = "fiu") -> bool:
-    value = _array(given)
-    return value.shape == () and value.dtype.kind in kinds
-
-
-def _array(given: Any) -> npt.NDArray[Any]:
-    try:
-        return np.asarray(given)
-    except ValueError:  # rows of different lengths
-        return np.asarray(given, dtype=object)
-
-
-# Systems that are stepped somewhere else, as an explorer sees them.
-
-
-def measured(system: System) -> System:
-    """Return a system of which nothing but its declaration is used.
-
-    A black box, such as an environment of Gymnasium, is not started: its known part is compiled,
-    and its states are those that the explorer is told.
-
-    Raises
-    ------
-    SpecificationError
-        If its outputs mix states: those that begin an exploration would be unknown.
-    """
-    if system.output_matrix:
-        raise SpecificationError(
-            f"env.output_matrix is {list(system.output_matrix)}, but an explorer is told states, "
-            f"all of them or some: set env.measured_states, or take the outputs for states."
-        )
-    if not isinstance(system, BlackBox) or system.measured:
-        return system
-    kind, section = type(system), section_of(system)
-    declared: dict[str, Any] = {
-        "compiled": True,
-        "measured": True,
-        "to_section": lambda self: section,  # noqa: ARG005  # that of the system itself
-        "__module__": kind.__module__,
-    }
-    explored: type[System] = dataclasses.dataclass(frozen=True, kw_only=True)(
-        type(kind.__name__, (kind,), declared)
-    )
-    return explored(**{key.name: getattr(system, key.name) for key in dataclasses.fields(system)})
-
 
 # A planner that is waited for until a deadline.
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from dopt.control.task import Feedback
 from dopt.errors import SpecificationError
-from dopt.kernel.evaluation import points_of_trial
-from dopt.kernel.from_spec import KernelState, shared_points
+from dopt.kernel.from_spec import KernelState, points_of_trial, shared_points
 from dopt.kernel.held import HeldTrial
 from dopt.kernel.pointers import Compiled, compiled_trial
 from dopt.kernel.steps import SteppedTrial, is_stepped

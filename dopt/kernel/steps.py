@@ -13,8 +13,7 @@ from dopt.control.task import Feedback
 from dopt.custom_planner import custom_planner
 from dopt.errors import SpecificationError
 from dopt.kernel import loop
-from dopt.kernel.evaluation import points_of_trial
-from dopt.kernel.from_spec import KernelState, shared_points
+from dopt.kernel.from_spec import KernelState, points_of_trial, shared_points
 from dopt.kernel.held import HeldTrial
 from dopt.kernel.linear_algebra import dense
 from dopt.kernel.loop import act_next, evaluate_next, learn_next, observe_next

@@ -8,8 +8,7 @@ from typing import ClassVar, TypeVar
 
 import numpy as np
 
-from dopt.kernel.compiler import StoredCode, compiled
-from dopt.kernel.pointers import content_digest
+from dopt.kernel.compiler import StoredCode, compiled, content_digest
 from dopt.kernel.structs import Trial
 from dopt.learning.base import Array, CustomLearner, Updater
 from dopt.policies.base import CustomPolicy, Planner

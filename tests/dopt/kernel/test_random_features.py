@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from dopt.assessment import model_forecast
-from dopt.kernel.evaluation import points_of_trial
-from dopt.kernel.from_spec import shared_points
+from dopt.kernel.from_spec import points_of_trial, shared_points
 from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
 from dopt.run import run_trial

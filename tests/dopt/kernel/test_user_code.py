@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dopt.kernel.pointers import content_digest
+from dopt.kernel.compiler import content_digest
 from tests.paths import ROOT
 
 MODULE = """
@@ -31,7 +31,7 @@ def plan(x, out):
 PROGRAM = """
 import numpy as np, sys
 from numba import float64, void
-from dopt.kernel.pointers import compiled_own
+from dopt.kernel.compiler import compiled_own
 from own import plan
 compiled = compiled_own(plan, void(float64, float64[::1]))
 out = np.zeros(1)
