@@ -5,7 +5,8 @@ docstrings, or strings that stand alone below a name.
 
 The walk of a specification: one short trial is run twice by ``dopt.run.run_trial``, and the second
 run is followed by ``sys.setprofile``. A room is a module of the packages in which a function is
-called with a ``TrialSpec`` among its arguments. A return is the end of such a call whose caller
+called with a ``TrialSpec`` among its arguments, except the module of ``TrialSpec``: reading an
+attribute of the specification takes it nowhere. A return is the end of such a call whose caller
 lies in another module of the packages. Beside them stand all modules of the packages of which a
 function ran. Functions that are compiled are not seen.
 """
@@ -109,6 +110,8 @@ def walk() -> tuple[int, int, int]:
         if event == "call" and _own(frame):
             ran.add(_module(frame))
         if event == "call" and _own(frame) and _is_given(frame, TrialSpec):
+            if _module(frame) == TrialSpec.__module__:
+                return
             rooms.add(_module(frame))
             calls.append((frame, _comes_from_another(frame)))
         elif event == "return" and calls and calls[-1][0] is frame:
