@@ -8,10 +8,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType, TracebackType
-from typing import Any, Self, TextIO
+from typing import Self, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -163,6 +163,19 @@ class Repetition:
         return False
 
 
+@contextmanager
+def handling(
+    numbers: Sequence[signal.Signals], handler: Callable[[int, FrameType | None], None]
+) -> Iterator[None]:
+    """Let ``handler`` take the signals in the block."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
+
+
 class Interrupt:
     """Context manager in which the first signal sets ``stop_requested``, and calls ``at_first``.
 
@@ -182,18 +195,17 @@ class Interrupt:
         self._at_first = at_first
         self._signals = signals
         self._notice = notice
-        self._before: dict[signal.Signals, Any] = {}
+        self._handled = ExitStack()
         self._repeated = Repetition()
 
     def __enter__(self) -> Self:
-        self._before = {number: signal.signal(number, self._handle) for number in self._signals}
+        self._handled.enter_context(handling(self._signals, self._handle))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, _: object, __: TracebackType | None
     ) -> None:
-        for number, before in self._before.items():
-            signal.signal(number, before)
+        self._handled.close()
 
     def _handle(self, number: int, _: FrameType | None) -> None:
         if self._repeated(number):
@@ -229,11 +241,9 @@ def undisturbed() -> Iterator[None]:
 
     # SIGUSR1 belongs to whoever uses it, except where a handler is set as ours are.
     used = [signal.SIGUSR1] if callable(signal.getsignal(signal.SIGUSR1)) else []
-    before = {number: signal.signal(number, hold) for number in (*SIGNALS, *used)}
     try:
-        yield
+        with handling((*SIGNALS, *used), hold):
+            yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
         for one in held:
             signal.raise_signal(one)

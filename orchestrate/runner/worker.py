@@ -12,7 +12,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
 
@@ -32,7 +31,14 @@ from orchestrate.runner.chunks import (
     Chunks,
     memory_of_this_machine,
 )
-from orchestrate.runner.progress import SIGNALS, Interrupt, Progress, Repetition, Tally
+from orchestrate.runner.progress import (
+    SIGNALS,
+    Interrupt,
+    Progress,
+    Repetition,
+    Tally,
+    handling,
+)
 from orchestrate.runner.run_grid import (
     WORK,
     Output,
@@ -140,7 +146,13 @@ def run_worker(settings: WorkerSettings, output: Output, work: Work | None = Non
     StoreError, InfrastructureError
         As :func:`orchestrate.runner.run_grid.launch_grid`.
     """
-    with _signals_interrupt():
+    repeated = Repetition()
+
+    def interrupt(number: int, _: FrameType | None) -> None:
+        if not repeated(number):
+            raise KeyboardInterrupt
+
+    with handling(WARNINGS, interrupt):  # as Ctrl-C until trials are claimed
         launch = settings.launch
         record = launch_record(sys.argv, [], ROOT)
         start = time.monotonic()
@@ -150,23 +162,6 @@ def run_worker(settings: WorkerSettings, output: Output, work: Work | None = Non
             output,
             lambda store: _work(store, settings, launch, work or WORK, output, start),
         )
-
-
-@contextmanager
-def _signals_interrupt() -> Iterator[None]:
-    """Interrupt the preparation, in which no trial is claimed, at a warning, as Ctrl-C does."""
-    repeated = Repetition()
-
-    def interrupt(number: int, _: FrameType | None) -> None:
-        if not repeated(number):
-            raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in WARNINGS}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _work(

@@ -21,9 +21,7 @@ from tests.orchestrate.faults.conftest import (  # noqa: F401  fixtures, which p
     laboratory_at,
     postgresql_url,
     server,
-    sqlite_url,
     undisturbed,
-    url,
 )
 from tests.orchestrate.faults.laboratory import Laboratory, Server, flaws, preempt, results
 from tests.orchestrate.faults.test_workers import register
@@ -58,7 +56,7 @@ def test_a_grid_survives_everything(
     disturbances = ON_SQLITE
     if database == "postgresql":
         server, disturbances = request.getfixturevalue("server"), ON_POSTGRESQL
-    url = request.getfixturevalue(f"{database}_url")  # noqa: F811
+    url = request.getfixturevalue(f"{database}_url")
     laboratory = laboratory_at(url, TRIALS, seconds=0.005, settings=SETTINGS)
     supervisor = Supervisor(laboratory, server, disturbances, random.Random(1))
     try:
@@ -75,7 +73,7 @@ def test_a_grid_survives_everything(
 
 
 def test_workers_survive_a_preemption_every_second_or_two(
-    url: str,  # noqa: F811
+    url: str,
     laboratory_at: At,  # noqa: F811
     tell: Callable[[str], None],
 ) -> None:
@@ -85,7 +83,7 @@ def test_workers_survive_a_preemption_every_second_or_two(
     laboratory.check()
     assert laboratory.count("status = 'failed'") == 0
     tell(f"{TRIALS // 2:,} trials, signals {dict(sent)}, attempts {dict(attempts(laboratory))}")
-    assert sent.total() >= min(10, TRIALS // 200)
+    assert sent.total() >= min(10, TRIALS // 500)
 
 
 def attempts(laboratory: Laboratory) -> list[tuple[str, int]]:

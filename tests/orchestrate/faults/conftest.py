@@ -30,18 +30,8 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture
-def sqlite_url(tmp_path: Path) -> str:
-    return f"sqlite:///{tmp_path}/results/results.db"
-
-
-@pytest.fixture
 def postgresql_url(server: Server) -> str:
     return server.new_url()
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest) -> str:
-    return str(request.getfixturevalue(f"{request.param}_url"))
 
 
 @pytest.fixture(scope="session")

@@ -28,6 +28,7 @@ from orchestrate.errors import ExitCode
 from orchestrate.executors import local
 from orchestrate.executors import worker as worker_process
 from orchestrate.runner import scheduler, start, worker
+from orchestrate.runner.progress import undisturbed
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store, StoreUnavailableError
@@ -134,22 +135,18 @@ class ForkedWorker:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         self.returncode: int | None = None
-        # The interpreter ignores exceptions of its functions around a fork, an interrupt included.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
-        self.pid = os.fork()
-        try:
+        with undisturbed():  # an interrupt in a function that runs around a fork would be ignored
+            self.pid = os.fork()
             if self.pid == 0:
-                self._work(mask, *descriptors)
-                os._exit(0)
-        finally:
-            if self.pid == 0:
-                os._exit(1)
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+                try:
+                    self._work(*descriptors)
+                    os._exit(0)
+                finally:
+                    os._exit(1)
 
     @staticmethod
-    def _work(mask: set[int], connection: int, crash_report: int, errors: int) -> None:
+    def _work(connection: int, crash_report: int, errors: int) -> None:
         os.setpgid(0, 0)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for stream in (1, 2):
             os.dup2(crash_report, stream)
         kept = sorted({connection, crash_report, errors})

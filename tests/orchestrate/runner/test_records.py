@@ -112,6 +112,14 @@ def git(folder: Path, *arguments: str) -> str:
     return done.stdout.decode().strip()
 
 
+def commit(folder: Path, name: str) -> None:
+    """Make a repository of the folder, with one file."""
+    git(folder, "init")
+    (folder / name).write_text("a = 1\n")
+    git(folder, "add", ".")
+    git(folder, "commit", "-m", "Add a file")
+
+
 def test_outside_a_repository_there_is_no_commit(tmp_path: Path) -> None:
     record = launch_record(["launch.py"], ["seed=1"], tmp_path)
     assert (record.git_commit, record.git_dirty, record.git_diff_hash) == (None, None, None)
@@ -128,10 +136,7 @@ def test_an_image_without_its_repository_says_the_commit(
 
 
 def test_the_commit_and_what_differs_from_it(tmp_path: Path) -> None:
-    git(tmp_path, "init")
-    (tmp_path / "code.py").write_text("a = 1\n")
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "-m", "Add code")
+    commit(tmp_path, "code.py")
     clean = launch_record([], [], tmp_path)
     assert (clean.git_commit, clean.git_dirty) == (git(tmp_path, "rev-parse", "HEAD"), False)
     assert clean.git_diff_hash is None
@@ -150,10 +155,7 @@ def test_the_commit_and_what_differs_from_it(tmp_path: Path) -> None:
 
 
 def test_a_repository_around_an_installed_copy_is_not_that_of_the_code(tmp_path: Path) -> None:
-    git(tmp_path, "init")
-    (tmp_path / "note").write_text("mine\n")
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "-m", "Add a note")
+    commit(tmp_path, "note")
     installed = tmp_path / "site-packages"
     installed.mkdir()
     assert launch_record([], [], installed).git_commit is None
@@ -166,10 +168,7 @@ def test_the_processor_and_what_compiles_for_it_are_named(tmp_path: Path) -> Non
 
 
 def test_untracked_results_and_builds_leave_the_code_clean(tmp_path: Path) -> None:
-    git(tmp_path, "init")
-    (tmp_path / "code.py").write_text("a = 1\n")
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "-m", "Add code")
+    commit(tmp_path, "code.py")
     for name in ("exported/curves.csv", "build/lib/code.py", "dist/dopt.whl", "notes.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("output\n")
