@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import re
+import sys
 from datetime import UTC, datetime
+from pathlib import Path
 
 from httpx import Response
 from starlette.testclient import TestClient
 
 from dopt.spec.trial import TrialSpec
+from orchestrate.config import Grid
+from orchestrate.config.launch_settings import LaunchSettings
+from orchestrate.runner.run_grid import Work, launch_grid
 from orchestrate.store import Failure, LaunchRecord, RunRecord, Store
 from tests.analysis.synthetic import fake_result, fill, make_grid
+from tests.orchestrate.faults.trials import Gate, Gated
 
 SHORT = {"env": {"horizon": 40}}
 TRACEBACK = "Traceback (most recent call last):\n  <script>alert('no')</script>\nValueError: no"
@@ -109,3 +115,17 @@ def post(client: TestClient, path: str, statement: str, **headers: str) -> Respo
     """Send a statement, with headers whose names have underscores for dashes."""
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     return client.post(path, data={"q": statement, "token": token(client)}, headers=named)
+
+
+def launch(url: str, seeds: int, folder: Path) -> int:
+    """Launch pendulum trials of two policies that pass a gate: ``-m ... URL SEEDS FOLDER``."""
+    specs = make_grid(("pendulum",), ("d_optimal", "random"), range(seeds), **SHORT)
+    settings = LaunchSettings(executor="inprocess", store_url=url, workers=1)
+    record = LaunchRecord(argv=["launch"], overrides=[], host="here", pid=1)
+    work = Work(Gated(fake_result, Gate(folder)), prepare=lambda: None)
+    grid = Grid(specs, n_jobs=len(specs), left_out={})
+    return int(launch_grid(grid, settings, record, work, lambda _: None, stream=None))
+
+
+if __name__ == "__main__":
+    sys.exit(launch(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])))

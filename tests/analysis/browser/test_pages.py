@@ -221,7 +221,7 @@ def test_pages_follow_a_launch(browser: Browser, tmp_path: Path) -> None:
         expect(page.locator("#grid")).to_contain_text("has no trials yet")
         gate = Gate(tmp_path)
         gate.let(3)
-        module = "tests.analysis.browser.slow_launch"
+        module = "tests.analysis.browser.grids"
         program = [sys.executable, "-m", module, url, "6", str(tmp_path)]
         launch = subprocess.Popen(program, cwd=ROOT)
         expect(page.locator("#state")).to_have_attribute("data-mode", "writing")
