@@ -36,7 +36,7 @@ SHORT = {"env": {"horizon": 40}}
 TASK = {"task": {"name": "control", "checkpoints": [20]}}
 
 SHELL = {
-    "docs/plants.md": {"rig.py"},  # tests/dopt/explorer/test_rig.py
+    "docs/plants.md": {"rig.py"},  # tests/dopt/explorer/test_explorer.py
     "docs/install.md": {".", "make"},
     "docs/many_machines.md": {
         "sh",

@@ -1,8 +1,9 @@
-"""Environments that a Gymnasium of a user might hold, among them a point mass without secrets."""
+"""Environments of Gymnasium, well-behaved and rough."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import random
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -12,7 +13,9 @@ from gymnasium.spaces import Box, Discrete
 
 from dopt.fields import parameter
 from dopt.gymnasium import Environment
-from dopt.systems import Feature
+from dopt.learning.base import CustomLearner, Updater
+from dopt.systems import Feature, System
+from dopt.trial_view import TrialView
 
 DRAG = 0.7
 """Of the point mass, v̇ = u - DRAG v, by the Euler map."""
@@ -114,3 +117,201 @@ class Blurred(Point):
     @staticmethod
     def state(observation: Any) -> Sequence[float]:
         return tuple(observation[:1])
+
+
+PIECE = 7
+"""Steps after which :class:`Restarting` begins anew."""
+
+
+class Whole(PointEnv):
+    """Takes whole numbers, in single precision or not."""
+
+    def __init__(self, kind: Any = np.int64, low: float = -2, high: float = 2) -> None:
+        super().__init__(wall=1e9)
+        self.action_space = Box(low, high, (1,), kind)
+        self.taken: list[Any] = []
+        TAKEN.append(self.taken)
+
+    def step(self, action: Any) -> Any:
+        assert action.dtype == self.action_space.dtype
+        self.taken.append(action.copy())
+        return super().step(action)
+
+
+TAKEN: list[list[Any]] = []
+"""Actions of each environment of the class :class:`Whole`."""
+
+
+class Truncating(PointEnv):
+    """Truncates after some steps, and goes on as if nothing had happened."""
+
+    def __init__(self, after: int = PIECE, spread: float = 50.0) -> None:
+        super().__init__(wall=1e9)
+        self.after, self.spread, self.count = after, spread, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.count = 0
+        info = super().reset(seed=seed, options=options)[1]
+        self.place = self.place * 1e3  # far apart: who learns across it learns nonsense
+        self.speed = self.np_random.uniform(-self.spread, self.spread, 1)
+        return np.concatenate([self.place, self.speed]), info
+
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        self.count += 1
+        over = self.count >= self.after
+        return self.after_step(observation, over), rest[0], rest[1], over, rest[3]
+
+    def after_step(self, observation: Any, over: bool) -> Any:  # noqa: ARG002
+        return observation
+
+
+class Restarting(Truncating):
+    """Begins anew by itself, and shows the new start in place of the last state."""
+
+    def after_step(self, observation: Any, over: bool) -> Any:
+        return self.reset()[0] if over else observation
+
+
+class OldReset(PointEnv):
+    def reset(self) -> Any:  # type: ignore[override]
+        return super().reset()[0]
+
+
+class OldResetTwo(PointEnv):
+    """Returns two numbers, which could be an observation with an info."""
+
+    def reset(self, **given: Any) -> Any:
+        return super().reset(**given)[0]
+
+
+class FourValues(PointEnv):
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, _, info = super().step(action)
+        return observation, reward, terminated, info
+
+
+class NotFinite(PointEnv):
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        return np.where(np.abs(self.place).max() > 0.2, np.nan, observation), *rest
+
+
+class Failing(PointEnv):
+    def step(self, action: Any) -> Any:
+        if np.abs(self.place).max() > 0.2:
+            raise RuntimeError("the simulator has gone")
+        return super().step(action)
+
+
+class Tau(PointEnv):
+    dt = None  # type: ignore[assignment]
+    tau = 0.02
+
+
+class OneSided(PointEnv):
+    def __init__(self) -> None:
+        super().__init__(wall=1e9)
+        self.action_space = Box(0.0, 2.0, (1,))
+
+
+class Seedless(PointEnv):
+    """Ignores the seed of its reset."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:  # noqa: ARG002
+        observation, info = super().reset()
+        return observation, info
+
+
+class Shaken(PointEnv):
+    """Has noise of a generator that its seed does not reach."""
+
+    draw: Callable[[], float] = staticmethod(lambda: float(np.random.standard_normal()))  # noqa: NPY002
+
+    def step(self, action: Any) -> Any:
+        self.speed = self.speed + 0.01 * type(self).draw()
+        return super().step(action)
+
+
+class ShakenByPython(Shaken):
+    draw = staticmethod(lambda: random.gauss(0.0, 1.0))
+
+
+class Writing(PointEnv):
+    """Writes into the action that it is given."""
+
+    def step(self, action: Any) -> Any:
+        returned = super().step(action)
+        action[:] = 0.0
+        return returned
+
+
+class OneBuffer(PointEnv):
+    """Returns the same array each time."""
+
+    def __init__(self) -> None:
+        super().__init__(wall=1e9)
+        self.buffer = np.zeros(2)
+
+    def reset(self, **given: Any) -> Any:
+        self.buffer[:], info = super().reset(**given)
+        return self.buffer, info
+
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        self.buffer[:] = observation
+        return self.buffer, *rest
+
+
+FAR: dict[str, Any] = {"wall": 1e9}
+for kind, settings in {
+    Whole: {},
+    Truncating: {},
+    Restarting: {},
+    OldReset: FAR,
+    OldResetTwo: FAR,
+    FourValues: FAR,
+    NotFinite: FAR,
+    Failing: FAR,
+    Tau: FAR,
+    OneSided: {},
+    Seedless: FAR,
+    Shaken: FAR,
+    ShakenByPython: FAR,
+    Writing: FAR,
+    OneBuffer: {},
+}.items():
+    if f"dopt_tests/{kind.__name__}-v0" not in gymnasium.registry:
+        gymnasium.register(f"dopt_tests/{kind.__name__}-v0", kind, kwargs=dict(settings))
+for identity, settings in {"Single": {"after": 1}, "Near": {"spread": 2.0}}.items():
+    if f"dopt_tests/{identity}-v0" not in gymnasium.registry:
+        gymnasium.register(f"dopt_tests/{identity}-v0", Restarting, kwargs=dict(settings))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rough(Point):
+    """A point mass far from everything."""
+
+    name: ClassVar[str] = "rough"
+
+    grid_half_widths: tuple[float, ...] = parameter((60.0,), bound="positive")
+
+
+SEEN: list[Any] = []
+"""Accelerations that :class:`Noting` was taught last, (T, r)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noting(CustomLearner):
+    """Learns nothing, and notes what it is taught."""
+
+    name: ClassVar[str] = "noting"
+
+    def updater(self, system: System, rng: np.random.Generator) -> Updater:  # noqa: ARG002
+        return NotingUpdater()
+
+
+class NotingUpdater(Updater):
+    def update(self, view: TrialView) -> Any:
+        SEEN[:] = [view.sampled.copy(), view.sampled_inputs.copy(), view.accelerations.copy()]
+        return view.parameters

@@ -1,11 +1,16 @@
-"""Networks of a user's own: one that is the shipped model, and some that are mistakes."""
+"""Users' networks, some of them mistakes, and models of the reference for one point."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+
+from dopt.models import Model
+from dopt.reference.models import BatchModel, model_function
+from dopt.systems.base import System
 
 
 class Stack(nn.Module):
@@ -44,3 +49,17 @@ class Empty(nn.Module):
 class Broken(Stack):
     def forward(self, features: Tensor) -> Tensor:
         raise RuntimeError(f"no way from {features.shape[-1]} features")
+
+
+def for_one(model: BatchModel) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return a_θ: parameters (q,) and a point, (d,) or (d + m,), to accelerations (r,)."""
+
+    def accelerations(theta: Tensor, x: Tensor) -> Tensor:
+        return model(theta[None], x[None, None])[0, 0]
+
+    return accelerations
+
+
+def model_of_one(system: System, model: Model) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return a_θ of a registered model, for one trial and one point."""
+    return for_one(model_function(system, model))

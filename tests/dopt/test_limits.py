@@ -1,19 +1,26 @@
-"""Limits: inputs heed their bounds and rates, and keep the states of a plant within theirs."""
+"""Limits of inputs and states, and sensors."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from dopt import Explorer
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError, ScaleWarning, SpecificationError
+from dopt.kernel.run import KernelTrial
+from dopt.kernel.steps import SteppedTrial
+from dopt.kernel.structs import Record
 from dopt.limits import Limits
+from dopt.randomness import draw
 from dopt.result import TrialResult
 from dopt.run import run_trial
 from dopt.spec.label import config_label
 from dopt.spec.trial import TrialSpec
+from dopt.systems.black_box import delay, differentiated
+from dopt.types import Array
 from tests.dopt.trials import LEARNERS, MODELS, SMALL_GRIDS, SMALL_SEARCHES
 
 RAIL: dict[str, Any] = {"bounds": {"y": [-2.0, 2.0]}}
@@ -208,3 +215,227 @@ def test_wrong_limits_are_refused_in_a_sentence(given: object, message: str) -> 
     with pytest.raises(SpecificationError, match=message) as caught:
         limited("cartpole", given)
     assert "\n" not in str(caught.value)
+
+
+DEGREE = math.pi / 180
+ANGLE = {"measured_states": [0], "measurement_noise": [DEGREE]}
+CART = {"measured_states": [2, 0], "measurement_noise": [DEGREE, 0.01]}
+JOINTS = {"measured_states": [0, 2], "measurement_noise": [DEGREE, DEGREE]}
+
+
+def sensed(
+    env: str, sensors: dict[str, Any], learner: str = "joint_ekf", policy: str = "d_optimal", /, *,
+    horizon: int = 30, model: str = "mlp", path: str = "kernel", seed: int = 0, **fields: Any,
+) -> TrialSpec:  # fmt: skip
+    fitted = learner == "joint_ekf"
+    planner = {"name": policy} | ({"regularization": 3.0} if policy == "d_optimal" else {})
+    return TrialSpec.from_mapping(
+        {
+            "env": {"name": env, "horizon": horizon, "grid_points": SMALL_GRIDS[env], **sensors},
+            "policy": planner,
+            "model": {"name": model},
+            "learner": {"name": learner, **({"refit_every": 12} if fitted else {}), **fields},
+            "path": path,
+            "seed": seed,
+        }
+    )
+
+
+TIP = {"output_matrix": [1, 0, 1, 0, 0, 0.05, 1, 0], "measurement_noise": [0.02, 0.01]}
+"""Of a cartpole x + φ, about the position of its tip, and φ + 0.05 ẋ."""
+
+ABSOLUTE = {"output_matrix": [1, 0, 0, 0, 1, 0, 1, 0], "measurement_noise": [DEGREE, DEGREE]}
+"""Of an arm the angles of both links against the base."""
+
+
+class Filtered(NamedTuple):
+    """Estimates x̂ and θ at the end of a trial, and the variances of both."""
+
+    x: Array
+    theta: Array
+    variances: Array
+
+
+def augmented_filter(spec: TrialSpec) -> Filtered:
+    """Filter a trial with one covariance of state and parameters.
+
+    Plain matrices and differences, with all of what is linearised in one matrix F.
+    """
+    result, system, learner = run_trial(spec), spec.system, spec.learner
+    dt, rows, drawn = system.dt, list(system.learned_rows), draw(spec)
+    d, theta = system.n_states, drawn.weights
+    x = np.array(system.initial_state)
+    whole = np.zeros((d + len(theta),) * 2)
+    whole[d:, d:] = np.eye(len(theta)) / 3.0
+
+    def following(z: Array, u: Array) -> Array:
+        state, parameters = z[:d], z[d:]
+        rate = np.array(system.known(tuple(state), tuple(u), system.parameters), dtype=float)
+        rate[rows] += spec.model.predict(system, parameters, state[None])[0]
+        return np.concatenate([state + dt * rate, parameters])
+
+    for t, u in enumerate(result.inputs):
+        z = np.concatenate([x, theta])
+        steps = np.eye(len(z)) * 1e-6
+        F = np.stack([(following(z + e, u) - following(z - e, u)) / 2e-6 for e in steps], axis=1)
+        J = F[rows, d:] / dt
+        spread = learner.underweighting * J @ whole[d:, d:] @ J.T  # type: ignore[attr-defined]
+        noise = spread + learner.noise_variance * np.eye(len(rows))  # type: ignore[attr-defined]
+        whole = F @ whole @ F.T
+        whole[np.ix_(rows, rows)] += dt**2 * noise
+        z = following(z, u)
+        C = np.hstack([system.output_rows, np.zeros((system.n_measured, len(theta)))])
+        y = system.output_rows @ result.states[t + 1] + drawn.measurement_noise[t]
+        S = C @ whole @ C.T + np.diag(np.square(system.measurement_noise))
+        gain = whole @ C.T @ np.linalg.inv(S)
+        z = z + gain @ (y - C @ z)
+        whole = whole - gain @ S @ gain.T
+        x, theta = z[:d], z[d:]
+    return Filtered(x, theta, np.diag(whole))
+
+
+@pytest.mark.parametrize(
+    ("env", "sensors"), [("pendulum", ANGLE), ("cartpole", CART), ("cartpole", TIP)]
+)
+def test_it_is_the_filter_of_state_and_parameters_in_one(env: str, sensors: dict[str, Any]) -> None:
+    spec = sensed(env, sensors, horizon=12, refit_every=1000)
+    result = run_trial(spec)
+    x, theta, _ = augmented_filter(spec)
+    assert result.estimated_states is not None
+    # Linearised about the estimate after each measured state, not once for all of them: one of
+    # several is the same to the order of what an update changes.
+    tight = {"rtol": 1e-4, "atol": 1e-6} if env == "pendulum" else {"rtol": 1e-3, "atol": 1e-4}
+    np.testing.assert_allclose(result.estimated_states[-1], x, **tight)
+    np.testing.assert_allclose(result.parameters, theta, **tight)
+
+
+def test_what_is_measured_is_the_state_with_its_noise() -> None:
+    spec = sensed("pendulum", ANGLE, "adam", horizon=400, seed=4)
+    noise = draw(spec).measurement_noise
+    assert noise.shape == (400, 1)
+    assert 0.9 * DEGREE < noise.std() < 1.1 * DEGREE
+    fast = KernelTrial(sensed("pendulum", ANGLE, "adam", horizon=5))
+    fast.advance(5)
+    seen = fast.state.estimate.outputs[:, 0] - fast.record.true_states[1:, 0]
+    np.testing.assert_allclose(seen, draw(fast.spec).measurement_noise[:5, 0], atol=1e-15)
+
+
+def observed(spec: TrialSpec) -> tuple[Record, Array]:
+    """Return the record of a trial, and the accelerations that a learner in numpy observes."""
+    learner = {"learner": {"_target_": "tests.dopt.custom_plugins.Descent"}}
+    fast = SteppedTrial(TrialSpec.from_mapping(spec.to_mapping() | learner))
+    fast.advance(spec.system.horizon)
+    assert fast._parts is not None
+    return fast.record, fast._parts.targets
+
+
+EXACT = {"measurement_noise": [1e-13], "noise": 0.0}
+
+
+def test_filtered_differences_see_the_filtered_accelerations() -> None:
+    """Without noise: what the filter gives for v̇ less the known part is what it gives for a(x)."""
+    sensors = {"measured_states": [0], "initial_state": [1.0, 4.0], **EXACT}
+    spec = sensed("pendulum", sensors, "adam", "random", horizon=40)
+    system, (record, targets) = spec.system, observed(spec)
+    share, filtered, expected = -math.expm1(-2 * math.pi * 2.0 * system.dt), 0.0, []
+    for acceleration in system.learned(record.true_states[:-1])[:, 0]:
+        expected.append(filtered)  # differences come one step late
+        filtered += share * (acceleration - filtered)
+    np.testing.assert_allclose(targets[:, 0], expected, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("env", "sensors"),
+    [
+        ("pendulum", {"measured_states": [0]}),
+        ("pendulum", {"measured_states": [0], "integrator": "rk4"}),
+        ("cartpole", {"measured_states": [0, 1, 2], "measurement_noise": [1e-13] * 3}),
+        ("pendulum", {"measured_states": [0, 1], "measurement_noise": [1e-13] * 2}),
+    ],
+)
+def test_estimates_belong_together(env: str, sensors: dict[str, Any]) -> None:
+    """Without noise and in small motions, what is learned at an estimate is a(x̂)."""
+    sensors = EXACT | {"gamma": 0.05} | sensors  # small motions, of which a(x) is linear
+    spec = sensed(env, sensors, "adam", "periodic", horizon=300)
+    system, (record, targets) = spec.system, observed(spec)
+    truth = system.learned(system.sampled_states(record.states))
+    errors, sizes = (targets - truth)[100:], truth[100:]  # once the filters have settled
+    late = np.sqrt(np.mean(errors**2)) / np.sqrt(np.mean(sizes**2))
+    assert late < 0.01
+
+
+def test_differences_come_late_by_the_step_of_the_integrator() -> None:
+    systems = [sensed("pendulum", ANGLE | more).system for more in ({}, {"integrator": "rk4"})]
+    assert [delay(system) for system in systems] == [1.0, 0.5]
+    both = sensed("pendulum", {"measured_states": [0, 1], "measurement_noise": [0.1, 0.1]})
+    assert delay(both.system) == 0.0
+
+
+def test_rates_of_measured_states_are_found() -> None:
+    assert differentiated(sensed("pendulum", ANGLE).system) == [0, 0]
+    assert differentiated(sensed("cartpole", CART).system) == [0, 0, 2, 2]
+    rate = {"measured_states": [1], "measurement_noise": [0.1]}
+    assert differentiated(sensed("pendulum", rate).system) == [-1, 1]
+
+
+def test_without_measured_states_nothing_is_estimated() -> None:
+    spec = sensed("pendulum", {}, "adam_window")
+    assert run_trial(spec).estimated_states is None
+    assert "measured" not in spec.config_json
+    assert "velocity_cutoff" not in spec.config_json
+
+
+def test_a_trial_that_diverges_has_no_estimates_from_there_on() -> None:
+    sensors = ANGLE | {"state_limit": 0.05}
+    result = run_trial(sensed("pendulum", sensors, horizon=60, refit_every=1000))
+    assert result.diverged_at is not None
+    assert result.estimated_states is not None
+    assert np.isnan(result.estimated_states[result.diverged_at :]).all()
+    assert np.isfinite(result.estimated_states[: result.diverged_at]).all()
+
+
+REFUSED = [
+    ({"measured_states": [2], "measurement_noise": [0.1]}, "joint_ekf", "indices from 0 to 1"),
+    ({"measured_states": [0, 0], "measurement_noise": [0.1] * 2}, "joint_ekf", "none twice"),
+    ({"measured_states": [0]}, "joint_ekf", "measurement_noise has 0 entries"),
+    ({"measured_states": [0], "measurement_noise": [0.0]}, "joint_ekf", "above 0"),
+    (ANGLE | {"velocity_cutoff": 0.0}, "adam", "above 0"),
+]
+
+
+@pytest.mark.parametrize(("sensors", "learner", "said"), REFUSED)
+def test_sensors_that_make_no_sense_are_refused(
+    sensors: dict[str, Any], learner: str, said: str
+) -> None:
+    with pytest.raises(SpecificationError, match=said):
+        sensed("pendulum", sensors, learner)
+
+
+def test_what_does_not_go_with_sensors_is_refused() -> None:
+    with pytest.raises(IncompatibleError, match="'joint_ekf' goes with states that are measured"):
+        TrialSpec.from_names("pendulum", "d_optimal", learner="joint_ekf")  # and no warning
+    rate = {"measured_states": [1], "measurement_noise": [0.1]}
+    with pytest.raises(IncompatibleError, match="does not say that a state is the rate"):
+        sensed("pendulum", rate, "adam")
+
+
+def test_a_prior_that_says_nothing_is_warned_of() -> None:
+    mapping: dict[str, Any] = sensed("pendulum", ANGLE, seed=5).to_mapping()
+    with pytest.warns(ScaleWarning, match=r"variance 1e\+03, .* set policy.regularization to 3"):
+        TrialSpec.from_mapping(mapping | {"policy": {"name": "d_optimal", "regularization": 1e-3}})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_learns_from_the_angle_alone(seed: int) -> None:
+    """More than from filtered differences, and D-optimal inputs more than random ones."""
+    grid = {"grid_points": [16, 16]}
+    joint, differences, random = (
+        run_trial(sensed("pendulum", ANGLE | grid, *parts, horizon=300, seed=1000 + seed, **fields))
+        for parts, fields in (
+            (("joint_ekf",), {"refit_every": 100}),
+            (("gauss_newton",), {"noise_variance": 100.0, "refit_every": 5}),
+            (("joint_ekf", "random"), {"refit_every": 100, "regularization": 3.0}),
+        )
+    )
+    assert joint.loss[-1] < 0.5 * differences.loss[-1]
+    assert joint.loss[-1] < 0.5 * random.loss[-1]

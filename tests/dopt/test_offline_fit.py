@@ -1,8 +1,10 @@
-"""Offline fits: minima of their objective, models that can be recovered, samples, refusals."""
+"""Offline fits, calibration at held-out states, errors of parameters and predictions."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,22 +12,40 @@ import torch
 from torch.func import jacrev, vmap
 
 import dopt
-from dopt.errors import SpecificationError
+from dopt import Explorer
+from dopt.assessment import loss_by_parameter_error, parameter_error, true_parameters
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.evaluation import evaluation_set
+from dopt.kernel.learners import joint_kalman
+from dopt.kernel.learners.joint_kalman import run_filter
+from dopt.kernel.run import KernelTrial
 from dopt.offline_fit import (
     RIDGE,
+    HeldOut,
     Samples,
     fit_offline,
     grid_loss,
+    held_out_fit,
+    jacobian,
+    predicted_variances,
     recorded_samples,
     uniform_samples,
 )
 from dopt.randomness import draw, initial_weights
-from dopt.run import rerun
+from dopt.reference.models import mlp_function
+from dopt.result import TrialResult
+from dopt.run import rerun, run_trial
+from dopt.spec.compatibility import Information
 from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS, CoupledPendulums
 from dopt.types import Array
 from tests.close import assert_close
-from tests.dopt.kernel.twin import observed
-from tests.dopt.torch_models import model_of_one
+from tests.dopt.custom_networks import model_of_one
+from tests.dopt.explorer.plants import following
+from tests.dopt.explorer.test_measurements import ENCODER, JOINT
+from tests.dopt.kernel.twin import call, observed
+from tests.dopt.oracles.traces import model_step
+from tests.dopt.test_limits import ANGLE, CART, DEGREE, RAIL, augmented_filter, measures, sensed
 from tests.dopt.trials import trial
 
 SMALL = {"width": 4, "depth": 2}
@@ -42,7 +62,7 @@ def taught(spec: TrialSpec, states: Array) -> tuple[Array, Array]:
     return theta, spec.model.predict(spec.system, theta, states)
 
 
-def jacobian(spec: TrialSpec, theta: Array, states: Array) -> Array:
+def torch_jacobian(spec: TrialSpec, theta: Array, states: Array) -> Array:
     """Return ∂a_θ(x)/∂θ, (N r, q), by automatic differentiation."""
     model = model_of_one(spec.system, spec.model)
     rows = vmap(jacrev(model), in_dims=(None, 0))(torch.tensor(theta), torch.tensor(states))
@@ -71,7 +91,7 @@ def test_a_fit_ends_at_a_minimum_of_its_objective(env: str, ridge: float) -> Non
     samples = uniform_samples(spec)
     fitted = fit_offline(spec, samples.states, samples.accelerations, ridge=ridge)
     theta, prior = fitted.parameters, initial_weights(spec)
-    J = jacobian(spec, theta, samples.states)
+    J = torch_jacobian(spec, theta, samples.states)
     e = (samples.accelerations - spec.model.predict(spec.system, theta, samples.states)).ravel()
     slope = J.T @ e + ridge * (prior - theta)
     value = e @ e + ridge * np.sum((theta - prior) ** 2)
@@ -97,7 +117,9 @@ def test_each_network_of_an_ensemble_is_fitted_by_itself() -> None:
     for member, start in zip(others, drawn[1:], strict=True):
         assert not np.allclose(member, first)
         e = samples.accelerations - spec.model.predict(spec.system, member, samples.states)
-        slope = jacobian(spec, member, samples.states).T @ e.ravel() + RIDGE * (start - member)
+        slope = torch_jacobian(spec, member, samples.states).T @ e.ravel() + RIDGE * (
+            start - member
+        )
         assert np.linalg.norm(slope) < 1e-2 * np.linalg.norm(start - member)
 
 
@@ -211,3 +233,287 @@ def test_a_black_box_is_fitted_to_transitions_of_runs_of_its_own() -> None:
     assert len(samples.states) == 40
     fitted = fit_offline(spec, samples.states, samples.accelerations)
     assert fitted.loss < grid_loss(spec, initial_weights(spec))
+
+
+def limited(
+    limits: dict[str, Any] | None, policy: str = "d_optimal", /, *, horizon: int = 20,
+    seed: int = 0, path: str = "kernel", learner: str = "joint_ekf", **env: Any,
+) -> TrialSpec:  # fmt: skip
+    """Return a trial of the cartpole of which angle and place are measured."""
+    spec = sensed(
+        "cartpole", CART | env, learner, policy, horizon=horizon, path=path, seed=seed,
+        **({"refit_every": 1000} if learner == "joint_ekf" else {}),
+    )  # fmt: skip
+    return TrialSpec.from_mapping(spec.to_mapping() | {"limits": limits})
+
+
+def test_variances_are_those_of_state_and_parameters_in_one_filter() -> None:
+    sensors = {"measured_states": [0], "measurement_noise": [DEGREE]}
+    fast = KernelTrial(sensed("pendulum", sensors, horizon=13, refit_every=1000))
+    fast.advance(12)
+    shorter = sensed("pendulum", sensors, horizon=12, refit_every=1000)
+    expected = augmented_filter(shorter).variances[:2]
+    found = call(joint_kalman.state_variances, fast.trial, 12)
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+def beyond(result: TrialResult) -> float:
+    """Return the share of the steps after which the true cart is beyond its rail."""
+    return float(np.mean(np.abs(result.states[1:, 0]) > 2.0))
+
+
+def test_the_true_cart_stays_on_its_rail() -> None:
+    """Counted on the true states: without limits it leaves the rail, without a margin also."""
+    free, bare = (
+        run_trial(limited(RAIL | given, horizon=300))
+        for given in ({"enforced": False}, {"margin": 0.0})
+    )
+    kept = [run_trial(limited(RAIL, horizon=300, seed=seed)) for seed in range(3)]
+    assert beyond(free) > 0.5
+    assert sum(map(beyond, kept)) <= 0.01 * 3
+    assert beyond(kept[0]) < beyond(bare)
+    for result in (free, bare, *kept):
+        assert measures(result)["violations"] == pytest.approx(300 * beyond(result))
+
+
+def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None:
+    """Also while its rate is unknown at first; ``violations`` are those of the estimates."""
+    places, counts = [], []
+    for enforced in (True, False):
+        limits = {"bounds": {"angle": [-1.0, 1.0]}, "steps": 15, "enforced": enforced}
+        explorer = Explorer(ENCODER, steps=150, limits=limits, **JOINT)
+        rng, x = np.random.default_rng(0), np.array([0.1, 0.0])
+        y, visited = x[:1], []
+        for _ in range(150):
+            x = following(x, explorer.ask(y))
+            y = x[:1] + DEGREE * rng.standard_normal(1)
+            explorer.tell(y)
+            visited.append(abs(x[0]))
+        places.append(max(visited))
+        rows = {row.measure: row.value for row in explorer._result(None).assessments}
+        counts.append(rows["violations"])
+        assert counts[-1] == np.count_nonzero(np.abs(explorer.states[1:, 0]) > 1.0)
+    assert places[0] <= 1.0 < places[1]
+    assert counts[0] == 0.0 < counts[1]
+
+
+def test_limits_of_filtered_differences_are_refused() -> None:
+    """Nothing says how uncertain these are; limits that are counted alone need no such thing."""
+    with pytest.raises(
+        IncompatibleError, match="which knows how uncertain its estimates are, but l"
+    ):
+        limited(RAIL, learner="adam_window")
+    limited(RAIL | {"enforced": False}, learner="adam_window")
+
+
+def test_the_loss_of_coupled_pendulums_is_their_parameter_error_times_a_constant() -> None:
+    spec = trial("coupled_pendulums", "oracle", env={"n_pendulums": 3, "grid_half_widths": [2.0]})
+    steps = [1, 10, 30]
+    parameters = rerun(spec, steps).parameters
+    errors = np.array([parameter_error(spec.system, theta) for theta in parameters])
+    losses = run_trial(spec).loss[np.array(steps) - 1]
+    assert losses == pytest.approx(loss_by_parameter_error(spec.system) * errors, rel=1e-9)
+    assert errors[0] > 100 * errors[-1] > 0
+
+
+def test_true_parameters_are_those_of_the_step() -> None:
+    worn = SYSTEMS["drifting_pendulum"]()
+    names = worn.linear_parameters
+    first, last = (true_parameters(worn, step) for step in (0, worn.horizon + 5))
+    assert first[names.index("friction")] == worn.friction
+    assert last[names.index("friction")] == worn.history[-1][worn.physical.index("friction")]
+    assert parameter_error(worn, first, worn.horizon) == pytest.approx(abs(last - first).max())
+
+
+def test_systems_whose_loss_is_no_parameter_error_are_refused() -> None:
+    with pytest.raises(SpecificationError, match=r"'pendulum' weighs its parameters differently"):
+        loss_by_parameter_error(SYSTEMS["pendulum"]())
+    uneven = CoupledPendulums(n_pendulums=2, grid_half_widths=(1.0, 1.1))
+    with pytest.raises(SpecificationError, match=r"dopt\.run"):
+        loss_by_parameter_error(uneven)
+    even = dataclasses.replace(uneven, grid_half_widths=(1.0,))
+    assert loss_by_parameter_error(even) == pytest.approx(1 / 3**0.5, rel=1e-3)
+
+
+def test_a_system_without_linear_parameters_is_refused() -> None:
+    class Nothing(CoupledPendulums):
+        pass
+
+    system = Nothing()
+    object.__setattr__(system, "linear_parameters", ())
+    with pytest.raises(SpecificationError, match="no parameters that its accelerations are linear"):
+        true_parameters(system)
+
+
+def finished(spec: TrialSpec) -> KernelTrial:
+    fast = KernelTrial(spec)
+    fast.advance(spec.system.horizon)
+    return fast
+
+
+def objective(fast: KernelTrial) -> float:
+    """Return Σ (e²/s + log s) + λ‖θ - θ₀‖² at the present parameters, λ being the policy's."""
+    theta, prior, n = fast.state.theta, fast.state.prior, fast.done
+    total = call(run_filter, fast.trial, n, np.empty((0, len(theta))), np.empty(0))
+    return float(total + 3.0 * np.sum((theta - prior) ** 2))
+
+
+def test_a_fit_finds_parameters_at_which_all_that_was_measured_is_likelier() -> None:
+    objectives = {}
+    for steps in (1, 8):
+        fast = finished(sensed("pendulum", ANGLE, horizon=60, refit_every=60, steps=steps))
+        objectives[steps] = objective(fast)
+        if steps == 1:
+            fast.state.theta[:] = draw(fast.spec).weights
+            objectives[0] = objective(fast)
+    assert objectives[8] <= objectives[1] < objectives[0]
+
+
+def test_rows_of_a_fit_are_derivatives_of_the_innovations() -> None:
+    """With the gains held, as in the step of Gauss and Newton."""
+    fast = finished(sensed("pendulum", ANGLE, horizon=20, refit_every=1000))
+    theta = fast.state.theta.copy()
+    rows, found = np.empty((20, len(theta))), np.empty(20)
+    call(run_filter, fast.trial, 20, rows, found)
+    gains = _gains(fast, theta)
+    scale = np.array([s for _, s in gains]) ** -0.5
+    assert np.allclose(found, _errors(fast, theta, gains) * scale, rtol=1e-6, atol=1e-8)
+    direction = np.random.default_rng(1).standard_normal(len(theta))
+    ahead, behind = (_errors(fast, theta + sign * 1e-5 * direction, gains) for sign in (1.0, -1.0))
+    expected = -(ahead - behind) / 2e-5 * scale
+    np.testing.assert_allclose(rows @ direction, expected, rtol=1e-4, atol=1e-6)
+
+
+def _gains(fast: KernelTrial, theta: Array) -> list[tuple[Array, float]]:
+    """Return the gain and the variance of each step of the filter at some parameters."""
+    spec, x, P, found = fast.spec, fast.record.states[0], np.zeros((2, 2)), []
+    for t, u in enumerate(fast.record.inputs):
+        step = 1e-6 * np.eye(2)
+        ends = [[model_step(spec, theta, x + sign * e, u) for e in step] for sign in (1, -1)]
+        A = (np.array(ends[0]) - np.array(ends[1])).T / 2e-6
+        x = model_step(spec, theta, x, u)
+        P = A @ P @ A.T + np.diag([0.0, spec.system.dt**2 * 0.1])
+        variance = P[0, 0] + DEGREE**2
+        K = P[:, 0] / variance
+        found.append((K, variance))
+        P = P - np.outer(K, K) * variance
+        x = x + K * (fast.state.estimate.outputs[t, 0] - x[0])
+    return found
+
+
+def _errors(fast: KernelTrial, theta: Array, gains: list[tuple[Array, float]]) -> Array:
+    x, errors = fast.record.states[0], []
+    for t, (K, _) in enumerate(gains):
+        x = model_step(fast.spec, theta, x, fast.record.inputs[t])
+        error = fast.state.estimate.outputs[t, 0] - x[0]
+        errors.append(error)
+        x = x + K * error
+    return np.array(errors)
+
+
+LINEAR: dict[str, Any] = {
+    "model": {"name": "linear"},
+    "learner": {"name": "ekf", "regularization": 1e-6},
+}
+
+
+def fits(spec: TrialSpec) -> HeldOut:
+    result = run_trial(spec)
+    return held_out_fit(spec, result.parameters, result.states, result.inputs)
+
+
+def evaluated(spec: TrialSpec) -> Samples:
+    points = evaluation_set(spec.system)
+    return Samples(points.states, points.inputs, points.accelerations)
+
+
+def test_the_posterior_of_a_linear_model_covers_the_truth_as_often_as_it_says() -> None:
+    """Over trials, whose noise differs, 90 % of the intervals hold; so they do with more noise."""
+    for noise in (1e-3, 1e-2):
+        covered = [
+            fits(trial("pendulum", "random", seed, env={"noise": noise}, **LINEAR)).grid.covered
+            for seed in range(40)
+        ]
+        # Two parameters are unknown, so the errors of a trial go together: standard error 0.035.
+        assert np.mean(covered) == pytest.approx(0.9, abs=0.1)
+
+
+def test_the_log_loss_of_a_linear_model_is_lowest_with_the_covariance_of_the_noise() -> None:
+    """Trials that are judged by another noise than they had are judged too narrow or too wide."""
+    seeds, found = range(20), {}
+    for factor in (0.2, 1.0, 5.0):
+        values = []
+        for seed in seeds:
+            spec = trial("pendulum", "random", seed, **LINEAR)
+            result = run_trial(spec)
+            other = dataclasses.replace(spec.system, noise=factor * spec.system.noise)
+            judged = dataclasses.replace(
+                spec, config=dataclasses.replace(spec.config, system=other)
+            )
+            fit = held_out_fit(judged, result.parameters, result.states, result.inputs)
+            values.append(fit.grid.log_loss)
+        found[factor] = float(np.mean(values))
+    assert found[1.0] < min(found[0.2], found[5.0])
+
+
+def test_jacobians_are_those_of_automatic_differentiation() -> None:
+    spec = trial("cartpole", "random")
+    theta = run_trial(spec).parameters.astype(float)
+    found = jacobian(spec, theta, evaluated(spec))
+    states = torch.as_tensor(evaluation_set(spec.system).states)[None]
+    function = mlp_function(spec.system, spec.model)
+    expected = torch.func.jacrev(lambda one: function(one[None], states)[0])(torch.as_tensor(theta))
+    assert found == pytest.approx(expected.numpy(), rel=1e-6, abs=1e-8)
+
+
+def test_r_squared_is_one_for_the_truth_and_falls_with_the_error() -> None:
+    spec = trial("pendulum", "random", **LINEAR)
+    result = run_trial(spec)
+    points, system = evaluation_set(spec.system), spec.system
+    truth = np.array([getattr(system, name) for name in system.linear_parameters])
+    exact = held_out_fit(spec, truth, result.states, result.inputs)
+    assert exact.grid.r_squared == pytest.approx(1.0, abs=1e-12)
+    assert exact.grid.covered == exact.reachable.covered == 1.0
+    none = held_out_fit(spec, 0.0 * truth, result.states, result.inputs)
+    a = points.accelerations[points.n_grid :]
+    assert none.reachable.r_squared == pytest.approx(1 - np.sum(a**2) / np.sum((a - a.mean()) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("policy", "sections"),
+    [
+        ("random", {}),  # a network that Adam teaches: nobody holds M
+        ("d_optimal", {"env": {"noise": 0.0}}),
+        ("gaussian_process", {}),
+        ("random", {"model": {"name": "ensemble"}, "learner": {"name": "gauss_newton"}}),
+    ],
+)
+def test_what_has_no_covariance_has_a_fit_alone(policy: str, sections: dict[str, Any]) -> None:
+    found = fits(trial("pendulum", policy, **sections))
+    for fit in found:
+        assert np.isfinite(fit.r_squared)
+        assert np.isnan(fit.covered)
+        assert np.isnan(fit.log_loss)
+
+
+def test_accelerations_that_depend_on_no_parameter_do_not_count() -> None:
+    """As those of the quadrotor, whose drags are unknown, at rest: with them the mean is NaN."""
+    spec = trial("quadrotor", "random", **LINEAR)
+    result, points = run_trial(spec), evaluation_set(spec.system)
+    rows = jacobian(spec, result.parameters, evaluated(spec))
+    assert np.any(np.all(rows[points.n_grid :] == 0.0, axis=-1))
+    found = held_out_fit(spec, result.parameters, result.states, result.inputs)
+    assert np.isfinite(found.reachable.log_loss)
+    assert np.isfinite(found.grid.log_loss)
+
+
+def test_a_network_is_surer_of_states_that_it_was_taught() -> None:
+    """Of samples around hanging: the intervals are wider far away, in proportion to the noise."""
+    spec = trial("pendulum", "d_optimal", learner={"name": "gauss_newton"})
+    near, far = np.array([[0.0, 0.0]]), np.array([[np.pi, 6.0]])
+    result = run_trial(spec)
+    samples = recorded_samples(spec.system, result.states, result.inputs)
+    held = Information("primal", 1e-3)
+    at = Samples(np.concatenate([near, far]), np.zeros((2, 1)), np.zeros((2, 1)))
+    variances = predicted_variances(spec, result.parameters, held, samples, at)
+    assert 0.0 < variances[0, 0] < 0.1 * variances[1, 0]

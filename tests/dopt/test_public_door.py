@@ -1,13 +1,15 @@
-"""The names that ``import dopt`` offers, and what they load."""
+"""Public names and what they load, sentences of errors, and usable cores."""
 
 from __future__ import annotations
 
 import ast
 import importlib.metadata
 import json
+import os
 import pydoc
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,8 @@ import pytest
 
 import dopt
 from analysis.outputs import versions
-from dopt.errors import SpecificationError
+from dopt import process
+from dopt.errors import SpecificationError, unknown_name
 from orchestrate.runner.saving import launch_record
 from tests.paths import ROOT
 
@@ -118,3 +121,118 @@ def test_results_compare_by_identity() -> None:
     assert first == first
     assert first != second
     assert len({first, second}) == 2
+
+
+NAMES = ("random", "d_optimal", "first/random_held", "first/prbs", "second/exact", "second/max")
+
+
+@pytest.mark.parametrize(
+    ("given", "nearest"),
+    [
+        ("d_optimla", "d_optimal"),
+        ("second/exatc", "second/exact"),
+        ("secnd/exact", "second/exact"),
+        ("first/exact", "second/exact"),
+        ("second/random", "random"),
+        ("random_held", "first/random_held"),
+        ("random_hold", "first/random_held"),
+        ("prbs", "first/prbs"),
+        ("mxa", "second/max"),
+    ],
+)
+def test_the_nearest_name_counts_its_folder_or_not(given: str, nearest: str) -> None:
+    message = str(unknown_name("policy", given, NAMES))
+    start = f"policy '{given}' is unknown: did you mean '{nearest}'? Choose one of d_optimal, "
+    assert message.startswith(start)
+
+
+@pytest.mark.parametrize("given", ["", "wxyz", None, 7])
+def test_no_name_is_suggested_where_none_is_near(given: object) -> None:
+    assert str(unknown_name("policy", given, NAMES)).endswith(
+        "is unknown: choose one of d_optimal, first/prbs, first/random_held, random, "
+        "second/exact, second/max."
+    )
+
+
+def test_where_there_is_no_name_none_is_asked_for() -> None:
+    assert str(unknown_name("field", "form", ())).endswith(
+        "is unknown, no field exists: remove it."
+    )
+
+
+Group = Callable[..., None]
+
+
+@pytest.fixture
+def group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Group:
+    """Return a function that puts this process, on eight cores, into a control group."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {*range(8)})
+    monkeypatch.setattr(process, "PROC", tmp_path)
+
+    def put(kind: str, groups: str, quotas: dict[str, str], root: str = "/") -> None:
+        (tmp_path / "cgroup").write_text(groups)
+        options = "rw,nsdelegate" if kind == "cgroup2" else "rw,cpuacct,cpu"
+        (tmp_path / "mountinfo").write_text(
+            f"30 23 0:2 / /proc rw shared:1 - proc proc rw\n"
+            f"31 23 0:28 {root} {tmp_path}/fs rw,relatime shared:9 - {kind} cgroup {options}\n"
+        )
+        for name, quota in quotas.items():
+            path = tmp_path / "fs" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(quota)
+
+    return put
+
+
+def test_without_a_group_the_affinity_counts(group: Group, tmp_path: Path) -> None:
+    assert process.usable_cores() == 8  # no file says anything
+    group("cgroup2", "0::/\n", {"cpu.max": "max 100000\n"})
+    assert process.usable_cores() == 8
+    group("cgroup", "4:cpu,cpuacct:/\n", {"cpu.cfs_quota_us": "-1", "cpu.cfs_period_us": "100000"})
+    assert process.usable_cores() == 8
+    (tmp_path / "mountinfo").write_text("of another kind\n")
+    assert process.usable_cores() == 8
+
+
+@pytest.mark.parametrize(
+    ("quota", "expected"), [("50000", 1), ("150000", 1), ("200000", 2), ("900000", 8)]
+)
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_quota_counts_in_whole_cores(
+    group: Group, quota: str, expected: int, version: int
+) -> None:
+    if version == 2:
+        group("cgroup2", "0::/a/b\n", {"a/b/cpu.max": f"{quota} 100000\n"})
+    else:
+        files = {"a/b/cpu.cfs_quota_us": quota, "a/b/cpu.cfs_period_us": "100000"}
+        group("cgroup", "5:memory:/m\n4:cpu,cpuacct:/a/b\n", files)
+    assert process.usable_cores() == expected
+
+
+def test_the_smallest_quota_up_the_hierarchy_counts(group: Group) -> None:
+    quotas = {"a/cpu.max": "300000 100000", "a/b/cpu.max": "max 100000", "a/b/c/cpu.max": "5 1"}
+    group("cgroup2", "0::/a/b/c\n", quotas)
+    assert process.usable_cores() == 3
+
+
+def test_a_container_sees_its_own_group_as_the_top(group: Group) -> None:
+    """What is mounted begins at it, while its path is that on the host."""
+    files = {"cpu.cfs_quota_us": "250000", "cpu.cfs_period_us": "100000"}
+    group("cgroup", "4:cpu,cpuacct:/docker/1f\n", files, root="/docker/1f")
+    assert process.usable_cores() == 2
+    files = {"job/cpu.cfs_quota_us": "100000", "job/cpu.cfs_period_us": "100000"}
+    group("cgroup", "4:cpu,cpuacct:/docker/1f/job\n", files, root="/docker/1f")
+    assert process.usable_cores() == 1
+
+
+def test_nothing_else_counts_cores() -> None:
+    from tests.paths import ROOT
+
+    counting = ("cpu_count", "sched_getaffinity(0))")
+    found = [
+        str(path.relative_to(ROOT))
+        for package in ("dopt", "orchestrate", "analysis", "benchmarks")
+        for path in (ROOT / package).rglob("*.py")
+        if any(words in path.read_text() for words in counting)
+    ]
+    assert found == ["dopt/process.py"]

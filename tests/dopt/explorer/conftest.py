@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from dopt import Explorer
-from tests.dopt.explorer.saves import drive, explorer
+from tests.dopt.explorer.plants import drive, explorer
 
 
 @pytest.fixture

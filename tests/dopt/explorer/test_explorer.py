@@ -1,10 +1,18 @@
-"""An explorer takes the steps of a trial; what cannot be learned from is counted and left out."""
+"""Explorer: arguments, steps, plans, the guide, and the program of a rig."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
 import threading
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -12,9 +20,15 @@ import pytest
 import dopt
 from dopt import Explorer, TrialSpec
 from dopt.errors import ExplorationError, IncompatibleError, ScaleWarning, SpecificationError
-from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
-from tests.paths import EXAMPLE
-from tests.waiting import PATIENCE_SECONDS
+from dopt.explorer.explorer import uninterrupted
+from dopt.policies.base import CustomPolicy, Planner
+from dopt.systems import System
+from dopt.trial_view import TrialView
+from dopt.types import Array
+from orchestrate.store import Reader
+from tests.dopt.explorer.plants import MOTOR, drive, explorer, following, motor_acceleration
+from tests.paths import EXAMPLE, ROOT
+from tests.waiting import PATIENCE_SECONDS, until
 
 SHORT: dict[str, object] = {"name": "icem", "lookahead": 10, "hold": 5, "stride": 5, "plans": 12}
 
@@ -294,3 +308,308 @@ def test_a_custom_policy_and_learner_are_driven_too() -> None:
         assert np.array_equal(explorer.ask(x), u)
         explorer.tell(x_next)
     assert np.array_equal(explorer.parameters, trial.parameters)
+
+
+def test_numbers_of_numpy_describe_the_same_exploration() -> None:
+    plain: dict[str, Any] = {"gamma": 6, "dt": 0.25, "box": {"rate": 30}, "limit": 1000}
+    numpy = {
+        "gamma": np.int64(6),
+        "dt": np.float32(0.25),
+        "box": {"rate": np.int64(30)},
+        "limit": np.int64(1000),
+        "velocity_cutoff": np.float32(2.0),
+        "constants": {"gain": np.float32(5.0)},
+    }
+    expected = Explorer(dataclasses.replace(MOTOR, **plain), steps=10, seed=3)
+    given = Explorer(
+        dataclasses.replace(MOTOR, **numpy),
+        steps=np.int64(10),
+        seed=np.int64(3),
+        tolerance=np.float32(0.5),
+        model={"name": "mlp", "width": np.int64(16)},
+    )
+    assert given.spec.trial_key == expected.spec.trial_key
+    assert given.spec.to_mapping() == expected.spec.to_mapping()
+
+
+@pytest.mark.parametrize("steps", [2.5, 0, -1, True, "5", None, 10**8, 10**30, np.float64(5.0)])
+def test_steps_that_are_no_number_of_steps(steps: Any) -> None:
+    with pytest.raises(SpecificationError, match=r"^steps is .* from 1 to 10,000,000 is expected"):
+        Explorer(MOTOR, steps=steps)
+
+
+@pytest.mark.parametrize(
+    "plant", ["pendulum", {"name": "pendulum"}, dopt.Plant, dopt.SYSTEMS["pendulum"], None]
+)
+def test_a_plant_that_is_none(plant: Any) -> None:
+    with pytest.raises(SpecificationError, match=r"^plant is .*, but a plant or a system"):
+        Explorer(plant)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"policy": None}, "'policy' is None"),
+        ({"learner": None}, "'learner' is None"),
+        ({"model": 5}, "'model' is 5"),
+        ({"journal": 5}, "journal is 5, but the path of a file"),
+        ({"deadline": 1e12}, "deadline is 1000000000000.0, but a number above 0 and below"),
+        ({"deadline": [1.0, [2.0]]}, "deadline is"),
+    ],
+)
+def test_settings_of_another_type(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(SpecificationError, match=said):
+        Explorer(MOTOR, **given)
+
+
+STATES = np.cumsum(np.ones((101, 2)), axis=0)
+INPUTS = np.ones((100, 1))
+
+NO_NUMBERS: list[Any] = ["a", [[1.0, 2.0], [3.0]], [1j, 2.0], None, {}, [["a", "b"]]]
+
+
+@pytest.mark.parametrize("given", NO_NUMBERS)
+def test_states_that_are_no_numbers(given: Any) -> None:
+    one = Explorer(MOTOR, steps=5)
+    with pytest.raises(SpecificationError, match="an array of real numbers is expected"):
+        one.predict(given)
+    with pytest.raises(SpecificationError, match="an array of real numbers is expected"):
+        one.free_run_error(given, INPUTS)
+    with pytest.raises(SpecificationError, match="an array of real numbers is expected"):
+        one.free_run_error(STATES, given)
+
+
+@pytest.mark.parametrize("steps", [2.5, "5", True, None])
+def test_predictions_of_another_number_of_steps(steps: Any) -> None:
+    with pytest.raises(SpecificationError, match=r"^steps is .*a whole number"):
+        Explorer(MOTOR, steps=5).free_run_error(STATES, INPUTS, steps)
+    with pytest.raises(SpecificationError, match=r"shape \(1,\)"):
+        Explorer(MOTOR, steps=5).free_run_error(5, 5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_test_run_that_has_no_error_is_refused_and_not_stored(
+    value: float, tmp_path: Path
+) -> None:
+    url, states, inputs = f"sqlite:///{tmp_path}/results.db", STATES.copy(), INPUTS.copy()
+    with explorer() as run:
+        drive(run, 5)
+        states[3, 0] = inputs[7, 0] = value
+        with pytest.raises(SpecificationError, match=r"states of row 3 .* finite numbers"):
+            run.save(url, test=(states, INPUTS))
+        with pytest.raises(SpecificationError, match=r"inputs of row 7 .* finite numbers"):
+            run.save(url, test=(STATES, inputs))
+        with pytest.raises(SpecificationError, match="in which nothing changes"):
+            run.save(url, test=(np.zeros((101, 2)), INPUTS))
+        assert np.isfinite(run.free_run_error(STATES, INPUTS, np.int64(20)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Remembering(CustomPolicy):
+    """Notes the steps at which it is asked for an input."""
+
+    name: ClassVar[str] = "remembering"
+    steps: ClassVar[list[int]] = []
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return RememberingPlanner()
+
+
+class RememberingPlanner(Planner):
+    def choose(self, view: TrialView) -> Array:
+        Remembering.steps.append(view.t)
+        return np.zeros(1)
+
+
+def told_without_questions(policy: str | dict[str, Any], steps: int) -> tuple[Explorer, Array]:
+    """Return an exploration of inputs that were chosen elsewhere, and its last state."""
+    explorer, x = Explorer(MOTOR, policy=policy, steps=30), np.array([0.1, 0.0])
+    explorer.ask(x)
+    for t in range(steps):
+        u = np.array([3.0 * (-1) ** t])
+        x = following(x, u)
+        assert explorer.tell(x, applied=u)
+    return explorer, x
+
+
+def test_a_policy_that_may_remember_plans_at_each_step_also_where_none_is_asked() -> None:
+    Remembering.steps.clear()
+    told_without_questions({"_target_": f"{__name__}.Remembering"}, 5)
+    assert Remembering.steps == [1, 2, 3, 4]
+
+
+def test_episodes_are_planned_before_the_first_question() -> None:
+    policy = {**SHORT, "name": "episodic", "replan_every": 5}
+    explorer, x = told_without_questions(policy, 2)
+    assert abs(explorer.ask(x)[0]) > 0.1
+
+
+@pytest.mark.parametrize("deadline", [None, PATIENCE_SECONDS])
+def test_a_plan_that_fails_is_said_once_and_costs_no_state(deadline: float | None) -> None:
+    explorer = Explorer(MOTOR, policy="d_optimal", steps=30, deadline=deadline)
+    x = explored(explorer, 3)
+    planner: Any = explorer._planner
+    make, planner._make = planner._make, _failing
+    with pytest.raises(RuntimeError, match="no plan"):
+        explorer.ask(x)
+    planner._make = make
+    assert explorer.tell(following(x, np.array([1.0])), applied=[1.0])
+    explorer.close()
+
+
+def _failing() -> None:
+    raise RuntimeError("no plan")
+
+
+def test_ctrl_c_during_a_call_that_fails_is_not_lost() -> None:
+    @uninterrupted()
+    def fail() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        raise SpecificationError("a shape is wrong")
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+
+
+BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "plants.md").read_text(), re.DOTALL)
+
+
+def test_its_lines_run_as_they_stand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    state = {"x": np.zeros(2), "u": np.zeros(1), "time": 0.0}
+
+    def measure() -> tuple[Any, Any]:
+        return state["x"].copy(), state["time"]
+
+    def apply(u: np.ndarray) -> None:
+        """Hold an input for one time step of a motor."""
+        angle, rate = state["x"]
+        slope = np.array([rate, 40.0 * u[0] - 20.0 * np.sin(angle) - 2.0 * rate])
+        state["x"], state["time"] = state["x"] + 0.005 * slope, state["time"] + 0.005
+
+    names: dict[str, Any] = {"measure": measure, "apply": apply}
+    for block in BLOCKS:
+        shorter = block.replace("2000", "150")
+        exec(compile(shorter, "plants.md", "exec"), names)
+    explorer = names["explorer"]
+    assert explorer.n_steps == explorer.counts["learned"] == 150
+    assert (tmp_path / "motor.jsonl").stat().st_size > 0
+    assert "'learned': 150" in capsys.readouterr().out
+
+
+def test_a_plant_is_declared_in_fifteen_lines() -> None:
+    [declaration] = re.findall(r"motor = dopt\.Plant\(.*?\n\)", "".join(BLOCKS), re.DOTALL)
+    assert len(declaration.splitlines()) <= 15
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> object:
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    import rig
+
+    return rig
+
+
+def started(*words: str) -> subprocess.Popen[str]:
+    command = [sys.executable, EXAMPLE / "rig.py", *words]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+
+def reopened(rig: object, journal: Path) -> Explorer:
+    return Explorer(rig.MOTOR, steps=60_000, journal=journal)  # type: ignore[attr-defined]
+
+
+def wait_for_steps(journal: Path, count: int, after: str = "") -> None:
+    """Wait until the journal has so many learned steps after a text."""
+
+    def are_there() -> bool:
+        content = journal.read_text() if journal.exists() else ""
+        return after in content and content[content.find(after) :].count('"learn"') >= count
+
+    until(are_there, lambda: f"there are no {count} steps after '{after}'")
+
+
+def test_either_end_is_killed_and_the_exploration_goes_on(rig: object, tmp_path: Path) -> None:
+    journal = tmp_path / "rig.jsonl"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    motor = ["--role", "motor", "--port", port, "--loss", "0.05", "--jitter", "0.2"]
+    explorer = ["--role", "explorer", "--port", port, "--journal", str(journal)]
+    running = [started(*motor), started(*explorer, "--seconds", "600")]
+    try:
+        wait_for_steps(journal, 100)
+        running[0].send_signal(signal.SIGKILL)
+        running.append(started(*motor))
+        wait_for_steps(journal, 101, after="resets")
+        running[1].send_signal(signal.SIGKILL)
+        running[1].communicate(timeout=PATIENCE_SECONDS)
+        with reopened(rig, journal) as after:
+            told, parameters = after.n_steps, after.parameters
+        assert told > 200, after.counts
+        assert after.counts["resets"] == 1
+        assert after.counts["gaps"] > 0  # where datagrams were lost
+        learned = journal.read_text().count('"learn"')
+        running.append(started(*explorer, "--seconds", "600"))
+        wait_for_steps(journal, learned + 1)
+        running[-1].kill()
+        said = running[-1].communicate(timeout=PATIENCE_SECONDS)[0]
+        assert f"{told} steps in the journal" in said
+    finally:
+        for process in running:
+            process.kill()
+            process.communicate()
+    with reopened(rig, journal) as again:
+        assert again.n_steps > told
+        assert not np.array_equal(again.parameters, parameters)
+        assert np.isfinite(again.errors).all()
+
+
+def test_it_is_saved_and_its_answers_are_drawn(rig: object, tmp_path: Path) -> None:
+    url, picture = f"sqlite:///{tmp_path}/results.db", tmp_path / "answers.png"
+    journal = ["--journal", str(tmp_path / "rig.jsonl")]
+    process = started("--seconds", "3", *journal, "--save", url, "--histogram", str(picture))
+    said = process.communicate(timeout=PATIENCE_SECONDS)[0]
+    with reopened(rig, tmp_path / "rig.jsonl") as after, Reader.open(url) as reader:
+        [config] = reader.configs()
+        curves = reader.curves(config.config_key)
+        assert np.array_equal(curves.values, [after.errors])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "answers: " in said
+
+
+def test_a_database_that_fails_does_not_end_it(tmp_path: Path) -> None:
+    journal = ["--journal", str(tmp_path / "rig.jsonl")]
+    process = started("--seconds", "1", *journal, "--save", "sqlite:////dev/null/results.db")
+    said = process.communicate(timeout=PATIENCE_SECONDS)[0]
+    assert process.returncode == 0
+    assert "answers: " in said
+
+
+def test_the_seconds_begin_with_the_first_state(rig: object) -> None:
+    """A process that starts takes its time, and that of the exploration is not shortened by it."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as motor,
+        Explorer(rig.MOTOR, steps=50) as explorer,  # type: ignore[attr-defined]
+    ):
+        wire.bind(("127.0.0.1", 0))
+        state = rig.STATE.pack(1, 0.0, 0.0, 0.0, 0.0)  # type: ignore[attr-defined]
+        late = threading.Timer(0.3, motor.sendto, (state, wire.getsockname()))
+        late.start()
+        assert len(rig.explore(wire, explorer, seconds=0.1)) == 1  # type: ignore[attr-defined]
+        late.join()
+
+
+def test_a_motor_that_never_comes_is_not_waited_for(
+    rig: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig, "PATIENCE", 0.1)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire,
+        Explorer(rig.MOTOR, steps=50) as explorer,  # type: ignore[attr-defined]
+    ):
+        wire.bind(("127.0.0.1", 0))
+        assert len(rig.explore(wire, explorer, seconds=600.0)) == 0  # type: ignore[attr-defined]

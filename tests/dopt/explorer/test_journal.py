@@ -1,4 +1,4 @@
-"""Journal of an explorer: all that it was told is there before it answers, and is replayed."""
+"""Journal of an explorer: written before it answers, replayed, refused where damaged."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +22,10 @@ from dopt import Explorer
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Journal
 from dopt.systems import Pendulum
-from tests.dopt.explorer.plants import MOTOR, following
-from tests.dopt.explorer.saves import without_checksums
+from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, following, steered, without_checksums
 from tests.dopt.explorer.test_explorer import explored
 from tests.paths import ROOT
+from tests.waiting import PATIENCE_SECONDS
 
 
 @pytest.fixture
@@ -266,3 +269,364 @@ def test_a_file_that_cannot_be_read_is_refused_and_freed(
         with pytest.raises(SpecificationError, match="cannot be written or read"):
             Explorer(MOTOR, steps=5, journal=journal)
     Explorer(MOTOR, steps=5, journal=journal).close()
+
+
+@pytest.fixture
+def damaged(tmp_path: Path) -> Path:
+    return tmp_path / "motor.jsonl"
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.parametrize("fsync", [False, True])
+def test_a_journal_that_is_removed_is_said(damaged: Path, fsync: bool, replaced: bool) -> None:
+    with Explorer(MOTOR, steps=9, journal=damaged, fsync=fsync) as explorer:
+        x = explored(explorer, 3)
+        u = explorer.ask(x)
+        damaged.unlink()
+        if replaced:
+            damaged.touch()
+        with pytest.raises(ExplorationError, match=r"was removed or replaced .* another journal"):
+            explorer.tell(following(x, u))
+        assert explorer.n_steps == 3
+
+
+def test_a_renamed_journal_holds_what_follows(damaged: Path, tmp_path: Path) -> None:
+    with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
+        x = explored(explorer, 3)
+        damaged.rename(tmp_path / "renamed.jsonl")
+        explored(explorer, 2, x)
+    with Explorer(MOTOR, steps=9, journal=tmp_path / "renamed.jsonl") as again:
+        assert again.n_steps == 5
+
+
+@pytest.mark.parametrize("end", [b"", b" ", b"}"])
+def test_a_journal_without_newlines_is_kept(damaged: Path, end: bytes) -> None:
+    with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
+        explored(explorer, 0 if end else 3)
+    whole = damaged.read_bytes().replace(b"\n", b"") + end
+    damaged.write_bytes(whole)
+    with pytest.raises(
+        SpecificationError, match=r"no journal of format 1 or 2 \(it has no whole line"
+    ):
+        Explorer(MOTOR, steps=9, journal=damaged)
+    assert damaged.read_bytes() == whole
+
+
+def test_a_first_line_that_lacks_its_end_alone_is_begun_again(damaged: Path) -> None:
+    Explorer(MOTOR, steps=9, journal=damaged).close()
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:-1])
+    Explorer(MOTOR, steps=9, journal=damaged).close()
+    assert damaged.read_bytes() == whole
+
+
+LEARN = {"learn": [0.1, 0.0], "applied": [1.0], "dt": 0.02, "time": None}
+
+DAMAGED: list[object] = [
+    {"foo": 1},
+    {**LEARN, "learn": [1.0]},
+    {**LEARN, "learn": [1.0, 2.0, 3.0]},
+    {**LEARN, "learn": "ab"},
+    {**LEARN, "learn": [float("nan"), 0.0]},
+    {**LEARN, "applied": [1.0, 2.0]},
+    {**LEARN, "dt": "x"},
+    {**LEARN, "dt": 0.0},
+    {**LEARN, "time": [1]},
+    {"learn": [0.1, 0.0]},
+    {"lost": ["x"]},
+    {"lost": "x"},
+    {"counted": {}},
+    {"plan": 3},
+    {"missed": None},
+    {"begin": [0.1, 0.0]},
+    {"gap": [0.1, True], "time": "1"},
+    {"begin": [10**400, 0], "time": None},
+]
+
+
+@pytest.mark.parametrize("event", DAMAGED)
+def test_a_line_that_is_no_event_is_refused_with_its_number(damaged: Path, event: Any) -> None:
+    with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
+        explored(explorer, 1)
+    lines = without_checksums(damaged).splitlines(keepends=True)
+    lines.insert(3, f"{json.dumps(event)}\n")
+    damaged.write_text("".join(lines))
+    with pytest.raises(
+        SpecificationError, match=r"no journal of format 1 or 2 \(line 4 is no event"
+    ):
+        Explorer(MOTOR, steps=9, journal=damaged)
+    assert damaged.read_text() == "".join(lines)
+
+
+def test_a_journal_without_its_first_state_is_refused(damaged: Path) -> None:
+    with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
+        explored(explorer, 1)
+    first, _, *rest = without_checksums(damaged).splitlines(keepends=True)
+    damaged.write_text("".join([first, *rest]))
+    with pytest.raises(SpecificationError, match="line 2 is no event that can follow"):
+        Explorer(MOTOR, steps=9, journal=damaged)
+
+
+def test_more_steps_than_there_are_are_refused(damaged: Path) -> None:
+    with Explorer(MOTOR, steps=2, journal=damaged) as explorer:
+        explored(explorer, 2)
+    damaged.write_text(f"{without_checksums(journal)}{json.dumps(LEARN)}\n")
+    with pytest.raises(SpecificationError, match="line 7 is no event that can follow"):
+        Explorer(MOTOR, steps=2, journal=damaged)
+
+
+@pytest.mark.parametrize("trial", [5, None, [], {}, {"policy": 5}])
+def test_a_first_line_without_a_specification_is_refused(damaged: Path, trial: object) -> None:
+    damaged.write_text(f"{json.dumps({'format': 1, 'trial': trial})}\n")
+    with pytest.raises(SpecificationError, match=r"no exploration|another exploration"):
+        Explorer(MOTOR, steps=2, journal=damaged)
+
+
+@pytest.fixture
+def lines(damaged: Path) -> list[bytes]:
+    """Return the lines of a journal with some events of each kind."""
+    with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
+        x = explored(explorer, 2)
+        explorer.tell([np.nan, 0.0])
+        explorer.reset()
+        explored(explorer, 2, x)
+    return damaged.read_bytes().splitlines(keepends=True)
+
+
+def opened(damaged: Path, content: bytes) -> str:
+    """Return what is said of a journal that is opened, or refused and left as it is."""
+    damaged.write_bytes(content)
+    try:
+        with Explorer(MOTOR, steps=9, journal=damaged):
+            return "opened"
+    except SpecificationError as error:
+        assert damaged.read_bytes() == content
+        return str(error)
+
+
+def test_each_bit_of_a_journal_is_checked(damaged: Path, lines: list[bytes]) -> None:
+    """A flip that takes the last newline away leaves a torn line, which is dropped as ever."""
+    content = b"".join(lines)
+    ends = np.cumsum([len(line) for line in lines])
+    for bit in range(0, 8 * (len(content) - 1), 7):  # one bit of a byte, the next of the next
+        flipped = bytearray(content)
+        flipped[bit // 8] ^= 1 << bit % 8
+        number = int(np.searchsorted(ends, bit // 8, side="right")) + 1
+        damaged.write_bytes(flipped)
+        with pytest.raises(SpecificationError, match=rf"line {number}\b|first line"):
+            Journal(damaged, False, {"format": FORMAT, "trial": {}})
+
+
+def test_a_line_that_is_removed_repeated_swapped_or_added_is_refused(
+    damaged: Path, lines: list[bytes]
+) -> None:
+    for i in range(1, len(lines) - 1):
+        removed = i + 1, [*lines[:i], *lines[i + 1 :]]
+        repeated = i + 2, [*lines[: i + 1], *lines[i:]]
+        swapped = i + 1, [*lines[:i], lines[i + 1], lines[i], *lines[i + 2 :]]
+        for number, content in (removed, repeated, swapped):
+            assert f"line {number} of the journal" in opened(damaged, b"".join(content))
+    added = json.dumps(LEARN).encode() + b"\n"
+    assert "head -n 4 " in opened(damaged, b"".join([*lines[:4], added, *lines[4:]]))
+    assert "head -n" in opened(damaged, b"".join([*lines, added]))
+    assert opened(damaged, b"".join(lines[:-1])) == "opened"
+
+
+def test_a_line_of_brackets_is_refused_in_a_sentence(damaged: Path, lines: list[bytes]) -> None:
+    deep, first = b"[" * 100_000, without_checksums(damaged).split("\n")[0].encode()
+    assert "no journal" in opened(damaged, deep + b"\n")
+    assert "line 2 of the journal" in opened(damaged, lines[0] + deep + b"\n")
+    nested = b'{"plan": %s1%s}' % (b"[" * 900, b"]" * 900)
+    for event in (deep, nested, b'{"plan": [1%s]}' % (b"0" * 5000)):
+        assert "(line 2" in opened(damaged, b"%s\n%s\n" % (first, event))
+
+
+def test_a_journal_of_format_1_goes_on_with_checksums(damaged: Path, lines: list[bytes]) -> None:
+    old = without_checksums(damaged)
+    damaged.write_text(old)
+    with Explorer(MOTOR, steps=9, journal=damaged) as explorer:
+        explored(explorer, 2)
+    content = damaged.read_bytes()
+    assert content.startswith(old.encode())
+    assert opened(damaged, content) == "opened"
+    number = len(lines) + 1  # the first one with a checksum, of all before it
+    assert f"line {number} of" in opened(damaged, content.replace(b'"resets"', b'"unusable"'))
+
+
+REPLAY_SHORT = {"name": "icem", "lookahead": 6, "hold": 3, "stride": 3, "plans": 8, "elites": 3}
+
+SETTINGS: dict[str, Any] = {
+    "policy": REPLAY_SHORT,
+    "learner": "gauss_newton",
+    "steps": 80,
+    "deadline": PATIENCE_SECONDS,
+    "fallback": [0.25, -0.25],
+}
+
+
+def replayed(journal: Path) -> Explorer:
+    return Explorer(HOVERCRAFT, journal=journal, fsync=False, **SETTINGS)
+
+
+def condition(explorer: Explorer) -> dict[str, Any]:
+    """Return all by which an exploration goes on."""
+    state = explorer._state
+    return {
+        "n_steps": explorer.n_steps,
+        "counts": {k: v for k, v in explorer.counts.items() if k != "missed"},
+        "missed": explorer.counts["missed"],
+        "parameters": explorer.parameters.tobytes(),
+        "answer": None if state.answer is None else state.answer.tobytes(),
+        "present": None if state.present is None else state.present.tobytes(),
+        "time": state.time,
+        "errors": explorer.errors.tobytes(),
+    }
+
+
+@contextmanager
+def slow_plans(explorer: Explorer) -> Iterator[None]:
+    """Let no plan be ready in time until the end."""
+    may_end, plan = threading.Event(), explorer._state.plan
+    planner: Any = explorer._planner
+    before = planner._make, planner._deadline
+
+    def slow() -> None:
+        may_end.wait(PATIENCE_SECONDS)
+        plan()
+
+    planner._make, planner._deadline = slow, 0.001
+    try:
+        yield
+    finally:
+        may_end.set()
+        planner._make, planner._deadline = before
+
+
+class Plant:
+    """The hovercraft with its clock, and an explorer that meets all kinds of calls."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.x, self.now, self.u = np.array([0.1, 0.2, 0.0]), 0.0, np.zeros(2)
+
+    def call(self, explorer: Explorer) -> None:
+        """Make one drawn call."""
+        kinds = ["ask", "late", "tell", "tell", "tell", "again", "old", "nan", "gap", "reset"]
+        kind = self.rng.choice(kinds, p=[0.3, 0.08, 0.15, 0.15, 0.1, 0.06, 0.05, 0.04, 0.04, 0.03])
+        match kind:
+            case "ask":
+                self.u = explorer.ask(self.x, time=self.now)
+            case "late":
+                with slow_plans(explorer):
+                    self.u = explorer.ask(self.x, time=self.now)
+            case "tell":
+                self._move(HOVERCRAFT.dt * self.rng.uniform(0.8, 1.2))
+                explorer.tell(self.x, applied=self.u, time=self.now)
+            case "again":
+                explorer.tell(self.x, applied=self.u, time=self.now)
+            case "old":
+                explorer.tell(self.x + 0.1, applied=self.u, time=self.now - 0.03)
+            case "nan":
+                self._move(HOVERCRAFT.dt)
+                explorer.tell(self.x * np.nan, applied=self.u, time=self.now)
+            case "gap":
+                self._move(3.0 * HOVERCRAFT.dt)
+                explorer.tell(self.x, applied=self.u, time=self.now)
+            case "reset":
+                explorer.reset()
+
+    def _move(self, dt: float) -> None:
+        self.x, self.now = steered(self.x, self.u, dt), self.now + dt
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_it_goes_on_as_if_it_had_not_been_closed(seed: int, tmp_path: Path) -> None:
+    whole, cut = replayed(tmp_path / "whole.jsonl"), replayed(tmp_path / "cut.jsonl")
+    one, other = Plant(seed), Plant(seed)
+    closings = np.random.default_rng(100 + seed)
+    for _ in range(60):
+        one.call(whole)
+        other.call(cut)
+        assert condition(cut) == condition(whole)
+        if closings.random() < 0.2:
+            cut.close()
+            cut = replayed(tmp_path / "cut.jsonl")
+            whole._wait()  # as closing does: a late plan ends before
+            assert condition(cut) == condition(whole)
+    assert np.array_equal(cut.ask(one.x, time=one.now), whole.ask(one.x, time=one.now))
+    whole.close()
+    cut.close()
+
+
+def test_measured_times_are_learned_from_and_replayed(tmp_path: Path) -> None:
+    """A quarter more than dt, taken for dt, would be another acceleration and other parameters."""
+    told = replayed(tmp_path / "told.jsonl")
+    x = np.array([0.1, 0.2, 0.0])
+    u = told.ask(x, time=0.0)
+    assert told.tell(steered(x, u, 0.025), time=0.025)
+    exact = Explorer(HOVERCRAFT, **SETTINGS)
+    exact.ask(x)
+    slope = (steered(x, u, 0.025) - x) / 0.025
+    assert exact.tell(x + HOVERCRAFT.dt * slope, applied=u)
+    assert told.parameters == pytest.approx(exact.parameters, rel=1e-9)
+    before = condition(told)
+    told.close()
+    again = replayed(tmp_path / "told.jsonl")
+    assert condition(again) == before
+    again.close()
+
+
+def test_ctrl_c_waits_until_a_call_is_whole(tmp_path: Path) -> None:
+    """It comes while the event is written: the event is also done, once, and then it is raised."""
+    explorer = replayed(tmp_path / "run.jsonl")
+    x = np.array([0.1, 0.2, 0.0])
+    u = explorer.ask(x)
+    journal: Any = explorer._journal
+    write = journal.write
+
+    def interrupted(event: Any, *, durable: bool) -> None:
+        write(event, durable=durable)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    journal.write = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        explorer.tell(steered(x, u))
+    journal.write = write
+    before = condition(explorer)
+    assert before["n_steps"] == 1
+    explorer.close()
+    again = replayed(tmp_path / "run.jsonl")
+    assert condition(again) == before
+    again.close()
+
+
+def test_a_question_during_a_late_plan_does_not_wait() -> None:
+    explorer = Explorer(HOVERCRAFT, **SETTINGS)
+    x = np.array([0.1, 0.2, 0.0])
+    u = explorer.ask(x)
+    x = steered(x, u)
+    explorer.tell(x)
+    with slow_plans(explorer):
+        assert np.array_equal(explorer.ask(x), [0.25, -0.25])
+        assert explorer._planner.is_late
+        assert np.array_equal(explorer.ask(x), [0.25, -0.25])
+        assert explorer._planner.is_late
+    assert explorer.tell(steered(x, np.array([0.25, -0.25])))
+    assert explorer.counts["missed"] == 1
+    explorer.close()
+
+
+def test_an_exploration_that_is_closed_says_so(tmp_path: Path) -> None:
+    explorer = replayed(tmp_path / "run.jsonl")
+    explorer.close()
+    explorer.close()
+    with pytest.raises(ExplorationError, match="is closed"):
+        explorer.ask([0.1, 0.2, 0.0])
+
+
+def test_an_explorer_that_is_forgotten_frees_its_journal(tmp_path: Path) -> None:
+    """As a cell of a notebook that is run twice leaves one behind."""
+    explorer = Explorer(HOVERCRAFT, steps=5, journal=tmp_path / "run.jsonl")
+    with pytest.warns(ResourceWarning):
+        del explorer
+    Explorer(HOVERCRAFT, steps=5, journal=tmp_path / "run.jsonl").close()

@@ -1,8 +1,9 @@
-"""States that are late, lost, repeated, out of order or not finite: counted, not learned from."""
+"""Measurements that are late, lost, noisy or partial, and what an explorer does then."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,12 @@ import numpy as np
 import pytest
 
 from dopt import Explorer, Plant
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.explorer.saving import free_run_error
+from dopt.kernel.sensors import estimate_state
+from dopt.types import Array
 from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
+from tests.dopt.kernel.twin import call
 
 
 class TestMeasurements:
@@ -111,10 +116,7 @@ class TestMeasurements:
         journal = tmp_path / "run.jsonl"
         with Explorer(MOTOR, steps=40, journal=journal) as explorer:
             explorer.ask([0.1, 0.0], time=1e3)
-        with (
-            Explorer(MOTOR, steps=40, journal=journal) as explorer,
-            caplog.at_level("WARNING"),
-        ):
+        with Explorer(MOTOR, steps=40, journal=journal) as explorer, caplog.at_level("WARNING"):
             for step in range(30):
                 explorer.tell([0.1, 0.1 * step], time=0.02 * step)
                 explorer.ask([0.1, 0.1 * step], time=0.02 * step)
@@ -179,3 +181,197 @@ class TestMeasurements:
         u = explorer.ask(x, time=0.001)
         assert explorer.tell(following(x, u), time=0.021)
         assert (explorer.counts["resets"], explorer.counts["learned"]) == (1, 2)
+
+
+DEGREE = math.pi / 180
+ENCODER = dataclasses.replace(MOTOR, measured={"angle": DEGREE})
+JOINT: dict[str, Any] = {
+    "policy": {"name": "d_optimal", "regularization": 3.0},
+    "learner": {"name": "joint_ekf", "refit_every": 40},
+}
+
+
+def driven(explorer: Explorer, steps: int, seed: int = 0, start: Array | None = None) -> Array:
+    """Take steps with a simulated motor; return its last state."""
+    rng = np.random.default_rng(seed)
+    x = np.array([0.1, 0.0]) if start is None else start
+    y = x[:1] + DEGREE * rng.standard_normal(1)
+    for _ in range(steps):
+        u = explorer.ask(y)
+        x = following(x, u)
+        y = x[:1] + DEGREE * rng.standard_normal(1)
+        assert explorer.tell(y)
+    return x
+
+
+def error(explorer: Explorer) -> float:
+    """Return the root mean square error of the learned accelerations beside their size."""
+    rng = np.random.default_rng(5)
+    states = np.column_stack([rng.uniform(-math.pi, math.pi, 300), rng.uniform(-6, 6, 300)])
+    truth = np.array([[motor_acceleration(x)] for x in states]).reshape(300, 1)
+    predicted = explorer.predict(states)
+    return float(np.sqrt(np.mean((predicted - truth) ** 2) / np.mean(truth**2)))
+
+
+def test_it_learns_and_estimates_the_rate() -> None:
+    explorer = Explorer(ENCODER, steps=500, **JOINT)
+    x = driven(explorer, 400)
+    assert explorer.counts["learned"] == 400
+    assert error(explorer) < 0.2
+    assert np.abs(explorer.states[-1] - x)[0] < 4 * DEGREE
+    assert np.abs(explorer.states[-1] - x)[1] < 0.5
+    # once the model is good, what is predicted differs from what is measured by the noise
+    assert 0.5 < float(np.sqrt(np.mean(explorer.errors[-100:] ** 2))) < 2.0
+
+
+@pytest.mark.parametrize("learner", ["joint_ekf", "adam_window"])
+def test_a_journal_replays_to_the_same_parameters(learner: str, tmp_path: Path) -> None:
+    given = JOINT if learner == "joint_ekf" else {"learner": learner}
+    path = tmp_path / "run.jsonl"
+    with Explorer(ENCODER, steps=100, journal=path, **given) as explorer:
+        x = driven(explorer, 50)
+        explorer.reset()
+        driven(explorer, 10, 1, x)
+        parameters, states = explorer.parameters.copy(), explorer.states
+    with Explorer(ENCODER, steps=100, journal=path, **given) as again:
+        assert np.array_equal(again.parameters, parameters)
+        assert np.array_equal(again.states, states)
+
+
+def test_after_a_gap_the_rate_is_unknown_again() -> None:
+    explorer = Explorer(ENCODER, steps=300, **JOINT)
+    x = driven(explorer, 200)
+    explorer.reset()
+    x = np.array([0.5, 4.0])  # somewhere else, and fast
+    x = driven(explorer, 30, 2, x)
+    assert abs(explorer.states[-1][1] - x[1]) < 0.6
+    assert explorer.counts["resets"] == 1
+
+
+def test_a_question_later_than_the_measurement_keeps_the_estimate() -> None:
+    late, prompt = (Explorer(ENCODER, steps=60, **JOINT) for _ in range(2))
+    rng, x = np.random.default_rng(3), np.array([0.1, 0.0])
+    y = x[:1]
+    for t in range(50):
+        u = late.ask(y, time=0.02 * t + 0.002)
+        assert np.array_equal(u, prompt.ask(y, time=0.02 * t))
+        x = following(x, u)
+        y = x[:1] + DEGREE * rng.standard_normal(1)
+        late.tell(y, time=0.02 * (t + 1) + 0.002)
+        prompt.tell(y, time=0.02 * (t + 1))
+    np.testing.assert_allclose(late.states, prompt.states, atol=1e-9)
+
+
+def test_questions_about_other_measurements_are_warned_of(caplog: Any) -> None:
+    explorer = Explorer(ENCODER, steps=60, **JOINT)
+    for t in range(12):
+        explorer.ask([0.1 + 0.001 * t])
+        explorer.tell([0.1])
+    assert sum("ask with the one told last" in line for line in caplog.messages) == 1
+
+
+@pytest.mark.parametrize("learner", ["joint_ekf", "adam_window"])
+def test_filters_begin_anew_after_a_reset(learner: str) -> None:
+    """What comes after it is estimated as from the start of an exploration."""
+    given = JOINT if learner == "joint_ekf" else {"learner": learner}
+    explorer, other = (Explorer(ENCODER, steps=60, **given) for _ in range(2))
+    driven(explorer, 20)
+    explorer.reset()
+    steps, fresh = explorer._state.steps, other._state.steps
+    for one, at in ((steps, 20), (fresh, 0)):
+        state: Any = one
+        state.begin(at, np.array([0.3, 0.0]))
+        state.inputs[at], state.state.estimate.outputs[at] = 1.0, 0.31
+        call(estimate_state, state.trial, at, 0.02)
+    if learner == "adam_window":  # the filter over both predicts with what it has learned
+        np.testing.assert_array_equal(steps.states[21], fresh.states[1])
+    estimate: Any = steps.state.estimate  # type: ignore[attr-defined]
+    assert estimate.starts[20, 0] == 0.3
+
+
+def test_states_are_measured_in_their_own_order() -> None:
+    noises = {"rate": 0.1, "angle": DEGREE}
+    plant = dataclasses.replace(MOTOR, measured=noises).system(10)
+    assert plant.measured_states == (0, 1)
+    assert plant.measurement_noise == (DEGREE, 0.1)
+
+
+def test_an_angle_may_be_measured_over_one_turn() -> None:
+    turning, unrolled = (Explorer(ENCODER, steps=80, **JOINT) for _ in range(2))
+    rng, x = np.random.default_rng(3), np.array([3.0, 5.0])
+    y = x[:1]
+    for _ in range(60):
+        once = (y + math.pi) % (2 * math.pi) - math.pi
+        u = turning.ask(once)
+        assert np.array_equal(u, unrolled.ask(y))
+        x = following(x, u)
+        y = x[:1] + DEGREE * rng.standard_normal(1)
+        turning.tell((y + math.pi) % (2 * math.pi) - math.pi)
+        unrolled.tell(y)
+    np.testing.assert_allclose(turning.parameters, unrolled.parameters, atol=1e-6)
+
+
+def test_what_is_told_is_what_is_measured() -> None:
+    explorer = Explorer(ENCODER, steps=10, **JOINT)
+    with pytest.raises(SpecificationError, match="shape"):
+        explorer.ask([0.1, 0.0])
+
+
+def test_a_plant_says_what_is_measured() -> None:
+    section = ENCODER.to_section()
+    assert section["measured"] == {"angle": DEGREE}
+    assert Plant.from_section(section | {"horizon": 10}).measured_states == (0,)
+    assert "measured" not in MOTOR.to_section()
+
+
+@pytest.mark.parametrize(
+    ("measured", "said"),
+    [({"place": 1.0}, "place"), ({"angle": 0.0}, "positive"), (["angle"], "mapping")],
+)
+def test_what_cannot_be_measured_is_refused(measured: Any, said: str) -> None:
+    with pytest.raises(SpecificationError, match=said):
+        dataclasses.replace(MOTOR, measured=measured)
+
+
+def test_a_rate_without_its_angle_needs_the_filter() -> None:
+    gyroscope = dataclasses.replace(MOTOR, measured={"rate": 0.1})
+    with pytest.raises(IncompatibleError, match="joint_ekf"):
+        Explorer(gyroscope, steps=10)
+    Explorer(gyroscope, steps=10, **JOINT)
+
+
+def recorded(steps: int, noise: float) -> tuple[Array, Array, Array]:
+    """Return states, measured angles over one turn, and inputs of a run of the motor."""
+    rng = np.random.default_rng(9)
+    inputs = np.repeat(rng.uniform(-6, 6, (-(-steps // 10), 1)), 10, axis=0)[:steps]
+    states = [np.array([2.0, 5.0])]
+    for u in inputs:
+        states.append(following(states[-1], u))
+    angles = np.array(states)[:, :1] + noise * rng.standard_normal((steps + 1, 1))
+    return np.array(states), (angles + math.pi) % (2 * math.pi) - math.pi, inputs
+
+
+def true_motor(states: Array, inputs: Array) -> Array:  # noqa: ARG001  # they are known
+    return np.array([[motor_acceleration(x)] for x in states])
+
+
+def test_a_run_of_measured_angles_is_predicted_by_the_truth() -> None:
+    """Without noise the rate is found from the angles, and what remains is of its order."""
+    spec = Explorer(dataclasses.replace(MOTOR, measured={"angle": 1e-6}), steps=10, **JOINT).spec
+    _, angles, inputs = recorded(300, 1e-6)
+    right = free_run_error(spec, true_motor, angles, inputs, steps=30)
+    wrong = free_run_error(spec, lambda x, u: 0.9 * true_motor(x, u), angles, inputs, steps=30)
+    assert right < 1e-4 < 0.01 * wrong
+
+
+def test_the_error_of_measured_angles_is_nearly_that_of_the_states() -> None:
+    explorer = Explorer(ENCODER, steps=400, **JOINT)
+    _, angles, inputs = recorded(400, DEGREE)
+    before = explorer.free_run_error(angles, inputs)
+    driven(explorer, 300)
+    states, _, _ = recorded(400, DEGREE)
+    after = explorer.free_run_error(angles, inputs)
+    assert after < 0.3 * before
+    assert after == pytest.approx(explorer.free_run_error(states, inputs), rel=0.3)
+    with pytest.raises(SpecificationError, match=r"\(T \+ 1, 1\) and twice as many"):
+        explorer.free_run_error(angles[:80], inputs[:79])

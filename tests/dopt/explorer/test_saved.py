@@ -1,14 +1,21 @@
-"""Saved explorations: they live between saves, and commands, merges, pages and frames show them."""
+"""Explorations saved in a database: saves, commands, merges, pages and frames."""
 
 from __future__ import annotations
 
+import signal
 import sqlite3
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
+from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 import analysis
@@ -20,14 +27,27 @@ from analysis.errors import AnalysisError
 from analysis.serve.app import create_app
 from analysis.tables.comparisons import compare_policies
 from dopt import Explorer, TrialSpec
+from dopt.errors import DoptError, SpecificationError
+from dopt.policies.base import OpenLoop
+from dopt.systems import System
+from dopt.types import Array
 from orchestrate.__main__ import main
 from orchestrate.commands.maintenance import trial_key
-from orchestrate.store import Reader, Store, StoreUnavailableError, explorations
+from orchestrate.store import (
+    Reader,
+    Store,
+    StoreError,
+    StoreUnavailableError,
+    default_url,
+    explorations,
+)
+from orchestrate.store import results as writing
 from orchestrate.store.doctor import examine
 from orchestrate.store.merge import merge
-from tests.dopt.explorer.saves import content, drive, explorer
+from tests.dopt.explorer.plants import STEPS, content, drive, explorer
 from tests.orchestrate.store.fakes import LAUNCH, RUN
 from tests.orchestrate.store.test_leases import wait_for_renewals
+from tests.paths import ROOT
 
 
 def test_it_runs_until_it_is_closed(url: str, run: Explorer) -> None:
@@ -246,3 +266,287 @@ def test_rows_that_were_deleted_by_hand_are_said(
     with pytest.raises(StoreUnavailableError, match=r"its tables contradict each other.*restore"):
         run.save(sqlite_url)
     run.close()
+
+
+def test_what_is_stored_is_what_was_explored(url: str, run: Explorer) -> None:
+    assert run.save(url)
+    with Reader.open(url) as reader:
+        [config] = reader.configs()
+        curves = reader.curves(config.config_key)
+        stored = reader.trajectory(config.config_key, 0)
+        [trial] = reader.trials(config.config_key)
+    assert np.array_equal(curves.values, [run.errors])
+    assert curves.t.tolist() == list(range(40))
+    assert np.array_equal(stored.states, run.states)
+    assert np.array_equal(stored.inputs, run.inputs)
+    assert np.array_equal(stored.parameters, run.parameters)
+    assert (trial.status, trial.n_steps, trial.final_loss) == ("done", 40, run.errors[-1])
+    assert (config.env, config.horizon) == ("plant", STEPS)
+    assert config.label == "random, prequential loss"
+    assert config.config["env"]["loss"] == "prequential"
+
+
+def test_an_exploration_by_a_policy_of_a_script_is_saved(url: str) -> None:
+    """Nobody runs again what was measured: its class need not be importable."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Typed(OpenLoop):
+        name: ClassVar[str] = "typed"
+
+        def inputs(self, system: System, rng: np.random.Generator) -> Array:
+            return rng.uniform(-1.0, 1.0, (system.horizon, system.n_inputs))
+
+    with explorer(policy=Typed()) as one:
+        drive(one, 3)
+        assert one.save(url)
+    assert content(url)["n_steps"] == 3
+
+
+def test_saved_twice_is_saved_once(url: str, run: Explorer) -> None:
+    run.save(url)
+    once = content(url)
+    run.save(url)
+    assert content(url) == once
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_saved_while_it_grows_is_saved_at_the_end(
+    closed: bool, url: str, tmp_path: Path, run: Explorer
+) -> None:
+    for steps in (0, 1, 3, 130):
+        drive(run, steps)
+        run.save(url)
+    end = f"sqlite:///{tmp_path}/end.db"
+    if closed:
+        run.close()
+    run.save(end)
+    assert content(url) == content(end)
+    assert not examine(url, trial_key)
+
+
+def test_nothing_is_stored_before_the_first_step(url: str) -> None:
+    with explorer() as one:
+        assert not one.save(url)
+        with Reader.open(url) as reader:
+            assert not reader.configs()
+
+
+def test_the_default_is_the_database_of_the_launches(
+    run: Explorer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DOPT_DB", f"sqlite:///{tmp_path}/named.db")
+    run.save()
+    assert content(default_url())["n_steps"] == 40
+
+
+def test_the_states_of_a_trial_have_its_inputs_but_another_loss(url: str) -> None:
+    system = dopt.SYSTEMS["pendulum"](horizon=30)
+    spec = TrialSpec.of_system(system, "d_optimal")
+    trial = dopt.run_trial(spec)
+    with Explorer(system) as one:
+        for x, x_next in zip(trial.states, trial.states[1:], strict=False):
+            one.ask(x)
+            one.tell(x_next)
+        one.save(url)
+    with Reader.open(url) as reader:
+        [config] = reader.configs()
+        stored = reader.trajectory(config.config_key, 0)
+    assert np.array_equal(stored.inputs, trial.inputs)
+    assert np.array_equal(stored.states, trial.states)
+    assert config.env == "pendulum"
+    assert config.config_key != spec.config_key
+    assert content(url)["trial_key"] != spec.trial_key
+    assert config.label.endswith("prequential loss")
+
+
+def test_the_error_on_a_test_run_is_stored(url: str, run: Explorer) -> None:
+    with explorer(seed=1) as other:
+        drive(other, 120)
+        test = other.states, other.inputs
+    run.save(url, test=test)
+    assert content(url)["assessed"] == [(40, "free_run_error", run.free_run_error(*test))]
+    drive(run, 10)
+    run.save(url)
+    assert [t for t, *_ in content(url)["assessed"]] == [40], "what was stored stays"
+    run.save(url, test=test)
+    assert content(url)["assessed"] == [(50, "free_run_error", run.free_run_error(*test))]
+    with pytest.raises(SpecificationError, match="was given for predictions"):
+        run.save(url, test=(test[0], test[1][:5]))
+    with pytest.raises(SpecificationError, match="a pair"):
+        run.save(url, test=run.states)  # type: ignore[arg-type]
+
+
+def test_another_run_of_the_same_arguments_is_refused(url: str, run: Explorer) -> None:
+    run.save(url)
+    before = content(url)
+    with explorer() as other:
+        other.ask([0.3, 0.0])
+        other.tell([0.3, 0.1])
+        with pytest.raises(StoreError, match=r"holds another exploration .* \(40 steps\).*seed"):
+            other.save(url)
+    assert content(url) == before
+    with Reader.open(url) as reader:
+        assert len(reader.launches()) == 1
+
+
+def test_fewer_steps_of_the_same_run_are_left_out(url: str, run: Explorer) -> None:
+    run.save(url)
+    before = content(url)
+    with explorer() as other:
+        drive(other, 15)
+        assert not other.save(url)
+        assert content(url) == before
+        drive(other, 45)
+        assert other.save(url)
+    assert content(url)["n_steps"] == 60
+    assert run.save(url) is False, "the other one has gone further"
+
+
+def test_after_a_kill_the_journal_goes_on_with_the_same_trial(url: str, tmp_path: Path) -> None:
+    program = f"""
+import os, signal
+from tests.dopt.explorer.plants import drive, explorer
+one = explorer(journal={str(tmp_path / "run.jsonl")!r})
+for _ in range(3):
+    drive(one, 20)
+    one.save({url!r})
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False)
+    assert done.returncode == -signal.SIGKILL
+    before = content(url)
+    with explorer(journal=tmp_path / "run.jsonl") as again:
+        assert again.n_steps == before["n_steps"] == 60
+        again.save(url)
+        assert content(url) == before
+        drive(again, 10)
+        again.save(url)
+        after = content(url)
+    assert after["trial_key"] == before["trial_key"]
+    assert after["steps"][:60] == before["steps"]
+    assert after["n_steps"] == 70
+
+
+def test_a_save_that_fails_in_the_middle_leaves_what_was_stored(
+    url: str, run: Explorer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.save(url)
+    before = content(url)
+    drive(run, 20)
+
+    def fail(*_: object) -> None:
+        raise OperationalError("INSERT", {}, sqlite3.OperationalError("disk I/O error"))
+
+    with monkeypatch.context() as broken:
+        broken.setattr(writing, "_replace_arrays", fail)
+        with pytest.raises(StoreUnavailableError, match=r"^The results database .* \(disk I/O"):
+            run.save(url)
+    assert content(url) == before
+    drive(run, 20)
+    assert run.save(url)
+    assert content(url)["n_steps"] == 80
+    assert not examine(url, trial_key)
+
+
+def test_a_locked_database_is_said_and_the_exploration_goes_on(
+    sqlite_url: str, monkeypatch: pytest.MonkeyPatch, run: Explorer
+) -> None:
+    opening = partial(Store.open, patience=0.05)
+    monkeypatch.setattr("orchestrate.runner.saving.Store.open", opening)
+    run.save(sqlite_url)
+    before = content(sqlite_url)
+    other = sqlite3.connect(sqlite_url.removeprefix("sqlite:///"), isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    drive(run, 10)
+    with pytest.raises(StoreUnavailableError, match=r"has locked it for more than 0.05 s"):
+        run.save(sqlite_url)
+    assert content(sqlite_url) == before
+    drive(run, 10)
+    other.execute("ROLLBACK")
+    other.close()
+    assert run.save(sqlite_url)
+    assert content(sqlite_url)["n_steps"] == 60
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("nonsense", "cannot be read"),
+        ("results.db", "write it as sqlite:///results.db"),
+        ("mysql://host/name", "not supported"),
+        ("sqlite://", "in memory"),
+        ("sqlite:////dev/null/results.db", "cannot be"),
+        ("postgresql://postgres@127.0.0.1:1/postgres", "cannot be used"),
+    ],
+)
+def test_a_url_that_names_no_database_is_one_sentence(url: str, said: str, run: Explorer) -> None:
+    with pytest.raises(DoptError, match=said) as raised:
+        run.save(url)
+    assert "\n" not in str(raised.value)
+    drive(run, 5)
+
+
+def test_without_orchestrate_that_is_said(run: Explorer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "orchestrate.runner.saving", None)
+    with pytest.raises(DoptError, match=r"saved by the package orchestrate, .*: install dopt"):
+        run.save("sqlite:///results.db")
+
+
+def test_a_reader_sees_whole_runs_while_another_thread_saves(url: str) -> None:
+    seen: list[int] = []
+    with explorer() as one:
+        drive(one, 1)
+        one.save(url)
+        ended = threading.Event()
+
+        def save() -> None:
+            while not ended.is_set():
+                one.save(url)
+
+        thread = threading.Thread(target=save)
+        thread.start()
+        try:
+            while one.n_steps < STEPS:
+                drive(one, 1)
+                if one.n_steps % 10 == 0:
+                    found = content(url)
+                    states, inputs, _ = found["arrays"]
+                    seen.append(found["n_steps"])
+                    assert len(found["steps"]) == len(inputs) == len(states) - 1 == seen[-1]
+                    assert [loss for _, loss, _ in found["steps"]] == list(one.errors[: seen[-1]])
+        finally:
+            ended.set()
+            thread.join()
+        one.save(url)
+    assert seen == sorted(seen)
+    assert content(url)["n_steps"] == STEPS
+
+
+def test_parameters_that_are_not_finite_end_it_as_diverged(url: str) -> None:
+    with explorer(learner={"name": "adam_window", "learning_rate": 1e300}) as one:
+        drive(one, 1)
+        one.save(url)
+        with pytest.raises(DoptError, match="not finite"):
+            drive(one, 50)
+        one.save(url)
+        at = one.n_steps - 1
+    with Reader.open(url) as reader:
+        [config] = reader.configs()
+        [trial] = reader.trials(config.config_key)
+        curves = reader.curves(config.config_key)
+    assert (trial.status, trial.diverged_at, trial.n_steps) == ("diverged", at, at)
+    assert np.array_equal(np.isfinite(curves.values[0]), np.arange(STEPS) < at)
+    assert not examine(url, trial_key)
+    with Store.open(url) as store:
+        assert store.retry("all") == 0, "no launch can run it again"
+
+
+def test_no_launch_takes_it(url: str, run: Explorer) -> None:
+    run.save(url)
+    before = content(url)
+    with Store.open(url) as store:
+        launch = store.begin_launch(LAUNCH)
+        assert store.recover() == 0
+        assert store.claim(launch, [before["trial_key"]]) == []
+        assert store.retry("all") == 0
+    assert content(url) == before

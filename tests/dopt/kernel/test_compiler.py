@@ -1,29 +1,45 @@
-"""The cache of compiled code: one process writes, and no function takes another's place."""
+"""Compiled functions in the cache: one writer, digests, users' code, the plain mode."""
 
 from __future__ import annotations
 
 import ast
+import json
 import os
 import shutil
 import subprocess
 import sys
 import threading
+import types
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import llvmlite.binding
+import numpy as np
 import pytest
 
+from dopt.algorithm import Score, switch_step
+from dopt.errors import SpecificationError
 from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
 from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
-from dopt.kernel.compiler import compiled, contracted, squared, vectorized
+from dopt.kernel.compiler import compiled, content_digest, contracted, squared, vectorized
+from dopt.kernel.from_spec import network_of
 from dopt.kernel.information import FORMS
+from dopt.kernel.pointers import function_of
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.warming import choices, kernel_parts
 from dopt.learning import LEARNERS
-from dopt.policies import POLICIES
+from dopt.learning.base import Learner
+from dopt.models import Model
+from dopt.policies import POLICIES, Search
+from dopt.policies.base import ClosedLoop
+from dopt.policies.search import SCORES, score_code
+from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS
+from tests.dopt.trials import trial
 from tests.paths import ROOT
 from tests.waiting import PATIENCE_SECONDS
 
@@ -295,3 +311,202 @@ def test_a_cache_that_cannot_be_written_is_one_folder_for_all_processes(tmp_path
     made, used, there, still_there = done.stdout.split()
     assert (made, there, still_there) == (used, "True", "True")
     assert not Path(made).exists()
+
+
+MODULE = """
+import math
+import numpy as np
+from dopt.kernel.linear_algebra import inner
+
+FACTOR = {factor}
+TABLE = np.array([1.0, 2.0])
+
+def half(x):
+    return FACTOR * x
+
+def plan(x, out):
+    out[0] = half(x) + TABLE[1] + math.sqrt(4.0) + 0.0 * inner(out, out)
+"""
+PROGRAM = """
+import numpy as np, sys
+from numba import float64, void
+from dopt.kernel.compiler import compiled_own
+from own import plan
+compiled = compiled_own(plan, void(float64, float64[::1]))
+out = np.zeros(1)
+compiled(10.0, out)
+print(len(compiled.stats.cache_hits), out[0])
+"""
+
+
+def answer(folder: Path, factor: float) -> tuple[int, float]:
+    """Return how often a process found the code in the cache, and what the code returned."""
+    (folder / "own.py").write_text(MODULE.format(factor=factor))
+    path = os.pathsep.join([str(ROOT), str(folder)])
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", PROGRAM],
+        env={**os.environ, "PYTHONPATH": path, "DOPT_CACHE": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    hits, value = done.stdout.split()
+    return int(hits), float(value)
+
+
+def test_a_process_finds_what_another_compiled_until_the_file_changes(tmp_path: Path) -> None:
+    assert answer(tmp_path, 0.5) == (0, 9.0)
+    assert answer(tmp_path, 0.5) == (1, 9.0)
+    assert answer(tmp_path, 2.0) == (0, 24.0)
+    assert answer(tmp_path, 0.5) == (1, 9.0)
+
+
+def function_with(folder: Path, **values: object) -> types.FunctionType:
+    """Return the plan of a module in which names have other values than its file says."""
+    path = folder / "own.py"
+    path.write_text(MODULE.format(factor=0.5))
+    module = types.ModuleType("own")
+    exec(compile(path.read_text(), str(path), "exec"), module.__dict__)
+    module.__dict__.update(values)
+    function: types.FunctionType = module.plan
+    return function
+
+
+@pytest.mark.parametrize("value", [0.25, True, (1.0, 2.0), "text", np.array([3.0])])
+def test_a_constant_from_elsewhere_is_part_of_the_content(tmp_path: Path, value: object) -> None:
+    usual = content_digest(function_with(tmp_path))
+    assert usual is not None
+    assert content_digest(function_with(tmp_path)) == usual
+    other = content_digest(function_with(tmp_path, FACTOR=value))
+    assert other not in (None, usual)
+
+
+def test_what_cannot_be_told_is_not_kept(tmp_path: Path) -> None:
+    from tests.dopt import trials
+
+    for value in ([1.0], {"a": 1}, trials, trials.trial, object()):
+        assert content_digest(function_with(tmp_path, FACTOR=value)) is None
+
+
+def test_a_function_without_a_file_is_not_kept() -> None:
+    names: dict[str, types.FunctionType] = {}
+    exec("def plan(x, out):\n    out[0] = x\n", names)
+    assert content_digest(names["plan"]) is None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewPolicy(ClosedLoop):
+    name: ClassVar[str] = "new"
+    compiled: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewLearner(Learner):
+    name: ClassVar[str] = "new"
+    compiled: ClassVar[bool] = True
+    kernel_function: ClassVar[str] = "dopt.kernel.learners.adam.forgotten"
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewModel(Model):
+    name: ClassVar[str] = "new"
+    compiled: ClassVar[bool] = True
+
+    def n_parameters(self, system: object) -> int:  # noqa: ARG002
+        return 1
+
+    def initial_parameters(self, system: object, rng: object) -> np.ndarray:  # noqa: ARG002
+        return np.zeros(1)
+
+    def predict_at(self, system: object, parameters: object, points: np.ndarray) -> np.ndarray:  # noqa: ARG002
+        return points
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewSearch(Search):
+    name: ClassVar[str] = "new"
+
+    @property
+    def score(self) -> str:
+        return "juint"
+
+
+@pytest.mark.parametrize("part", [NewPolicy(), NewLearner()])
+def test_a_kernel_function_that_does_not_exist_is_named(part: ClosedLoop | Learner) -> None:
+    with pytest.raises(SpecificationError, match="'new' names the kernel function"):
+        function_of(part, None)
+
+
+def test_a_model_that_the_kernel_does_not_know_is_refused() -> None:
+    with pytest.raises(SpecificationError, match="model 'new' says that it is compiled"):
+        network_of(SYSTEMS["pendulum"](), NewModel())
+
+
+def test_an_unknown_score_is_refused() -> None:
+    with pytest.raises(SpecificationError, match=r"score of policy 'new'.*joint"):
+        score_code(NewSearch())
+
+
+def test_every_score_has_a_name_and_each_policy_that_searches_one_of_them() -> None:
+    assert list(SCORES.values()) == list(Score)
+    searching = [cls() for cls in POLICIES.values() if issubclass(cls, Search)]
+    assert {score_code(policy) for policy in searching} >= set(Score) - {Score.JOINT}
+
+
+@pytest.mark.parametrize(("steps", "switch"), [(1, 1), (2, 1), (5, 2), (6, 3)])
+def test_plans_switch_half_way(steps: int, switch: int) -> None:
+    assert switch_step(steps) == switch
+
+
+NETWORK = {"name": "mlp", "width": 3, "depth": 1}
+STAR = {"name": "grey_box", "unknown": ["center_x", "center_y"], "initial": [0.1, 0.1]}
+ENCODERS = {"measured_states": [0, 2], "measurement_noise": [0.01, 0.01], "horizon": 6}
+TRIALS = [
+    trial("pendulum", "d_optimal", 1, env={"horizon": 6}, model=NETWORK),
+    trial("moving_star", "lookahead", 1, env={"horizon": 12}, model=STAR),
+    trial("arm", "random", 1, env=ENCODERS, model=NETWORK, learner={"name": "joint_ekf"}),
+]
+PLAIN_PROGRAM = """
+import json, sys
+from numba.core.dispatcher import Dispatcher
+from dopt.kernel import loop
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
+assert not isinstance(loop.advance, Dispatcher)
+found = []
+for mapping in json.load(sys.stdin):
+    result = run_trial(TrialSpec.from_mapping(mapping))
+    found.append({name: getattr(result, name).tolist() for name in sys.argv[1:]})
+print(json.dumps(found))
+"""
+EXACT, SINGLE = ("states", "inputs", "parameters"), ("loss", "reachable_loss")
+"""What is computed in double precision, and losses, which may be judged in single precision."""
+
+
+@pytest.fixture(scope="module")
+def plain() -> list[dict[str, Any]]:
+    given = json.dumps([spec.to_mapping() for spec in TRIALS])
+    done = subprocess.run(
+        [sys.executable, "-c", PLAIN_PROGRAM, *EXACT, *SINGLE],
+        input=given,
+        env=os.environ | {"DOPT_PLAIN": "1"},
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    found: list[dict[str, Any]] = json.loads(done.stdout)
+    return found
+
+
+@pytest.mark.parametrize("index", range(len(TRIALS)))
+def test_both_give_the_same_trial(index: int, plain: list[dict[str, Any]]) -> None:
+    spec: TrialSpec = TRIALS[index]
+    compiled, found = run_trial(spec), plain[index]
+    for name in EXACT:
+        values = getattr(compiled, name)
+        scale = np.abs(values).max()
+        assert np.array(found[name]) == pytest.approx(values, rel=0.0, abs=1e-12 * scale), name
+    for name in SINGLE:
+        assert np.array(found[name]) == pytest.approx(getattr(compiled, name), rel=1e-5), name

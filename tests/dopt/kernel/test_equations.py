@@ -1,8 +1,10 @@
-"""Compiled equations of a system: its own numbers, under symbols that no other system has."""
+"""Compiled equations, steps, pointers to structures, episodes and evaluation."""
 
 from __future__ import annotations
 
+import itertools
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -12,10 +14,25 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import torch
+from numba.core.errors import TypingError
 
-from dopt.kernel import cache
+from dopt.errors import IncompatibleError
+from dopt.evaluation import evaluation_set
+from dopt.kernel import cache, pointers, run
 from dopt.kernel.equations import compiled_equations
+from dopt.kernel.held import HeldTrial, pointer_to, trial_in
+from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
+from dopt.kernel.run import KernelTrial, run_trial_in_kernel
+from dopt.policies import Episodic
+from dopt.run import run_trial
+from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, Chain, Pendulum, System
+from dopt.types import Vector
+from tests.dopt.custom_networks import model_of_one
+from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.newcomers import kept
+from tests.dopt.trials import PAIRS, trial
 from tests.paths import ROOT
 
 
@@ -101,3 +118,216 @@ def test_systems_cached_by_different_processes_are_not_confused(tmp_path: Path) 
     names = ("pendulum", "cartpole", "cartpole pendulum", "pendulum cartpole")
     command = [sys.executable, "-c", program, *names]
     subprocess.run(command, check=True, env=environment, cwd=ROOT)
+
+
+CASES = [
+    trial("pendulum", "d_optimal", 1, env={"horizon": 60}),
+    trial("quadrotor", "d_optimal", 1, env={"horizon": 60}, policy={"form": "dual"}),
+    trial("arm", "d_optimal", 1, env={"horizon": 60}, policy={"form": "sketch"}),
+    trial("cartpole", "uniform", 1, env={"horizon": 60}),
+]
+
+
+@pytest.mark.parametrize("spec", CASES, ids=lambda spec: spec.system.name)
+def test_the_numbers_do_not_depend_on_the_pieces(
+    spec: TrialSpec, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run_trial_in_kernel(spec)
+    lasts: list[int] = []
+    advance = KernelTrial.advance
+
+    def noted(trial: KernelTrial, last: int) -> None:
+        lasts.append(last)
+        advance(trial, last)
+
+    monkeypatch.setattr(KernelTrial, "advance", noted)
+    monkeypatch.setattr(run, "FIRST_STEPS", 7)
+    monkeypatch.setattr(run, "PIECE_SECONDS", 1e-9)
+    pieces = run_trial_in_kernel(spec)
+    assert lasts == [*range(7, 61)]
+    for name in ("loss", "reachable_loss", "states", "inputs", "parameters"):
+        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
+
+
+@kept
+def numbers(held: HeldTrial, out: Vector) -> None:
+    """Read numbers, arrays and structures in structures, and write through one of them."""
+    whole = trial_in(held)
+    plant, network = whole.plant, whole.network
+    waves = network.waves
+    out[0], out[1], out[2] = plant.dt, plant.n_inputs, waves.scale
+    out[3], out[4] = waves.frequencies.shape[0], waves.frequencies[0, 1]
+    out[5] = 1.0 if whole.limits.enforced else 0.0
+    out[6] = whole.state.theta[1:3].sum()
+    whole.state.covariance.n_pending[0] = 7
+
+
+def test_a_pointer_reads_and_writes_what_the_structures_hold() -> None:
+    fast, out = KernelTrial(TrialSpec.from_names("pendulum", "d_optimal")), np.empty(7)
+    plant, waves, theta = fast.trial.plant, fast.trial.network.waves, fast.state.theta
+    assert waves.frequencies.size == 0
+    waves = waves._replace(frequencies=np.arange(6.0).reshape(2, 3), scale=0.25)
+    network = fast.trial.network._replace(waves=waves)
+    fast.trial = fast.trial._replace(network=network)
+    function = compiled_for(path_of(numbers), numbers, (held_kind(fast.trial), kind_of(out)))
+    function(fast.held, out)
+    assert out.tolist() == [plant.dt, plant.n_inputs, 0.25, 2.0, 1.0, 0.0, theta[1:3].sum()]
+    assert fast.state.covariance.n_pending[0] == 7
+
+
+def test_a_field_that_does_not_exist_is_refused_by_name() -> None:
+    fast = KernelTrial(TrialSpec.from_names("pendulum", "d_optimal"))
+
+    def wrong(held: HeldTrial) -> float:
+        return float(trial_in(held).plant.mass)
+
+    with pytest.raises(TypingError, match=r"Unknown attribute 'mass' of type pointer\(Plant"):
+        kept(wrong).compile((held_kind(fast.trial),))  # type: ignore[attr-defined]
+
+
+def test_a_pointer_s_type_is_that_of_its_structure() -> None:
+    """The cache of machine code finds functions by the types of their arguments."""
+    short, other = (
+        kind_of(KernelTrial(TrialSpec.from_names(env, "d_optimal")).trial)
+        for env in ("pendulum", "arm")
+    )
+    assert pointer_to(short) == pointer_to(other)
+    assert pickle.loads(pickle.dumps(pointer_to(short))) == pointer_to(short)
+    assert pointer_to(short) != pointer_to(short.types[0])
+    assert len(str(pointer_to(short))) < 40  # names of machine code are made of it
+
+
+@pytest.mark.parametrize(
+    ("fields", "others"),
+    [
+        ({}, set()),
+        ({"limits": {"bounds": {"φ": [-4.0, 4.0]}}}, {"limit_input", "note_error"}),
+        ({"env": {"integrator": "rk4"}}, {"observe"}),
+        ({"env": {"measured_states": [0], "measurement_noise": [0.01]}}, {"estimate_state"}),
+    ],
+)
+def test_a_trial_calls_the_steps_that_it_consists_of(
+    fields: dict[str, dict[str, object]], others: set[str]
+) -> None:
+    mapping = trial("pendulum", "d_optimal").to_mapping()
+    for section, changes in fields.items():
+        mapping[section] = mapping.get(section, {}) | changes
+    chosen = pointers.other_steps(KernelTrial(TrialSpec.from_mapping(mapping)).trial)
+    for name, (usual, other) in pointers.OTHER_STEPS.items():
+        assert chosen[name] is (other if name in others else usual)
+
+
+SMALL = {"hold": 3, "stride": 2, "plans": 9, "iterations": 2, "elites": 3, "samples": 6}
+
+
+def spec_of(
+    env: str,
+    lookahead: int,
+    replan_every: int,
+    learner: dict[str, Any] | None = None,
+    **fields: Any,
+) -> TrialSpec:
+    given = SMALL | {"lookahead": lookahead, "replan_every": replan_every} | fields
+    return trial(env, "episodic", 3, policy=given, model={"width": 8}, learner=learner or {})
+
+
+def searches(horizon: int, replan_every: int) -> list[int]:
+    """Return the steps at which plans are drawn."""
+    return [t for t in range(1, horizon) if t == 1 or t % replan_every == 0]
+
+
+@pytest.mark.parametrize("hold", [1, 3, 10])
+@pytest.mark.parametrize("replan_every", [2, 6, 11])
+def test_between_two_searches_the_inputs_are_those_of_the_plan(
+    replan_every: int, hold: int
+) -> None:
+    spec = spec_of("arm", 11, replan_every, hold=hold)
+    policy = spec.policy
+    assert isinstance(policy, Episodic)
+    fast = KernelTrial(spec)
+    shape = (1 + policy.elites, policy.segments, 2)
+    starts = [*searches(30, replan_every), 30]
+    for start, following in itertools.pairwise(starts):
+        fast.advance(start + 1)
+        best = fast.state.policy_memory.reshape(shape)[1].copy()
+        fast.advance(following)
+        assert np.array_equal(fast.state.policy_memory.reshape(shape)[1], best)
+        for t in range(start, following):
+            assert np.array_equal(fast.record.inputs[t], best[t // hold - start // hold])
+    assert len(np.unique(fast.record.inputs[1:], axis=0)) > 3
+
+
+@pytest.mark.parametrize(("env", "hold"), [("pendulum", 1), ("arm", 3)])
+def test_planned_anew_at_every_step_it_is_the_sampling_planner(env: str, hold: int) -> None:
+    fields = SMALL | {"lookahead": 7, "hold": hold}
+    every = run_trial(spec_of(env, 7, 1, hold=hold))
+    plain = run_trial(trial(env, "icem", 3, policy=fields, model={"width": 8}))
+    assert relative_gap(every.inputs, plain.inputs) < 1e-9
+
+
+def test_a_plan_cannot_be_carried_out_past_its_end() -> None:
+    with pytest.raises(
+        IncompatibleError,
+        match=r"policy.replan_every is 8 steps, but the plans have 7: make it smaller, or",
+    ):
+        spec_of("pendulum", 7, 8)
+
+
+def losses(spec: TrialSpec, theta: np.ndarray, step: int = 0) -> tuple[float, float]:
+    """Return the L2 errors over the grid and over the reachable states, point by point."""
+    points, model = evaluation_set(spec.system), model_of_one(spec.system, spec.model)
+    found = np.stack([model(torch.tensor(theta), x).numpy() for x in torch.tensor(points.states)])
+    squares = ((found - spec.system.learned(points.states, step)) ** 2).sum(axis=1)
+    means = squares[: points.n_grid].mean(), squares[points.n_grid :].mean()
+    return float(np.sqrt(means[0])), float(np.sqrt(means[1]))
+
+
+@pytest.mark.parametrize(("env", "policy"), [p for p in PAIRS if p[1] in ("random", "oracle")])
+def test_the_loss_is_the_root_mean_square_over_the_points(env: str, policy: str) -> None:
+    spec = trial(env, policy, 1, env={"horizon": 3})
+    fast = KernelTrial(spec)
+    fast.advance(3)
+    grid, reachable = losses(spec, fast.state.theta, 2)
+    assert fast.record.loss[2] == pytest.approx(grid, rel=1e-5)
+    assert fast.record.reachable_loss[2] == pytest.approx(reachable, rel=1e-5)
+
+
+@pytest.mark.parametrize(("bend", "precision"), [(0.5, 1e-5), (0.1, 1e-8), (1e-3, 1e-6)])
+def test_a_small_loss_is_not_lost_in_rounding(bend: float, precision: float) -> None:
+    """One tanh of a small argument nearly is the friction of a pendulum without gravity."""
+    spec = trial(
+        "pendulum",
+        "random",
+        env={"horizon": 1, "gravity": 0.0, "grid_points": [16, 16]},
+        model={"depth": 1, "width": 1},
+        learner={"learning_rate": 1e-300},
+    )
+    pendulum, fast = spec.system, KernelTrial(spec)
+    width = pendulum.grid_half_widths[1]
+    slope = -3.0 * pendulum.friction / (pendulum.mass * pendulum.length**2)  # type: ignore[attr-defined]
+    fast.state.theta[:] = [0.0, 0.0, bend, 0.0, slope * width / bend, 0.0]
+    fast.advance(1)
+    grid, reachable = losses(spec, fast.state.theta)
+    assert grid < bend**2 * abs(slope) * width
+    assert fast.record.loss[0] == pytest.approx(grid, rel=precision)
+    assert fast.record.reachable_loss[0] == pytest.approx(reachable, rel=precision)
+
+
+@pytest.mark.parametrize("points", [[1, 1], [15, 17], [16, 16], [257, 1], [40, 20]])
+def test_any_number_of_points_is_evaluated(points: list[int]) -> None:
+    spec = trial("pendulum", "random", env={"horizon": 1, "grid_points": points})
+    fast = KernelTrial(spec)
+    fast.advance(1)
+    grid, reachable = losses(spec, fast.state.theta)
+    assert fast.record.loss[0] == pytest.approx(grid, rel=1e-5)
+    assert fast.record.reachable_loss[0] == pytest.approx(reachable, rel=1e-5)
+
+
+def test_steps_that_are_done_are_not_done_again() -> None:
+    spec = trial("pendulum", "d_optimal", 1)
+    straight, back = KernelTrial(spec), KernelTrial(spec)
+    straight.advance(20)
+    for last in (10, 5, 10, 20):
+        back.advance(last)
+    np.testing.assert_array_equal(back.parameters, straight.parameters)
+    assert np.isnan(back.states[21:]).all()

@@ -1,18 +1,33 @@
-"""The inverse information that the kernel carries, against fresh inverses."""
+"""Information matrices, Kalman filters and Gaussian processes against dense inverses."""
 
 from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch.func import jacrev, vmap
 
-from dopt.kernel.linear_algebra import dense
+from dopt.assessment import model_forecast
+from dopt.errors import IncompatibleError
+from dopt.kernel.learners.kalman import filter_step, whiten
+from dopt.kernel.linear_algebra import PENDING_ROWS, dense
 from dopt.kernel.run import KernelTrial
+from dopt.kernel.structs import Covariance
+from dopt.learning import LEARNERS, ExtendedKalman
+from dopt.models import GaussianProcess
+from dopt.policies import POLICIES, InformationPolicy
+from dopt.policies.base import CompiledPolicy
+from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
+from dopt.types import Array
 from tests.close import assert_close
-from tests.dopt.kernel.steps import run
-from tests.dopt.torch_models import model_of_one
+from tests.dopt.custom_networks import model_of_one
+from tests.dopt.kernel.twin import interpreted, observed, run
 from tests.dopt.trials import trial
 
 
@@ -65,3 +80,448 @@ def test_two_thousand_steps_lose_no_definiteness_and_little_accuracy() -> None:
     carried = np.einsum("ni,ij,nj->n", probes, covariance, probes)
     fresh = np.einsum("ni,in->n", probes, np.linalg.solve(M, probes.T))
     assert carried == pytest.approx(fresh, rel=1e-8)
+
+
+FRESH = {"information": "fresh"}
+NEWEST = {"name": "adam", "learning_rate": 0.05}
+"""A learner that moves the parameters far, so that old rows differ from fresh ones."""
+NETWORK_POLICIES = [
+    name
+    for name, policy in POLICIES.items()
+    if issubclass(policy, InformationPolicy) and name != "oracle"
+]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Numbered(CompiledPolicy, InformationPolicy):
+    """A compiled policy with a matrix M, whose input is the first number that it declares."""
+
+    name: ClassVar[str] = "numbered"
+
+    share: float = 0.25
+    form: str = "primal"
+
+    @staticmethod
+    def plan(trial: Any, t: int, u: Array) -> None:  # noqa: ARG004
+        u[:] = trial.algorithm.policy[1] * trial.plant.gamma
+
+    def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002
+        return self.form
+
+
+def rows(spec: TrialSpec, theta: Array, states: Array) -> Array:
+    """Return J of all states, (n r, q)."""
+    model = model_of_one(spec.system, spec.model)
+    over_states = vmap(jacrev(model), in_dims=(None, 0))
+    J: Array = over_states(torch.tensor(theta), torch.tensor(states)).flatten(0, 1).numpy()
+    return J
+
+
+def advanced(steps: int, policy: dict[str, Any], env: str = "arm") -> KernelTrial:
+    """Return a trial after some steps."""
+    fast = KernelTrial(
+        trial(env, "d_optimal", 2, policy=policy, learner=NEWEST, model={"width": 5})
+    )
+    fast.advance(steps)
+    return fast
+
+
+def summed(fast: KernelTrial, last: int) -> Array:
+    """Return λI + Σ JᵀJ over the first states at the present parameters, (q, q)."""
+    J = rows(fast.spec, fast.state.theta, fast.record.states[:last])
+    M: Array = 1e-3 * np.eye(J.shape[1]) + J.T @ J
+    return M
+
+
+def check_inverse(fast: KernelTrial, M: Array) -> None:
+    """See that a trial holds M⁻¹, but for rounding."""
+    assert_close(dense(fast.state.covariance) @ M, np.eye(len(M)), abs=1e-13 * np.linalg.cond(M))
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_the_matrix_is_that_of_all_states_at_the_present_parameters(env: str) -> None:
+    fast = advanced(25, FRESH, env)
+    M = summed(fast, 25)
+    check_inverse(fast, M)
+    old = advanced(25, {"information": "accumulated"}, env)
+    assert not np.allclose(np.linalg.inv(dense(old.state.covariance)), M, rtol=0.1)
+
+
+def test_between_two_sums_the_newest_rows_are_added() -> None:
+    policy = FRESH | {"refresh_every": 4}
+    M = summed(advanced(24, policy), 24)
+    for steps in (25, 26):
+        newest = advanced(steps, policy)
+        J = rows(newest.spec, newest.state.theta, newest.record.states[steps - 1 : steps])
+        M = M + J.T @ J
+        check_inverse(newest, M)
+    check_inverse(advanced(28, policy), summed(advanced(28, policy), 28))
+
+
+@pytest.mark.parametrize("refresh_every", [1, 4])
+def test_a_trial_that_is_cut_gives_the_numbers_of_one_call(refresh_every: int) -> None:
+    policy = FRESH | {"refresh_every": refresh_every}
+    whole, cut = advanced(30, policy), advanced(1, policy)
+    for last in (2, 7, 8, 21, 30):
+        cut.advance(last)
+    assert np.array_equal(cut.record.inputs, whole.record.inputs)
+    assert np.array_equal(cut.record.loss, whole.record.loss)
+    assert np.array_equal(cut.state.theta, whole.state.theta)
+    assert np.array_equal(dense(cut.state.covariance), dense(whole.state.covariance))
+
+
+@pytest.mark.parametrize("policy", NETWORK_POLICIES)
+def test_every_policy_plans_by_another_matrix(policy: str) -> None:
+    plain = trial("arm", policy, 1, learner=NEWEST)
+    fresh = trial("arm", policy, 1, policy=FRESH, learner=NEWEST)
+    assert not np.array_equal(run_trial(fresh).inputs, run_trial(plain).inputs)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "exact"])
+def test_a_prior_below_rounding_ends_the_trial_as_diverged(policy: str) -> None:
+    given = FRESH | {"regularization": 1e-300}
+    spec = trial("arm", policy, 1, policy=given)
+    result = run_trial(spec)
+    assert result.diverged_at is not None
+    assert np.isnan(result.loss[result.diverged_at :]).all()
+
+
+def test_stored_trials_keep_their_keys() -> None:
+    plain = trial("arm", "d_optimal", 1)
+    said = trial("arm", "d_optimal", 1, policy={"information": "accumulated", "refresh_every": 1})
+    assert said.trial_key == plain.trial_key
+    assert '"information"' not in plain.canonical_json()
+    assert '"refresh_every"' not in plain.canonical_json()
+    fresh = trial("arm", "d_optimal", 1, policy=FRESH)
+    seldom = trial("arm", "d_optimal", 1, policy=FRESH | {"refresh_every": 5})
+    assert len({spec.trial_key for spec in (plain, fresh, seldom)}) == 3
+    for spec in (plain, fresh, seldom):
+        assert TrialSpec.from_mapping(spec.to_mapping()) == spec
+
+
+@pytest.mark.parametrize("form", ["dual", "sketch"])
+def test_it_needs_the_primal_form(form: str) -> None:
+    with pytest.raises(IncompatibleError, match=r"policy.information 'fresh' goes with policy"):
+        trial("arm", "d_optimal", policy=FRESH | {"form": form})
+
+
+@pytest.mark.parametrize(
+    "learner", [name for name, one in LEARNERS.items() if one.updates_information]
+)
+def test_a_learner_that_updates_the_matrix_decides_about_it(learner: str) -> None:
+    model = {"name": "mlp" if LEARNERS[learner].structure == "gradient" else "linear"}
+    estimates = LEARNERS[learner].estimates_states
+    env = {"measured_states": [0], "measurement_noise": [0.1]} if estimates else {}
+    policy = FRESH | ({"regularization": 3.0} if estimates else {})
+    with pytest.raises(
+        IncompatibleError, match=r"^policy.information 'fresh' goes with .*: change"
+    ):
+        trial("arm", "d_optimal", policy=policy, learner={"name": learner}, model=model, env=env)
+
+
+@pytest.mark.parametrize("model", ["linear", "linear_state", "rff"])
+def test_it_is_refused_where_it_would_be_the_accumulated_one(model: str) -> None:
+    least_squares = {"name": "recursive_least_squares"}
+    with pytest.raises(
+        IncompatibleError,
+        match=rf"goes with model 'mlp', 'affine', 'black_box' or 'grey_box', but model '{model}'",
+    ):
+        trial(
+            "mass_spring" if model == "linear_state" else "arm",
+            "d_optimal",
+            policy=FRESH,
+            model={"name": model},
+            learner=least_squares,
+        )
+
+
+def test_a_count_of_steps_says_nothing_without_it() -> None:
+    with pytest.raises(IncompatibleError, match=r"policy.refresh_every 2 goes with policy.inform"):
+        trial("arm", "d_optimal", policy={"refresh_every": 2})
+
+
+def test_a_wide_network_holds_it_in_the_primal_form() -> None:
+    wide = trial("arm", "d_optimal", policy=FRESH, model={"width": 64})
+    assert wide.policy.chosen_form(10_000, 60) == "primal"  # type: ignore[attr-defined]
+    assert trial("arm", "d_optimal").policy.chosen_form(10_000, 60) == "dual"  # type: ignore[attr-defined]
+
+
+def own(**fields: object) -> TrialSpec:
+    given = {"name": "numbered", "_target_": f"{__name__}.Numbered", **fields}
+    mapping = trial("arm", "random", 1, learner=NEWEST).to_mapping()
+    return TrialSpec.from_mapping({**mapping, "policy": given})
+
+
+def test_the_numbers_of_a_users_compiled_policy_keep_their_places() -> None:
+    for fields in ({}, FRESH, FRESH | {"refresh_every": 3}):
+        spec = own(**fields)
+        assert spec.policy.kernel_numbers(10, 1.0) == (1e-3, 0.25)
+        result = run_trial(spec)
+        assert result.inputs[1:] == pytest.approx(0.25 * spec.system.gamma)
+
+
+def test_a_users_compiled_policy_has_fresh_information() -> None:
+    fast = KernelTrial(own(information="fresh"))
+    fast.advance(12)
+    check_inverse(fast, summed(fast, 12))
+    with pytest.raises(IncompatibleError, match=r"'fresh' goes with policy.form 'primal'"):
+        own(information="fresh", form="dual")
+
+
+EKF = {"name": "ekf"}
+WEIGHED = {"name": "ekf", "underweighting": 2.0, "noise_variance": 0.1}
+FADING = {"name": "ekf", "forgetting": 0.95, "noise_variance": 3.0, "regularization": 0.02}
+
+
+def kalman_jacobians(spec: TrialSpec, before: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Return J at each state and the parameters before its learning step, (t, r, q)."""
+    model = model_of_one(spec.system, spec.model)
+    rows = [
+        jacrev(model)(torch.tensor(p), torch.tensor(x)) for p, x in zip(before, states, strict=True)
+    ]
+    return torch.stack(rows).numpy()
+
+
+def filtered(learner: dict[str, Any], policy: str = "d_optimal", steps: int = 25) -> Any:
+    """Return a trial, the parameters before each step and after the last, and J of each step."""
+    spec = trial("arm", policy, 2, env={"horizon": steps}, learner=learner, model={"width": 5})
+    fast = KernelTrial(spec)
+    initial = fast.state.theta.copy()
+    parameters = np.concatenate([initial[None], run(fast, steps)])
+    return fast, parameters, kalman_jacobians(spec, parameters[:-1], fast.record.states[:-1])
+
+
+@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
+def test_of_a_linear_model_it_is_recursive_least_squares(env: str) -> None:
+    plain = run_trial(trial(env, "oracle", 4, env={"horizon": 60}))
+    kalman = run_trial(trial(env, "oracle", 4, env={"horizon": 60}, learner=EKF))
+    assert kalman.parameters == pytest.approx(plain.parameters, rel=1e-9)
+    assert kalman.states == pytest.approx(plain.states, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("regularization", [1e-6, 1e-1])
+def test_with_a_matrix_of_its_own_it_is_ridge_regression(regularization: float) -> None:
+    given = {"regularization": regularization, "noise_variance": 4.0}
+    spec = trial("cartpole", "random", 3, model={"name": "linear"}, learner=EKF | given)
+    fast = KernelTrial(spec)
+    fast.advance(30)
+    states, zero = fast.record.states[:-1], np.zeros((30, 3))
+    psi = kalman_jacobians(spec, zero, states).reshape(-1, 3)
+    offset = spec.model.predict(spec.system, zero[0], states)
+    rows = np.concatenate([psi / 2.0, np.sqrt(regularization) * np.eye(3)])
+    values = (observed(fast, 30) - offset).ravel() / 2.0
+    expected = np.linalg.lstsq(rows, np.concatenate([values, np.zeros(3)]))[0]
+    assert fast.state.theta == pytest.approx(expected, rel=1e-7)
+
+
+def test_planner_and_filter_hold_one_matrix_of_the_rows_before_each_step() -> None:
+    fast, parameters, J = filtered(EKF | {"noise_variance": 2.0})
+    M = 1e-3 * np.eye(J.shape[2])  # that of the policy
+    targets = observed(fast, len(J))
+    model = fast.spec.model
+    for t, rows in enumerate(J):
+        M = M + rows.T @ rows / 2.0
+        state = fast.record.states[t : t + 1]
+        residual = targets[t] - model.predict(fast.spec.system, parameters[t], state)[0]
+        step = np.linalg.solve(M, rows.T @ residual / 2.0)
+        assert parameters[t + 1] - parameters[t] == pytest.approx(step, rel=1e-5, abs=1e-7)
+    assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-8)
+
+
+def test_an_underweighted_sample_has_the_variance_of_its_prediction_as_well() -> None:
+    fast, parameters, J = filtered(WEIGHED | {"forgetting": 0.9})
+    k, weight = ExtendedKalman(forgetting=0.9).renewal(J.shape[2], 1e-3)
+    M = 1e-3 * np.eye(J.shape[2])
+    targets = observed(fast, len(J))
+    for t, rows in enumerate(J):
+        M = 0.9 * M
+        for i in range(t * k, (t + 1) * k):
+            M[i % len(M), i % len(M)] += weight
+        predicted = rows @ np.linalg.solve(M, rows.T)
+        gain = np.linalg.solve(M, rows.T) @ np.linalg.inv(0.1 * np.eye(2) + 3.0 * predicted)
+        state = fast.record.states[t : t + 1]
+        residual = targets[t] - fast.spec.model.predict(fast.spec.system, parameters[t], state)[0]
+        step = gain @ residual
+        assert parameters[t + 1] - parameters[t] == pytest.approx(step, rel=1e-5, abs=1e-7)
+        M = M + rows.T @ np.linalg.solve(0.1 * np.eye(2) + 2.0 * predicted, rows)
+    assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-7)
+
+
+@given(st.integers(0, 1000), st.floats(0.01, 20.0), st.floats(1e-3, 10.0), st.floats(1e-6, 1e6))
+def test_a_step_removes_at_most_a_share_of_an_error_and_of_its_variance(
+    seed: int, underweighting: float, noise_variance: float, regularization: float
+) -> None:
+    """Of a linear model, with any λ; and nearly all that the plain filter does where λ is large."""
+    rng = np.random.default_rng(seed)
+    J, e, theta = rng.standard_normal((1, 5)), rng.standard_normal(1), np.zeros(5)
+    covariance = Covariance(
+        np.eye(5) / regularization, np.zeros((PENDING_ROWS, 5)), np.zeros(1, np.int64)
+    )
+    before = float(J[0] @ J[0]) / regularization
+    rows, residuals = J.copy(), e.copy()
+    interpreted(whiten)(covariance, rows, residuals, noise_variance, underweighting)
+    interpreted(filter_step)(covariance, theta, rows, residuals)
+    share = underweighting / (1.0 + underweighting)
+    left = float((e - J @ theta)[0] / e[0])
+    assert left >= share * (1 - 1e-9)
+    assert float((J @ dense(covariance) @ J.T)[0, 0]) >= share * before * (1 - 1e-6)
+    plain = noise_variance / (noise_variance + before)
+    assert plain * (1 - 1e-9) <= left <= plain + underweighting * before / noise_variance + 1e-12
+
+
+def test_of_a_linear_model_it_ends_where_recursive_least_squares_ends() -> None:
+    """Samples count alike once their prediction is far more certain than they are."""
+    given = {"name": "linear"}
+    env = {"horizon": 400, "noise": 0.0}
+    plain, weighed = (
+        run_trial(trial("cartpole", "random", 3, env=env, model=given, learner=one)).parameters
+        for one in (EKF, EKF | {"underweighting": 2.0})
+    )
+    assert np.array_equal(plain, weighed) is False
+    assert weighed == pytest.approx(plain, rel=1e-2)
+
+
+def test_the_policy_decides_about_the_prior_of_a_matrix_that_it_shares() -> None:
+    learners = [EKF | {"regularization": value} for value in (1e-3, 1.0)]
+    shared = [run_trial(trial("arm", "d_optimal", learner=one)) for one in learners]
+    own = [run_trial(trial("arm", "random", learner=one)) for one in learners]
+    assert np.array_equal(shared[0].parameters, shared[1].parameters)
+    assert not np.array_equal(own[0].parameters, own[1].parameters)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "random"])
+@pytest.mark.parametrize("forgetting", [0.3, 0.9, 0.99])
+def test_what_fades_is_the_information_and_never_the_prior(forgetting: float, policy: str) -> None:
+    learner = FADING | {"forgetting": forgetting}
+    fast, _, J = filtered(learner, policy, 80)
+    regularization = 1e-3 if policy == "d_optimal" else 0.02
+    k, weight = ExtendedKalman(forgetting=forgetting).renewal(J.shape[2], regularization)
+    M = regularization * np.eye(J.shape[2])
+    for t, rows in enumerate(J):
+        M = forgetting * M + rows.T @ rows / 3.0
+        for i in range(t * k, (t + 1) * k):
+            M[i % len(M), i % len(M)] += weight
+        assert np.linalg.eigvalsh(M)[0] >= 0.5 * regularization * (1 - 1e-9)
+    assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-7)
+
+
+@given(st.integers(1, 400), st.floats(0.01, 0.9999), st.floats(1e-6, 1.0))
+def test_the_renewal_holds_every_entry_between_half_and_twice_the_prior(
+    n: int, forgetting: float, regularization: float
+) -> None:
+    k, weight = ExtendedKalman(forgetting=forgetting).renewal(n, regularization)
+    diagonal = np.full(n, regularization)
+    for t in range(min(3 * -(-n // k), 2_000)):
+        diagonal *= forgetting
+        np.add.at(diagonal, np.arange(t * k, (t + 1) * k) % n, weight)
+        assert diagonal.min() >= 0.5 * regularization * (1 - 1e-9)
+        assert diagonal.max() <= 2.0 * regularization
+
+
+def test_a_filter_that_forgets_nothing_renews_nothing() -> None:
+    assert ExtendedKalman().renewal(353, 1.0) == (0, 0.0)
+
+
+def test_a_filter_needs_the_primal_form() -> None:
+    with pytest.raises(IncompatibleError, match=r"learner 'ekf' goes with policy.form 'primal'"):
+        trial("arm", "d_optimal", learner=EKF, policy={"form": "dual"})
+
+
+def test_auto_is_primal_for_a_filter_of_any_size() -> None:
+    spec = trial("arm", "d_optimal", learner=EKF, model={"width": 30}, env={"horizon": 3})
+    fast = KernelTrial(spec)
+    assert fast.state.covariance.upper.shape == (1202, 1202)
+    assert spec.config.memory > 2 * 8 * 1202**2
+
+
+def test_a_filter_that_loses_its_numbers_ends_the_trial() -> None:
+    learner = EKF | {"noise_variance": 1e-308}
+    result = run_trial(trial("pendulum", "random", learner=learner))
+    assert result.diverged_at is not None
+    assert result.final_loss is None
+
+
+def process(
+    env: str, policy: str = "gaussian_process", seed: int = 3, /, **fields: Any
+) -> TrialSpec:
+    """Return a small trial that learns a Gaussian process."""
+    sections = {"model": {"name": "gaussian_process"}, "learner": {"name": "conditioning"}}
+    for key, entries in fields.items():
+        sections[key] = sections.get(key, {}) | entries
+    return trial(env, policy, seed, **sections)
+
+
+def covariance(spec: TrialSpec, states: np.ndarray) -> np.ndarray:
+    """Return K + σ²/dt I at states, (n, d)."""
+    assert isinstance(spec.model, GaussianProcess)
+    phi = spec.system.featurize(states)
+    noise = spec.model.noise_variance(spec.system)
+    return spec.model.kernel(phi, phi) + noise * np.eye(len(states))
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    lengthscale=st.floats(0.3, 3.0),
+    amplitude=st.floats(0.5, 20.0),
+    noise=st.floats(0.005, 0.1),
+)
+def test_the_growing_factor_is_that_of_a_fresh_factorisation(
+    seed: int, lengthscale: float, amplitude: float, noise: float
+) -> None:
+    sizes = {"horizon": 40, "noise": noise}
+    model = {"lengthscale": lengthscale, "amplitude": amplitude}
+    fast = KernelTrial(process("pendulum", "gaussian_process", seed, env=sizes, model=model))
+    fast.advance(40)
+    K = covariance(fast.spec, fast.states[:40])
+    factor = np.tril(fast.state.posterior.factor)
+    assert_close(factor, np.linalg.cholesky(K), abs=1e-8 * amplitude)
+    assert_close(factor @ factor.T, K, abs=1e-12 * amplitude**2)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+def test_the_mean_is_that_of_dense_algebra(env: str) -> None:
+    spec = process(env, env={"noise": 0.02})
+    fast = KernelTrial(spec)
+    fast.advance(30)
+    system, x, u = spec.system, fast.states, fast.record.inputs
+    known = np.stack(
+        [
+            system.known(tuple(a), tuple(b), system.parameters)
+            for a, b in zip(x[:-1], u, strict=True)
+        ]
+    )
+    observed = ((x[1:] - x[:-1]) / system.dt - known)[:, list(system.learned_rows)]
+    at = np.random.default_rng(0).normal(size=(4, system.n_states))
+    assert isinstance(spec.model, GaussianProcess)
+    cross = spec.model.kernel(system.featurize(at), system.featurize(x[:-1]))
+    mean = cross @ np.linalg.solve(covariance(spec, x[:-1]), observed)
+    predicted = spec.model.predict(system, fast.parameters, at)
+    assert predicted == pytest.approx(mean, rel=1e-6, abs=1e-6)
+
+
+def test_stored_parameters_give_the_last_loss() -> None:
+    spec = process("arm")
+    result, grid = run_trial(spec), spec.system.grid()
+    errors = spec.model.predict(spec.system, result.parameters, grid) - spec.system.learned(grid)
+    assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(result.final_loss, rel=1e-9)
+
+
+def test_where_a_trial_is_cut_makes_no_difference() -> None:
+    whole, pieces = KernelTrial(process("arm")), KernelTrial(process("arm"))
+    whole.advance(30)
+    for last in (1, 2, 17, 30):
+        pieces.advance(last)
+    np.testing.assert_array_equal(pieces.record.loss, whole.record.loss)
+    np.testing.assert_array_equal(pieces.parameters, whole.parameters)
+
+
+def test_an_assessment_predicts_with_the_process() -> None:
+    spec = process("arm", env={"horizon": 20})
+    parameters, rng = run_trial(spec).parameters, np.random.default_rng(1)
+    x = rng.normal(size=(5, spec.system.n_states))
+    u = rng.normal(size=(5, 1, spec.system.n_inputs))
+    flow = np.stack(spec.system.known(tuple(x.T), tuple(u[:, 0].T), spec.system.parameters))
+    flow[list(spec.system.learned_rows)] += spec.model.predict(spec.system, parameters, x).T
+    following = model_forecast(spec.system, spec.model, parameters)(x, u)[0]
+    assert following == pytest.approx(x + spec.system.dt * flow.T, rel=1e-12)

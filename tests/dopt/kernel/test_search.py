@@ -1,7 +1,9 @@
-"""Policies that search, against dense linear algebra."""
+"""Policies that search, sample, follow a gradient or linearise, against dense algebra."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -9,15 +11,26 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.evaluation import evaluation_set, reachable_states
 from dopt.kernel.linear_algebra import dense
 from dopt.kernel.run import KernelTrial
-from dopt.policies import Search, TaskOptimal
-from dopt.policies.task_states import task_states
+from dopt.kernel.search.sampling import domain_weight
+from dopt.policies import Exact, Lookahead, Search, TaskOptimal
+from dopt.policies.d_optimal import ascend, is_linear
+from dopt.policies.search import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
+from dopt.policies.task_states import domain_box, goal_weights, task_states
 from dopt.randomness import draw
 from dopt.reference.models import model_function
 from dopt.run import run_trial
+from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
-from tests.dopt.torch_models import for_one
+from dopt.systems import SYSTEMS
+from dopt.systems.properties import eigenmode
+from dopt.types import Array
+from tests.dopt.custom_networks import for_one
+from tests.dopt.kernel.twin import interpreted
+from tests.dopt.oracles.traces import Trace, information, jacobian, model_step, trace
 from tests.dopt.trials import trial
 
 SEARCHES: list[tuple[str, dict[str, Any]]] = [
@@ -50,10 +63,10 @@ def rows_of_candidates(fast: KernelTrial) -> tuple[np.ndarray, np.ndarray]:
         flow = np.array(system.known(tuple(x), tuple(u), system.parameters))
         flow[list(system.learned_rows)] += learned
         states.append(x + system.dt * flow)
-    return candidates, jacobian(fast, np.stack(states))
+    return candidates, torch_jacobian(fast, np.stack(states))
 
 
-def jacobian(fast: KernelTrial, states: np.ndarray) -> np.ndarray:
+def torch_jacobian(fast: KernelTrial, states: np.ndarray) -> np.ndarray:
     """Return J at states, (N, r, q), by automatic differentiation."""
     model = model_function(fast.spec.system, fast.spec.model)
     rows = vmap(jacrev(for_one(model)), (None, 0))(
@@ -74,7 +87,7 @@ def worth(policy: str, fast: KernelTrial, M: np.ndarray, J: np.ndarray) -> float
     if policy == "e_optimal":
         return float(np.linalg.eigvalsh(grown)[0])
     assert isinstance(fast.spec.policy, TaskOptimal)
-    G = jacobian(fast, task_states(fast.spec.system, fast.spec.policy)).reshape(-1, len(M))
+    G = torch_jacobian(fast, task_states(fast.spec.system, fast.spec.policy)).reshape(-1, len(M))
     return -float(np.trace(G @ np.linalg.solve(grown, G.T)))
 
 
@@ -160,3 +173,314 @@ class TestBudget:
 
     def test_with_time_enough_all_plans_are_scored(self) -> None:
         assert np.array_equal(run_trial(self.spec(1e9)).inputs, run_trial(self.spec(0.0)).inputs)
+
+
+@pytest.mark.parametrize("env", SYSTEMS)
+def test_candidates_have_the_largest_norm(env: str) -> None:
+    system = SYSTEMS[env]()
+    candidates = Exact(candidates=12).compared_inputs(system)
+    assert np.linalg.norm(candidates, axis=1) == pytest.approx(system.gamma, rel=1e-12)
+
+
+@pytest.mark.parametrize("env", SYSTEMS)
+def test_a_plan_lasts_a_share_of_the_natural_period(env: str) -> None:
+    system = SYSTEMS[env]()
+    mode = eigenmode(system)
+    steps = Lookahead().steps(system)
+    if mode is None:
+        assert steps == STEPS_WITHOUT_PERIOD
+    else:
+        period = 2 * np.pi / mode.frequency
+        assert abs(steps * system.dt - PERIOD_SHARE * period) <= system.dt / 2
+    assert Lookahead(lookahead=7).steps(system) == 7
+    assert Lookahead(lookahead=27).stride_of(system) == 5
+    assert Lookahead(lookahead=27, stride=2).stride_of(system) == 2
+    assert Lookahead(lookahead=1).stride_of(system) == 1
+
+
+def test_the_states_of_a_task_are_those_that_its_goal_weighs() -> None:
+    system = SYSTEMS["pendulum"]()
+    upright = TaskOptimal(goal=(-3.1, 0.0), radius=0.2, count=20)
+    states = task_states(system, upright)
+    assert states.shape == (20, 2)
+    assert len(np.unique(states, axis=0)) == 20
+    distance = np.abs(np.abs(states[:, 0]) - np.pi) / np.pi  # on the circle: both sides of upright
+    assert distance.mean() < 0.25
+    assert np.abs(states[:, 1] / 8.0).mean() < 0.25
+    assert (states[:, 0] > 0).any()
+    weights = goal_weights(system, upright, np.array([[-3.1, 0.0], [-3.1, 0.2 * 8.0]]))
+    assert weights == pytest.approx([1.0, np.exp(-0.5)])
+
+
+def test_a_task_without_a_goal_draws_from_the_set_that_it_names() -> None:
+    system = SYSTEMS["pendulum"]()
+    reachable = {tuple(state) for state in reachable_states(system)}
+    box = task_states(system, TaskOptimal(count=10**6))
+    assert not any(tuple(state) in reachable for state in box)
+    half_widths = np.array(system.grid_half_widths)
+    assert np.all(np.abs(box) <= half_widths)
+    assert np.all(np.abs(box).max(axis=0) > 0.99 * half_widths)
+    named = task_states(system, TaskOptimal(states="reachable"))
+    assert all(tuple(state) in reachable for state in named)
+
+
+def test_a_task_is_not_told_where_the_model_is_judged() -> None:
+    system = SYSTEMS["pendulum"]()
+    judged = {tuple(state) for state in evaluation_set(system).states}
+    assert not any(tuple(state) in judged for state in task_states(system, TaskOptimal()))
+
+
+def test_of_a_tiny_task_the_nearest_state_is_left() -> None:
+    tiny = TaskOptimal(goal=(1.0, 0.0), radius=1e-300)
+    system = SYSTEMS["pendulum"]()
+    nearest = task_states(system, TaskOptimal(goal=(1.0, 0.0), radius=1e-3, count=1))
+    np.testing.assert_allclose(task_states(system, tiny), nearest, atol=0.2)
+    assert len(task_states(system, tiny)) == 1
+
+
+@pytest.mark.parametrize(
+    ("policy", "fields", "message"),
+    [
+        (
+            "exact",
+            {"candidates": 0},
+            r"policy\.candidates is 0 .* from 1 to 2147483647: set policy\.candidates to a whole",
+        ),
+        ("exact", {"budget_us": -1.0}, r"policy\.budget_us is -1\.0 µs, .* at least 0"),
+        ("exact", {"form": "dual"}, r"form"),
+        ("lookahead", {"criterion": "jont"}, r"policy\.criterion .* did you mean 'joint'"),
+        ("lookahead", {"lookahead": 0}, r"policy\.lookahead is 0 steps, .* 1 to 2147483647: set"),
+        ("task", {"states": "gird"}, r"policy\.states .* did you mean 'grid'"),
+    ],
+)
+def test_a_wrong_field_is_answered_by_one_sentence(
+    policy: str, fields: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(SpecificationError, match=message):
+        trial("pendulum", policy, policy=fields)
+
+
+@pytest.mark.parametrize(
+    ("policy", "fields", "message"),
+    [
+        ("task", {"goal": (1.0,)}, r"policy\.goal has 1 entries, .* has 2: give one for each"),
+        ("lookahead", {"lookahead": 4, "stride": 5}, r"policy\.stride is 5 steps, .* have 4: make"),
+        (
+            "lookahead",
+            {"lookahead": 31},
+            r"policy\.lookahead is 31 steps, but a trial .* has 30: lower",
+        ),
+        ("max", {"lookahead": 31}, r"policy\.lookahead is 31 steps, but a trial .* has 30: lower"),
+    ],
+)
+def test_a_field_that_does_not_fit_the_system_is_answered_by_one_sentence(
+    policy: str, fields: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(IncompatibleError, match=message):
+        trial("pendulum", policy, policy=fields)
+
+
+def test_the_torch_path_does_not_search() -> None:
+    config = trial("pendulum", "lookahead").config
+    with pytest.raises(IncompatibleError, match="'lookahead' runs in the compiled kernel alone"):
+        dataclasses.replace(config, path="reference")
+
+
+def test_plans_along_a_model_in_the_physical_parametrisation() -> None:
+    """What searches runs with least squares of the physical parameters, as the oracle does."""
+    oracle = trial("pendulum", "oracle")
+    policy = Lookahead(lookahead=12, regularization=1e-6)
+    config = TrialConfig(oracle.system, policy, oracle.model, oracle.learner)
+    result = run_trial(dataclasses.replace(oracle, config=config))
+    assert np.isfinite(result.loss).all()
+    assert result.loss[-1] < 0.05 * result.loss[0]
+
+
+@pytest.mark.parametrize("policy", ["exact", "trace", "a_optimal", "e_optimal", "task"])
+def test_random_features_are_searched_by_their_weights_alone(policy: str) -> None:
+    sections = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+    result = run_trial(trial("pendulum", policy, **sections))
+    assert np.isfinite(result.loss).all()
+    assert np.abs(result.inputs) == pytest.approx(2.0)
+
+
+SMALL = {"lookahead": 7, "hold": 3, "stride": 2, "plans": 9, "iterations": 2, "elites": 3}
+GAUSS_NEWTON = {"name": "gauss_newton"}
+
+
+def test_outside_of_the_domain_rows_count_less() -> None:
+    """Beside a box that is never left nothing changes, and one that is does make a difference."""
+    inputs = {}
+    for name, half_widths in (("wide", (7.0, 1e6)), ("narrow", (0.02, 0.02))):
+        for domain in ("everywhere", "box"):
+            fields = SMALL | {"domain": domain, "lookahead": 12, "stride": 6}
+            env = {"grid_half_widths": half_widths, "horizon": 14}
+            spec = trial("pendulum", "icem", 3, env=env, policy=fields)
+            inputs[name, domain] = run_trial(spec).inputs
+    assert np.array_equal(inputs["wide", "box"], inputs["wide", "everywhere"])
+    assert not np.array_equal(inputs["narrow", "box"], inputs["narrow", "everywhere"])
+
+
+def test_the_weight_of_a_state_falls_with_its_distance_from_the_box_on_the_circle() -> None:
+    system = SYSTEMS["arm"]()
+    domain, half = domain_box(system, "box"), np.array(system.grid_half_widths)
+    weight = interpreted(domain_weight)
+    assert weight(domain, half) == 1.0
+    assert weight(domain, half * [1.25, 1.0, 1.0, 1.0]) == pytest.approx(math.exp(-0.5))
+    turned = half + np.array([2 * math.pi, 0.0, -2 * math.pi, 0.0])
+    assert weight(domain, turned) == pytest.approx(1.0)
+
+
+def test_where_every_sampled_plan_leaves_the_bounds_chance_decides() -> None:
+    spec = trial("pendulum", "icem", 3, env={"state_limit": 3.2}, policy=SMALL)
+    inputs = run_trial(spec).inputs
+    assert np.abs(np.abs(inputs[np.isfinite(inputs)]) - spec.system.gamma).max() < 1e-12
+
+
+def test_it_gathers_more_information_than_held_random_inputs() -> None:
+    gained = []
+    for policy, fields in (
+        ("icem", {"lookahead": 20, "hold": 5, "stride": 5}),
+        ("random_held", {}),
+    ):
+        spec = trial("arm", policy, 5, env={"horizon": 100}, policy=fields, learner=GAUSS_NEWTON)
+        result = run_trial(spec)
+        J = np.concatenate(jacobian(spec, result.parameters, result.states[:100]))
+        gained.append(np.linalg.slogdet(1e-3 * np.eye(J.shape[1]) + J.T @ J)[1])
+    assert gained[0] > gained[1] + 20.0
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"lookahead": 31}, "policy.lookahead is 31 steps, but a trial of env 'pendulum' has 30"),
+        ({"stride": 8}, "policy.stride is 8 steps, but the plans have 7"),
+        ({"elites": 10}, "policy.elites is 10, but an iteration draws 9 plans"),
+    ],
+)
+def test_settings_that_make_no_plan_are_refused(fields: dict[str, int], sentence: str) -> None:
+    with pytest.raises(IncompatibleError, match=sentence):
+        trial("pendulum", "icem", policy=SMALL | fields)
+
+
+ENVS = ["pendulum", "cartpole", "arm", "quadrotor"]
+
+
+def circle(gamma: float, m: int) -> Array:
+    angles = np.linspace(0.0, 2 * np.pi, 721)
+    two = gamma * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return two if m == 2 else np.array([[gamma], [-gamma]])
+
+
+@pytest.mark.parametrize("information_of", ["accumulated", "ekf"])
+@pytest.mark.parametrize("env", ENVS)
+def test_no_input_on_the_sphere_gains_more(env: str, information_of: str) -> None:
+    """By log det(M + JᵀJ/ρ) of whole matrices; a filter shares its M with the plan."""
+    filters, rho = information_of == "ekf", 0.1 if information_of == "ekf" else 1.0
+    learner = {"name": "ekf", "noise_variance": rho} if filters else {"name": "adam"}
+    given, small = {"regularization": 0.1}, {"width": 3, "depth": 1}
+    spec = trial(env, "gradient", 2, env={"horizon": 8}, policy=given, model=small, learner=learner)
+    run = trace(spec)
+    for t in (1, 4, 7):
+        M, theta = information(spec, run, t, 0.1), run.parameters[t]
+        if filters:  # which takes the rows before it learns
+            before = run.parameters[:t], run.states[:t]
+            rows = [jacobian(spec, p, x[None])[0] for p, x in zip(*before, strict=True)]
+            M = 0.1 * np.eye(len(M)) + sum(J.T @ J for J in rows) / rho
+        found, *scan = (
+            gain(spec, M, theta, run, t, u, rho)
+            for u in (run.inputs[t], *circle(spec.system.gamma, spec.system.n_inputs))
+        )
+        assert np.linalg.norm(run.inputs[t]) == pytest.approx(spec.system.gamma)
+        assert found >= max(scan) - 1e-3 * np.ptp(scan)
+
+
+def gain(spec: object, M: Array, theta: Array, run: Trace, t: int, u: Array, rho: float) -> float:
+    """Return log det[M + J(x(u))ᵀ J(x(u))/ρ]."""
+    x = model_step(spec, theta, run.states[t], u)  # type: ignore[arg-type]
+    J = jacobian(spec, theta, x[None])[0]  # type: ignore[arg-type]
+    return float(np.linalg.slogdet(M + J.T @ J / rho)[1])
+
+
+def test_ascent_ends_at_the_top_axis_of_a_quadratic_form() -> None:
+    Q = np.diag([1.0, 2.0, 5.0])
+    for start in ([1.0, 1.0, 0.3], [-1.0, 0.2, -0.1]):
+        previous = -np.inf
+        for iterations in (0, 3, 10, 60):
+            given = (np.array(start), 0.5, iterations)
+            value, u = ascend(lambda v: (v @ Q @ v, 2.0 * Q @ v), *given)
+            assert value >= previous
+            assert np.linalg.norm(u) == pytest.approx(np.linalg.norm(start))
+            previous = value
+        assert value == pytest.approx(5.0 * np.sum(np.square(start)), rel=1e-6)
+
+
+def linear_trial(policy: str, seed: int = 0, **env: Any) -> TrialSpec:
+    return trial(
+        "mass_spring",
+        policy,
+        seed,
+        env=env,
+        policy={"regularization": 1e-3},
+        model={"name": "linear_state"},
+        learner={"name": "recursive_least_squares"},
+    )
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_d_optimal_policy_recovers_the_linear_one_exactly(seed: int) -> None:
+    """Section 2: "we recover the D-optimal exploration algorithm of [7]"."""
+    general, closed = (
+        run_trial(linear_trial(policy, seed, horizon=80)) for policy in ("d_optimal", "linear")
+    )
+    assert closed.inputs == pytest.approx(general.inputs, rel=0.0, abs=1e-7)
+    assert closed.states == pytest.approx(general.states, rel=0.0, abs=1e-7)
+    assert closed.loss == pytest.approx(general.loss, rel=1e-5)
+    assert len(np.unique(closed.inputs.round(6), axis=0)) > 50
+
+
+def test_no_input_on_the_circle_grows_the_determinant_more() -> None:
+    spec = linear_trial("linear", 3)
+    system, run = spec.system, trace(spec)
+    gram = 1e-3 * np.eye(4)
+    angles = np.linspace(0.0, 2 * np.pi, 721)
+    circle = system.gamma * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    for t in range(12):
+        x, theta = run.states[t], run.parameters[t]
+        gains = [_log_det(spec, theta, gram, x, u) for u in (run.inputs[t], *circle)]
+        if t > 0:
+            assert gains[0] >= max(gains[1:]) - 1e-9
+        z = system.featurize(x[None])[0]
+        gram += np.outer(z, z)
+
+
+def _log_det(
+    spec: TrialSpec, theta: np.ndarray, gram: np.ndarray, x: np.ndarray, u: np.ndarray
+) -> float:
+    """Return log det(Γ + x(u) x(u)ᵀ) with the current estimate in x(u)."""
+    system = spec.system
+    step = np.array(system.known(tuple(x), tuple(u), system.parameters))
+    step[list(system.learned_rows)] += spec.model.predict(system, theta, x[None])[0]
+    z = system.featurize((x + system.dt * step)[None])[0]
+    return float(np.linalg.slogdet(gram + np.outer(z, z))[1])
+
+
+def test_the_estimate_tends_to_the_true_matrix() -> None:
+    spec = linear_trial("linear", 1, horizon=200)
+    system = spec.system
+    assert system.name == "mass_spring"
+    found = run_trial(spec).parameters.reshape(2, 4) / np.array(system.feature_scales)
+    k, c = system.parameters[1:]
+    true = [[-2 * k, -2 * c, k, c], [k, c, -2 * k, -2 * c]]
+    assert found == pytest.approx(np.array(true), abs=0.02)
+
+
+def test_only_linear_systems_are_linear() -> None:
+    assert [name for name, system in SYSTEMS.items() if is_linear(system())] == ["mass_spring"]
+    with pytest.raises(IncompatibleError, match="policy 'linear' needs dynamics that are linear"):
+        trial("arm", "linear")
+
+
+def test_the_linear_policy_takes_the_linear_model() -> None:
+    with pytest.raises(IncompatibleError, match="goes with model 'linear_state'"):
+        trial("mass_spring", "linear", model={"name": "rff"})

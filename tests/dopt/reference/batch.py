@@ -12,7 +12,7 @@ from torch.func import jacrev, vmap
 from dopt.randomness import draw
 from dopt.reference.models import BatchModel, model_function
 from dopt.spec.trial import TrialSpec
-from tests.dopt.torch_models import for_one
+from tests.dopt.custom_networks import for_one
 
 
 class Situation(NamedTuple):

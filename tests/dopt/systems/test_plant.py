@@ -1,21 +1,26 @@
-"""Plants are declared by names, units and expressions, and refused in a sentence."""
+"""Plants declared by expressions, evaluation grids, and what a model may know."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import pickle
 import re
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dopt import Plant
+from dopt.assessment import true_parameters
 from dopt.errors import SpecificationError
 from dopt.kernel.equations import compiled_equations
-from dopt.systems import system_from_mapping
+from dopt.systems import SYSTEMS, Chain, System, system_from_mapping
 from dopt.systems.plant import compiled_text
 from tests.dopt.explorer.plants import MOTOR
+from tests.dopt.systems.strategies import NAMES, inputs, states, systems, vectors
 
 CRANE = Plant(
     states={"place": "m", "speed": "m/s", "tilt": "rad", "spin": "rad/s"},
@@ -208,3 +213,159 @@ def test_names_of_arguments_may_be_quantities() -> None:
 def test_expressions_keep_their_order() -> None:
     function = compiled_text({"first": "a - b", "second": "2**b"}, {"x": ["a", "b"], "p": []})
     assert function((5, 3), ()) == (2, 8)
+
+
+full = pytest.mark.parametrize(
+    "name", [name for name in NAMES if not SYSTEMS[name].low_discrepancy]
+)
+
+
+@full
+@given(data=st.data())
+def test_the_grid_fills_its_box_evenly(name: str, data: st.DataObject) -> None:
+    cls = SYSTEMS[name]
+    axes = len(cls.grid_indices)
+    counts = tuple(data.draw(st.lists(st.integers(1, 5), min_size=axes, max_size=axes)))
+    widths = tuple(data.draw(st.lists(st.floats(0.1, 9.0), min_size=axes, max_size=axes)))
+    system = cls(grid_points=counts, grid_half_widths=widths)
+    grid = system.grid()
+    assert grid.shape == (math.prod(counts), system.n_states)
+    assert len(np.unique(grid, axis=0)) == len(grid)
+    for index, count, width in zip(cls.grid_indices, counts, widths, strict=True):
+        cells = (grid[:, index] + width) / (2 * width) * count
+        assert cells - np.floor(cells) == pytest.approx(0.5)
+        assert np.bincount(np.floor(cells).astype(int)).tolist() == [len(grid) // count] * count
+    others = [i for i in range(system.n_states) if i not in cls.grid_indices]
+    assert not grid[:, others].any()
+
+
+@full
+def test_the_mean_over_the_grid_tends_to_the_mean_over_the_box(name: str) -> None:
+    cls = SYSTEMS[name]
+    widths = np.array(cls().grid_half_widths)
+    exact = np.prod(np.sin(widths / 3) / (widths / 3))
+    errors = []
+    for n in (8, 16):
+        grid = cls(grid_points=(n,) * len(widths)).grid()[:, list(cls.grid_indices)]
+        errors.append(abs(np.cos(grid / 3).prod(axis=1).mean() - exact))
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.5)
+
+
+@settings(max_examples=20)
+@given(st.integers(1, 4), st.integers(0, 9))
+def test_a_low_discrepancy_set_takes_every_midpoint_of_every_axis_once(
+    n_links: int, exponent: int
+) -> None:
+    n = 2**exponent
+    chain = Chain(n_links=n_links, grid_points=(n,), grid_half_widths=(1.5, 4.0))
+    grid = chain.grid()
+    assert grid.shape == (n, 2 * n_links)
+    for column, width in zip(grid.T, chain.grid_half_widths, strict=True):
+        midpoints = (2 * np.arange(n) + 1 - n) / n * width
+        assert np.sort(column) == pytest.approx(midpoints, abs=1e-12)
+
+
+def test_a_low_discrepancy_set_is_closer_to_the_mean_over_the_box_than_random_points() -> None:
+    widths = np.array([1.0, 2.0] * 5)
+    exact = np.prod(np.sin(widths / 3) / (widths / 3))
+    random = np.random.default_rng(0).uniform(-widths, widths, (100, 1024, 10))
+    grid = Chain(grid_points=(1024,), grid_half_widths=(1.0, 2.0)).grid()
+    errors = np.abs(np.cos(random / 3).prod(axis=-1).mean(axis=1) - exact)
+    assert abs(np.cos(grid / 3).prod(axis=1).mean() - exact) < 0.1 * np.median(errors)
+
+
+def test_the_number_of_points_of_a_low_discrepancy_set_is_a_power_of_two() -> None:
+    with pytest.raises(
+        SpecificationError, match=r"grid_points is \[1000\], .* set it to 512 or 1024"
+    ):
+        Chain(grid_points=(1000,))
+
+
+EACH_SYSTEM = pytest.mark.parametrize("name", NAMES)
+
+
+def regressors(system: System, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the offset, (r,), and Psi, (r, number of parameters)."""
+    point = system.points(x[None], u[None])[0]
+    offset, *units = (np.array(system.accelerations(tuple(point), p)) for p in system.linear_form)
+    return offset, np.stack(units, axis=-1) - offset[:, None]
+
+
+@EACH_SYSTEM
+@settings(max_examples=50)
+@given(data=st.data())
+def test_accelerations_are_affine_in_the_linear_parameters(name: str, data: st.DataObject) -> None:
+    system, x, u = data.draw(systems(name)), data.draw(states(name)), data.draw(inputs(name))
+    offset, psi = regressors(system, x, u)
+    theta = data.draw(vectors(len(system.linear_parameters), 5.0).map(np.abs))
+    values = dict(zip(system.physical, system.parameters, strict=True))
+    values |= dict(zip(system.linear_parameters, theta.tolist(), strict=True))
+    scale = 1.0 + np.abs(offset) + np.abs(psi) @ theta
+    point = (*x, *u) if system.reads_inputs else tuple(x)
+    expected = np.array(system.accelerations(point, tuple(values.values())))
+    assert (offset + psi @ theta) / scale == pytest.approx(expected / scale, abs=1e-12)
+    assert offset + psi @ true_parameters(system) == pytest.approx(
+        system.learned(x[None], inputs=u[None])[0], rel=1e-12, abs=1e-12 * scale.max()
+    )
+
+
+@EACH_SYSTEM
+def test_the_linear_parameters_can_be_told_apart_on_the_grid(name: str) -> None:
+    system = SYSTEMS[name]()
+    u = np.full(system.n_inputs, system.gamma)
+    psi = np.concatenate([regressors(system, x, u)[1] for x in system.grid()])
+    assert np.linalg.matrix_rank(psi) == len(system.linear_parameters)
+
+
+@EACH_SYSTEM
+@settings(max_examples=50)
+@given(data=st.data())
+def test_the_input_enters_linearly(name: str, data: st.DataObject) -> None:
+    system, x = data.draw(systems(name)), data.draw(states(name))
+    u, factor = data.draw(inputs(name)), data.draw(st.floats(-3.0, 3.0))
+    rest = system.derivative(x, np.zeros(system.n_inputs))
+    change = system.derivative(x, u) - rest
+    scaled = system.derivative(x, factor * u) - rest
+    assert scaled == pytest.approx(factor * change, abs=1e-10 * (1 + np.abs(rest).max()))
+
+
+@EACH_SYSTEM
+@settings(max_examples=50)
+@given(data=st.data())
+def test_accelerations_depend_on_the_state_through_the_features_alone(
+    name: str, data: st.DataObject
+) -> None:
+    system, x = data.draw(systems(name)), data.draw(states(name))
+    moved = x.copy()
+    for index in system.angle_indices:
+        moved[index] += 2 * np.pi * data.draw(st.integers(-3, 3))
+    unseen = set(range(system.n_states)) - {feature.index for feature in system.features}
+    for index in unseen:
+        moved[index] = data.draw(st.floats(-10.0, 10.0))
+    both = np.stack([x, moved])
+    phi = system.featurize(both)
+    assert phi[1] == pytest.approx(phi[0], abs=1e-13)
+    first, second = system.learned(both)
+    assert second == pytest.approx(first, abs=1e-9 * (1.0 + np.abs(first).max()))
+
+
+@EACH_SYSTEM
+def test_features_are_of_order_one_on_the_grid(name: str) -> None:
+    system = SYSTEMS[name]()
+    sizes = np.abs(system.featurize(system.grid())).max(axis=0)
+    assert np.all((sizes > 0.3) & (sizes <= 1.0))
+
+
+@EACH_SYSTEM
+@settings(max_examples=20)
+@given(data=st.data())
+def test_one_state_and_many_states_give_the_same_accelerations(
+    name: str, data: st.DataObject
+) -> None:
+    system = data.draw(systems(name))
+    some = np.stack([data.draw(states(name)) for _ in range(3)])
+    for x, row in zip(some, system.learned(some), strict=True):
+        flow = system.derivative(x, np.zeros(system.n_inputs))
+        known = np.array(system.known(tuple(x), (0.0,) * system.n_inputs, system.parameters))
+        rows = list(system.learned_rows)
+        assert (flow - known)[rows] == pytest.approx(row, rel=1e-12, abs=1e-10)

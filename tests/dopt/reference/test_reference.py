@@ -1,0 +1,421 @@
+"""Torch path: D-optimal plans, derivatives, information, learning, own modules."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.func import jacrev, jvp, vmap
+
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.models import MLP
+from dopt.policies import POLICIES
+from dopt.reference import batch as reference
+from dopt.reference.batch import Lockstep, run_trials
+from dopt.reference.models import (
+    BatchModel,
+    gradients_and_changes,
+    jacobian,
+    model_function,
+    network_function,
+)
+from dopt.reference.planning import (
+    SMALL,
+    BatchInformation,
+    d_optimal_inputs,
+    planning_columns,
+    quadratic_problem,
+)
+from dopt.run import rerun, run_trial
+from dopt.spec.config import TrialConfig
+from dopt.spec.trial import TrialSpec
+from dopt.sphere import maximize_on_sphere
+from dopt.systems import SYSTEMS
+from tests.dopt.custom_networks import for_one
+from tests.dopt.reference.batch import Situation, situation, sphere, step_from
+from tests.dopt.trials import PAIRS, SMALL_SEARCHES, trial
+from tests.paths import EXAMPLE
+
+CASES = [(env, policy) for env, policy in PAIRS if policy in ("d_optimal", "oracle")]
+
+
+def gradients(now: Situation, x: Tensor) -> Tensor:
+    """Return J = ∂a/∂θ at n states, (n, r, q)."""
+    return vmap(jacrev(for_one(now.model)), (None, 0))(now.theta, x)
+
+
+@functools.cache
+def pieces(spec: TrialSpec, seed: int) -> tuple[Tensor, Tensor]:
+    """Return J, (r, q), and D B, (r, q, m), at x̄, both of D and B by central differences."""
+    system, now = spec.system, situation(spec, seed)
+    zero = torch.zeros(system.n_inputs, dtype=torch.float64)
+    bar = step_from(spec, now, zero)
+    at_bar = now._replace(state=bar)
+    B = torch.stack(
+        [(step_from(spec, at_bar, e) - step_from(spec, at_bar, -e)) / 2 for e in _axes(zero)], dim=1
+    )
+    step = 1e-5
+    moved = step * _axes(bar)
+    D = (gradients(now, bar + moved) - gradients(now, bar - moved)) / (2 * step)
+    return gradients(now, bar[None])[0], D.permute(1, 2, 0) @ B
+
+
+def _axes(like: Tensor) -> Tensor:
+    return torch.eye(len(like), dtype=torch.float64)
+
+
+class Solved(BatchInformation):
+    """Matrices, (n, s, s), with which systems of equations are solved as they are."""
+
+    def __init__(self, matrices: Tensor) -> None:
+        self._matrices = matrices
+
+    def solve(self, columns: Tensor) -> Tensor:
+        return torch.linalg.solve(self._matrices, columns)
+
+
+def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return Q, v and the chosen input of the reference."""
+    given = now.theta[None], now.state[None], torch.tensor([component])
+    columns = planning_columns(spec.system, now.model, *given)
+    problem = quadratic_problem(columns, Solved(now.information[None]))
+    ties = torch.ones(1, spec.system.n_inputs, dtype=torch.float64)
+    u = d_optimal_inputs(problem, spec.system.gamma, ties)
+    return problem.Q[0], problem.v[0], u[0]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("env", "policy"), CASES)
+def test_the_problem_is_made_of_finite_differences_of_the_gradient(
+    env: str, policy: str, seed: int
+) -> None:
+    spec = trial(env, policy)
+    now = situation(spec, seed)
+    inverse = torch.linalg.inv(now.information)
+    for component, (g, DB) in enumerate(zip(*pieces(spec, seed), strict=True)):
+        Q, v, _ = solve(spec, now, component)
+        # Difference quotients of |v| v and of products lose half of the digits.
+        scale = float((DB.mT @ inverse @ DB).abs().max() + (DB.mT @ inverse @ g).abs().max())
+        assert torch.allclose(Q, DB.mT @ inverse @ DB, rtol=0.0, atol=1e-6 * scale)
+        assert torch.allclose(v, -DB.mT @ inverse @ g, rtol=0.0, atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("env", "policy"), CASES)
+def test_no_input_on_the_sphere_has_a_larger_linearised_gain(
+    env: str, policy: str, seed: int
+) -> None:
+    spec = trial(env, policy)
+    now, gamma = situation(spec, seed), spec.system.gamma
+    for component, (g, DB) in enumerate(zip(*pieces(spec, seed), strict=True)):
+        columns = torch.column_stack([g, DB])
+        form = columns.mT @ torch.linalg.solve(now.information, columns)
+
+        def gain(u: Tensor, form: Tensor = form) -> Tensor:
+            """Return rowᵀ M⁻¹ row for the row g + D B u, of each of the inputs."""
+            weights = torch.cat([torch.ones(len(u), 1, dtype=torch.float64), u], dim=1)
+            return ((weights @ form) * weights).sum(-1)
+
+        u = solve(spec, now, component)[2]
+        scan = sphere(gamma, spec.system.n_inputs)
+        assert u.norm().item() == pytest.approx(gamma, rel=1e-12)
+        assert gain(u[None]) >= gain(scan).max() - 1e-7 * gain(u[None]).abs()
+
+
+def test_the_linearised_gain_is_the_gain_to_first_order_in_the_step() -> None:
+    """Proposition 1: the difference falls with dt², while what the input changes falls with dt."""
+    for env in ("pendulum", "cartpole", "arm", "quadrotor"):
+        errors, effects = zip(*(_gap_and_effect(env, dt) for dt in (4e-3, 2e-3, 1e-3)), strict=True)
+        for coarse, fine in ((0, 1), (1, 2)):
+            assert errors[coarse] / errors[fine] == pytest.approx(4.0, rel=0.15), env
+            assert effects[coarse] / effects[fine] == pytest.approx(2.0, rel=0.1), env
+        assert errors[2] < 0.1 * effects[2]
+
+
+def _gap_and_effect(env: str, dt: float) -> tuple[float, float]:
+    """Return |exact - linearised| gain of one component, and how much the input changes it."""
+    spec = trial(env, "d_optimal")
+    system = dataclasses.replace(spec.system, dt=dt)
+    spec = TrialSpec(TrialConfig(system, spec.policy, spec.model, spec.learner))
+    now, component = situation(spec, 6), system.n_learned - 1
+    J, DBs = pieces(spec, 6)
+    g, DB = J[component], DBs[component]
+    u = torch.full((system.n_inputs,), system.gamma / system.n_inputs**0.5, dtype=torch.float64)
+
+    def logdet(row: Tensor) -> float:
+        return float(torch.logdet(now.information + torch.outer(row, row)))
+
+    exact, opposite = (
+        logdet(gradients(now, step_from(spec, now, sign * u)[None])[0, component])
+        for sign in (1, -1)
+    )
+    return abs(exact - logdet(g + DB @ u)), abs(exact - opposite)
+
+
+def test_each_trial_of_a_batch_has_its_own_problem() -> None:
+    spec = trial("arm", "d_optimal")
+    several = [situation(spec, seed) for seed in range(3)]
+    theta, x = (torch.stack([now[i] for now in several]) for i in (1, 2))
+    columns = planning_columns(spec.system, several[0].model, theta, x, torch.tensor([0, 1, 1]))
+    information = Solved(torch.stack([now.information for now in several]))
+    problem = quadratic_problem(columns, information)
+    ties = torch.ones(3, 2, dtype=torch.float64)
+    inputs = d_optimal_inputs(problem, spec.system.gamma, ties)
+    for i, component in enumerate((0, 1, 1)):
+        Q, v, u = solve(spec, several[i], component)
+        assert torch.allclose(problem.Q[i], Q, rtol=1e-12)
+        assert torch.allclose(problem.v[i], v, rtol=1e-12)
+        expected = maximize_on_sphere(Q.numpy(), v.numpy(), spec.system.gamma, ties[i].numpy())
+        assert inputs[i].numpy() == pytest.approx(expected, rel=1e-9)
+        assert u.numpy() == pytest.approx(expected)
+
+
+MODELS = ["mlp", "linear"]
+
+
+def items(model: str, n: int, points: int) -> tuple[BatchModel, int, torch.Tensor, torch.Tensor]:
+    """Return a model of the arm, its number of outputs, parameters (n, q) and points (n, N, ·)."""
+    learner = "recursive_least_squares" if model == "linear" else "adam_window"
+    policy = "oracle" if model == "linear" else "random"
+    spec = trial("arm", policy, model={"name": model}, learner={"name": learner})
+    rng = np.random.default_rng(1)
+    theta = torch.tensor(rng.normal(size=(n, spec.model.n_parameters(spec.system))))
+    x = torch.tensor(rng.normal(size=(n, points, spec.system.n_states)))
+    return model_function(spec.system, spec.model), spec.system.n_learned, theta, x
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_rows_are_those_of_each_item(model: str) -> None:
+    function, r, theta, points = items(model, 3, 4)
+    found = jacobian(function, r, theta, points)
+    for i in range(3):
+        for j in range(4):
+            one = jacrev(for_one(function))(theta[i], points[i, j])
+            torch.testing.assert_close(found[i, j], one, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_changes_of_a_gradient_are_those_of_each_item(model: str) -> None:
+    function, _, theta, points = items(model, 5, 1)
+    components = torch.tensor([0, 1, 1, 0, 1])
+    directions = torch.tensor(np.random.default_rng(2).normal(size=points[:, 0].shape))
+    g, changes = gradients_and_changes(function, theta, points[:, 0], components, directions)
+    for i, k in enumerate(components.tolist()):
+
+        def gradient(x: torch.Tensor, i: int = i, k: int = k) -> torch.Tensor:
+            J: torch.Tensor = jacrev(for_one(function))(theta[i], x)
+            return J[k]
+
+        value, change = jvp(gradient, (points[i, 0],), (directions[i],))
+        torch.testing.assert_close(g[i], value, rtol=1e-10, atol=1e-12)
+        torch.testing.assert_close(changes[i], change, rtol=1e-9, atol=1e-12)
+
+
+def test_a_model_whose_slope_is_free_of_its_parameters_does_not_change_its_gradient() -> None:
+    """A = x₁ + θ: neither the slope nor the gradient holds the other."""
+
+    def model(theta: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        return x[..., :1] + theta.unsqueeze(1)
+
+    one = torch.ones(2, 1, dtype=torch.float64)
+    k = torch.zeros(2, dtype=torch.long)
+    g, change = gradients_and_changes(model, one, one.expand(2, 3), k, one.expand(2, 3))
+    assert torch.equal(g, one)
+    assert torch.equal(change, torch.zeros_like(one))
+
+
+def test_a_network_that_does_not_use_a_parameter_has_zeros_there() -> None:
+    class Partly(torch.nn.Linear):
+        def __init__(self) -> None:
+            super().__init__(3, 1, dtype=torch.float64)
+            self.unused = torch.nn.Parameter(torch.ones(2, dtype=torch.float64))
+
+    function = network_function(SYSTEMS["pendulum"](), Partly())
+    theta, x = torch.ones(2, 6, dtype=torch.float64), torch.ones(2, 3, 2, dtype=torch.float64)
+    J = jacobian(function, 1, theta, x)
+    assert torch.equal(J[..., 4:], torch.zeros_like(J[..., 4:]))
+    assert bool((J[..., :4] != 0).all())
+
+
+SIZES = (7, SMALL, SMALL + 1, 150)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_it_solves_as_a_fresh_factorisation(size: int) -> None:
+    rng = torch.Generator().manual_seed(size)
+    M = 0.1 * torch.eye(size, dtype=torch.float64).repeat(3, 1, 1)
+    information = BatchInformation(0.1, M[:, 0])
+    scales = torch.logspace(-1.5, 1.5, size, dtype=torch.float64)
+    for step in range(48):
+        rows = torch.randn(3, 1 + step % 3, size, generator=rng, dtype=torch.float64) * scales
+        information.add(rows)
+        M = M + rows.mT @ rows
+        columns = torch.randn(3, size, 2, generator=rng, dtype=torch.float64)
+        expected = torch.linalg.solve(M, columns)
+        gap = (information.solve(columns) - expected).abs().max() / expected.abs().max()
+        assert gap < 1e-8
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_trial_without_a_factor_has_no_solution_and_the_others_keep_theirs(size: int) -> None:
+    information = BatchInformation(1.0, torch.zeros(2, size, dtype=torch.float64))
+    rows, columns = torch.ones(2, 1, size).double(), torch.ones(2, size, 1).double()
+    rows[0] = torch.nan
+    information.add(rows)
+    solved = information.solve(columns)
+    assert solved[0].isnan().all()
+    assert solved[1].isfinite().all()
+
+
+def test_the_steps_are_those_of_the_optimizer_of_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    rule = {"name": "adam", "learning_rate": 0.03, "beta_1": 0.8, "beta_2": 0.95, "epsilon": 1e-6}
+    specs = [trial("pendulum", "random", seed, learner=rule) for seed in (1, 2)]
+    batch = reference.Lockstep(specs)
+    slopes = torch.tensor(np.random.default_rng(0).normal(size=(30, *batch.theta.shape)))
+    theirs, left = batch.theta.clone(), iter(slopes)
+    monkeypatch.setattr(reference, "loss_gradient", lambda *_: next(left))
+    optimizer = torch.optim.Adam([theirs], lr=0.03, betas=(0.8, 0.95), eps=1e-6, foreach=False)
+    for t, slope in enumerate(slopes):
+        batch.learn(t)
+        theirs.grad = slope
+        optimizer.step()
+        assert torch.equal(batch.theta, theirs)
+
+
+HERE = "tests.dopt.custom_networks"
+
+
+def specification(
+    target: str = "Stack", seed: int = 0, policy: str = "d_optimal", **arguments: Any
+) -> TrialSpec:
+    return TrialSpec.from_mapping(
+        {
+            "env": {"name": "cartpole", "horizon": 20, "grid_points": [3, 4, 3]},
+            "policy": {"name": policy},
+            "model": {"_target_": target if "." in target else f"{HERE}.{target}", **arguments},
+            "learner": {"name": "adam_window"},
+            "seed": seed,
+        }
+    )
+
+
+@pytest.mark.parametrize("env", SYSTEMS)
+def test_a_network_predicts_what_the_shipped_one_does(env: str) -> None:
+    model, system = specification(width=5, depth=3).model, SYSTEMS[env]()
+    shipped, rng = MLP(width=5, depth=3), np.random.default_rng(0)
+    theta = rng.normal(size=shipped.n_parameters(system))
+    states = rng.normal(size=(7, system.n_states))
+    assert model.n_parameters(system) == len(theta)
+    predicted, expected = (one.predict(system, theta, states) for one in (model, shipped))
+    np.testing.assert_allclose(predicted, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random"])
+@torch.no_grad()
+def test_a_trial_with_it_is_that_of_the_shipped_network(policy: str) -> None:
+    spec = specification(policy=policy)
+    shipped = TrialSpec.from_mapping(spec.to_mapping() | {"model": {"name": "mlp"}})
+    batch, own = Lockstep([shipped]), run_trial(spec)
+    batch.theta.copy_(Lockstep([spec]).theta)
+    for t in range(spec.system.horizon):
+        batch.step(t)
+    np.testing.assert_allclose(own.states, batch.states[0].numpy(), rtol=1e-9)
+    np.testing.assert_allclose(own.loss, batch.columns["loss"][0], rtol=1e-9)
+    assert own.loss[-1] < own.loss[0]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_policy_runs_with_it_or_says_why_not(policy: str) -> None:
+    mapping = specification(policy="random", width=4).to_mapping()
+    mapping["env"] = {"name": "pendulum", "horizon": 6, "grid_points": [4, 4]}
+    given = {"name": policy, **SMALL_SEARCHES.get(policy, {})}
+    try:
+        spec = TrialSpec.from_mapping(mapping | {"policy": given})
+    except IncompatibleError as error:
+        assert str(error).startswith(f"policy '{policy}' ")  # noqa: PT017  # the rest runs
+        return
+    result = run_trial(spec)
+    assert np.isfinite(result.loss).all()
+
+
+def test_the_seed_alone_gives_the_initial_parameters() -> None:
+    torch.manual_seed(1)
+    first = Lockstep([specification(policy="random")]).theta
+    torch.manual_seed(2)
+    expected = torch.rand(1)
+    torch.manual_seed(2)
+    second = Lockstep([specification(policy="d_optimal")]).theta
+    assert torch.equal(torch.rand(1), expected), "torch's own generator was touched"
+    assert torch.equal(first, second)
+    assert not torch.equal(first, Lockstep([specification(seed=1)]).theta)
+
+
+def test_a_batch_holds_networks_with_initial_parameters_of_their_own() -> None:
+    specs = [specification(seed=seed) for seed in range(2)]
+    for together, spec in zip(run_trials(specs), specs, strict=True):
+        np.testing.assert_allclose(together.states, run_trial(spec).states, rtol=1e-9)
+
+
+def test_the_trial_comes_back_from_its_mapping_and_from_another_process() -> None:
+    spec = specification(width=7)
+    again = TrialSpec.from_mapping(spec.to_mapping())
+    sent = pickle.loads(pickle.dumps(spec))
+    assert again.trial_key == spec.trial_key == sent.trial_key
+    assert spec.config.path == "reference"
+    assert spec.columns()["model"] == "Stack"
+    assert spec.trial_key != specification(width=8).trial_key
+
+
+def test_another_state_of_its_file_is_another_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    before = specification("networks.Residual")
+    text = (EXAMPLE / "networks.py").read_text()
+    (tmp_path / "networks.py").write_text(text + "\n# changed\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.modules.pop("networks")
+    after = specification("networks.Residual")
+    sys.modules.pop("networks")
+    assert after.trial_key != before.trial_key
+    with pytest.raises(SpecificationError, match="another state of its file"):
+        TrialSpec.from_mapping(before.to_mapping())
+    assert "networks" not in sys.modules, "the other file has not run"
+
+
+def test_a_replay_leads_through_the_same_states() -> None:
+    spec = specification()
+    seen, whole = rerun(spec, [0, 5, 20]), run_trial(spec)
+    np.testing.assert_array_equal(seen.states, whole.states)
+    np.testing.assert_array_equal(seen.parameters[-1], whole.parameters)
+    assert seen.steps.tolist() == [0, 5, 20]
+
+
+@pytest.mark.parametrize(
+    ("target", "arguments", "sentence"),
+    [
+        ("nowhere.Net", {}, "cannot be imported"),
+        ("Stakc", {}, "cannot be imported"),
+        ("itertools", {}, "a class derived from torch.nn.Module is expected"),
+        ("Stack", {"widht": 3}, "unexpected keyword argument 'widht'"),
+        ("Stack", {"name": "mlp"}, "is called 'Stack'"),
+        ("Stack", {"width": float("nan")}, "finite numbers, texts and lists"),
+        ("Wide", {}, r"maps 4 features to shape \(2,\) is expected, and it gave: \(3,\)"),
+        ("Empty", {}, "has parameters is expected"),
+        ("Broken", {}, "no way from 4 features"),
+    ],
+)
+def test_a_wrong_network_is_refused_in_a_sentence(
+    target: str, arguments: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(SpecificationError, match=sentence) as caught:
+        specification(target, **arguments)
+    assert "model." in str(caught.value)

@@ -1,0 +1,329 @@
+"""Checks before a trial runs: names, numbers, scales and memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from dopt.errors import ScaleWarning, SpecificationError
+from dopt.fields import parameter
+from dopt.kernel.state_from_spec import empty_record, initial_state
+from dopt.randomness import draw
+from dopt.spec.config import LARGEST_HORIZON
+from dopt.spec.custom_system import check_system, warn_of_scale
+from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS, Feature, Pendulum, System
+from dopt.systems.elementary import where
+from tests.dopt.trials import PAIRS, covering, trial
+
+
+def quadratic(state: Any, parameters: Any) -> tuple[Any, ...]:
+    return (-(parameters[3] ** 2) * state[1],)
+
+
+def divided(state: Any, parameters: Any) -> tuple[Any, ...]:
+    return (-state[1] / parameters[3],)
+
+
+def of_the_product(state: Any, parameters: Any) -> tuple[Any, ...]:
+    return (-parameters[1] * parameters[3] * state[1],)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("attributes", "sentence"),
+    [
+        (
+            {"linear_parameters": ("frition",)},
+            r"linear_parameters of env 'pendulum' names 'frition', .* did you mean 'friction'",
+        ),
+        (
+            {"physical": ("mass", "lenth", "gravity", "friction")},
+            r"physical of env 'pendulum' names 'lenth', but Broken has no attr.* lenth: float = pa",
+        ),
+        ({"accelerations": quadratic, "linear_parameters": ("friction",)}, "not affine in them"),
+        ({"accelerations": divided, "linear_parameters": ("friction",)}, "not affine in them"),
+        (
+            {"accelerations": of_the_product, "linear_parameters": ("length", "friction")},
+            r"linear_parameters of env 'pendulum' are length, friction, but .* not affine in them",
+        ),
+    ],
+)
+def test_wrong_names_of_parameters_are_refused(attributes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(SpecificationError, match=sentence):
+        check_system(broken_system(**attributes))
+
+
+def test_a_product_is_affine_in_each_parameter_alone() -> None:
+    check_system(broken_system(accelerations=of_the_product, linear_parameters=("friction",)))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("attributes", "sentence"),
+    [
+        (
+            {"accelerations": lambda state, *_: (1.0 / state[1],), "compiled": False},
+            r"^accelerations\(\) of env 'pendulum' gives inf for the derivative of .* at the "
+            r"initial state, .* = 0.001, .* = 0, but a finite number is expected: .*initial_state",
+        ),
+        (
+            {"accelerations": lambda state, *_: ((state[1] + 1.5) ** 0.5,)},
+            r"gives nan .* at a state of the evaluation grid, .* = -.*, .* env\.grid_half_widths",
+        ),
+        (
+            {"known": lambda state, inputs, *_: (state[1], inputs[0] / state[1])},
+            r"^known\(\) of env 'pendulum' gives nan .* at the initial state",
+        ),
+    ],
+)
+def test_equations_without_numbers_are_refused(attributes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(SpecificationError, match=sentence):
+        check_system(broken_system(**attributes))
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_pole_that_no_trial_begins_at_and_no_grid_has_is_accepted() -> None:
+    check_system(broken_system(accelerations=lambda x, *_: (where(x[1] > 50, np.inf, 0.0),)))
+
+
+def broken_system(**attributes: Any) -> System:
+    """Return a pendulum of another class, with some of its attributes replaced."""
+    functions = {
+        name: staticmethod(value) if callable(value) else value
+        for name, value in attributes.items()
+    }
+    made: Any = dataclass(frozen=True, kw_only=True)(type("Broken", (Pendulum,), functions))
+    system: System = made()
+    return system
+
+
+def by_the_sign(state: Any, parameters: Any) -> tuple[Any, ...]:  # noqa: ARG001  # one signature
+    return (1.0,) if state[1] > 0 else (-1.0,)
+
+
+CASES: list[tuple[str, Any, str]] = [
+    ("learned_rows", (5,), r"learned_rows of env 'pendulum' holds 5, but its 2 states .* 0 to 1"),
+    ("learned_rows", (1, 1), r"learned_rows of env 'pendulum' are \(1, 1\), but no row twice"),
+    ("features", (Feature("cos", 7),), r"features of env 'pendulum' holds 7"),
+    ("features", (("cos", 0),), r"features of env 'pendulum' hold \('cos', 0\), .* Feature\('cos"),
+    ("features", (Feature("tan", 0),), r"one of kind 'tan', but the kinds are identity, cos, sin"),
+    ("phase_plane", (0, -1), r"phase_plane of env 'pendulum' holds -1"),
+    (
+        "accelerations",
+        lambda state, *_: (state[0], state[1]),
+        r"accelerations\(\) .* returns 2 numbers, but 1 are expected, one for each learned row",
+    ),
+    (
+        "accelerations",
+        lambda state, *_: -state[1],
+        r"accelerations\(\) .* returns one number, but a tuple of 1 is .* return a, with its comma",
+    ),
+    ("known", lambda *_: 0.0, r"known\(\) .* returns one number, but a tuple of 2 is expected"),
+    ("accelerations", lambda *_: None, r"accelerations\(\) .* fails .*TypeError"),
+    (
+        "accelerations",
+        lambda state, *_: (math.sin(state[0]),),
+        r"fails for arrays of 5 states .* the functions of dopt\.systems\.elementary",
+    ),
+    ("accelerations", by_the_sign, r"fails for arrays of 5 states \(ValueError"),
+    (
+        "known",
+        lambda state, *_: (state[1],),
+        r"known\(\) .* returns 1 numbers, but 2 are expected, one for each state: correct it",
+    ),
+    (
+        "known",
+        lambda state, inputs, *_: (state[1], inputs[0] ** 2),
+        r"known\(\) of env 'pendulum' is not affine in the inputs",
+    ),
+    (
+        "known",
+        lambda state, inputs, *_: (state[1], abs(inputs[0])),
+        r"known\(\) of env 'pendulum' is not affine in the inputs",
+    ),
+]
+
+
+@pytest.mark.parametrize(("attribute", "value", "sentence"), CASES)
+def test_what_is_no_system_is_refused(
+    attribute: str, value: Callable[..., Any] | tuple[Any, ...], sentence: str
+) -> None:
+    system = broken_system(**{attribute: value})
+    with pytest.raises(SpecificationError, match=sentence):
+        dataclasses.replace(trial("pendulum", "random").config, system=system)
+
+
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
+def test_what_is_shipped_is_sound(name: str) -> None:
+    check_system(SYSTEMS[name]())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motor(System):
+    """DC motor: L di/dt = -R i - k ω + u, J dω/dt = k i - b ω; the current is i times ``unit``."""
+
+    name: ClassVar[str] = "motor"
+    physical: ClassVar[tuple[str, ...]] = (
+        "resistance",
+        "inductance",
+        "constant",
+        "inertia",
+        "unit",
+    )
+    state_labels: ClassVar[tuple[str, ...]] = ("i [A]", "ω [rad/s]")
+    input_labels: ClassVar[tuple[str, ...]] = ("u [V]",)
+    learned_rows: ClassVar[tuple[int, ...]] = (0, 1)
+    features: ClassVar[tuple[Feature, ...]] = (Feature("identity", 0), Feature("identity", 1))
+    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
+    grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
+
+    resistance: float = parameter(1.0, "Ω", "positive")
+    inductance: float = parameter(1e-3, "H", "positive")
+    constant: float = parameter(0.05, "N m/A", "positive")
+    inertia: float = parameter(5e-5, "kg m²", "positive")
+    unit: float = parameter(1.0, "A", "positive")
+    gamma: float = parameter(12.0, "V", "positive")
+    dt: float = parameter(2e-4, "s", "positive")
+    initial_state: tuple[float, ...] = parameter((0.0, 0.0))
+    grid_half_widths: tuple[float, ...] = parameter((8.0, 150.0), bound="positive")
+    grid_points: tuple[int, ...] = parameter((16, 16), bound="positive")
+
+    @staticmethod
+    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
+        _, inductance, _, _, unit = parameters
+        return inputs[0] / (inductance * unit), 0.0 * state[1]
+
+    @staticmethod
+    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
+        resistance, inductance, constant, inertia, unit = parameters
+        current = state[0] * unit
+        voltage = -resistance * current - constant * state[1]
+        return voltage / (inductance * unit), constant * current / inertia
+
+
+def test_the_number_and_the_unit_are_said() -> None:
+    config = trial("pendulum", "random").config
+    with pytest.warns(ScaleWarning) as caught:
+        dataclasses.replace(config, system=Motor())
+    current, speed = (str(warning.message) for warning in caught)
+    assert "i [A] in env 'motor' has a root mean square of 6.3" in current
+    assert "ω [rad/s]" in speed
+    assert all(text.endswith("times as large.") for text in (current, speed))
+
+
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
+def test_the_shipped_systems_have_the_size_of_a_network(name: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_scale(SYSTEMS[name](), trial("pendulum", "random").model)
+
+
+def size(item: Any) -> int:
+    """Return the bytes of all arrays in nested tuples."""
+    if isinstance(item, np.ndarray):
+        return item.nbytes
+    return sum(map(size, item)) if isinstance(item, tuple) else 0
+
+
+def held(spec: TrialSpec) -> int:
+    """Return the bytes of what a trial is made of in the kernel, its evaluation aside."""
+    draws = draw(spec)
+    arrays = (draws.noise, draws.inputs, draws.components, draws.ties)
+    record = empty_record(spec.system)
+    return size(arrays) + size(record) + size(initial_state(spec, draws.weights, record))
+
+
+@pytest.mark.parametrize(("env", "policy"), covering(PAIRS))
+def test_a_usual_trial_needs_little(env: str, policy: str) -> None:
+    assert trial(env, policy, env={"horizon": 500}).config.memory < 2**26
+
+
+@pytest.mark.parametrize(
+    ("changes", "setting"),
+    [
+        ({"policy": {"form": "primal"}, "model": {"width": 40}}, "model.width"),
+        ({"policy": {"form": "dual"}, "env": {"horizon": 1500}}, "env.horizon"),
+        ({"policy": {"form": "sketch", "sketch_size": 1500}}, "policy.sketch_size"),
+        ({"env": {"grid_points": (500, 400, 2)}}, "env.grid_points"),
+    ],
+)
+def test_what_is_large_is_estimated_and_named(changes: dict[str, Any], setting: str) -> None:
+    spec = trial("cartpole", "d_optimal", **changes)
+    assert spec.config.largest_setting == setting
+    if setting != "env.grid_points":  # whose arrays the kernel makes
+        assert held(spec) <= 1.1 * spec.config.memory
+        assert spec.config.memory <= 4 * held(spec)
+
+
+@pytest.mark.parametrize(
+    ("policy", "learner"), [("lookahead", "adam"), ("exact", "ekf"), ("d_optimal", "gauss_newton")]
+)
+def test_a_wide_network_is_estimated(policy: str, learner: str) -> None:
+    wide = {"model": {"width": 48}, "learner": {"name": learner}}
+    spec = trial("cartpole", policy, env={"horizon": 300}, **wide)
+    assert held(spec) <= 1.5 * spec.config.memory
+    assert spec.config.memory <= 8 * held(spec)
+
+
+@pytest.mark.parametrize(
+    ("changes", "setting"),
+    [
+        ({"model": {"width": 1_000_000}}, "model.width"),
+        ({"model": {"depth": 2**31 - 1}}, "model.width"),
+        ({"env": {"grid_points": (2**31 - 1,) * 3}}, "env.grid_points"),
+        ({"policy": {"form": "sketch", "sketch_size": 10**6}}, "policy.sketch_size"),
+        ({"policy": {"form": "dual"}, "env": {"horizon": 10**6}}, "env.horizon"),
+    ],
+)
+def test_what_no_machine_can_hold_is_refused_by_name(changes: dict[str, Any], setting: str) -> None:
+    with pytest.raises(SpecificationError, match=rf"GiB .* because of {setting}, .* smaller\.$"):
+        trial("cartpole", "d_optimal", **changes)
+
+
+def test_features_are_what_makes_a_linear_model_large() -> None:
+    with pytest.raises(SpecificationError, match=r"because of model\.n_features, .* smaller\.$"):
+        trial(
+            "pendulum",
+            "d_optimal",
+            model={"name": "rff", "n_features": 1_000_000},
+            learner={"name": "recursive_least_squares"},
+        )
+
+
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_the_reference_holds_the_matrix_in_any_form(form: str) -> None:
+    spec = trial("cartpole", "d_optimal", model={"width": 256}, policy={"form": form})
+    q = spec.model.n_parameters(spec.system)
+    there = dataclasses.replace(spec.config, path="reference")
+    assert there.memory > 2 * 8 * q**2
+    assert there.largest_setting == "model.width"
+
+
+def test_a_horizon_has_a_bound() -> None:
+    assert trial("pendulum", "random", env={"horizon": LARGEST_HORIZON}).system.horizon
+    with pytest.raises(SpecificationError, match=r"env\.horizon is 10,000,001 steps, .* at most"):
+        trial("pendulum", "random", env={"horizon": LARGEST_HORIZON + 1})
+
+
+FRESH = {"information": "fresh"}
+
+
+@pytest.mark.parametrize("width", [16, 48])
+@pytest.mark.parametrize("policy", ["d_optimal", "exact"])
+def test_fresh_information_is_estimated(policy: str, width: int) -> None:
+    spec = trial("arm", policy, policy=FRESH, env={"horizon": 400}, model={"width": width})
+    assert held(spec) <= 1.1 * spec.config.memory
+    assert spec.config.memory <= 8 * held(spec)
+
+
+def test_fresh_information_that_no_machine_can_hold_is_refused_by_name() -> None:
+    with pytest.raises(SpecificationError, match=r"because of model\.width, .* smaller\.$"):
+        trial("arm", "d_optimal", policy=FRESH, env={"horizon": 10**7}, model={"width": 200})

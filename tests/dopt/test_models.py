@@ -1,0 +1,513 @@
+"""Models linear in their parameters, grey boxes, ensembles, input models, outputs."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
+from dopt.assessment import model_forecast, parameter_error
+from dopt.control.planning import forecast_by
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.evaluation import evaluation_set
+from dopt.explorer import Explorer
+from dopt.kernel.learners.joint_kalman import run_filter
+from dopt.kernel.run import KernelTrial
+from dopt.models import MODELS, RFF, GaussianProcess
+from dopt.offline_fit import fit_offline, grid_loss, uniform_samples
+from dopt.randomness import PLANNED_DIMENSIONS, draw, initial_weights
+from dopt.run import rerun, run_trial
+from dopt.spec.config import PLAN_VERSION
+from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS
+from tests.dopt.kernel.twin import call, model_of_kernel
+from tests.dopt.oracles.traces import jacobian, observed, trace
+from tests.dopt.test_limits import ABSOLUTE, ANGLE, CART, DEGREE, JOINTS, sensed
+from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES, trial
+
+LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
+    "gaussian_process": "conditioning"
+}
+
+
+def regression(env: str, model: str, policy: str = "random_held", /, **fields: Any) -> TrialSpec:
+    """Return a small trial with one of the models."""
+    sections: dict[str, Any] = {"model": {"name": model}, "learner": {"name": LEARNERS[model]}}
+    if policy in ("d_optimal", "linear"):
+        sections["policy"] = {"regularization": 1e-2}
+    for key, entries in fields.items():
+        sections[key] = sections.get(key, {}) | entries
+    return trial(env, policy, 5, **sections)
+
+
+@pytest.mark.parametrize("model", LEARNERS)
+def test_the_stored_parameters_give_the_last_loss(model: str) -> None:
+    spec = regression("arm", model)
+    result = run_trial(spec)
+    grid = spec.system.grid()
+    errors = spec.model.predict(spec.system, result.parameters, grid) - spec.system.learned(grid)
+    assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(result.final_loss, rel=1e-5)
+
+
+def test_random_features_have_the_kernel_in_expectation() -> None:
+    model = RFF(n_features=40_000, lengthscale=0.7, amplitude=3.0)
+    system = trial("pendulum", "random").system
+    drawn = model.initial_parameters(system, np.random.default_rng(0))
+    states = np.random.default_rng(1).normal(size=(5, 2))
+    first = model.n_features
+    frequencies = drawn[first:-first].reshape(first, 3)
+    psi = model.scale * np.cos(system.featurize(states) @ frequencies.T + drawn[-first:])
+    phi = system.featurize(states)
+    expected = GaussianProcess(lengthscale=0.7, amplitude=3.0).kernel(phi, phi)
+    assert psi @ psi.T == pytest.approx(expected, abs=0.15)
+
+
+def test_random_features_stay_and_differ_from_seed_to_seed() -> None:
+    spec = regression("arm", "rff")
+    result = run_trial(spec)
+    fixed = spec.model.n_fixed_parameters(spec.system)
+    before = draw(spec).weights
+    assert np.array_equal(result.parameters[-fixed:], before[-fixed:])
+    assert np.all(before[:-fixed] == 0.0)
+    assert np.all(result.parameters[:-fixed] != 0.0)
+    assert np.all(draw(spec.with_seed(6)).weights[-fixed:] != before[-fixed:])
+
+
+@pytest.mark.parametrize("policy", ["random_held", "d_optimal"])
+@pytest.mark.parametrize(("env", "model"), [("arm", "rff"), ("mass_spring", "linear_state")])
+def test_least_squares_minimise_the_ridge_loss(env: str, model: str, policy: str) -> None:
+    """With the ridge of a policy that plans by the same matrix, or their own."""
+    spec = regression(env, model, policy, learner={"regularization": 3e-2})
+    run = trace(spec)
+    states = run.states[:-1]
+    targets = np.array([observed(spec, run, t) for t in range(len(states))])
+    q = spec.model.n_parameters(spec.system) - spec.model.n_fixed_parameters(spec.system)
+    drawn = draw(spec).weights
+    units = np.concatenate([np.eye(q), np.tile(drawn[q:], (q, 1))], axis=1)
+    columns = [spec.model.predict(spec.system, unit, states).ravel() for unit in units]
+    ridge = 1e-2 if policy == "d_optimal" else 3e-2
+    design = np.concatenate([np.stack(columns, axis=1), np.sqrt(ridge) * np.eye(q)])
+    aims = np.concatenate([targets.ravel(), np.zeros(q)])
+    expected = np.linalg.lstsq(design, aims, rcond=None)[0]
+    found = run.parameters[-1][:q]
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-7 * np.abs(expected).max())
+
+
+def test_information_of_random_features_is_about_the_learned_parameters_alone() -> None:
+    spec = regression("arm", "rff", "d_optimal", model={"n_features": 20}, env={"horizon": 4})
+    assert KernelTrial(spec).state.covariance.upper.shape == (40, 40)
+
+
+def test_the_noise_of_a_process_is_that_of_the_trial_but_not_below_rounding() -> None:
+    spec = regression("pendulum", "gaussian_process", env={"noise": 0.1})
+    assert isinstance(spec.model, GaussianProcess)
+    assert spec.model.noise_variance(spec.system) == pytest.approx(0.1**2 / 0.02)
+    quiet = regression("pendulum", "gaussian_process", env={"noise": 0.0})
+    assert spec.model.noise_variance(quiet.system) == pytest.approx(1e-8)
+    assert run_trial(quiet).diverged_at is None
+
+
+def grey(
+    system: str, policy: str, model: dict[str, Any], learner: dict[str, Any], **fields: Any
+) -> TrialSpec:
+    return trial(system, policy, 0, model={"name": "grey_box"} | model, learner=learner, **fields)
+
+
+@pytest.mark.parametrize("env", ["pendulum_unknown_gain", "cartpole", "quadrotor"])
+def test_with_linear_parameters_it_is_the_linear_model(env: str) -> None:
+    """The filter of both takes the same steps; an effect of the inputs is a parameter as others."""
+    filtered = {"name": "ekf", "regularization": 1e-3}
+    linear = trial(env, "random", 0, model={"name": "linear"}, learner=filtered)
+    q = linear.model.n_parameters(linear.system)
+    box = grey(env, "random", {"initial": [0.0] * q, "spread": 0.0}, filtered)
+    one, other = (run_trial(spec) for spec in (linear, box))
+    assert other.parameters == pytest.approx(one.parameters, rel=1e-6, abs=1e-9)
+    assert other.loss == pytest.approx(one.loss, rel=1e-6, abs=1e-9)
+
+
+def test_parameters_that_enter_nonlinearly_are_found() -> None:
+    spec = grey(
+        "moving_star",
+        "random",
+        {"unknown": ["radius", "core"], "initial": [0.4, 0.05], "spread": 0.0},
+        {"name": "gauss_newton", "regularization": 1e-8, "steps": 3},
+        env={"period": 1e6, "initial_state": [0.87, 0.0], "noise": 0.0},
+    )
+    found = rerun(spec, [1, 30]).parameters
+    errors = [parameter_error(spec.system, theta, 0, ["radius", "core"]) for theta in found]
+    assert errors[1] < 1e-4 < 0.05 < errors[0]
+
+
+def test_a_moving_star_is_followed_by_a_fit_of_the_newest_samples() -> None:
+    names = ["center_x", "center_y"]
+    spec = grey(
+        "moving_star",
+        "random",
+        {"unknown": names, "initial": [0.95, 0.05], "spread": 0.0},
+        {"name": "gauss_newton", "capacity": 5, "regularization": 1e-8, "steps": 3},
+    )
+    (theta,) = rerun(spec, [30]).parameters
+    assert parameter_error(spec.system, theta, 29, names) < 0.03
+    assert parameter_error(spec.system, theta, 0, names) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        ({"unknown": ["gravity", "weight"]}, r"model\.unknown goes with names out of mass, length"),
+        ({"unknown": ["gravity", "gravity"]}, "none of them twice"),
+        ({"unknown": ["gravity"], "initial": [1.0, 2.0]}, "one number for each of gravity"),
+    ],
+)
+def test_unknown_parameters_are_the_systems_own(model: dict[str, Any], words: str) -> None:
+    with pytest.raises(IncompatibleError, match=words):
+        grey("pendulum", "random", model, {"name": "adam"})
+
+
+def test_initial_parameters_scatter_about_the_guess_by_the_seed() -> None:
+    spec = grey("pendulum", "random", {"unknown": ["mass"], "initial": [2.0]}, {"name": "adam"})
+    drawn = [
+        spec.model.initial_parameters(spec.system, np.random.default_rng(seed))[0]
+        for seed in range(200)
+    ]
+    assert np.mean(drawn) == pytest.approx(2.0, abs=0.03)
+    assert np.std(drawn) == pytest.approx(0.1, rel=0.2)
+
+
+STEPS = 9
+ENSEMBLE = {"name": "ensemble", "members": 4}
+GAUSS_NEWTON = {"name": "gauss_newton"}
+
+
+def make(
+    model: dict[str, Any], policy: str = "d_optimal", learner: dict[str, Any] = GAUSS_NEWTON
+) -> TrialSpec:
+    env = {"name": "arm", "horizon": STEPS, "grid_points": list(SMALL_GRIDS["arm"])}
+    section = {"name": policy, **SMALL_SEARCHES.get(policy, {})}
+    parts = {"env": env, "policy": section, "model": model, "learner": learner}
+    return TrialSpec.from_mapping({**parts, "seed": 5})
+
+
+def members_of(parameters: np.ndarray) -> np.ndarray:
+    return parameters.reshape(ENSEMBLE["members"], -1)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "icem"])
+def test_it_explores_as_its_first_member_does_alone(policy: str) -> None:
+    found, alone = run_trial(make(ENSEMBLE, policy)), run_trial(make({"name": "mlp"}, policy))
+    np.testing.assert_array_equal(found.states, alone.states)
+    np.testing.assert_array_equal(members_of(found.parameters)[0], alone.parameters)
+    assert not np.allclose(found.loss, alone.loss)
+
+
+def test_one_member_is_the_network() -> None:
+    found, alone = (
+        run_trial(make({"name": "ensemble", "members": 1})),
+        run_trial(make({"name": "mlp"})),
+    )
+    for name in ("states", "parameters", "loss", "reachable_loss"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+
+
+def test_the_others_take_turns() -> None:
+    spec = make(ENSEMBLE)
+    steps = rerun(spec, (0, 1, 2, 4))
+    initial, one, two, four = (members_of(parameters) for parameters in steps.parameters)
+    np.testing.assert_array_equal(initial, members_of(initial_weights(spec)))
+    for parameters, before, learning in ((one, initial, {0, 1}), (two, one, {0, 2})):
+        changed = {k for k in range(len(before)) if not np.array_equal(parameters[k], before[k])}
+        assert changed == learning
+    assert {k for k in range(len(two)) if not np.array_equal(four[k], two[k])} == {0, 1, 3}
+
+
+def test_the_loss_is_that_of_the_mean_prediction() -> None:
+    spec = make(ENSEMBLE)
+    result = run_trial(spec)
+    assert result.loss[-1] == pytest.approx(grid_loss(spec, result.parameters), rel=1e-5)
+    states = evaluation_set(spec.system).states[:5]
+    members = [
+        make({"name": "mlp"}).model.predict(spec.system, theta, states)
+        for theta in members_of(result.parameters)
+    ]
+    found = spec.model.predict(spec.system, result.parameters, states)
+    np.testing.assert_allclose(found, np.mean(members, axis=0), rtol=1e-12)
+
+
+def test_forecasts_follow_the_mean() -> None:
+    rng = np.random.default_rng(0)
+    spec = make(ENSEMBLE)
+    parameters = run_trial(spec).parameters
+    states, inputs = rng.standard_normal((3, 4)), rng.standard_normal((3, 6, 2))
+    by_mean = forecast_by(
+        spec.system, lambda x, u: spec.model.predict(spec.system, parameters, x, u)
+    )
+    found = model_forecast(spec.system, spec.model, parameters)(states, inputs)
+    np.testing.assert_allclose(found, by_mean(states, inputs), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("learner", "words"),
+    [
+        ({"name": "adam_window"}, "and model 'ensemble' with learner 'gauss_newton', but the two"),
+        (
+            {"name": "ekf"},
+            "goes with model 'mlp', 'affine', 'black_box', 'linear' or 'grey_box' and model "
+            "'ensemble' with",
+        ),
+        ({"name": "gauss_newton", "refit_every": 2}, "but learner.refit_every 2 was given"),
+    ],
+)
+def test_learners_that_keep_something_of_one_network_are_refused(
+    learner: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(IncompatibleError, match=words):
+        make(ENSEMBLE, learner=learner)
+
+
+FITTED: dict[str, Any] = {"noise": "fitted", "refit_every": 7, "horizon": 22}
+ONE_FIT: dict[str, Any] = {"noise": "fitted", "refit_every": 60, "horizon": 60}
+
+
+def test_it_is_the_likeliest_of_its_neighbours() -> None:
+    fast = KernelTrial(sensed("pendulum", ANGLE, **ONE_FIT, noise_variance=30.0))
+    fast.advance(60)
+    noise, none = fast.state.estimate.noise_variance, np.empty((0, len(fast.state.theta)))
+    fitted, lowest = float(noise[0]), call(run_filter, fast.trial, 60, none, np.empty(0))
+    moves = abs(math.log10(fitted / 30.0)) / math.log10(NOISE_FACTORS[0])
+    assert 0.5 < moves < MOST_NOISE_FACTORS - 0.5
+    for factor in NOISE_FACTORS:
+        noise[0] = factor * fitted
+        assert call(run_filter, fast.trial, 60, none, np.empty(0)) >= lowest
+
+
+def test_it_forgets_where_it_began() -> None:
+    """From ρ of 1e-3 and 1e3 alike: the angle better than measured, the loss below that of both."""
+    errors, losses = {}, {}
+    for noise in ("given", "fitted"):
+        for start in (1e-3, 1e3):
+            fields = {"noise": noise, "noise_variance": start, "refit_every": 25, "horizon": 200}
+            result = run_trial(sensed("pendulum", ANGLE, **fields))
+            assert result.estimated_states is not None
+            gaps = (result.estimated_states - result.states)[100:, 0]
+            errors[noise, start] = float(np.sqrt(np.mean(gaps**2)))
+            losses[noise, start] = float(result.loss[-1])
+    measured = ANGLE["measurement_noise"][0]
+    assert max(errors["fitted", start] for start in (1e-3, 1e3)) < measured
+    assert errors["given", 1e-3] > 2 * measured
+    fitted = [losses["fitted", start] for start in (1e-3, 1e3)]
+    assert max(fitted) < 1.5 * min(fitted)
+    assert max(fitted) < 0.5 * min(losses["given", start] for start in (1e-3, 1e3))
+
+
+READERS = ("affine", "black_box")
+UNKNOWN = [name for name, system in SYSTEMS.items() if system.reads_inputs]
+
+
+def small(
+    env: str, model: str = "affine", policy: str = "d_optimal", learner: str = "adam_window",
+    /, *, seed: int = 0, **sections: dict[str, Any],
+) -> TrialSpec:  # fmt: skip
+    parts: dict[str, dict[str, Any]] = {
+        "env": {"name": env, "horizon": 12, "grid_points": SMALL_GRIDS[env]},
+        "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
+        "model": {"name": model} | ({"width": 6} if model in READERS else {}),
+        "learner": {"name": learner},
+    }
+    merged = {key: part | sections.get(key, {}) for key, part in parts.items()}
+    return TrialSpec.from_mapping(merged | {"seed": seed})
+
+
+@pytest.mark.parametrize("model", READERS)
+def test_values_and_rows_are_those_of_the_model(model: str) -> None:
+    spec = small("arm", model)
+    rng = np.random.default_rng(1)
+    theta = draw(spec).weights + 0.1 * rng.standard_normal(len(draw(spec).weights))
+    x, u = rng.standard_normal((5, 4)), 3.0 * rng.standard_normal((5, 2))
+    values, points = spec.model.predict(spec.system, theta, x, u), np.hstack([x, u])
+    kernel = model_of_kernel(spec, theta)
+    assert kernel.predict(points) == pytest.approx(values, rel=1e-12)
+    for point, J in zip(points, jacobian(spec, theta, points), strict=True):
+        np.testing.assert_allclose(kernel.jacobian(point), J, rtol=1e-9, atol=1e-12)
+        along, step = rng.standard_normal((1, 6)), 1e-5
+        change = kernel.jacobian_change(point, along)[0]
+        ends = jacobian(spec, theta, point + step * along * np.array([[1.0], [-1.0]]))
+        np.testing.assert_allclose(change, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("model", READERS)
+def test_only_one_is_affine_in_the_inputs(model: str) -> None:
+    spec, rng = small("arm", model), np.random.default_rng(2)
+    theta, x = draw(spec).weights, rng.standard_normal((7, 4))
+    first, second = rng.standard_normal((2, 7, 2))
+    free, one, other, both = (
+        spec.model.predict(spec.system, theta, x, u)
+        for u in (0 * first, first, second, first + second)
+    )
+    apart = np.abs(one + other - both - free).max()
+    assert apart < 1e-12 if model == "affine" else apart > 1e-3
+    assert np.array_equal(free, spec.model.predict(spec.system, theta, x))
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_an_unknown_effect_moves_the_system_as_a_known_one(name: str) -> None:
+    unknown, known = SYSTEMS[name](), SYSTEMS[name.removesuffix("_unknown_gain")]()
+    rng = np.random.default_rng(5)
+    for x, u in zip(rng.standard_normal((9, known.n_states)), rng.standard_normal(9), strict=True):
+        expected = known.derivative(x, [u])
+        assert unknown.derivative(x, [u]) == pytest.approx(expected, rel=1e-12)
+        assert not np.any(
+            np.array(unknown.known(x, [u], unknown.parameters))[list(unknown.learned_rows)]
+        )
+    weak = SYSTEMS[name](gain=0.5)  # type: ignore[call-arg]
+    assert weak.derivative(x, [u]) == pytest.approx(known.derivative(x, [0.5 * u]), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_the_oracle_learns_the_gain(name: str) -> None:
+    spec = small(name, "linear", "oracle", "recursive_least_squares",
+                 env={"horizon": 200, "gain": 1.3})  # fmt: skip
+    result = run_trial(spec)
+    assert result.parameters[-1] == pytest.approx(1.3, rel=0.02)
+
+
+@pytest.mark.parametrize("model", READERS)
+def test_the_loss_is_the_error_over_states_and_inputs(model: str) -> None:
+    spec = small("cartpole_unknown_gain", model)
+    result, points = run_trial(spec), evaluation_set(spec.system)
+    assert np.abs(points.inputs[: points.n_grid]).max() <= spec.system.gamma
+    truth = spec.system.learned(points.states, inputs=points.inputs)
+    errors = truth - spec.model.predict(
+        spec.system, result.parameters, points.states, points.inputs
+    )
+    squares = np.sum(errors**2, axis=1)
+    assert result.loss[-1] == pytest.approx(np.sqrt(squares[: points.n_grid].mean()), rel=1e-5)
+    reachable = np.sqrt(squares[points.n_grid :].mean())
+    assert result.reachable_loss[-1] == pytest.approx(reachable, rel=1e-5)
+
+
+def test_samples_of_states_and_inputs_are_fitted_offline() -> None:
+    spec = small("pendulum_unknown_gain", env={"horizon": 300, "grid_points": [8, 8]})
+    samples = uniform_samples(spec)
+    given = (spec, samples.states, samples.accelerations)
+    fitted = fit_offline(*given, inputs=samples.inputs)
+    size = float(np.sqrt(np.mean(samples.accelerations**2)))
+    assert fitted.loss < 0.02 * size
+    with pytest.raises(SpecificationError, match="'affine' reads inputs, but none were given"):
+        fit_offline(*given)
+    with pytest.raises(SpecificationError, match="300 states and 299 inputs"):
+        fit_offline(*given, inputs=samples.inputs[1:])
+
+
+@pytest.mark.parametrize(("model", "width"), [("affine", 6), ("black_box", 16)])
+def test_d_optimal_inputs_teach_more_than_random_ones(model: str, width: int) -> None:
+    """On the pendulum with an unknown gain, in the median of ten seeds."""
+
+    def paper(policy: str, seed: int) -> TrialSpec:
+        env = {"horizon": 500, "grid_points": [16, 16]}
+        sections = {"env": env, "model": {"width": width}}
+        return small("pendulum_unknown_gain", model, policy, seed=seed, **sections)
+
+    losses = [
+        [run_trial(paper(policy, seed)).loss[-1] for seed in range(10)]
+        for policy in ("d_optimal", "random")
+    ]
+    assert np.median(np.array(losses[0]) / np.array(losses[1])) < 0.5
+
+
+@pytest.mark.parametrize("env", ["cartpole_unknown_gain", "arm"])
+def test_inputs_fill_the_ball_where_their_effect_is_not_affine(env: str) -> None:
+    spec = small(env, "black_box", env={"horizon": 300})
+    gamma, m, drawn = spec.system.gamma, spec.system.n_inputs, draw(spec)
+    norms = np.linalg.norm(run_trial(spec).inputs, axis=1) / gamma
+    assert norms[1:] == pytest.approx(drawn.radii[1:, 0], rel=1e-9)
+    assert np.linalg.norm(run_trial(small(env)).inputs, axis=1) == pytest.approx(gamma, rel=1e-12)
+    # Of n dimensions, the n-th power of a uniform point's norm is uniform between 0 and 1.
+    for radii, dimensions in zip(drawn.radii.T, (PLANNED_DIMENSIONS * m, m), strict=True):
+        assert kstest(radii**dimensions, "uniform").pvalue > 0.01
+    assert abs(np.corrcoef(drawn.radii.T)[0, 1]) < 0.2
+    uniform = np.linalg.norm(uniform_samples(spec).inputs, axis=1) / gamma
+    assert kstest(uniform**m, "uniform").pvalue > 0.01
+
+
+def test_trials_with_other_plans_have_other_keys() -> None:
+    """Those of an earlier version took inputs of norm γ alone."""
+
+    def version(model: str, policy: str) -> object:
+        return json.loads(small("arm", model, policy).config_json).get("plan_version")
+
+    assert version("black_box", "d_optimal") == PLAN_VERSION
+    assert version("black_box", "trace_linearized") == PLAN_VERSION
+    assert version("black_box", "random") is None
+    assert version("affine", "d_optimal") is None
+    assert version("mlp", "d_optimal") is None
+
+
+def test_what_reads_no_inputs_is_refused() -> None:
+    with pytest.raises(IncompatibleError, match="a model that learns the effect of the inputs"):
+        small("pendulum_unknown_gain", "mlp")
+    with pytest.raises(IncompatibleError, match="policy 'gradient' goes with a model of the state"):
+        small("arm", "affine", "gradient")
+    with pytest.raises(IncompatibleError, match="'primal' or 'sketch'"):
+        small("arm", "affine", policy={"form": "dual"})
+    with pytest.raises(IncompatibleError, match="'auto', which takes 'dual' here"):
+        small("arm", "affine", model={"width": 64}, env={"horizon": 500})
+    small("arm", "black_box", policy={"form": "dual"})
+
+
+def test_the_models_that_read_inputs_are_these() -> None:
+    system = SYSTEMS["arm"]()
+    assert {name for name, model in MODELS.items() if model().n_inputs_read(system)} == set(READERS)
+
+
+def test_a_matrix_that_selects_states_measures_them() -> None:
+    rows = {"output_matrix": [0, 0, 1, 0, 1, 0, 0, 0], "measurement_noise": [DEGREE, 0.01]}
+    selected, given = (
+        run_trial(sensed("cartpole", sensors, horizon=20)) for sensors in (CART, rows)
+    )
+    assert np.array_equal(selected.inputs, given.inputs)
+    assert np.array_equal(selected.parameters, given.parameters)
+
+
+def test_the_matrix_of_the_outputs_is_part_of_the_key() -> None:
+    changed = ABSOLUTE | {"output_matrix": [1, 0, 0, 0, 1, 0, 2, 0]}
+    specs = [sensed("arm", sensors) for sensors in (JOINTS, ABSOLUTE, changed)]
+    assert len({spec.trial_key for spec in specs}) == 3
+    assert len({spec.config_key for spec in specs}) == 3
+
+
+def test_outputs_that_mix_states_tell_the_state() -> None:
+    """By the absolute angles of its links an arm is known as well as by those of its joints."""
+    errors = []
+    for sensors in (JOINTS, ABSOLUTE):
+        result = run_trial(sensed("arm", sensors, horizon=200, noise_variance=10.0))
+        assert result.estimated_states is not None
+        errors.append(np.sqrt(np.mean((result.estimated_states - result.states)[20:, ::2] ** 2)))
+    assert max(errors) < DEGREE  # less than a single measurement is off
+    assert errors[1] < 1.5 * errors[0]
+
+
+REFUSED = [
+    (ANGLE | {"output_matrix": [1.0, 0.0]}, "one of the two is expected"),
+    ({"output_matrix": [1.0], "measurement_noise": [0.1]}, "needs 2 for each output"),
+    ({"output_matrix": [0, 0], "measurement_noise": [0.1]}, "no row of 2 zeros"),
+    ({"output_matrix": [1, 1]}, "measurement_noise has 0 entries, but pendulum needs 1"),
+]
+
+
+@pytest.mark.parametrize(("sensors", "said"), REFUSED)
+def test_matrices_that_make_no_sense_are_refused(sensors: dict[str, Any], said: str) -> None:
+    with pytest.raises(SpecificationError, match=said):
+        sensed("pendulum", sensors)
+
+
+def test_what_estimates_no_states_is_refused() -> None:
+    mixed = {"output_matrix": [1, 0.1], "measurement_noise": [0.1]}
+    with pytest.raises(IncompatibleError, match=r"output_matrix goes with .* 'joint_ekf'"):
+        sensed("pendulum", mixed, "adam")
+    with pytest.raises(SpecificationError, match="an explorer is told states"):
+        Explorer(sensed("pendulum", mixed).system, learner="joint_ekf")

@@ -1,0 +1,346 @@
+"""Users' policies and learners, in numpy and compiled."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from dopt.errors import SpecificationError
+from dopt.learning import Adam
+from dopt.learning.base import CompiledLearner
+from dopt.policies import DOptimal
+from dopt.policies.base import CompiledPolicy, CustomPolicy, Planner
+from dopt.reference.batch import run_trials
+from dopt.run import run_trial
+from dopt.spec.config import TrialConfig
+from dopt.spec.trial import TrialSpec
+from dopt.systems import System
+from dopt.trial_view import TrialView
+from tests.dopt.custom_plugins import ANSWERS
+from tests.dopt.kernel.twin import relative_gap
+from tests.dopt.trials import trial
+from tests.paths import EXAMPLE, ROOT
+from tests.typed_commands import empty_folder, run_typed
+
+HERE = "tests.dopt.custom_plugins"
+
+
+def specification(seed: int = 0, **sections: dict[str, Any]) -> TrialSpec:
+    usual: dict[str, Any] = {
+        "env": {"name": "pendulum", "horizon": 25, "grid_points": [4, 4]},
+        "policy": {"name": "d_optimal"},
+        "model": {"name": "mlp"},
+        "learner": {"name": "adam"},
+    }
+    return TrialSpec.from_mapping(usual | sections | {"seed": seed})
+
+
+def own(name: str, **fields: Any) -> dict[str, Any]:
+    return {"_target_": f"{HERE}.{name}", **fields}
+
+
+PATHS = pytest.mark.parametrize("path", ["kernel", "reference"])
+
+
+@PATHS
+def test_a_plan_in_numpy_repeats_algorithm_2(path: str) -> None:
+    plain = run_trial(specification(policy=own("Copy")), path)
+    shipped = run_trial(specification(), path)
+    np.testing.assert_allclose(plain.inputs, shipped.inputs, atol=1e-12)
+    np.testing.assert_allclose(plain.loss, shipped.loss, rtol=1e-9)
+
+
+@PATHS
+def test_an_update_in_numpy_repeats_adam(path: str) -> None:
+    plain = run_trial(specification(learner=own("Descent")), path)
+    shipped = run_trial(specification(), path)
+    np.testing.assert_allclose(plain.states, shipped.states, rtol=1e-9)
+    np.testing.assert_allclose(plain.parameters, shipped.parameters, rtol=1e-9)
+
+
+@PATHS
+def test_a_plan_and_an_update_in_numpy_go_together(path: str) -> None:
+    plain = run_trial(specification(policy=own("Copy"), learner=own("Descent")), path)
+    shipped = run_trial(specification(), path)
+    np.testing.assert_allclose(plain.inputs, shipped.inputs, atol=1e-12)
+    np.testing.assert_allclose(plain.parameters, shipped.parameters, rtol=1e-9)
+
+
+@pytest.mark.parametrize("env", [{"name": "pendulum"}, {"name": "arm", "integrator": "rk4"}])
+def test_both_paths_answer_the_same(env: dict[str, Any]) -> None:
+    spec = specification(policy=own("Asking"), env={**env, "horizon": 12})
+    answered = []
+    for path in ("kernel", "reference"):
+        ANSWERS.clear()
+        run_trial(spec, path)
+        answered.append([dict(answers) for answers in ANSWERS])
+    fast, plain = answered
+    assert len(fast) == len(plain) == 11
+    for one, other in zip(fast, plain, strict=True):
+        for name, values in one.items():
+            assert values.shape == other[name].shape, name
+            np.testing.assert_allclose(values, other[name], rtol=1e-7, atol=1e-9, err_msg=name)
+
+
+def test_a_plan_in_the_kernel_cannot_change_what_was_observed() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        run_trial(specification(policy=own("Tampering")))
+
+
+def test_what_the_model_is_asked_has_the_right_shape() -> None:
+    """Compiled code would read beyond the end of an array."""
+    expected = r"inputs of shape \(1, 2\), but \(N, 1\) is expected"
+    with pytest.raises(SpecificationError, match=expected):
+        run_trial(specification(policy=own("Misasking", of_inputs=1)))
+    with pytest.raises(SpecificationError, match=r"a state of shape \(1, 2\), but \(2,\) is expec"):
+        run_trial(specification(policy=own("Misasking")))
+
+
+def test_the_time_of_a_plan_and_an_update_in_numpy_is_measured() -> None:
+    result = run_trial(specification(policy=own("Copy"), learner=own("Descent")))
+    assert (result.plan_us[1:] > 10.0).all()
+    assert (result.learn_us > 10.0).all()
+
+
+def test_limits_hold_for_a_plan_in_numpy() -> None:
+    limits = {"bounds": {"u": [-0.5, 0.5]}}
+    spec = specification(policy=own("Coin"), limits=limits)
+    assert np.abs(run_trial(spec).inputs).max() == 0.5
+
+
+def test_trials_in_lockstep_are_those_run_alone() -> None:
+    specs = [specification(seed, policy=own("Coin")) for seed in range(3)]
+    together, alone = run_trials(specs), [run_trial(spec, "reference") for spec in specs]
+    for one, other in zip(together, alone, strict=True):
+        np.testing.assert_allclose(one.states, other.states, rtol=1e-9)
+    assert not np.array_equal(alone[0].inputs, alone[1].inputs)
+    np.testing.assert_array_equal(alone[0].inputs, run_trial(specs[0]).inputs)
+
+
+@PATHS
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"scale": 2.0}, "chose an input of norm 4 at step 5, but env.gamma is 2: scale it down"),
+        ({"size": 2}, r"chose an input of shape \(2,\) at step 1, but \(1,\) is expected"),
+    ],
+)
+def test_an_input_out_of_bounds_is_refused(
+    fields: dict[str, Any], sentence: str, path: str
+) -> None:
+    with pytest.raises(SpecificationError, match=sentence):
+        run_trial(specification(policy=own("Wild", **fields)), path)
+
+
+@PATHS
+def test_an_update_of_another_size_is_refused(path: str) -> None:
+    with pytest.raises(SpecificationError, match="learner 'descent' returned parameters of shape"):
+        run_trial(specification(learner=own("Descent", extra=1)), path)
+
+
+@PATHS
+def test_a_plan_that_gets_lost_is_refused_while_the_model_is_sound(path: str) -> None:
+    with pytest.raises(SpecificationError, match=r"returned array\(\[nan\]\) at step 5"):
+        run_trial(specification(policy=own("Lost")), path)
+
+
+@PATHS
+def test_a_plan_that_gets_lost_with_its_model_ends_its_trial_alone(path: str) -> None:
+    learner = {"name": "adam", "learning_rate": 1e40}
+    result = run_trial(specification(policy=own("Lost"), learner=learner), path)
+    assert result.diverged_at == 5
+    assert np.isfinite(result.loss[:5]).all()
+    assert np.isnan(result.loss[5:]).all()
+
+
+def test_a_config_of_own_parts_is_a_value() -> None:
+    first, second = (specification(policy=own("Coin")).config for _ in range(2))
+    assert isinstance(first, TrialConfig)
+    assert first == second
+    assert hash(first) == hash(second)
+
+
+@pytest.mark.parametrize("part", ["policy", "learner"])
+def test_what_was_written_in_torch_is_told_where_to_go(part: str) -> None:
+    """The sentence names both doors, numpy and the compiled kernel."""
+    with pytest.raises(SpecificationError, match=rf"numpy .* Compiled{part.capitalize()}\.$"):
+        specification(**{part: own("InTorch" if part == "policy" else "TaughtInTorch")})
+
+
+def test_torch_is_loaded_where_a_trial_needs_it_and_no_sooner() -> None:
+    """The driver of a grid only makes the specification, and sends it to its workers."""
+    plain = specification(policy=own("Coin"), learner=own("Descent")).to_mapping()
+    in_torch = specification().to_mapping() | {"path": "reference"}
+    program = (
+        "import pickle, sys; from dopt.spec.trial import TrialSpec; "
+        f"plain, in_torch = map(TrialSpec.from_mapping, ({plain!r}, {in_torch!r})); "
+        "[pickle.dumps(spec) for spec in (plain, in_torch)]; in_torch.trial_key; "
+        "from dopt.run import run_trial; run_trial(plain); assert 'torch' not in sys.modules; "
+        "run_trial(in_torch); assert 'torch' in sys.modules; "
+        "assert 'torch._dynamo' not in sys.modules"  # its compiler, which takes a second to load
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Large(CompiledPolicy):
+    name: ClassVar[str] = "large"
+
+    factor: float = 2.0
+
+    @staticmethod
+    def plan(trial: Any, t: int, u: np.ndarray) -> None:  # noqa: ARG004
+        u[:] = trial.algorithm.policy[0] * trial.plant.gamma
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn(CompiledPolicy, CustomPolicy):
+    """A random direction at each step."""
+
+    name: ClassVar[str] = "drawn"
+    compiled: ClassVar[bool] = True
+
+    @staticmethod
+    def plan(trial: Any, t: int, u: np.ndarray) -> None:
+        u[:] = trial.plant.gamma * trial.randomness.ties[t]
+
+    def planner(self, system: System, rng: np.random.Generator) -> Planner:  # noqa: ARG002
+        return Directions()
+
+
+class Directions(Planner):
+    def choose(self, view: TrialView) -> np.ndarray:
+        return view.system.gamma * view.tie
+
+
+@dataclass(frozen=True, kw_only=True)
+class Broken(CompiledLearner):
+    name: ClassVar[str] = "broken"
+
+    @staticmethod
+    def learn(trial: Any, t: int, target: np.ndarray) -> None:  # noqa: ARG004
+        trial.state.no_such_field[0] = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counting(CompiledLearner):
+    """Counts its steps in its memory and writes the count into the first parameter."""
+
+    name: ClassVar[str] = "counting"
+
+    @staticmethod
+    def learn(trial: Any, t: int, target: np.ndarray) -> None:  # noqa: ARG004
+        trial.state.learner_memory[1] += 1.0
+        trial.state.theta[0] = trial.state.learner_memory[1]
+
+    def memory_size(self, system: object, n_parameters: int) -> int:  # noqa: ARG002
+        return 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undeclared(DOptimal):
+    """Changes an algorithm and does not say that the kernel knows the change."""
+
+    name: ClassVar[str] = "undeclared"
+
+
+@pytest.fixture(autouse=True)
+def on_the_path(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(EXAMPLE))
+    yield
+    for name in ("frontier", "heavy_ball"):
+        sys.modules.pop(name, None)
+
+
+def own_compiled(name: str, **fields: object) -> dict[str, object]:
+    return {"_target_": f"{__name__}.{name}", **fields}
+
+
+def changed(
+    section: str, given: dict[str, object], env: str = "pendulum", **more: Any
+) -> TrialSpec:
+    mapping = trial(env, "random", 1, env={"horizon": 12}, learner={"name": "adam"}).to_mapping()
+    return TrialSpec.from_mapping({**mapping, section: given, **more})
+
+
+@pytest.mark.parametrize("env", ["pendulum", "arm"])
+@pytest.mark.parametrize(
+    ("section", "target"), [("policy", "frontier.Frontier"), ("learner", "heavy_ball.HeavyBall")]
+)
+def test_the_examples_of_the_tutorial_mean_the_same_on_both_paths(
+    env: str, section: str, target: str
+) -> None:
+    spec = changed(section, {"_target_": target}, env)
+    assert spec.config.path == "kernel"
+    fast, plain = run_trial(spec), run_trial(spec, "reference")
+    assert relative_gap(fast.inputs, plain.inputs) < 1e-8
+    assert relative_gap(fast.parameters, plain.parameters) < 1e-8
+
+
+def test_copies_of_shipped_classes_give_their_very_numbers() -> None:
+    shipped = trial("cartpole", "d_optimal", 2, env={"horizon": 120})
+    for section, name in (("policy", "OwnDOptimal"), ("learner", "OwnAdam")):
+        given = {"_target_": f"studies.speed.compiled_plugins.{name}"}
+        copy = run_trial(TrialSpec.from_mapping({**shipped.to_mapping(), section: given}))
+        assert np.array_equal(copy.inputs, run_trial(shipped).inputs)
+        assert np.array_equal(copy.parameters, run_trial(shipped).parameters)
+
+
+def test_the_file_is_part_of_the_key() -> None:
+    section = changed("policy", own_compiled("Large")).to_mapping()["policy"]
+    assert isinstance(section, dict)
+    assert len(str(section["source"])) == 16
+
+
+def test_a_learner_keeps_its_memory() -> None:
+    assert run_trial(changed("learner", own_compiled("Counting"))).parameters[0] == 12.0
+
+
+def test_an_input_that_is_too_large_is_refused() -> None:
+    spec = changed("policy", own_compiled("Large"))
+    with pytest.raises(SpecificationError, match=r"'large' chose an input of norm .* at step 1"):
+        run_trial(spec)
+    run_trial(changed("policy", own_compiled("Large", factor=1.0)))
+
+
+def test_both_paths_have_the_same_random_directions() -> None:
+    spec = changed("policy", own_compiled("Drawn"), "arm")
+    fast, plain = run_trial(spec), run_trial(spec, "reference")
+    assert np.array_equal(fast.inputs, plain.inputs)
+    assert len(np.unique(fast.inputs, axis=0)) == 12
+
+
+def test_a_function_that_does_not_compile_is_one_sentence() -> None:
+    with pytest.raises(SpecificationError, match="of learner 'broken' does not compile") as e:
+        run_trial(changed("learner", own_compiled("Broken")))
+    assert len(str(e.value).splitlines()) == 1
+
+
+def test_what_brings_a_compiled_function_alone_is_refused_on_the_reference_path() -> None:
+    with pytest.raises(SpecificationError, match="'large' runs in the compiled kernel alone"):
+        changed("policy", own_compiled("Large"), path="reference")
+
+
+def test_a_class_does_not_inherit_that_it_is_compiled() -> None:
+    assert DOptimal.compiled
+    assert not Undeclared.compiled
+    assert not type("Slower", (Adam,), {"name": "slower"}).compiled
+
+
+@pytest.mark.long
+def test_the_commands_of_the_page_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty_folder(tmp_path, monkeypatch)
+    page = (ROOT / "docs" / "compiled_plugins.md").read_text()
+    lines = [line.strip() for line in page.splitlines() if line.startswith("    PYTHONPATH=")]
+    assert len(lines) == 2
+    for line in lines:
+        run_typed(line, monkeypatch, capsys)

@@ -1,0 +1,528 @@
+"""Specifications of trials: content and keys, labels, the options of conf/, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import string
+from collections.abc import Callable, Mapping
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from dopt.errors import IncompatibleError, SpecificationError
+from dopt.learning import LEARNERS
+from dopt.models import MODELS
+from dopt.policies import POLICIES, TITLES
+from dopt.registry import build
+from dopt.run import run_trial
+from dopt.spec.config import completed
+from dopt.spec.label import config_label, labels, value_label
+from dopt.spec.trial import TrialSpec
+from dopt.systems import SYSTEMS, Pendulum, Quadrotor
+from dopt.systems.properties import euler_spectral_radius, jacobians
+from tests.dopt.trials import ALL_PAIRS, covering, trial
+from tests.paths import CONF
+
+SECTIONS = {"env": "system", "policy": "policy", "model": "model", "learner": "learner"}
+OF_FRESH_ROWS = ("information", "refresh_every")
+"""Fields that have one value where the model is linear in its parameters."""
+
+OF_ONE_LEARNER = ("output_matrix",)
+"""Fields that go with one learner: their part in the key is tested in test_output_matrix.py."""
+
+
+def every_field(spec: TrialSpec) -> list[tuple[str, str, Any]]:
+    """Return (section, field, another valid value) for every field of a trial."""
+    return [
+        (section, field.name, other(getattr(getattr(spec, attribute), field.name), field, spec))
+        for section, attribute in SECTIONS.items()
+        for field in dataclasses.fields(getattr(spec, attribute))
+        if field.name not in OF_ONE_LEARNER
+    ]
+
+
+def other(value: Any, field: dataclasses.Field[Any], spec: TrialSpec) -> Any:
+    if value is None:
+        return 1 if "int" in str(field.type) else 1.5
+    if isinstance(value, str):
+        return next(choice for choice in field.metadata["choices"] if choice != value)
+    if field.name.startswith("measure"):
+        return tuple(range(spec.system.n_states))
+    if value == ():
+        return spec.system.initial_state
+    if field.name == "grid_points":
+        return [2 * value[0], *value[1:]]  # some have to be powers of two
+    if isinstance(value, tuple):
+        return [other(value[0], field, spec), *value[1:]]
+    return 0.5 * value if 0 < value < 1 else value + 1
+
+
+def with_value(spec: TrialSpec, section: str, field: str, value: Any) -> TrialSpec:
+    mapping: dict[str, Any] = spec.to_mapping()
+    needed: dict[str, Any] = {"information": "fresh"} if field == "refresh_every" else {}
+    if field == "measured_states":
+        needed = {"measurement_noise": [0.1] * len(value)}
+    if field == "measurement_noise":
+        needed, value = {"measured_states": value}, [0.2] * len(value)
+    return TrialSpec.from_mapping(mapping | {section: mapping[section] | needed | {field: value}})
+
+
+def test_every_trial_comes_back_from_its_mapping_and_its_json() -> None:
+    for env, policy in ALL_PAIRS:
+        spec = trial(env, policy, 7)
+        again = TrialSpec.from_mapping(json.loads(json.dumps(spec.to_mapping())))
+        assert again == spec
+        assert again.trial_key == spec.trial_key
+        assert again.canonical_json() == spec.canonical_json()
+
+
+@pytest.mark.parametrize(("env", "policy"), covering(ALL_PAIRS))
+def test_every_field_is_part_of_the_key(env: str, policy: str) -> None:
+    spec = trial(env, policy)
+    linear = spec.model.structure != "gradient"
+    changes = [one for one in every_field(spec) if not (linear and one[1] in OF_FRESH_ROWS)]
+    variants = [with_value(spec, *change) for change in changes]
+    keys = [spec.config_key, *(variant.config_key for variant in variants)]
+    assert len(set(keys)) == len(keys) > len(dataclasses.fields(spec.system))
+    trial_keys = [spec.trial_key, *(variant.trial_key for variant in variants)]
+    assert len(set(trial_keys)) == len(trial_keys)
+
+
+def test_pairs_have_keys_of_their_own() -> None:
+    specs = [trial(env, policy, seed) for env, policy in ALL_PAIRS for seed in range(3)]
+    assert len({spec.trial_key for spec in specs}) == len(specs)
+    assert len({spec.config_key for spec in specs}) == len(ALL_PAIRS)
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))
+def test_only_the_trial_key_depends_on_the_seed(first: int, second: int) -> None:
+    one, two = trial("arm", "uniform", first), trial("arm", "uniform").with_seed(second)
+    assert one.config_key == two.config_key
+    assert one.config_json == two.config_json
+    assert (one.trial_key == two.trial_key) == (first == second)
+
+
+def test_keys_are_64_hexadecimal_digits() -> None:
+    spec = trial("pendulum", "random")
+    for key in (spec.trial_key, spec.config_key):
+        assert len(key) == 64
+        assert set(key) <= set(string.hexdigits.lower())
+
+
+def test_the_key_does_not_depend_on_how_a_value_is_written() -> None:
+    spec = trial("pendulum", "d_optimal", env={"mass": 1, "initial_state": [0, 0]})
+    same: dict[str, Any] = {
+        "seed": 0,
+        "learner": {"name": "adam_window"},
+        "model": {"depth": 2, "width": 16, "name": "mlp"},
+        "policy": {"regularization": 0.001, "name": "d_optimal"},
+        "env": {
+            "initial_state": (0.0, -0.0),
+            "grid_points": (4, 4),
+            "mass": 1.0,
+            "horizon": 30,
+            "name": "pendulum",
+        },
+    }
+    assert TrialSpec.from_mapping(same).trial_key == spec.trial_key
+
+
+def test_canonical_json_is_sorted_compact_json_of_the_content() -> None:
+    spec = trial("cartpole", "periodic", 5)
+    content = json.loads(spec.canonical_json())
+    assert content["seed"] == 5
+    whole = completed(content)
+    assert {key: whole[key] for key in spec.to_mapping()} == spec.to_mapping()
+    written = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    assert spec.canonical_json() == written
+    del content["seed"]
+    assert json.loads(spec.config_json) == content
+
+
+def test_columns_are_those_of_a_table_of_configurations() -> None:
+    assert trial("arm", "d_optimal", env={"gamma": 3, "dt": 0.01}).columns() == {
+        "env": "arm",
+        "policy": "d_optimal",
+        "model": "mlp",
+        "learner": "adam_window",
+        "width": 16,
+        "depth": 2,
+        "horizon": 30,
+        "dt": 0.01,
+        "gamma": 3.0,
+        "label": "D-optimal, dt=0.01, γ=3, grid_points=[2, 2, 2, 2], horizon 30",
+    }
+    oracle = trial("arm", "oracle").columns()
+    assert (oracle["width"], oracle["depth"]) == (None, None)
+
+
+@settings(max_examples=50)
+@given(
+    mass=st.floats(1e-3, 1e3),
+    start=st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=2),
+    width=st.integers(1, 300),
+    rate=st.floats(1e-12, 1e3),
+    seed=st.integers(0, 2**63 - 1),
+)
+def test_any_numbers_come_back(
+    mass: float, start: list[float], width: int, rate: float, seed: int
+) -> None:
+    env = {"mass": mass, "initial_state": start}
+    fields = {"env": env, "model": {"width": width}, "learner": {"learning_rate": rate}}
+    spec = trial("pendulum", "d_optimal", seed, **fields)
+    assert TrialSpec.from_mapping(spec.to_mapping()) == spec
+    assert (spec.system.mass, spec.model.width, spec.seed) == (mass, width, seed)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("seed", [-1, 1.0, True, "3", None, 0.5])
+def test_a_seed_is_a_whole_number(seed: Any) -> None:
+    with pytest.raises(SpecificationError, match=r"^seed is .* whole number of 0 or above"):
+        TrialSpec.from_mapping(trial("arm", "random").to_mapping() | {"seed": seed})
+
+
+def test_an_unknown_section_is_answered_with_the_nearest() -> None:
+    with pytest.raises(SpecificationError, match=r"'polcy' is unknown.*did you mean 'policy'\?"):
+        TrialSpec.from_mapping(trial("arm", "random").to_mapping() | {"polcy": {}})
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+@pytest.mark.parametrize("given_value", [None, "pendulum", 3])
+def test_a_section_has_to_be_one(section: str, given_value: Any) -> None:
+    mapping = trial("arm", "random").to_mapping() | {section: given_value}
+    with pytest.raises(SpecificationError, match=rf"'{section}' is .* a section"):
+        TrialSpec.from_mapping(mapping)
+
+
+LINEAR = {"name": "linear"}
+LEAST_SQUARES = {"name": "recursive_least_squares"}
+
+
+@pytest.mark.parametrize(
+    ("env", "policy", "changes"),
+    [
+        ("quadrotor", "periodic", {}),
+        ("pendulum", "periodic", {"env": {"name": "pendulum", "friction": 50.0}}),
+        ("pendulum", "oracle", {"model": {"name": "mlp"}}),
+        ("pendulum", "oracle", {"learner": {"name": "adam"}}),
+        ("pendulum", "d_optimal", {"learner": LEAST_SQUARES}),
+        ("pendulum", "random", {"model": LINEAR, "learner": LEAST_SQUARES}),
+        ("pendulum", "uniform", {"model": LINEAR}),
+    ],
+)
+def test_pairs_that_make_no_sense_are_told_apart_from_bad_values(
+    env: str, policy: str, changes: dict[str, Any]
+) -> None:
+    possible = "arm" if policy == "periodic" else env
+    mapping: dict[str, Any] = trial(possible, policy).to_mapping()
+    mapping |= {"env": {"name": env}} | changes
+    with pytest.raises(IncompatibleError) as caught:
+        TrialSpec.from_mapping(mapping)
+    assert isinstance(caught.value, SpecificationError)
+    ends = (": change one of them.", ": choose another policy.")
+    if env == "pendulum" and policy == "periodic":
+        ends = (": set policy.frequency, or choose another policy.",)
+    assert str(caught.value).endswith(ends)
+
+
+@pytest.mark.parametrize(
+    ("model", "learner", "sentence"),
+    [
+        (
+            "rff",
+            "ekf",
+            "learner 'ekf' goes with model 'mlp', 'affine', 'black_box', 'linear' or 'grey_box' "
+            "and model 'rff' with learner 'recursive_least_squares', but the two together were "
+            "given",
+        ),
+        (
+            "mlp",
+            "recursive_least_squares",
+            "learner 'recursive_least_squares' goes with model 'linear', 'linear_state' or 'rff' "
+            "and model 'mlp' with learner 'adam', 'adam_window', 'adam_replay', 'ekf', "
+            "'gauss_newton' or 'joint_ekf', but",
+        ),
+    ],
+)
+def test_which_learners_a_model_takes_and_which_models_a_learner_is_said(
+    model: str, learner: str, sentence: str
+) -> None:
+    mapping = trial("arm", "random").to_mapping()
+    del mapping["path"]
+    mapping |= {"model": {"name": model}, "learner": {"name": learner}}
+    with pytest.raises(IncompatibleError) as caught:
+        TrialSpec.from_mapping(mapping)
+    assert str(caught.value).startswith(sentence)
+
+
+def test_the_linear_model_also_goes_with_d_optimal_inputs() -> None:
+    spec = trial("pendulum", "oracle")
+    mapping: dict[str, Any] = spec.to_mapping()
+    mixed = TrialSpec.from_mapping(mapping | {"policy": {"name": "d_optimal"}})
+    assert mixed.columns()["width"] is None
+
+
+def test_the_key_of_a_stored_periodic_trial_stays() -> None:
+    """Its section has held these entries since the first release."""
+    spec = TrialSpec.from_names(env="pendulum", policy="periodic")
+    assert '"policy":{"frequency":null,"name":"periodic"}' in spec.canonical_json()
+
+
+Config = Mapping[str, object]
+
+
+def config(system: str, name: str, **sections: Mapping[str, object]) -> Config:
+    """Return the stored form of a configuration; ``sections`` override fields."""
+    linear = name == "oracle"
+    mapping: dict[str, Mapping[str, object]] = {
+        "env": {"name": system},
+        "policy": {"name": name},
+        "model": {"name": "linear" if linear else "mlp"},
+        "learner": {"name": "recursive_least_squares" if linear else "adam_window"},
+    }
+    for key, fields in sections.items():
+        mapping[key] = {**mapping.get(key, {}), **fields}
+    found: Config = json.loads(TrialSpec.from_mapping(mapping).config_json)
+    return found
+
+
+PLAIN = config("pendulum", "d_optimal")
+BOUND = config("pendulum", "d_optimal", env={"gamma": 3})
+REPLAY = config("pendulum", "d_optimal", learner={"name": "adam_replay", "steps": 60})
+WIDE = config("pendulum", "d_optimal", model={"width": 64})
+ORACLE = config("pendulum", "oracle")
+RANDOM = config("pendulum", "random")
+TASK = config("pendulum", "random", task={"name": "control"})
+RAIL = {"bounds": {"φ": [-2.0, 2.0]}}
+ENFORCED = config("pendulum", "d_optimal", limits=RAIL)
+COUNTED = config("pendulum", "d_optimal", limits={**RAIL, "enforced": False})
+ALL = (PLAIN, BOUND, REPLAY, WIDE, ORACLE, RANDOM, TASK, ENFORCED, COUNTED)
+
+
+@pytest.mark.parametrize(
+    ("one", "label"),
+    [
+        (PLAIN, "D-optimal"),
+        (BOUND, "D-optimal, γ=3"),
+        (REPLAY, "D-optimal, adam_replay ×60"),
+        (WIDE, "D-optimal, width 64"),
+        (ORACLE, "oracle"),
+        (TASK, "random, task control"),
+        (ENFORCED, "D-optimal, limits, φ=[-2, 2]"),
+        (COUNTED, "D-optimal, limits, φ=[-2, 2], enforced=False"),
+    ],
+)
+def test_a_stored_label_says_what_is_not_the_default(one: Config, label: str) -> None:
+    assert config_label(one) == label
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        ([PLAIN], ["D-optimal"]),
+        ([BOUND], ["D-optimal"]),
+        ([PLAIN, BOUND], ["D-optimal", "γ=3"]),
+        ([PLAIN, REPLAY], ["D-optimal", "adam_replay ×60"]),
+        ([PLAIN, RANDOM], ["D-optimal", "random"]),
+        ([PLAIN, RANDOM, BOUND], ["D-optimal", "random", "D-optimal, γ=3"]),
+        ([RANDOM, TASK], ["random", "task control"]),
+        ([PLAIN, ENFORCED], ["D-optimal", "limits, φ=[-2, 2]"]),
+        ([ENFORCED], ["D-optimal, limits"]),
+        ([COUNTED], ["D-optimal, limits, enforced=False"]),
+        ([ENFORCED, COUNTED], ["D-optimal, limits", "D-optimal, limits, enforced=False"]),
+        ([], []),
+    ],
+)
+def test_labels_beside_each_other_say_only_what_differs(
+    shown: list[Config], expected: list[str]
+) -> None:
+    assert labels(shown) == expected
+
+
+def test_settings_of_different_environments_are_not_compared() -> None:
+    shown = [PLAIN, RANDOM, config("cartpole", "d_optimal"), config("cartpole", "random")]
+    assert labels(shown) == ["D-optimal", "random", "D-optimal", "random"]
+
+
+def test_no_two_configurations_share_a_label() -> None:
+    close = [config("pendulum", "random", env={"gamma": 1 + 1e-9 * step}) for step in range(3)]
+    older = {**PLAIN, "code_version": 0}
+    for pair in combinations((*ALL, *close, older), 2):
+        assert len(set(labels(pair))) == 2, pair
+    assert len(set(labels((*ALL, *close, older)))) == len(ALL) + 4
+
+
+def test_the_order_in_which_they_are_given_does_not_matter() -> None:
+    assert labels(ALL[::-1]) == labels(ALL)[::-1]
+
+
+def test_settings_of_a_class_that_is_not_loaded_are_told_apart() -> None:
+    env = {"name": "boat", "_target_": "my_module.Boat", "source": "0" * 16}
+    boats = [{**PLAIN, "env": {**env, "mass": mass}} for mass in (1.0, 2.0)]
+    assert [config_label(boat) for boat in boats] == ["D-optimal", "D-optimal"]
+    assert labels(boats) == ["mass=1", "mass=2"]
+
+
+def test_a_class_and_its_file_are_named_only_where_nothing_else_differs() -> None:
+    env = {"name": "boat", "_target_": "my_module.Boat", "mass": 2.0}
+    policy = {"name": "curiosity", "_target_": "my_module.Curiosity", "candidates": 32}
+    old, new = ({**section, "source": digit * 16} for section, digit in ((env, "0"), (env, "1")))
+    plain, edited = ({**PLAIN, "env": one} for one in (old, new))
+    own = {**plain, "policy": {**policy, "source": "2" * 16}}
+    many = {**own, "policy": {**policy, "source": "2" * 16, "candidates": 64}}
+    again = {**own, "policy": {**policy, "source": "3" * 16}}
+    heavy = {**edited, "env": {**new, "mass": 3.0}}
+    assert labels([plain, own]) == ["D-optimal", "curiosity"]
+    assert labels([plain, own, many]) == [
+        "D-optimal",
+        "curiosity, candidates=32",
+        "curiosity, candidates=64",
+    ]
+    assert labels([plain, heavy]) == ["mass=2", "mass=3"]
+    assert labels([plain, edited]) == [f"D-optimal, source={digit * 16}" for digit in "01"]
+    assert labels([plain, own, again]) == [
+        "D-optimal",
+        *(f"curiosity, source={digit * 16}" for digit in "23"),
+    ]
+
+
+def test_every_shipped_policy_has_a_title() -> None:
+    assert set(TITLES) == set(POLICIES)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "text"),
+    [
+        ("policy", "d_optimal", "D-optimal"),
+        ("policy", "my_own", "my own"),
+        ("learner", "adam_replay", "adam_replay"),
+        ("env.gamma", 3.0, "γ=3"),
+        ("width", 64, "width 64"),
+        ("width", None, "no width"),
+        ("policy.criterion", "joint", "criterion=joint"),
+    ],
+)
+def test_a_value_has_words_of_its_own(path: str, value: object, text: str) -> None:
+    assert value_label(path, value) == text
+
+
+UNSTABLE_AT_REST = {"moving_star", "van_der_pol"}
+"""A star that pushes away, and an oscillator that is fed."""
+
+GROUPS: list[tuple[str, dict[str, Any]]] = [("model", MODELS), ("learner", LEARNERS)]
+
+
+def section_in(path: Path) -> dict[str, object]:
+    section = OmegaConf.to_container(OmegaConf.merge({"width": 16}, OmegaConf.load(path)))
+    assert isinstance(section, dict)
+    section = section.get("policy", section)
+    return {k: v for k, v in section.items() if k not in ("width", "defaults")} | (
+        {"width": 16} if path.parent.name == "model" and section["name"] == "mlp" else {}
+    )
+
+
+def reasons_of(name: str) -> str:
+    """Return the reasons for the numbers of a system, in its file or its class, on one line."""
+    path = CONF / f"env/{name}.yaml"
+    text = path.read_text() if path.exists() else str(SYSTEMS[name].__doc__)
+    return " ".join(line.lstrip("# ") for line in text.splitlines())
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_euler_map_is_stable_where_the_system_is(name: str) -> None:
+    """Where motions about rest grow, those of the map grow alike up to O(dt²)."""
+    system = SYSTEMS[name]()
+    rest = system.equilibrium or system.initial_state
+    values = np.linalg.eigvals(jacobians(system, rest, np.zeros(system.n_inputs))[0])
+    growth = values.real.max()
+    if growth <= 1e-12:
+        assert euler_spectral_radius(system) <= 1.0 + 1e-12
+        return
+    assert name in UNSTABLE_AT_REST
+    farthest = (system.dt * np.abs(values).max()) ** 2
+    assert euler_spectral_radius(system) <= math.exp(growth * system.dt) + farthest < 1.05
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_spectral_radius_is_the_stated_one(name: str) -> None:
+    stated = re.search(r"spectral radius (0\.\d+) at rest", reasons_of(name))
+    if stated:
+        assert stated[1] == f"{euler_spectral_radius(SYSTEMS[name]()):.3f}"
+
+
+@pytest.mark.parametrize(("name", "field"), [("chain", "friction"), ("cartpole", "pivot_friction")])
+def test_the_least_friction_of_a_stable_euler_map_is_the_stated_one(name: str, field: str) -> None:
+    stated = re.search(r"takes (0\.\d+) at least", reasons_of(name))
+    assert stated
+    bound, last_digit = float(stated[1]), 10.0 ** -(len(stated[1]) - 2)
+    radii = [
+        euler_spectral_radius(dataclasses.replace(SYSTEMS[name](), **{field: friction}))
+        for friction in (bound - last_digit, bound)
+    ]
+    assert radii[0] > 1.0 + 1e-9
+    assert radii[1] <= 1.0 + 1e-12
+
+
+def test_the_thrust_of_the_quadrotor_is_the_stated_one() -> None:
+    """The bound is one of the norm of both thrusts: equal ones have the largest sum."""
+    system = Quadrotor()
+    thrust, weight = math.sqrt(2.0) * system.gamma, system.mass * system.gravity
+    fall, climb = (math.sqrt(force / system.drag) for force in (weight, thrust - weight))
+    change = system.dt * (thrust + weight) / system.mass
+    comment = reasons_of("quadrotor")
+    for phrase in (
+        f"{system.gamma:.0f} N is the norm of the two thrusts, whose sum reaches {thrust:.1f} N",
+        f"weight of {weight:.0f} N",
+        f"terminal speeds of {fall:.1f} m/s in free fall and {climb:.1f} m/s in a climb",
+        f"change the speeds by at most {change:.2f} m/s in a step",
+    ):
+        assert phrase in comment
+
+
+@pytest.mark.parametrize("name", [name for name in SYSTEMS if name != "moving_star"])
+def test_a_trial_starts_close_to_rest(name: str) -> None:
+    """All but that of the star, which pushes at once."""
+    system = SYSTEMS[name]()
+    rest = np.array(system.equilibrium or np.zeros(system.n_states))
+    rest[[i for i, label in enumerate(system.state_labels) if label.startswith("e₀")]] = 1.0
+    assert system.initial_state == pytest.approx(rest, abs=0.01)
+
+
+@pytest.mark.parametrize(("group", "registry"), GROUPS, ids=[group for group, _ in GROUPS])
+def test_every_registered_choice_has_a_file_that_loads(
+    group: str, registry: dict[str, Any]
+) -> None:
+    paths = sorted((CONF / group).rglob("*.yaml"))
+    assert paths
+    built = [build(group, registry, section_in(path)) for path in paths]
+    assert {item.name for item in built} == set(registry)
+
+
+CASES: list[tuple[Callable[..., Any], tuple[Any, ...], str]] = [
+    (
+        TrialSpec.from_names,
+        (Pendulum(), "random"),
+        r"key 'env' is a Pendulum, but a name or a section is .* to TrialSpec\.of_system",
+    ),
+    (TrialSpec.from_names, ("pendulum", 3), r"configuration key 'policy' is 3, but a section"),
+    (TrialSpec.of_system, (Pendulum, "random"), r"is the class Pendulum, .* of it, Pendulum\(\)\."),
+    (TrialSpec.of_system, ("pendulum", "random"), r"is 'pendulum', .* use TrialSpec\.from_names"),
+    (TrialSpec.of_system, (Pendulum(), None), r"configuration key 'policy' is None, but a section"),
+    (run_trial, ("pendulum",), r"run_trial was given 'pendulum', but a TrialSpec is expected"),
+]
+
+
+@pytest.mark.parametrize(("call", "arguments", "sentence"), CASES)
+def test_another_kind_of_thing_is_refused_in_a_sentence(
+    call: Callable[..., Any], arguments: tuple[Any, ...], sentence: str
+) -> None:
+    with pytest.raises(SpecificationError, match=sentence):
+        call(*arguments)
