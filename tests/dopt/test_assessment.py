@@ -30,7 +30,7 @@ from dopt.result import TrialResult
 from dopt.run import rerun, run_trial
 from dopt.spec.config import REACHABLE_VERSION
 from dopt.spec.trial import TrialSpec
-from dopt.systems import SYSTEMS, Cartpole, Pendulum, Quadrotor
+from dopt.systems import SYSTEMS, Cartpole, Pendulum
 from dopt.systems.properties import eigenmode
 from orchestrate.executors.base import Task
 from orchestrate.executors.lockstep import run_batch
@@ -263,13 +263,6 @@ def test_a_pendulum_is_never_faster_than_its_terminal_speed() -> None:
     terminal = (pendulum.gamma + weight) / pendulum.friction
     speeds = np.abs(reachable_states(pendulum)[:, 1])
     assert 1.0 < speeds.max() <= terminal
-
-
-def test_a_quadrotor_is_never_faster_than_its_terminal_speed() -> None:
-    quadrotor = Quadrotor()
-    thrust = math.sqrt(2.0) * quadrotor.gamma + quadrotor.mass * quadrotor.gravity
-    speeds = np.abs(reachable_states(quadrotor)[:, [1, 3]])
-    assert 1.0 < speeds.max() <= math.sqrt(thrust / quadrotor.drag)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -322,8 +322,3 @@ def test_fresh_information_is_estimated(policy: str, width: int) -> None:
     spec = trial("arm", policy, policy=FRESH, env={"horizon": 400}, model={"width": width})
     assert held(spec) <= 1.1 * spec.config.memory
     assert spec.config.memory <= 8 * held(spec)
-
-
-def test_fresh_information_that_no_machine_can_hold_is_refused_by_name() -> None:
-    with pytest.raises(SpecificationError, match=r"because of model\.width, .* smaller\.$"):
-        trial("arm", "d_optimal", policy=FRESH, env={"horizon": 10**7}, model={"width": 200})

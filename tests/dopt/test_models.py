@@ -11,8 +11,7 @@ import pytest
 from scipy.stats import kstest
 
 from dopt.algorithm import MOST_NOISE_FACTORS, NOISE_FACTORS
-from dopt.assessment import model_forecast, parameter_error
-from dopt.control.planning import forecast_by
+from dopt.assessment import parameter_error
 from dopt.errors import IncompatibleError, SpecificationError
 from dopt.evaluation import evaluation_set
 from dopt.explorer import Explorer
@@ -20,7 +19,7 @@ from dopt.kernel.learners.joint_kalman import run_filter
 from dopt.kernel.run import KernelTrial
 from dopt.models import MODELS, RFF, GaussianProcess
 from dopt.offline_fit import fit_offline, grid_loss, uniform_samples
-from dopt.randomness import PLANNED_DIMENSIONS, draw, initial_weights
+from dopt.randomness import PLANNED_DIMENSIONS, draw
 from dopt.run import rerun, run_trial
 from dopt.spec.config import PLAN_VERSION
 from dopt.spec.trial import TrialSpec
@@ -205,26 +204,6 @@ def test_it_explores_as_its_first_member_does_alone(policy: str) -> None:
     assert not np.allclose(found.loss, alone.loss)
 
 
-def test_one_member_is_the_network() -> None:
-    found, alone = (
-        run_trial(make({"name": "ensemble", "members": 1})),
-        run_trial(make({"name": "mlp"})),
-    )
-    for name in ("states", "parameters", "loss", "reachable_loss"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
-
-
-def test_the_others_take_turns() -> None:
-    spec = make(ENSEMBLE)
-    steps = rerun(spec, (0, 1, 2, 4))
-    initial, one, two, four = (members_of(parameters) for parameters in steps.parameters)
-    np.testing.assert_array_equal(initial, members_of(initial_weights(spec)))
-    for parameters, before, learning in ((one, initial, {0, 1}), (two, one, {0, 2})):
-        changed = {k for k in range(len(before)) if not np.array_equal(parameters[k], before[k])}
-        assert changed == learning
-    assert {k for k in range(len(two)) if not np.array_equal(four[k], two[k])} == {0, 1, 3}
-
-
 def test_the_loss_is_that_of_the_mean_prediction() -> None:
     spec = make(ENSEMBLE)
     result = run_trial(spec)
@@ -236,18 +215,6 @@ def test_the_loss_is_that_of_the_mean_prediction() -> None:
     ]
     found = spec.model.predict(spec.system, result.parameters, states)
     np.testing.assert_allclose(found, np.mean(members, axis=0), rtol=1e-12)
-
-
-def test_forecasts_follow_the_mean() -> None:
-    rng = np.random.default_rng(0)
-    spec = make(ENSEMBLE)
-    parameters = run_trial(spec).parameters
-    states, inputs = rng.standard_normal((3, 4)), rng.standard_normal((3, 6, 2))
-    by_mean = forecast_by(
-        spec.system, lambda x, u: spec.model.predict(spec.system, parameters, x, u)
-    )
-    found = model_forecast(spec.system, spec.model, parameters)(states, inputs)
-    np.testing.assert_allclose(found, by_mean(states, inputs), rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +236,6 @@ def test_learners_that_keep_something_of_one_network_are_refused(
         make(ENSEMBLE, learner=learner)
 
 
-FITTED: dict[str, Any] = {"noise": "fitted", "refit_every": 7, "horizon": 22}
 ONE_FIT: dict[str, Any] = {"noise": "fitted", "refit_every": 60, "horizon": 60}
 
 
@@ -283,25 +249,6 @@ def test_it_is_the_likeliest_of_its_neighbours() -> None:
     for factor in NOISE_FACTORS:
         noise[0] = factor * fitted
         assert call(run_filter, fast.trial, 60, none, np.empty(0)) >= lowest
-
-
-def test_it_forgets_where_it_began() -> None:
-    """From ρ of 1e-3 and 1e3 alike: the angle better than measured, the loss below that of both."""
-    errors, losses = {}, {}
-    for noise in ("given", "fitted"):
-        for start in (1e-3, 1e3):
-            fields = {"noise": noise, "noise_variance": start, "refit_every": 25, "horizon": 200}
-            result = run_trial(sensed("pendulum", ANGLE, **fields))
-            assert result.estimated_states is not None
-            gaps = (result.estimated_states - result.states)[100:, 0]
-            errors[noise, start] = float(np.sqrt(np.mean(gaps**2)))
-            losses[noise, start] = float(result.loss[-1])
-    measured = ANGLE["measurement_noise"][0]
-    assert max(errors["fitted", start] for start in (1e-3, 1e3)) < measured
-    assert errors["given", 1e-3] > 2 * measured
-    fitted = [losses["fitted", start] for start in (1e-3, 1e3)]
-    assert max(fitted) < 1.5 * min(fitted)
-    assert max(fitted) < 0.5 * min(losses["given", start] for start in (1e-3, 1e3))
 
 
 READERS = ("affine", "black_box")
@@ -403,22 +350,6 @@ def test_samples_of_states_and_inputs_are_fitted_offline() -> None:
         fit_offline(*given, inputs=samples.inputs[1:])
 
 
-@pytest.mark.parametrize(("model", "width"), [("affine", 6), ("black_box", 16)])
-def test_d_optimal_inputs_teach_more_than_random_ones(model: str, width: int) -> None:
-    """On the pendulum with an unknown gain, in the median of ten seeds."""
-
-    def paper(policy: str, seed: int) -> TrialSpec:
-        env = {"horizon": 500, "grid_points": [16, 16]}
-        sections = {"env": env, "model": {"width": width}}
-        return small("pendulum_unknown_gain", model, policy, seed=seed, **sections)
-
-    losses = [
-        [run_trial(paper(policy, seed)).loss[-1] for seed in range(10)]
-        for policy in ("d_optimal", "random")
-    ]
-    assert np.median(np.array(losses[0]) / np.array(losses[1])) < 0.5
-
-
 @pytest.mark.parametrize("env", ["cartpole_unknown_gain", "arm"])
 def test_inputs_fill_the_ball_where_their_effect_is_not_affine(env: str) -> None:
     spec = small(env, "black_box", env={"horizon": 300})
@@ -478,17 +409,6 @@ def test_the_matrix_of_the_outputs_is_part_of_the_key() -> None:
     specs = [sensed("arm", sensors) for sensors in (JOINTS, ABSOLUTE, changed)]
     assert len({spec.trial_key for spec in specs}) == 3
     assert len({spec.config_key for spec in specs}) == 3
-
-
-def test_outputs_that_mix_states_tell_the_state() -> None:
-    """By the absolute angles of its links an arm is known as well as by those of its joints."""
-    errors = []
-    for sensors in (JOINTS, ABSOLUTE):
-        result = run_trial(sensed("arm", sensors, horizon=200, noise_variance=10.0))
-        assert result.estimated_states is not None
-        errors.append(np.sqrt(np.mean((result.estimated_states - result.states)[20:, ::2] ** 2)))
-    assert max(errors) < DEGREE  # less than a single measurement is off
-    assert errors[1] < 1.5 * errors[0]
 
 
 REFUSED = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from typing import Any
 
@@ -17,7 +16,7 @@ from dopt.control.planning import forecast_by, forecast_by_equations
 from dopt.errors import SpecificationError
 from dopt.evaluation import evaluation_set, simulate
 from dopt.kernel.run import KernelTrial
-from dopt.models import MLP, Linear
+from dopt.models import MLP, RFF, Ensemble, Linear
 from dopt.models.base import Model
 from dopt.randomness import _STREAMS, draw, stream
 from dopt.reference.batch import run_trials
@@ -25,7 +24,7 @@ from dopt.result import TrialResult
 from dopt.run import rerun, run_trial
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS, DriftingPendulum, Pendulum
-from dopt.systems.base import System
+from dopt.systems.base import INTEGRATORS, System
 from tests.dopt.custom_networks import model_of_one
 from tests.dopt.trials import KNOWN_EFFECT, MODELS, PAIRS, covering, trial
 
@@ -63,11 +62,12 @@ def test_the_observed_path_is_that_of_the_changing_system(path: Any) -> None:
     assert simulate(spec.system, result.inputs[:, None])[:, 0] == pytest.approx(result.states)
 
 
-RFF = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
+FEATURES = {"model": {"name": "rff"}, "learner": {"name": "recursive_least_squares"}}
 
 
 @pytest.mark.parametrize(
-    ("policy", "parts"), [("random", {}), ("oracle", {}), ("gaussian_process", {}), ("random", RFF)]
+    ("policy", "parts"),
+    [("random", {}), ("oracle", {}), ("gaussian_process", {}), ("random", FEATURES)],
 )
 def test_the_loss_of_a_step_is_that_against_the_truth_of_the_step(policy: str, parts: Any) -> None:
     spec = trial("drifting_pendulum", policy, env=DRIFT | {"grid_points": (20, 20)}, **parts)
@@ -100,15 +100,8 @@ def test_trials_that_share_a_config_do_not_share_the_truth() -> None:
     assert np.array_equal(first.record.loss, second.record.loss)
 
 
-@pytest.mark.parametrize(("model", "seeds", "ratio"), [("mlp", 48, 1.1), ("linear", 8, 3.0)])
-def test_forgetting_follows_a_drift_that_memory_averages(
-    model: str, seeds: int, ratio: float
-) -> None:
-    """Paired over seeds: the loss in the second half of the trial, against the truth of then.
-
-    The trials of a network are chaotic, and differ between processors as they do between seeds:
-    over 96 seeds its loss is 1.22 times smaller, over 16 of them 1.14 to 1.29 times.
-    """
+def test_forgetting_follows_a_drift_that_memory_averages() -> None:
+    """Paired over seeds: the loss in the second half of the trial, against the truth of then."""
 
     def losses(forgetting: float) -> np.ndarray:
         specs = [
@@ -117,16 +110,16 @@ def test_forgetting_follows_a_drift_that_memory_averages(
                 "random_held",
                 seed,
                 env={"horizon": 600, "grid_points": (16, 16)},
-                model={"name": model},
+                model={"name": "linear"},
                 learner={"name": "ekf", "forgetting": forgetting},
             )
-            for seed in range(seeds)
+            for seed in range(8)
         ]
         return np.array([run_trial(spec).loss[300:].mean() for spec in specs])
 
     gain = np.log(losses(1.0) / losses(0.98))
     assert stats.ttest_1samp(gain, 0.0, alternative="greater").pvalue < 1e-3
-    assert np.exp(gain.mean()) > ratio
+    assert np.exp(gain.mean()) > 3.0
 
 
 COLUMNS = ("loss", "reachable_loss", "plan_us", "learn_us", "evaluate_us", "states", "inputs")
@@ -179,7 +172,7 @@ def test_an_absurd_learning_rate_ends_a_trial(policy: str) -> None:
     assert check_rows(run_trial(spec, "reference")) == end
 
 
-@pytest.mark.parametrize("rate", [1e3, 1e8, 1e30, 1e100, 1e154, 1e200])
+@pytest.mark.parametrize("rate", [1e3, 1e30, 1e154])
 @pytest.mark.parametrize("policy", ["uniform", "d_optimal"])
 def test_any_learning_rate_gives_a_result(policy: str, rate: float) -> None:
     """The trial ends, or goes on with poor numbers: it never raises."""
@@ -382,16 +375,13 @@ def test_ties_are_unit_vectors_in_all_directions() -> None:
     assert np.abs(ties.mean(axis=0)).max() < 0.05
 
 
-def test_the_same_trial_draws_the_same_numbers() -> None:
-    for env, policy in itertools.islice(PAIRS, 0, None, 5):
-        one, two = draw(trial(env, policy, 2)), draw(trial(env, policy, 2))
-        for name in NAMES:
-            assert np.array_equal(getattr(one, name), getattr(two, name))
-
-
 STATES, STEPS = 7, 12
 CHANGING = {"drifting_pendulum", "moving_star"}
 """Systems that a forecast takes to stay as they are at the start."""
+
+
+NETWORKS = [MLP(), MLP(width=5, depth=3), Ensemble(members=3, width=5)]
+FORECAST = [*NETWORKS, Linear(), RFF(n_features=20)]
 
 
 def asked(system: System) -> tuple[np.ndarray, np.ndarray]:
@@ -409,7 +399,7 @@ def test_the_truth_is_that_of_the_first_step(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(SYSTEMS))
-@pytest.mark.parametrize("model", [MLP(), MLP(width=5, depth=3), Linear()])
+@pytest.mark.parametrize("model", FORECAST)
 def test_a_model_is_rolled_as_its_predictions_say(name: str, model: Model) -> None:
     system = SYSTEMS[name]()
     rng = np.random.default_rng(1)
@@ -425,11 +415,13 @@ def test_a_model_is_rolled_as_its_predictions_say(name: str, model: Model) -> No
 
 @pytest.mark.parametrize("name", [one for one in sorted(SYSTEMS) if one not in CHANGING])
 def test_forecasts_are_the_simulation_of_the_evaluation(name: str) -> None:
-    system = SYSTEMS[name]()
-    _, inputs = asked(system)
-    starts = np.tile(system.initial_state, (STATES, 1))
-    expected = simulate(system, inputs.swapaxes(0, 1))[1:]
-    np.testing.assert_allclose(true_forecast(system)(starts, inputs), expected, rtol=1e-11)
+    for integrator in INTEGRATORS:
+        system = SYSTEMS[name](integrator=integrator)
+        _, inputs = asked(system)
+        starts = np.tile(system.initial_state, (STATES, 1))
+        expected = simulate(system, inputs.swapaxes(0, 1))[1:]
+        found = true_forecast(system)(starts, inputs)
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-13)
 
 
 def test_the_parameters_of_the_moment_are_kept() -> None:

@@ -238,16 +238,6 @@ def test_a_journal_replays_to_the_same_parameters(learner: str, tmp_path: Path) 
         assert np.array_equal(again.states, states)
 
 
-def test_after_a_gap_the_rate_is_unknown_again() -> None:
-    explorer = Explorer(ENCODER, steps=300, **JOINT)
-    x = driven(explorer, 200)
-    explorer.reset()
-    x = np.array([0.5, 4.0])  # somewhere else, and fast
-    x = driven(explorer, 30, 2, x)
-    assert abs(explorer.states[-1][1] - x[1]) < 0.6
-    assert explorer.counts["resets"] == 1
-
-
 def test_a_question_later_than_the_measurement_keeps_the_estimate() -> None:
     late, prompt = (Explorer(ENCODER, steps=60, **JOINT) for _ in range(2))
     rng, x = np.random.default_rng(3), np.array([0.1, 0.0])

@@ -286,7 +286,7 @@ def test_what_is_stored_is_what_was_explored(url: str, run: Explorer) -> None:
     assert config.config["env"]["loss"] == "prequential"
 
 
-def test_an_exploration_by_a_policy_of_a_script_is_saved(url: str) -> None:
+def test_an_exploration_by_a_policy_of_a_script_is_saved(sqlite_url: str) -> None:
     """Nobody runs again what was measured: its class need not be importable."""
 
     @dataclass(frozen=True, kw_only=True)
@@ -298,8 +298,8 @@ def test_an_exploration_by_a_policy_of_a_script_is_saved(url: str) -> None:
 
     with explorer(policy=Typed()) as one:
         drive(one, 3)
-        assert one.save(url)
-    assert content(url)["n_steps"] == 3
+        assert one.save(sqlite_url)
+    assert content(sqlite_url)["n_steps"] == 3
 
 
 def test_saved_twice_is_saved_once(url: str, run: Explorer) -> None:
@@ -324,10 +324,10 @@ def test_saved_while_it_grows_is_saved_at_the_end(
     assert not examine(url, trial_key)
 
 
-def test_nothing_is_stored_before_the_first_step(url: str) -> None:
+def test_nothing_is_stored_before_the_first_step(sqlite_url: str) -> None:
     with explorer() as one:
-        assert not one.save(url)
-        with Reader.open(url) as reader:
+        assert not one.save(sqlite_url)
+        with Reader.open(sqlite_url) as reader:
             assert not reader.configs()
 
 
@@ -339,7 +339,7 @@ def test_the_default_is_the_database_of_the_launches(
     assert content(default_url())["n_steps"] == 40
 
 
-def test_the_states_of_a_trial_have_its_inputs_but_another_loss(url: str) -> None:
+def test_the_states_of_a_trial_have_its_inputs_but_another_loss(sqlite_url: str) -> None:
     system = dopt.SYSTEMS["pendulum"](horizon=30)
     spec = TrialSpec.of_system(system, "d_optimal")
     trial = dopt.run_trial(spec)
@@ -347,33 +347,33 @@ def test_the_states_of_a_trial_have_its_inputs_but_another_loss(url: str) -> Non
         for x, x_next in zip(trial.states, trial.states[1:], strict=False):
             one.ask(x)
             one.tell(x_next)
-        one.save(url)
-    with Reader.open(url) as reader:
+        one.save(sqlite_url)
+    with Reader.open(sqlite_url) as reader:
         [config] = reader.configs()
         stored = reader.trajectory(config.config_key, 0)
     assert np.array_equal(stored.inputs, trial.inputs)
     assert np.array_equal(stored.states, trial.states)
     assert config.env == "pendulum"
     assert config.config_key != spec.config_key
-    assert content(url)["trial_key"] != spec.trial_key
+    assert content(sqlite_url)["trial_key"] != spec.trial_key
     assert config.label.endswith("prequential loss")
 
 
-def test_the_error_on_a_test_run_is_stored(url: str, run: Explorer) -> None:
+def test_the_error_on_a_test_run_is_stored(sqlite_url: str, run: Explorer) -> None:
     with explorer(seed=1) as other:
         drive(other, 120)
         test = other.states, other.inputs
-    run.save(url, test=test)
-    assert content(url)["assessed"] == [(40, "free_run_error", run.free_run_error(*test))]
+    run.save(sqlite_url, test=test)
+    assert content(sqlite_url)["assessed"] == [(40, "free_run_error", run.free_run_error(*test))]
     drive(run, 10)
-    run.save(url)
-    assert [t for t, *_ in content(url)["assessed"]] == [40], "what was stored stays"
-    run.save(url, test=test)
-    assert content(url)["assessed"] == [(50, "free_run_error", run.free_run_error(*test))]
+    run.save(sqlite_url)
+    assert [t for t, *_ in content(sqlite_url)["assessed"]] == [40], "what was stored stays"
+    run.save(sqlite_url, test=test)
+    assert content(sqlite_url)["assessed"] == [(50, "free_run_error", run.free_run_error(*test))]
     with pytest.raises(SpecificationError, match="was given for predictions"):
-        run.save(url, test=(test[0], test[1][:5]))
+        run.save(sqlite_url, test=(test[0], test[1][:5]))
     with pytest.raises(SpecificationError, match="a pair"):
-        run.save(url, test=run.states)  # type: ignore[arg-type]
+        run.save(sqlite_url, test=run.states)  # type: ignore[arg-type]
 
 
 def test_another_run_of_the_same_arguments_is_refused(url: str, run: Explorer) -> None:
@@ -389,17 +389,17 @@ def test_another_run_of_the_same_arguments_is_refused(url: str, run: Explorer) -
         assert len(reader.launches()) == 1
 
 
-def test_fewer_steps_of_the_same_run_are_left_out(url: str, run: Explorer) -> None:
-    run.save(url)
-    before = content(url)
+def test_fewer_steps_of_the_same_run_are_left_out(sqlite_url: str, run: Explorer) -> None:
+    run.save(sqlite_url)
+    before = content(sqlite_url)
     with explorer() as other:
         drive(other, 15)
-        assert not other.save(url)
-        assert content(url) == before
+        assert not other.save(sqlite_url)
+        assert content(sqlite_url) == before
         drive(other, 45)
-        assert other.save(url)
-    assert content(url)["n_steps"] == 60
-    assert run.save(url) is False, "the other one has gone further"
+        assert other.save(sqlite_url)
+    assert content(sqlite_url)["n_steps"] == 60
+    assert run.save(sqlite_url) is False, "the other one has gone further"
 
 
 def test_after_a_kill_the_journal_goes_on_with_the_same_trial(url: str, tmp_path: Path) -> None:
@@ -522,22 +522,22 @@ def test_a_reader_sees_whole_runs_while_another_thread_saves(url: str) -> None:
     assert content(url)["n_steps"] == STEPS
 
 
-def test_parameters_that_are_not_finite_end_it_as_diverged(url: str) -> None:
+def test_parameters_that_are_not_finite_end_it_as_diverged(sqlite_url: str) -> None:
     with explorer(learner={"name": "adam_window", "learning_rate": 1e300}) as one:
         drive(one, 1)
-        one.save(url)
+        one.save(sqlite_url)
         with pytest.raises(DoptError, match="not finite"):
             drive(one, 50)
-        one.save(url)
+        one.save(sqlite_url)
         at = one.n_steps - 1
-    with Reader.open(url) as reader:
+    with Reader.open(sqlite_url) as reader:
         [config] = reader.configs()
         [trial] = reader.trials(config.config_key)
         curves = reader.curves(config.config_key)
     assert (trial.status, trial.diverged_at, trial.n_steps) == ("diverged", at, at)
     assert np.array_equal(np.isfinite(curves.values[0]), np.arange(STEPS) < at)
-    assert not examine(url, trial_key)
-    with Store.open(url) as store:
+    assert not examine(sqlite_url, trial_key)
+    with Store.open(sqlite_url) as store:
         assert store.retry("all") == 0, "no launch can run it again"
 
 

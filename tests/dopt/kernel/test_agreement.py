@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-import torch
 
 from dopt.algorithm import Form
 from dopt.errors import IncompatibleError, SpecificationError
@@ -31,10 +30,10 @@ from dopt.systems import SYSTEMS, System
 from dopt.trial_view import TrialView
 from tests.dopt.every_choice import CASES, combined
 from tests.dopt.kernel.test_information import jacobians
-from tests.dopt.kernel.twin import interpreted, relative_gap, run, transplant
+from tests.dopt.kernel.twin import interpreted, relative_gap, run
 from tests.dopt.newcomers import Alternating, Average
 from tests.dopt.trials import LEARNERS as FIXED
-from tests.dopt.trials import PAIRS, trial
+from tests.dopt.trials import PAIRS, covering, trial
 from tests.paths import ROOT
 
 WINDOW = {"name": "adam_window", "window": 4}
@@ -96,12 +95,6 @@ def test_both_paths_run_the_same_trial(env: str, policy: str, learner: dict[str,
         assert relative_gap(fast.parameters, plain.parameters) < 1e-8
 
 
-@pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
-@pytest.mark.parametrize("model", [{"width": 5, "depth": 1}, {"width": 7, "depth": 3}])
-def test_networks_of_any_shape_agree(policy: str, model: dict[str, int]) -> None:
-    check_agreement(trial("arm", policy, 4, env={"horizon": 12}, model=model))
-
-
 @pytest.mark.parametrize("model", [{"width": 9, "depth": 3}, {"width": 20, "depth": 1}])
 @pytest.mark.parametrize("form", ["primal", "dual", "sketch"])
 @pytest.mark.parametrize("env", ["pendulum", "arm"])
@@ -117,34 +110,6 @@ def test_d_optimal_inputs_of_the_oracle_model_at_another_ridge(env: str) -> None
     policy = {"name": "d_optimal", "regularization": 0.1}
     mapping: dict[str, Any] = trial(env, "oracle", 5, env={"horizon": 12}).to_mapping()
     check_agreement(TrialSpec.from_mapping(mapping | {"policy": policy}))
-
-
-@pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
-@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
-def test_late_in_a_trial_equal_states_give_equal_steps(env: str, policy: str) -> None:
-    late = 150
-    fast = KernelTrial(trial(env, policy, 6, env={"horizon": late + 1}))
-    plain = transplant(fast, run(fast, late))
-    fast.advance(late + 1)
-    with torch.no_grad():
-        plain.step(late)
-    gamma = fast.spec.system.gamma
-    assert plain.inputs[0, late].numpy() == pytest.approx(
-        fast.record.inputs[late], abs=1e-8 * gamma
-    )
-    assert relative_gap(fast.record.states[late + 1], plain.states[0, late + 1].numpy()) < 1e-8
-    assert relative_gap(fast.state.theta, plain.theta[0].numpy()) < 1e-8
-    assert fast.record.loss[late] == pytest.approx(plain.columns["loss"][0, late], rel=LOSS)
-
-
-@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
-def test_without_noise_the_path_is_that_of_the_simulator(env: str) -> None:
-    from dopt.evaluation import simulate
-
-    spec = trial(env, "random", env={"noise": 0.0})
-    result = run_trial(spec)
-    path = simulate(spec.system, result.inputs[:, None])[:, 0]
-    assert result.states == pytest.approx(path, rel=1e-11, abs=1e-12)
 
 
 def test_times_are_measured_and_add_up_to_less_than_the_whole() -> None:
@@ -246,29 +211,15 @@ def numbers(result: TrialResult) -> bytes:
     return b"".join(getattr(result, name).tobytes() for name in NUMBERS)
 
 
-@pytest.mark.parametrize("policy", sorted({policy for _, policy in PAIRS}))
-def test_the_same_trial_gives_the_same_bits_whatever_ran_before(policy: str) -> None:
-    """In every system, the second time after other systems than the first time."""
-    specs = [trial(env, policy, 8) for env, one in PAIRS if one == policy]
+def test_the_same_trial_gives_the_same_bits_whatever_ran_before() -> None:
+    """The second time after other trials than the first time."""
+    specs = [trial(env, policy, 8) for env, policy in covering(PAIRS)]
     first = [numbers(run_trial(spec)) for spec in specs]
     run_trial(trial("arm", "d_optimal", 9, model={"width": 11}))
     run_trial(trial("quadrotor", "oracle", 10))
     for spec, expected in zip(reversed(specs), reversed(first), strict=True):
         again = numbers(run_trial(TrialSpec.from_mapping(spec.to_mapping())))
-        assert again == expected, spec.system.name
-
-
-@pytest.mark.parametrize("policy", ["random", "uniform", "d_optimal", "oracle"])
-def test_a_trial_in_pieces_is_the_trial_at_once(policy: str) -> None:
-    spec = trial("arm", policy, 3)
-    whole, pieces = KernelTrial(spec), KernelTrial(spec)
-    whole.advance(30)
-    for last in (1, 2, 9, 9, 29, 30):
-        pieces.advance(last)
-        assert pieces.done == last
-    for name in ("states", "inputs", "loss", "reachable_loss"):
-        assert np.array_equal(getattr(whole.record, name), getattr(pieces.record, name)), name
-    assert np.array_equal(whole.state.theta, pieces.state.theta)
+        assert again == expected, spec.config.label
 
 
 def test_another_process_gives_the_same_bits() -> None:
@@ -280,11 +231,6 @@ def test_another_process_gives_the_same_bits() -> None:
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert bytes.fromhex(done.stdout) == numbers(run_trial(trial("cartpole", "d_optimal", 8)))
-
-
-def test_another_seed_gives_another_trial() -> None:
-    one, two = (run_trial(trial("arm", "d_optimal", seed)) for seed in (0, 1))
-    assert not np.any(one.loss == two.loss)
 
 
 def test_seeds_share_what_they_are_told_apart_by() -> None:
@@ -408,11 +354,11 @@ def test_an_input_that_is_no_finite_numbers_is_refused(what: str, shown: str, pa
     refused(own("Bringing", what), "adam", path, sentence)
 
 
-STEPS = 10_000
+STEPS = 4_000
 REGULARIZATION = 1e-7
 
 
-def test_ten_thousand_steps_at_a_tiny_regularization_drift_little() -> None:
+def test_many_steps_at_a_tiny_regularization_drift_little() -> None:
     spec = trial(
         "cartpole",
         "d_optimal",

@@ -94,19 +94,12 @@ def test_a_failed_compilation_is_not_taken_for_a_complete_one(folder: Path) -> N
     assert not (folder / "loop.complete").exists()
 
 
-def test_a_warm_cache_is_seen_without_the_compiler() -> None:
+def test_a_warm_cache_is_seen_without_the_compiler_and_a_trial_runs_without_its_rules() -> None:
+    """Numba would load the rules first, for a tenth of a second in every process."""
     warm_up()
     program = (
-        "import sys; from dopt.kernel import warm_up; warm_up(); assert 'numba' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True, cwd=ROOT)
-
-
-def test_a_trial_of_a_warm_cache_is_run_without_the_compiler_s_rules() -> None:
-    """Numba would load them first, for a tenth of a second in every process."""
-    warm_up()
-    program = (
-        "import sys; from dopt import TrialSpec, run_trial; "
+        "import sys; from dopt.kernel import warm_up; warm_up(); "
+        "assert 'numba' not in sys.modules; from dopt import TrialSpec, run_trial; "
         "run_trial(TrialSpec.from_names('pendulum', 'd_optimal')); "
         "assert not {'numba.np.arraymath', 'numba.typed.typeddict'} & {*sys.modules}"
     )
@@ -212,7 +205,8 @@ def test_another_checkout_finds_what_is_compiled(tmp_path: Path) -> None:
     assert first[1] == second[1]
 
 
-def test_a_function_compiled_for_another_is_not_stored(tmp_path: Path) -> None:
+def test_a_function_compiled_for_another_or_called_with_one_is_not_stored(tmp_path: Path) -> None:
+    """Whoever opened the second would compile its argument, without what its module prepares."""
     (tmp_path / "pair.py").write_text(
         "from pathlib import Path\n"
         "from dopt.kernel import stored_code\n"
@@ -224,32 +218,15 @@ def test_a_function_compiled_for_another_is_not_stored(tmp_path: Path) -> None:
         "@compiled\n"
         "def outer(x):\n"
         "    return 2.0 * inner(x)\n"
-        "assert outer(1.0) == 4.0\n"
+        "@compiled\n"
+        "def applied(functions, x):\n"
+        "    return 2.0 * functions[0](x)\n"
+        "assert outer(1.0) == applied((inner,), 1.0) == 4.0\n"
     )
     environment = os.environ | {"DOPT_CACHE": str(tmp_path / "cache")}
     subprocess.run([sys.executable, tmp_path / "pair.py"], check=True, env=environment)
     found = [path.name.partition("-")[0] for path in tmp_path.rglob("*.nbi")]
     assert found == ["pair.outer"]
-
-
-def test_code_for_compiled_functions_as_arguments_is_not_stored(tmp_path: Path) -> None:
-    """Whoever opened the file would compile the argument, without what its module prepares."""
-    (tmp_path / "called.py").write_text(
-        "from pathlib import Path\n"
-        "from dopt.kernel import stored_code\n"
-        "stored_code._PACKAGE = Path(__file__).parent\n"
-        "from dopt.kernel.compiler import compiled\n"
-        "@compiled\n"
-        "def inner(x):\n"
-        "    return x + 1.0\n"
-        "@compiled\n"
-        "def outer(functions, x):\n"
-        "    return 2.0 * functions[0](x)\n"
-        "assert outer((inner,), 1.0) == 4.0\n"
-    )
-    environment = os.environ | {"DOPT_CACHE": str(tmp_path / "cache")}
-    subprocess.run([sys.executable, tmp_path / "called.py"], check=True, env=environment)
-    assert not list(tmp_path.rglob("called.outer*"))
 
 
 ROUNDED = 1.0 + 2.0**-27
@@ -359,7 +336,6 @@ def test_a_process_finds_what_another_compiled_until_the_file_changes(tmp_path: 
     assert answer(tmp_path, 0.5) == (0, 9.0)
     assert answer(tmp_path, 0.5) == (1, 9.0)
     assert answer(tmp_path, 2.0) == (0, 24.0)
-    assert answer(tmp_path, 0.5) == (1, 9.0)
 
 
 def function_with(folder: Path, **values: object) -> types.FunctionType:

@@ -49,39 +49,6 @@ def test_it_is_the_inverse_of_the_sum_of_all_rows(env: str, policy: str) -> None
     assert_close(product, np.eye(len(M)), abs=1e-9)
 
 
-def test_information_never_decreases() -> None:
-    fast = KernelTrial(trial("arm", "d_optimal", env={"horizon": 60}, model={"width": 6}))
-    before = dense(fast.state.covariance)
-    for t in range(60):
-        fast.advance(t + 1)
-        after = dense(fast.state.covariance)
-        gained = np.linalg.eigvalsh(before - after)
-        assert gained[0] >= -1e-11 * before.max()
-        assert np.sum(gained > 1e-9 * gained[-1]) <= fast.spec.system.n_learned
-        before = after
-
-
-def test_two_thousand_steps_lose_no_definiteness_and_little_accuracy() -> None:
-    steps = 2_000
-    spec = trial(
-        "pendulum", "d_optimal", 2, env={"horizon": steps}, policy={"regularization": 1e-3}
-    )
-    fast = KernelTrial(spec)
-    parameters = run(fast, steps)
-    J = jacobians(spec, parameters, fast.record.states[:-1]).reshape(steps, -1)
-    M = 1e-3 * np.eye(J.shape[1]) + J.T @ J
-    covariance = dense(fast.state.covariance)
-    assert np.array_equal(covariance, covariance.T)
-    values = np.linalg.eigvalsh(covariance)
-    assert values[0] > 0.0
-    assert values[-1] <= 1e3 * (1 + 1e-9)
-    grid = spec.system.grid()
-    probes = jacobians(spec, np.repeat(parameters[-1:], len(grid), axis=0), grid)[:, 0]
-    carried = np.einsum("ni,ij,nj->n", probes, covariance, probes)
-    fresh = np.einsum("ni,in->n", probes, np.linalg.solve(M, probes.T))
-    assert carried == pytest.approx(fresh, rel=1e-8)
-
-
 FRESH = {"information": "fresh"}
 NEWEST = {"name": "adam", "learning_rate": 0.05}
 """A learner that moves the parameters far, so that old rows differ from fresh ones."""
@@ -273,22 +240,13 @@ WEIGHED = {"name": "ekf", "underweighting": 2.0, "noise_variance": 0.1}
 FADING = {"name": "ekf", "forgetting": 0.95, "noise_variance": 3.0, "regularization": 0.02}
 
 
-def kalman_jacobians(spec: TrialSpec, before: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Return J at each state and the parameters before its learning step, (t, r, q)."""
-    model = model_of_one(spec.system, spec.model)
-    rows = [
-        jacrev(model)(torch.tensor(p), torch.tensor(x)) for p, x in zip(before, states, strict=True)
-    ]
-    return torch.stack(rows).numpy()
-
-
 def filtered(learner: dict[str, Any], policy: str = "d_optimal", steps: int = 25) -> Any:
     """Return a trial, the parameters before each step and after the last, and J of each step."""
     spec = trial("arm", policy, 2, env={"horizon": steps}, learner=learner, model={"width": 5})
     fast = KernelTrial(spec)
     initial = fast.state.theta.copy()
     parameters = np.concatenate([initial[None], run(fast, steps)])
-    return fast, parameters, kalman_jacobians(spec, parameters[:-1], fast.record.states[:-1])
+    return fast, parameters, jacobians(spec, parameters[:-1], fast.record.states[:-1])
 
 
 @pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
@@ -306,7 +264,7 @@ def test_with_a_matrix_of_its_own_it_is_ridge_regression(regularization: float) 
     fast = KernelTrial(spec)
     fast.advance(30)
     states, zero = fast.record.states[:-1], np.zeros((30, 3))
-    psi = kalman_jacobians(spec, zero, states).reshape(-1, 3)
+    psi = jacobians(spec, zero, states).reshape(-1, 3)
     offset = spec.model.predict(spec.system, zero[0], states)
     rows = np.concatenate([psi / 2.0, np.sqrt(regularization) * np.eye(3)])
     values = (observed(fast, 30) - offset).ravel() / 2.0
@@ -367,26 +325,6 @@ def test_a_step_removes_at_most_a_share_of_an_error_and_of_its_variance(
     assert float((J @ dense(covariance) @ J.T)[0, 0]) >= share * before * (1 - 1e-6)
     plain = noise_variance / (noise_variance + before)
     assert plain * (1 - 1e-9) <= left <= plain + underweighting * before / noise_variance + 1e-12
-
-
-def test_of_a_linear_model_it_ends_where_recursive_least_squares_ends() -> None:
-    """Samples count alike once their prediction is far more certain than they are."""
-    given = {"name": "linear"}
-    env = {"horizon": 400, "noise": 0.0}
-    plain, weighed = (
-        run_trial(trial("cartpole", "random", 3, env=env, model=given, learner=one)).parameters
-        for one in (EKF, EKF | {"underweighting": 2.0})
-    )
-    assert np.array_equal(plain, weighed) is False
-    assert weighed == pytest.approx(plain, rel=1e-2)
-
-
-def test_the_policy_decides_about_the_prior_of_a_matrix_that_it_shares() -> None:
-    learners = [EKF | {"regularization": value} for value in (1e-3, 1.0)]
-    shared = [run_trial(trial("arm", "d_optimal", learner=one)) for one in learners]
-    own = [run_trial(trial("arm", "random", learner=one)) for one in learners]
-    assert np.array_equal(shared[0].parameters, shared[1].parameters)
-    assert not np.array_equal(own[0].parameters, own[1].parameters)
 
 
 @pytest.mark.parametrize("policy", ["d_optimal", "random"])
@@ -477,34 +415,6 @@ def test_the_growing_factor_is_that_of_a_fresh_factorisation(
     factor = np.tril(fast.state.posterior.factor)
     assert_close(factor, np.linalg.cholesky(K), abs=1e-8 * amplitude)
     assert_close(factor @ factor.T, K, abs=1e-12 * amplitude**2)
-
-
-@pytest.mark.parametrize("env", ["pendulum", "arm"])
-def test_the_mean_is_that_of_dense_algebra(env: str) -> None:
-    spec = process(env, env={"noise": 0.02})
-    fast = KernelTrial(spec)
-    fast.advance(30)
-    system, x, u = spec.system, fast.states, fast.record.inputs
-    known = np.stack(
-        [
-            system.known(tuple(a), tuple(b), system.parameters)
-            for a, b in zip(x[:-1], u, strict=True)
-        ]
-    )
-    observed = ((x[1:] - x[:-1]) / system.dt - known)[:, list(system.learned_rows)]
-    at = np.random.default_rng(0).normal(size=(4, system.n_states))
-    assert isinstance(spec.model, GaussianProcess)
-    cross = spec.model.kernel(system.featurize(at), system.featurize(x[:-1]))
-    mean = cross @ np.linalg.solve(covariance(spec, x[:-1]), observed)
-    predicted = spec.model.predict(system, fast.parameters, at)
-    assert predicted == pytest.approx(mean, rel=1e-6, abs=1e-6)
-
-
-def test_stored_parameters_give_the_last_loss() -> None:
-    spec = process("arm")
-    result, grid = run_trial(spec), spec.system.grid()
-    errors = spec.model.predict(spec.system, result.parameters, grid) - spec.system.learned(grid)
-    assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(result.final_loss, rel=1e-9)
 
 
 def test_where_a_trial_is_cut_makes_no_difference() -> None:

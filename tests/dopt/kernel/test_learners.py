@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch.func import grad, jacrev, vmap
 
-from dopt.assessment import model_forecast
 from dopt.errors import IncompatibleError
 from dopt.kernel.from_spec import points_of_trial, shared_points
 from dopt.kernel.linear_algebra import BLOCK, dense
@@ -96,16 +95,6 @@ def test_recursive_least_squares_is_ridge_regression(env: str, regularization: f
     assert fast.state.theta == pytest.approx(expected, rel=1e-7)
 
 
-@pytest.mark.parametrize("env", ["pendulum", "cartpole", "arm", "quadrotor"])
-def test_the_oracle_finds_the_true_parameters(env: str) -> None:
-    spec = trial(env, "oracle", env={"horizon": 200, "noise": 1e-4})
-    fast = KernelTrial(spec)
-    fast.advance(200)
-    truth = [getattr(spec.system, name) for name in spec.system.linear_parameters]
-    assert fast.state.theta == pytest.approx(truth, abs=0.05)
-    assert fast.record.loss[-1] < 0.05 * fast.record.loss[0]
-
-
 GAUSS_NEWTON = {"name": "gauss_newton"}
 OTHER = {"name": "gauss_newton", "capacity": 6, "refit_every": 3, "steps": 2}
 OTHER |= {"noise_variance": 0.2, "regularization": 0.02}
@@ -187,15 +176,6 @@ def test_a_fit_never_raises_what_it_minimises() -> None:
     assert np.median(falls) > 1e-6
 
 
-def test_many_steps_of_a_fit_end_at_a_minimum() -> None:
-    fast = advanced(GAUSS_NEWTON | {"steps": 100}, 12)
-    theta = fast.state.theta
-    J, e = linearized(fast, theta)
-    slope = J.T @ e + 1e-3 * (fast.state.prior - theta)
-    observations = observed(fast, fast.done).ravel()
-    assert np.abs(slope).max() < 1e-5 * np.abs(J.T @ observations).max()
-
-
 def test_a_buffer_that_is_full_forgets_the_oldest_samples() -> None:
     before, after = (advanced(GAUSS_NEWTON | {"capacity": 6}, steps) for steps in (24, 25))
     J, _ = linearized(after, before.state.theta, 19)
@@ -211,15 +191,6 @@ def test_between_two_fits_the_newest_sample_is_filtered() -> None:
     step = np.linalg.solve(M, J.T @ e / 0.5)
     assert after.state.theta - before.state.theta == pytest.approx(step, rel=1e-5, abs=1e-8)
     check_inverse(after, M)
-
-
-@pytest.mark.parametrize("env", ["pendulum", "quadrotor"])
-def test_it_explains_all_samples_better_than_the_window(env: str) -> None:
-    errors = []
-    for learner in (GAUSS_NEWTON, {"name": "adam_window"}):
-        fast = advanced(learner, 40, env, "random")
-        errors.append(np.sqrt(np.mean(linearized(fast, fast.state.theta)[1] ** 2)))
-    assert errors[0] < 0.1 * errors[1]
 
 
 def test_a_prior_below_rounding_ends_the_trial_as_diverged() -> None:
@@ -289,12 +260,6 @@ def test_a_step_follows_the_gradient_over_the_newest_samples_in_the_drawn_places
         assert fast.state.moment_1 == pytest.approx(expected.numpy(), rel=0.0, abs=1e-9 * scale)
 
 
-def test_an_absurd_learning_rate_ends_a_trial() -> None:
-    fast = KernelTrial(trial("pendulum", "random", learner=REPLAY | {"learning_rate": 1e300}))
-    fast.advance(30)
-    assert fast.diverged_at is not None
-
-
 FEATURES = {"name": "rff", "n_features": 30}
 
 
@@ -336,32 +301,6 @@ def test_change_of_the_rows_is_that_of_finite_differences(env: str) -> None:
         change = model.jacobian_change(x, direction[None])[0]
         for k, expected in enumerate((ahead - behind) / (2.0 * h)):
             assert relative_gap(change[k], expected) < 1e-8
-
-
-def test_stored_parameters_give_the_last_loss_and_keep_what_was_drawn() -> None:
-    spec = features("arm")
-    result, before = run_trial(spec), KernelTrial(spec).parameters
-    grid = spec.system.grid()
-    errors = spec.model.predict(spec.system, result.parameters, grid) - spec.system.learned(grid)
-    assert np.sqrt((errors**2).sum(axis=1).mean()) == pytest.approx(result.final_loss, rel=1e-9)
-    assert np.array_equal(result.parameters[60:], before[60:])
-    assert np.all(result.parameters[:60] != 0.0)
-    other = KernelTrial(spec.with_seed(4)).parameters
-    assert np.all(other[60:] != before[60:])
-
-
-def test_an_assessment_predicts_with_all_parameters() -> None:
-    spec = features("arm", env={"horizon": 20})
-    parameters = run_trial(spec).parameters
-    rng = np.random.default_rng(1)
-    states = rng.normal(size=(5, spec.system.n_states))
-    inputs = rng.normal(size=(5, 2, spec.system.n_inputs))
-    following = model_forecast(spec.system, spec.model, parameters)(states, inputs)[0]
-    flow = np.stack(
-        [*spec.system.known(tuple(states.T), tuple(inputs[:, 0].T), spec.system.parameters)]
-    )
-    flow[list(spec.system.learned_rows)] += spec.model.predict(spec.system, parameters, states).T
-    assert following == pytest.approx(states + spec.system.dt * flow.T, rel=1e-12)
 
 
 def test_memory_counts_the_features_at_the_evaluation_points() -> None:
@@ -409,23 +348,15 @@ def test_tanh_is_right_to_a_few_units_in_the_last_place() -> None:
     assert np.abs(found - exact).max() <= 2 * np.spacing(1.0)
     assert np.all(np.abs(found - exact) <= 6 * np.spacing(exact))
     assert np.all(found <= 1.0)
-
-
-def test_tanh_is_odd() -> None:
-    for x in np.random.default_rng(1).standard_normal(200) * 5:
-        assert tanh(-x) == -tanh(x)
+    assert [tanh(-x) for x in sizes[::50]] == [-value for value in found[::50]]
 
 
 @pytest.mark.parametrize(
-    "x", [0.0, -0.0, 5e-324, 1e-310, 1e-30, 19.99, 20.0, 20.01, 1e308, math.inf]
+    "x", [0.0, -0.0, 5e-324, 1e-310, 1e-30, 19.99, 20.0, 20.01, 1e308, math.inf, math.nan]
 )
 def test_tanh_at_the_edges(x: float) -> None:
-    assert tanh(x) == pytest.approx(math.tanh(x), rel=1e-15)
-    assert tanh(-x) == pytest.approx(math.tanh(-x), rel=1e-15)
-
-
-def test_tanh_of_nan_is_nan() -> None:
-    assert math.isnan(tanh(math.nan))
+    for value in (x, -x):
+        assert tanh(value) == pytest.approx(math.tanh(value), rel=1e-15, nan_ok=True)
 
 
 def test_tanh_never_falls() -> None:
@@ -466,19 +397,6 @@ def decrease(J: Array, C: Array, noise_variance: float) -> Array:
     removed = CJ @ np.linalg.solve(noise_variance * np.eye(J.shape[1]) + J @ CJ, CJ.mT)
     traces: Array = np.trace(removed, axis1=1, axis2=2)
     return traces
-
-
-def test_the_measures_are_those_of_the_whole_matrix() -> None:
-    rng = np.random.default_rng(0)
-    J, root = rng.normal(size=(3, 2, 7)), rng.normal(size=(7, 7))
-    M = np.eye(7) + root @ root.T
-    C = np.linalg.inv(M)
-    for noise_variance in (0.01, 30.0):
-        after = M + J.mT @ J / noise_variance
-        logs = np.linalg.slogdet(after)[1] - np.linalg.slogdet(M)[1]
-        traces = np.trace(C) - np.trace(np.linalg.inv(after), axis1=1, axis2=2)
-        assert growth(J, C, noise_variance) == pytest.approx(logs, rel=1e-9)
-        assert decrease(J, C, noise_variance) == pytest.approx(traces, rel=1e-9)
 
 
 MEASURES = {"exact": growth, "a_optimal": decrease}

@@ -6,7 +6,6 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
-import torch
 from numba import float64, int64
 from numba.core.dispatcher import Dispatcher
 
@@ -16,34 +15,10 @@ from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.steps import KernelSteps, NumpyParts
 from dopt.kernel.structs import Evaluation
-from dopt.reference.batch import AdamLearner, Lockstep
-from dopt.reference.models import jacobian
 from dopt.spec.trial import TrialSpec
 from dopt.trial_view import TrialView
 from dopt.types import Array, CompiledFunction, Matrix
 from tests.dopt.newcomers import kept
-
-
-def transplant(trial: KernelTrial, parameters: Array) -> Lockstep:
-    """Return a batch of one trial with the kernel's parameters, moments and history.
-
-    M is summed afresh from the rows at the ``parameters``, (t, q), after each of the steps done.
-    """
-    t, state, record = trial.done, trial.state, trial.record
-    twin = Lockstep([trial.spec])
-    twin.theta.copy_(torch.tensor(state.theta)[None])
-    twin.states[0, : t + 1] = torch.tensor(record.states[: t + 1])
-    twin.inputs[0, :t] = torch.tensor(record.inputs[:t])
-    twin.sampled_states[0, :t] = twin.states[0, :t]  # by the Euler map
-    twin.targets[0, :t] = torch.tensor(observed(trial, t))
-    if twin.information is not None:
-        rows, x = torch.tensor(parameters), twin.states[0, :t].unsqueeze(1)
-        J = jacobian(twin.model, twin.system.n_learned, rows, x)
-        twin.information.add(J.flatten(0, 2)[None])
-    assert isinstance(twin.learner, AdamLearner)
-    for ours, theirs in zip(twin.learner._moments, (state.moment_1, state.moment_2), strict=True):
-        ours.copy_(torch.tensor(theirs)[None])
-    return twin
 
 
 def observed(trial: KernelTrial, t: int) -> Array:

@@ -14,8 +14,8 @@ from tests.dopt.oracles.traces import jacobian, model_step
 from tests.dopt.trials import trial
 
 
-def filtered(spec: TrialSpec, outputs: Array, inputs: Array) -> tuple[Array, Array]:
-    """Return the estimated states, (T + 1, d), and parameters, (T + 1, q), without fits."""
+def filtered(spec: TrialSpec, outputs: Array, inputs: Array) -> tuple[Array, Array, Array]:
+    """Return states, (T + 1, d), parameters, (T + 1, q), and the last variances, without fits."""
     system, learner, C = spec.system, spec.learner, spec.system.output_rows
     assert isinstance(learner, JointKalman)
     theta, d, dt = draw(spec).weights, system.n_states, system.dt
@@ -45,7 +45,7 @@ def filtered(spec: TrialSpec, outputs: Array, inputs: Array) -> tuple[Array, Arr
         gain = covariance @ H.T @ np.linalg.inv(S)
         z = z + gain @ (y - H @ z)
         covariance = covariance - gain @ S @ gain.T
-    return np.array([*states, z[:d]]), np.array([*parameters, z[d:]])
+    return np.array([*states, z[:d]]), np.array([*parameters, z[d:]]), np.diag(covariance)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +70,6 @@ def test_it_is_the_filter_over_both_at_once(
     run = KernelTrial(spec)
     run.advance(15)
     outputs = run.record.true_states[1:] @ spec.system.output_rows.T + draw(spec).measurement_noise
-    states, parameters = filtered(spec, outputs, run.record.inputs)
+    states, parameters, _ = filtered(spec, outputs, run.record.inputs)
     assert run.record.states == pytest.approx(states, abs=1e-7)
     assert run.parameters == pytest.approx(parameters[-1], abs=1e-7)

@@ -12,10 +12,9 @@ from dopt.errors import SpecificationError
 from dopt.kernel.run import KernelTrial
 from dopt.randomness import draw
 from dopt.reference.batch import Lockstep, run_trials
-from dopt.reference.models import network_function
 from dopt.reference.planning import uniform_inputs
 from tests.close import assert_close
-from tests.dopt.custom_networks import for_one, model_of_one
+from tests.dopt.custom_networks import for_one
 from tests.dopt.reference.batch import situation, sphere, step_from
 from tests.dopt.trials import KNOWN_EFFECT, PAIRS, trial
 
@@ -84,20 +83,6 @@ def test_the_registered_network_is_the_module_of_the_same_weights() -> None:
     assert own.loss == pytest.approx(registered.loss, rel=1e-8)
 
 
-def test_the_flat_vector_holds_the_parameters_in_the_order_of_torch() -> None:
-    spec = trial("cartpole", "random", 1)
-    n_in, *_, n_out = spec.model.layer_sizes(spec.system)  # type: ignore[attr-defined]
-    hidden = [nn.Linear(n_in, 16), nn.Tanh(), nn.Linear(16, 16), nn.Tanh()]
-    module = nn.Sequential(*hidden, nn.Linear(16, n_out)).double()
-    theta = nn.utils.parameters_to_vector(module.parameters()).detach()
-    x = torch.tensor([0.3, -1.0, 2.0, 0.7], dtype=torch.float64)
-    phi = torch.tensor(spec.system.featurize(x.numpy()[None])[0])
-    function = network_function(spec.system, module)
-    registered = model_of_one(spec.system, spec.model)
-    assert torch.equal(for_one(function)(theta, x), module(phi))
-    assert registered(theta, x).numpy() == pytest.approx(module(phi).detach().numpy(), rel=1e-14)
-
-
 def test_information_is_the_prior_and_all_rows_after_each_learning_step() -> None:
     spec = trial("cartpole", "d_optimal", 2, env={"horizon": 6})
     batch = Lockstep([spec])
@@ -134,7 +119,7 @@ def spread(path: Tensor, following: Tensor) -> Tensor:
     return (following.unsqueeze(1) - path).norm(dim=-1).sum(dim=1)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("env", KNOWN_EFFECT)
 def test_no_input_on_the_sphere_leads_farther(env: str, seed: int) -> None:
     spec = trial(env, "uniform")

@@ -161,28 +161,6 @@ def test_the_input_turns_the_first_pendulum_alone() -> None:
     assert change == pytest.approx([0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_compiled_equations_are_those_of_a_row_of_that_length(n: int) -> None:
-    row, rng = CoupledPendulums(n_pendulums=n), np.random.default_rng(n)
-    assert_compiled_equations_agree(row, rng.normal(size=2 * n), rng.normal(size=1))
-
-
-def test_what_depends_on_the_number_of_pendulums_follows_it() -> None:
-    row = CoupledPendulums(n_pendulums=3, initial_state=(0.1, 0.2), friction=0.5)
-    assert (row.n_states, row.n_inputs, row.n_learned) == (6, 1, 3)
-    assert row.linear_parameters == ("friction_1", "friction_2", "friction_3")
-    assert row.parameters == (1.0, 6.25, 0.5, 0.5, 0.5)
-    assert (row.initial_state, row.grid_half_widths) == ((0.1, 0.2) * 3, (3.0,) * 3)
-    assert dataclasses.replace(row) == row
-
-
-def test_rows_without_number_are_refused() -> None:
-    with pytest.raises(SpecificationError, match=r"n_pendulums is 51, .* at most 50"):
-        CoupledPendulums(n_pendulums=51)
-    with pytest.raises(SpecificationError, match=r"initial_state has 3 entries, .* needs 4"):
-        CoupledPendulums(n_pendulums=2, initial_state=(0.0, 0.0, 0.0))
-
-
 def test_an_upright_drone_hovers_and_one_upside_down_falls() -> None:
     drone = Drone()
     assert drone.derivative(drone.initial_state, np.zeros(4)) == pytest.approx(0.0, abs=1e-14)

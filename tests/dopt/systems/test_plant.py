@@ -239,18 +239,6 @@ def test_the_grid_fills_its_box_evenly(name: str, data: st.DataObject) -> None:
     assert not grid[:, others].any()
 
 
-@full
-def test_the_mean_over_the_grid_tends_to_the_mean_over_the_box(name: str) -> None:
-    cls = SYSTEMS[name]
-    widths = np.array(cls().grid_half_widths)
-    exact = np.prod(np.sin(widths / 3) / (widths / 3))
-    errors = []
-    for n in (8, 16):
-        grid = cls(grid_points=(n,) * len(widths)).grid()[:, list(cls.grid_indices)]
-        errors.append(abs(np.cos(grid / 3).prod(axis=1).mean() - exact))
-    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.5)
-
-
 @settings(max_examples=20)
 @given(st.integers(1, 4), st.integers(0, 9))
 def test_a_low_discrepancy_set_takes_every_midpoint_of_every_axis_once(
