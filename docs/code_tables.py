@@ -6,7 +6,6 @@ import argparse
 import ast
 import dataclasses
 import functools
-import importlib
 import inspect
 import re
 import sqlite3
@@ -20,6 +19,7 @@ from analysis.cli import parser
 from dopt import LEARNERS, MODELS, POLICIES, Explorer, Plant
 from dopt.assessment import MEASURES
 from dopt.control import TASKS
+from dopt.kernel import plugin
 from dopt.systems import NAMED_SYSTEMS
 from dopt.systems.base import System
 from dopt.trial_view import TrialView
@@ -209,30 +209,17 @@ def figure_options() -> str:
     return markdown(["option", "meaning"], rows)
 
 
-KERNEL = "dopt.kernel."
-HELPERS = (
-    "policies.prediction.predicted_state",
-    "policies.prediction.input_columns",
-    "policies.prediction.learned_columns",
-    "information.update.model_rows",
-    "information.primal.quadratic_forms",
-    "learners.samples.store_sample",
-    "learners.samples.sampled_point",
-    "learners.adam.adam_step",
-    "points.model_point",
-)
-
-
 def kernel_helpers() -> str:
     """Return the functions of the kernel that compiled policies and learners may call."""
     rows = []
-    for path in HELPERS:
-        module, _, name = path.rpartition(".")
-        made = getattr(importlib.import_module(KERNEL + module), name)
+    for name in plugin.__all__:
+        made = getattr(plugin, name)
+        if inspect.isclass(made):
+            continue
         made = getattr(made, "py_func", made)
         said = first_sentence(inspect.getdoc(made) or "").removeprefix("Return ")
         names = ", ".join(inspect.signature(made).parameters)
-        rows.append([f"`{KERNEL}{path}({names})`", said])
+        rows.append([f"`{plugin.__name__}.{name}({names})`", said])
     return markdown(["function", "result"], rows)
 
 

@@ -44,7 +44,7 @@ def true_forecast(system: System) -> Forecast:
 def model_forecast(system: System, model: Model, parameters: Array) -> Forecast:
     """Return the forecast by a model with parameters (q,) in place of the true accelerations.
 
-    In compiled code are those of networks and of the linear form of physics.
+    Forecasts by networks and by the linear form of physics run in compiled code.
     """
     if not (system.compiled and model.compiled and isinstance(model, (MLP, Linear))):
         return forecast_by(system, lambda x, u: model.predict(system, parameters, x, u))
@@ -183,7 +183,7 @@ def parameter_error(
 ) -> float:
     """Return ‖θ - θ*‖₂ for learned parameters θ, (q,), with θ* true at a step.
 
-    They are those of the names, or without any those of the linear model.
+    They are the named parameters, or by default the linear model's.
     """
     return float(np.linalg.norm(np.asarray(parameters) - true_parameters(system, step, names)))
 

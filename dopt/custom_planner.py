@@ -27,7 +27,7 @@ def custom_planner(spec: TrialSpec) -> Planner | None:
     Raises
     ------
     SpecificationError
-        If a policy of a user's own returns something else.
+        If a user's policy returns something else.
     """
     policy, system, rng = spec.policy, spec.system, stream(spec.seed, "planner")
     if not isinstance(policy, CustomPolicy):
@@ -46,7 +46,7 @@ def custom_planner(spec: TrialSpec) -> Planner | None:
 
 
 class _Checked(Planner):
-    """A plan of a user's own, whose inputs are finite numbers or refused."""
+    """A user's plan, whose inputs are finite numbers or refused."""
 
     def __init__(self, name: str, plan: Planner) -> None:
         self._name, self._plan = name, plan
@@ -57,7 +57,7 @@ class _Checked(Planner):
         Raises
         ------
         SpecificationError
-            If it is none, no real numbers, or not finite while the model still is sound.
+            If it is no array of real numbers, or not finite while the model still is sound.
         """
         given: Any = self._plan.choose(view)
         chosen = _array(given)
@@ -83,7 +83,7 @@ class _Checked(Planner):
 
 
 def _array(given: Any) -> Array | None:
-    """Return what was given as an array; None for what is none, such as lists of two lengths."""
+    """Return what was given as an array; None if it is not one, such as lists of two lengths."""
     try:
         array: Array = np.asarray(given)
     except (TypeError, ValueError, RuntimeError):

@@ -125,7 +125,7 @@ def reachable_points(system: System) -> tuple[Array, Array]:
     inputs are random ones held for 5, 10, 20 and 40 steps, square waves at and around the
     eigenfrequency and one of rising frequency, each over the horizon, at most
     :data:`LONGEST_RUN` steps, without process noise. They are of the kind of two baselines,
-    ``random_held`` and ``periodic_square``, which visit states like those of the set. The sample
+    ``random_held`` and ``periodic_square``, which visit similar states. The sample
     is drawn without replacement from all states visited, with a fixed seed.
     """
     rng = np.random.default_rng(_SEED)

@@ -304,7 +304,7 @@ class KernelSupport(Validated):
 
     ``compiled`` says whether it does. A class with a ``name`` does not inherit it from another such
     class, whose algorithm may be another one: it declares it itself or is not compiled. It does
-    inherit it from a class without a name, such as that of all open-loop policies, and from one
+    inherit it from a class without a name, such as the base of open-loop policies, and from one
     whose algorithm is in numpy: the kernel has nothing of it.
     """
 

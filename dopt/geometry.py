@@ -1,4 +1,4 @@
-"""Drawings of systems in a plane, vertical but for those that move on one, as polylines and masses.
+"""Drawings of systems in a plane as polylines and masses; vertical, or the plane they move on.
 
 A custom system gets a drawing by registering one::
 

@@ -38,7 +38,7 @@ class Environment(BlackBox):
 
     A subclass names the environment and declares what :class:`BlackBox` asks for, and
     :meth:`state`, the map from an observation to the state. Positions must be among what is
-    observed with their rates: an environment that shows less is none for this package. Components
+    observed with their rates: an environment that shows less cannot be used. Components
     in ``angle_indices`` are followed over the full turn.
 
     ``dt`` has to be the time between two steps of the environment, γ within the box of its actions.

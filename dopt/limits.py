@@ -37,8 +37,8 @@ class Limits(Validated):
     Parameters
     ----------
     bounds : tuple of (name, lower, upper)
-        Bounds of states and inputs by name, in their units; infinite where there is none. Those of
-        an input hold 0.
+        Bounds of states and inputs by name, in their units; infinite where there is none. An
+        input's bounds include 0.
     rates : tuple of (name, rate)
         Largest change of inputs, in their unit per second.
     steps : int
@@ -212,7 +212,7 @@ def _rate(name: str, given: object) -> float:
 
 
 def _number(given: object) -> float:
-    """Return a number, NaN for what is none or is too large for one."""
+    """Return a float; NaN for anything that is not a number or is too large."""
     if not isinstance(given, int | float | np.number) or isinstance(given, bool):
         return math.nan
     try:

@@ -1,6 +1,6 @@
 """Samples of a trial, offline fits of its model to them, and the calibration of a learned model.
 
-In the calibration, the covariance of the parameters is that of the model's linearisation (Laplace
+In the calibration, the covariance of the parameters follows from the linearised model (Laplace
 approximation), with the rows of all samples at the learned parameters.
 
 ======  ==========================================================  =====
@@ -61,16 +61,16 @@ class Samples:
 def uniform_samples(spec: TrialSpec) -> Samples:
     """Return as many samples as a trial has steps, at states drawn uniformly from its grid's box.
 
-    The noise is that of the trial, w_t of equation 2. One step from a state x under any input is
+    The noise is the trial's, w_t of equation 2. One step from a state x under any input is
     observed as y = a(x) + w/dt in the learned rows: the known part, and with it the input, cancels.
     Where the effect of the inputs is learned, they are drawn uniformly from the sphere ‖u‖ = γ, or
     from the ball within for a model that is not affine in them.
     State components without an axis in the grid are zero, as they are there. Of a system that
-    changes, the accelerations are those of the last step, by which the final loss is judged.
+    changes, the accelerations belong to the last step, by which the final loss is judged.
 
-    Of a black box that tells the truth at any state, the samples are that, without noise. Of others
-    they are transitions under random inputs, as those of its loss are, from runs of other inputs;
-    there may be fewer.
+    A black box that tells the truth at any state gives it, without noise. Other black boxes give
+    transitions of runs under random inputs, made as for the loss but with other inputs; there may
+    be fewer.
     """
     system, rng = spec.system, stream(spec.seed, "uniform_states")
     states, inputs = _uniform_points(system, rng)
@@ -102,17 +102,17 @@ def recorded_samples(system: System, states: Array, inputs: Array) -> Samples:
     The observed accelerations are those that its learner was given: (x_{t+1} - x_t)/dt less the
     known part at x_t and u_t, in the learned rows. With the integrator of Runge and Kutta they are
     taken in the middle of the step, without what the learner's model adds to them. Where states are
-    measured with noise they are those of the true states, which the learner was not given.
+    measured with noise they follow from the true states, which the learner was not given.
 
     Raises
     ------
     SpecificationError
-        If the trial may have begun anew in its course: its record does not say where.
+        If the trial may have restarted on its way: its record does not say where.
     """
     if getattr(system, "restarts", False):
         raise SpecificationError(
             f"env.restarts of {system.name} is true, but the samples of a trial in one piece are "
-            f"expected, as its record does not say where it began anew: leave such trials out."
+            f"expected, as its record does not say where it restarted: leave such trials out."
         )
     at = system.sampled_states(states)
     known = system.known(tuple(at.T), tuple(inputs.T), system.parameters)
@@ -125,8 +125,8 @@ RIDGE = 1e-4
 """Weight ρ of ‖θ - θ₀‖² beside the sum of squares.
 
 It is the weight of a Gaussian prior around θ₀: the variance of an observed acceleration, σ²/dt, by
-that of a parameter. In the paper's systems the former is 1e-5 to 5e-5, and a fitted network moves
-its parameters by 0.2 to 0.5, root mean square.
+the variance of a parameter. In the paper's systems the former is 1e-5 to 5e-5, and a fit moves
+the parameters of a network by 0.2 to 0.5, root mean square.
 """
 
 MAX_STEPS = 3000
@@ -147,7 +147,7 @@ class OfflineFit:
     residual : float
         Root mean square error over the samples, noise included.
     steps : int
-        Steps of the fit; of an ensemble those of the network that took most.
+        Steps of the fit; for an ensemble the steps of the network that took most.
     converged : bool
         Whether further steps would have changed nothing that matters.
     """
@@ -183,7 +183,7 @@ def fit_offline(
     states : (N, d)
         States x.
     accelerations : (N, r)
-        Observed accelerations y, such as those of :func:`dopt.offline_fit.recorded_samples`.
+        Observed accelerations y, such as from :func:`dopt.offline_fit.recorded_samples`.
     inputs : (N, m), optional
         Inputs u, for a model that reads them.
     ridge : float
@@ -241,12 +241,12 @@ def fit_offline(
 
 
 def can_be_fitted(model: Model) -> bool:
-    """Tell whether a model has an offline fit."""
+    """Return True if a model has an offline fit."""
     return is_network(model) or model.structure == "least_squares"
 
 
 def is_network(model: Model) -> bool:
-    """Tell whether a model is the network that the kernel knows, or several of them."""
+    """Return True if a model is the kernel's network, or an ensemble of such networks."""
     return isinstance(model, MLP) and model.compiled
 
 
@@ -307,7 +307,7 @@ def _fit_network(
     columns = (np.array(rows.T, order="C") for rows in (features, accelerations))
     problem, theta = Problem(network, initial, float(ridge), *columns), initial.copy()
     kinds = tuple(map(kind_of, (problem, theta, most)))
-    # The machine code itself: called by its name, Numba would compile it anew for its own type of
+    # The machine code itself: called by its name, Numba would compile it again for its own type of
     # a tuple of equal numbers.
     code: Any = compiled_for("offline_fit", fit, kinds)
     steps, converged = code(problem, theta, most)
@@ -349,7 +349,7 @@ class HeldOutFit(NamedTuple):
     ----------
     r_squared : float
         1 - Σ e² / Σ (a - mean a)² over the states, mean over the learned components; 1 is a perfect
-        fit, 0 that of the mean.
+        fit, 0 a prediction of the mean.
     covered : float
         Share of the true accelerations within their interval of 90 %, NaN without a covariance.
         Accelerations that depend on no parameter, as those at rest may, do not count.
@@ -377,7 +377,7 @@ def held_out_fit(spec: TrialSpec, parameters: Array, states: Array, inputs: Arra
     parameters : (q,)
         Learned parameters θ.
     states, inputs : (T + 1, d), (T, m)
-        Of the trial: its samples give the covariance. There is none where the trial holds no
+        Of the trial: its samples give the covariance, NaN where the trial holds no
         information matrix, has several networks, no noise, or states that are measured with noise.
     """
     system, points = spec.system, evaluation_set(spec.system)

@@ -21,7 +21,7 @@ def usable_cores() -> int:
     """Return the number of cores that this process can keep busy, at least 1.
 
     Quotas of control groups count (``docker --cpus``, limits of Kubernetes, ``CPUQuota`` of
-    systemd), versions 1 and 2, also those of the groups around that of this process. A part of a
+    systemd), versions 1 and 2, including the groups around this process's group. A part of a
     core counts for nothing.
     """
     return max(1, int(min([len(os.sched_getaffinity(0)), *_quotas()])))

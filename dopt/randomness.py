@@ -41,7 +41,7 @@ _STREAMS = {
 }
 
 PLANNED_DIMENSIONS = 4
-"""Norms of planned inputs are those of points drawn uniformly from a ball of 4 m dimensions."""
+"""Planned inputs have the norms of points drawn uniformly from a ball of 4 m dimensions."""
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
@@ -75,9 +75,9 @@ class Draws:
         Unit vectors that decide between inputs of equal value.
     radii : (T, 2)
         Norm in γ of the planned input, and of the next sample's input in the criterion of that
-        plan. They are 1 but for a model that is not affine in the inputs, which learns of the ball
-        ‖u‖ ≤ γ only what it has seen: the first is that of a uniform point of a ball of 4 m
-        dimensions, the second of a ball of m.
+        plan. They are 1 unless the model is not affine in the inputs: it learns only where in the
+        ball ‖u‖ ≤ γ it has samples. Then the first is the norm of a uniform point of a ball of
+        4 m dimensions, the second of a ball of m.
     replay : (T, steps, batch)
         Places of the buffer that make the minibatches of a learner with replay; otherwise empty.
     plans, parameters : (blocks, ·), (q, s)

@@ -306,7 +306,7 @@ def source_digest(cls: type) -> str:
     Raises
     ------
     SpecificationError
-        If the source cannot be read, as that of an interpreter's lines.
+        If the source cannot be read, as for a class typed into an interpreter.
     """
     if cls not in _digests:
         _digests[cls] = _digest(_source(cls))

@@ -37,7 +37,7 @@ def run_trial(spec: TrialSpec, path: Path | None = None) -> TrialResult:
     Raises
     ------
     SpecificationError
-        If that path cannot run the trial, or the specification is none.
+        If that path cannot run the trial, or ``spec`` is not a TrialSpec.
     """
     if not isinstance(spec, TrialSpec):
         raise SpecificationError(
@@ -65,7 +65,7 @@ class Rerun:
     Attributes
     ----------
     steps : (k,)
-        Numbers of steps done; past a divergence there are none.
+        Numbers of steps done, none past a divergence.
     parameters : (k, q)
         Parameters of the model after each of them.
     states : (T + 1, d)

@@ -17,7 +17,7 @@ from dopt.trial_view import TrialView
 class Curiosity(CustomPolicy):
     """Take the candidate whose predicted next state is farthest from its nearest neighbour.
 
-    Distances are measured between features, so that an angle and its full turn are the same place.
+    Distances are those of the features, so that an angle and its full turn are the same place.
 
     Parameters
     ----------

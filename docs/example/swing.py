@@ -44,7 +44,7 @@ class Swing(Environment):
     def known(
         state: Any,
         inputs: Any,
-        parameters: Any,  # noqa: ARG004  # it has no parameters
+        parameters: Any,  # noqa: ARG004  # there are none
     ) -> tuple[Any, ...]:
         return state[1], 3.0 * inputs[0]
 

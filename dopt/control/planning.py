@@ -174,7 +174,7 @@ def run_episode(
     plant
         Of the true system.
     forecast
-        Prediction that the planner uses: that of a model, or of the true system.
+        Prediction that the planner uses, by a model or by the true system.
     noise : (steps, d)
         w_t of the plant.
     rng
@@ -247,7 +247,7 @@ def costs(system: System, goal: Goal, states: Array, inputs: Array) -> Array:
 
 
 def succeeds(system: System, goal: Goal, states: Array) -> bool:
-    """Tell whether the last ``settle_steps`` of states (n, d) are at the goal."""
+    """Return True if the last ``settle_steps`` of states (n, d) are at the goal."""
     errors = states[-goal.settle_steps :] - np.array(goal.goal)
     angles = list(system.angle_indices)
     errors[:, angles] = np.angle(np.exp(1j * errors[:, angles]))
@@ -304,7 +304,7 @@ def free_run_error(system: System, forecast: Forecast, steps: int) -> float:
 
     The squared error of each state component is divided by the mean square of its true change
     since the start, and the mean over the components is taken: 1 is the error of the prediction
-    that nothing changes, 0 that of the true model. No unit. Infinite or NaN where the model's
+    that nothing changes, 0 the error of the true model. No unit. Infinite or NaN where the model's
     prediction overflows.
     """
     truth = held_out(system, steps)

@@ -156,7 +156,7 @@ class Control(Validated):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Goal:
-    """Settings of a task that depend on the system; the fields are those of :class:`Control`.
+    """Settings of a task that depend on the system; fields as in :class:`Control`.
 
     The tasks of the shipped systems share the values that are given here.
     """

@@ -137,7 +137,7 @@ def measured(system: System) -> System:
     declared: dict[str, Any] = {
         "compiled": True,
         "measured": True,
-        "to_section": lambda self: section,  # noqa: ARG005  # that of the system itself
+        "to_section": lambda self: section,  # noqa: ARG005  # the system's own
         "__module__": kind.__module__,
     }
     explored: type[System] = dataclasses.dataclass(frozen=True, kw_only=True)(

@@ -92,7 +92,7 @@ class UnlearnedStates:
             _log.warning(
                 "nothing was learned from the last %d states (%s), but states are expected every "
                 "%g s: tell() each state that followed an input, give times in seconds, call "
-                "reset() if their clock began anew, and give a limit that no state is beyond, and "
+                "reset() if their clock restarted, and give a limit that no state is beyond, and "
                 "a policy and a learner that are faster than that",
                 *(MANY, counts, self._dt),
             )
@@ -142,7 +142,7 @@ class Explorer(SavedExplored):
         The plant; a system, such as one of ``dopt.SYSTEMS`` or an environment of Gymnasium, says by
         its horizon how many steps there are.
     policy, model, learner : str, mapping or object
-        As those of :meth:`dopt.TrialSpec.of_system`.
+        As in :meth:`dopt.TrialSpec.of_system`.
     limits : mapping, optional
         Bounds of states and inputs that inputs are to heed, and rates of inputs, such as
         ``{"bounds": {"angle": [-2, 2], "voltage": [-5, 5]}, "rates": {"voltage": 100}}``
@@ -169,7 +169,7 @@ class Explorer(SavedExplored):
     Raises
     ------
     SpecificationError, IncompatibleError
-        As :meth:`dopt.TrialSpec.from_names`; also if the journal is that of another exploration.
+        As :meth:`dopt.TrialSpec.from_names`; also if the journal belongs to another exploration.
     """
 
     def __init__(
@@ -249,7 +249,7 @@ class Explorer(SavedExplored):
             return self._answer(x, now, self._was_told(state, now)).copy()
 
     def _was_told(self, state: npt.ArrayLike, now: float | None) -> bool:
-        """Tell whether a state is the one that was told last, and so is counted already."""
+        """Return True if a state was told last, and so is already counted."""
         told, then = self._told
         return now in (None, then) and np.array_equal(np.asarray(state), told, equal_nan=True)
 
@@ -273,7 +273,7 @@ class Explorer(SavedExplored):
         return state.answer
 
     def reset(self) -> None:
-        """Forget the present state: the plant, or its clock, starts anew with the next one."""
+        """Forget the present state: the plant, or its clock, restarts with the next one."""
         with uninterrupted(), self._lock:
             self._require_open()
             self._wait()
@@ -358,7 +358,7 @@ class Explorer(SavedExplored):
         return x
 
     def _is_usable(self, x: Array) -> bool:
-        """Tell whether a state can be a measurement; angles may turn as often as they like."""
+        """Return True if a state can be a measurement; angles may turn without bound."""
         return bool(np.all(np.abs(x) <= self._limits))  # also false for NaN
 
     def _require_open(self) -> None:
@@ -418,7 +418,7 @@ class Explorer(SavedExplored):
         stored, given = completed(journal.events[0]["trial"]), completed(self.spec.to_mapping())
         if stored != given:
             raise SpecificationError(
-                f"the journal {journal.path} is that of another exploration "
+                f"the journal {journal.path} belongs to another exploration "
                 f"({difference(stored, given)}): give the same arguments as then, or "
                 f"another file."
             )

@@ -56,7 +56,7 @@ class Journal:
     Raises
     ------
     SpecificationError
-        If the file cannot be opened, is being written, or is none of this kind.
+        If the file cannot be opened, is being written, or is not a journal.
     """
 
     def __init__(self, path: str | Path, fsync: bool, about: Event) -> None:
@@ -179,7 +179,7 @@ def _read(path: Path, beginning: bytes) -> tuple[int, int, list[dict[str, Any]]]
     if events and (
         events[0].get("format") not in (1, FORMAT) or not isinstance(events[0].get("trial"), dict)
     ):
-        raise foreign(path, "its first line is that of no exploration")
+        raise foreign(path, "its first line describes no exploration")
     return whole, before, events
 
 
@@ -204,7 +204,7 @@ def _damaged(path: Path, number: int) -> SpecificationError:
 
 
 def foreign(path: Path, reason: str) -> SpecificationError:
-    """Return the error for a file that is none of this kind."""
+    """Return the error for a file that is not a journal."""
     return SpecificationError(
         f"{path} is no journal of format 1 or {FORMAT} ({reason}), but one was expected there: "
         f"give the path of a journal, or of a file that does not exist."
@@ -228,7 +228,7 @@ _INPUTS = ("applied", "plan", "missed")
 
 
 def is_event(event: Event, n_states: int, n_inputs: int) -> bool:
-    """Tell whether an event has the entries of its kind, and finite numbers in them."""
+    """Return True if an event has the entries of its kind, with finite numbers."""
     entries = next((entries for kind, entries in _ENTRIES.items() if kind in event), ())
     if not entries or not event.keys() >= set(entries):
         return False

@@ -93,7 +93,7 @@ def free_run_error(
     """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations.
 
     Where the run has the measured states alone, predictions start from the estimates of a filter,
-    the first of them after so many steps as a prediction has, and their error is that of the
+    the first of them after so many steps as a prediction has, and the error is taken over the
     measured states.
     """
     system = spec.system
@@ -149,7 +149,7 @@ def _check_finite(run: Array, inputs: Array) -> None:
 
 
 def _variance(spec: TrialSpec) -> float:
-    """Return ρ of the filter over the state: that of the learner, or of joint_ekf by default."""
+    """Return ρ of the filter over the state: the learner's, or the default of joint_ekf."""
     learner = spec.learner if isinstance(spec.learner, JointKalman) else JointKalman()
     return learner.noise_variance
 
@@ -216,8 +216,8 @@ class Explored:
     def errors(self) -> Array:
         """Errors ‖y - a_θ(x, u)‖ of the accelerations, each before it was learned, (t,).
 
-        Where states are measured with noise, they are those of the predicted measurements, in
-        standard deviations of their noise.
+        Where states are measured with noise, they are errors of predicted measurements, in
+        standard deviations of the noise.
         """
         return self._state.steps.errors[: self.n_steps].copy()
 
@@ -246,9 +246,9 @@ class Explored:
         Returns
         -------
         float
-            Relative root mean square error, without a unit: 0 for perfect predictions, 1 for those
-            that nothing changes (:func:`dopt.control.planning.relative_error`). That of measured
-            states alone has their noise in it.
+            Relative root mean square error, without a unit: 0 for perfect predictions, 1 for the
+            prediction that nothing changes (:func:`dopt.control.planning.relative_error`). Over
+            measured states it includes their noise.
 
         Raises
         ------
@@ -309,14 +309,14 @@ class SavedExplored(Explored):
     def save(self, url: str | None = None, test: Run | None = None) -> bool:
         """Store the exploration so far as a trial in the results database of the launches.
 
-        The loss of its steps is :attr:`errors`: prequential, and not that of a grid. Called again,
+        The loss of its steps is :attr:`errors`: prequential, not over a grid. Called again,
         also after the journal was reopened, it adds the new steps to the same trial in one
         transaction. It may be called from another thread than :meth:`ask` and :meth:`tell`.
 
         Parameters
         ----------
         url : str, optional
-            Database, such as ``sqlite:///results.db``; by default that of a launch.
+            Database, such as ``sqlite:///results.db``; by default the one a launch uses.
         test : (states, inputs), optional
             Another recorded run, of shapes (T + 1, d) and (T, m). The error of predictions of it
             (:meth:`free_run_error`) is stored as the assessment ``free_run_error``.
@@ -380,7 +380,7 @@ class SavedExplored(Explored):
         if not isinstance(test, tuple | list) or len(test) != 2:
             raise SpecificationError(
                 f"test is {type(test).__name__}, but a pair (states, inputs) is expected: give "
-                f"those of a recorded run."
+                f"both of a recorded run."
             )
         predicted = functools.partial(predict, self.spec, parameters)
         return Assessment(n, "free_run_error", free_run_error(self.spec, predicted, *test))

@@ -89,7 +89,7 @@ class PunctualPlanner:
 
 
 def may_remember_plans(spec: TrialSpec) -> bool:
-    """Tell whether the plan of a step may depend on those of the steps before."""
+    """Return True if the plan of a step may depend on earlier plans."""
     policy, q = spec.policy, spec.model.n_parameters(spec.system)
     compiled = policy.compiled and not policy.is_in_numpy()
     return not compiled or policy.memory_size(spec.system, q) > 0
@@ -177,7 +177,7 @@ class ExplorerState:
             self._move(x, event["time"])
         elif "gap" in event:
             self.counts["gaps"] += 1
-            self.present = None  # a state after a gap is begun anew, whatever it is
+            self.present = None  # after a gap the exploration goes on from any state
             self._move(np.array(event["gap"]), event["time"])
         elif "lost" in event:
             self.counts[event["lost"]] += 1
@@ -186,7 +186,7 @@ class ExplorerState:
             self.counts[event["counted"]] += 1
 
     def may_replay(self, event: Event) -> bool:
-        """Tell whether an event of a journal is one that can follow."""
+        """Return True if an event of a journal can follow the present state."""
         needs_state = event.keys() & {"learn", "plan", "missed"}
         follows = self.present is not None and self.done < self.spec.system.horizon
         whole = is_event(event, len(self._measured), self.spec.system.n_inputs)

@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 class Learner(KernelPart):
     """An online update of the model's parameters from the samples seen so far.
 
-    ``structure`` is that of the models which it teaches (:class:`dopt.models.Model`), and
+    ``structure`` is the kind of model this learner can train (:class:`dopt.models.Model`), and
     ``updates_information`` says whether its step also adds the sample to the information matrix.
     ``reads_inputs`` says whether it teaches models that depend on the inputs, and
     ``estimates_states`` whether it learns from measured states with noise by estimating all states.
@@ -79,7 +79,7 @@ class CustomLearner(Learner):
 
 
 def _checked(make: Callable[..., Updater]) -> Callable[..., Updater]:
-    """Return a method that makes an updater and refuses what is none."""
+    """Return a method that makes an updater and refuses any other object."""
 
     @functools.wraps(make)
     def updater(self: CustomLearner, system: System, rng: np.random.Generator) -> Updater:
@@ -139,14 +139,14 @@ def check_update(name: str, updated: Array, shape: tuple[int, ...]) -> None:
 class InformationLearner(Learner):
     """A learner that updates θ and the information matrix M together.
 
-    There is one information matrix. With a policy that plans by M the learner takes that of the
-    policy, with its λ; with any other it holds one of its own. M is held as a q × q matrix.
+    There is one information matrix. With a policy that plans by M the learner uses the policy's
+    matrix, with its λ; with any other it holds one of its own. M is held as a q × q matrix.
 
     Parameters
     ----------
     regularization : float
         λ of a learner with a matrix of its own; with ρ = 1 it is the ratio of the variance of the
-        observations to that of the initial parameters.
+        observations to the variance of the initial parameters.
     noise_variance : float
         ρ, in the units in which the parameters have the variance 1/λ.
     """

@@ -85,7 +85,7 @@ class GaussNewton(InformationLearner):
 
     A fit takes damped Gauss-Newton steps θ += s M⁻¹ (Jᵀe/ρ + λ(θ₀ - θ)): s is 1, or the first of
     1/2, 1/4, ... 1/64 at which the objective does not grow; where it grows at all of them, θ stays.
-    M is then that of the last step: the rows of all samples in the buffer at the parameters before
+    M then belongs to the last step: the rows of all samples in the buffer at the parameters before
     it. (With other learners M sums rows at the parameters of their own time.) Between two fits the
     newest sample is filtered (:class:`dopt.learning.ExtendedKalman`). A λ so small that rounding
     leaves M indefinite ends the trial as diverged.
@@ -197,8 +197,8 @@ class JointKalman(InformationLearner):
 
         P ← A P Aᵀ + dt² E (ρI + ζ J M⁻¹ Jᵀ) Eᵀ,    Ψ ← A Ψ + dt E J,
 
-    and takes each measured state in with the gain K = P Cᵀ/s: M ← M + (CΨ)ᵀ(CΨ)/s, hence the
-    information is that of the output's Jacobian CΨ; θ ← θ + Δ with Δ = M⁻¹(CΨ)ᵀ e/s;
+    and takes each measured state in with the gain K = P Cᵀ/s: M ← M + (CΨ)ᵀ(CΨ)/s, hence its
+    rows are the output's Jacobian CΨ; θ ← θ + Δ with Δ = M⁻¹(CΨ)ᵀ e/s;
     Ψ ← Ψ - K CΨ; x̂ ← x̂ + K e + ΨΔ; P ← P - K Kᵀ s. The initial state is known.
 
     Plans of searches count a sample as JᵀJ/ρ, which is more than outputs tell; D-optimal inputs do
@@ -206,9 +206,9 @@ class JointKalman(InformationLearner):
 
     ζ stands for what the linearisation leaves out (:class:`dopt.learning.ExtendedKalman`).
 
-    Every ``refit_every`` steps θ is fitted anew to all that was measured: with the filter over x̂
+    Every ``refit_every`` steps θ is fitted again to all that was measured: with the filter over x̂
     alone, damped Gauss-Newton steps lead to the minimum of Σ (e²/s + log s) + λ‖θ - θ₀‖², and x̂,
-    P, Ψ and M are those of the whole run at the θ that is found. The time of a fit grows with the
+    P, Ψ and M are computed over the whole run at the θ found. The time of a fit grows with the
     number of steps. With ``noise="fitted"`` it then moves ρ by factors of 10^(1/4), two decades at
     most, as long as Σ (e²/s + log s) falls: to what is likeliest. One ρ stands for all
     accelerations.
@@ -220,7 +220,7 @@ class JointKalman(InformationLearner):
     underweighting : float
         ζ, at least 0.
     refit_every : int
-        Steps from one fit to the next; with more than a trial has there is none.
+        Steps from one fit to the next; with more than a trial has, there is no fit.
     steps : int
         Gauss-Newton steps of a fit.
     noise : str

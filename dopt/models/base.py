@@ -41,11 +41,11 @@ class Model(KernelSupport):
 
     @property
     def n_members(self) -> int:
-        """Number of networks that take turns in learning steps and plans, 1 but for ensembles."""
+        """Number of ensemble members (1 for a single network)."""
         return 1
 
     def n_member_parameters(self, system: System) -> int:
-        """Return how many parameters a learning step and a plan work on: those of one member."""
+        """Return the number of parameters of one member, which a learning step or plan works on."""
         return self.n_parameters(system) // self.n_members
 
     @abstractmethod
@@ -74,12 +74,12 @@ class Model(KernelSupport):
         return with_inputs(states, inputs, self.n_inputs_read(system))
 
     def features(self, system: System) -> tuple[Feature, ...]:
-        """Return the p features of a point: those of the state, then the inputs, if they count."""
+        """Return the p features of a point: of the state, then the inputs that the model reads."""
         first, m = system.n_states, self.n_inputs_read(system)
         return (*system.features, *(Feature("identity", first + j) for j in range(m)))
 
     def feature_scales(self, system: System) -> tuple[float, ...]:
-        """Return the divisor of each feature: that of the system, and γ for an input."""
+        """Return the divisor of each feature: the system's scale, and γ for an input."""
         return (*system.feature_scales, *[system.gamma] * self.n_inputs_read(system))
 
     def featurize(self, system: System, points: Array) -> Array:

@@ -108,7 +108,7 @@ class AffineMLP(BlackBoxMLP):
 
     With h the last hidden layer, the output layer is linear in (h, h u₁/γ, ..., h u_m/γ, u/γ): one
     matrix W, (r, (1 + m) w + m), and a bias, (r,). In the flat parameter vector they come last, as
-    those of the last layer of :class:`dopt.models.MLP`.
+    the last layer of :class:`dopt.models.MLP` does.
     """
 
     name: ClassVar[str] = "affine"
@@ -137,7 +137,7 @@ class Ensemble(MLP):
     it, so that the trial explores as with one network. The others take turns, one learns at each
     step, so that a step costs two learning steps whatever E is. Losses, predictions and control use
     the mean of all members, whose errors partly cancel. It goes with a learner that fits all
-    samples anew at each step. The parameters are those of the members one after the other.
+    samples again at each step. The parameters are the members' parameters, one after the other.
     Reference: B. Lakshminarayanan et al., "Simple and scalable predictive uncertainty
     estimation using deep ensembles" (2017).
 

@@ -158,7 +158,7 @@ class CustomPolicy(ClosedLoop):
 
 @dataclass(frozen=True, kw_only=True)
 class TaskPolicy(CustomPolicy):
-    """A policy that learns the control task of the trial, or that of the system where it has none.
+    """A policy that learns the control task of the trial, or by default of the system.
 
     Its plan has a law of feedback (:meth:`Planner.feedback`), which is assessed beside the model.
     """

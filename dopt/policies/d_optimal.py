@@ -309,7 +309,7 @@ class GreedyLinearPlan(Planner):
 
 
 def is_linear(system: System) -> bool:
-    """Tell whether f(x, u) adds up over states and inputs, and the features are the whole state."""
+    """Return True if f(x, u) is linear and the features are the whole state."""
     if isinstance(system, BlackBox):
         return False
     seen = sorted(feature.index for feature in system.features)

@@ -224,7 +224,7 @@ class SpaceFilling(HeldCandidates, CustomPolicy):
     """Apply the input that leads farthest from the samples, without an information matrix.
 
     Each candidate is held for ``lookahead`` predicted steps. With φ the features of the state
-    that it leads to, and of u/γ where the model reads inputs, φ_s those of the samples, y and y_s
+    that it leads to, and of u/γ where the model reads inputs, φ_s the samples' features, y and y_s
     the predicted and the observed accelerations, each by the standard deviation of the latter, it
     is worth
 
@@ -261,7 +261,7 @@ class SpaceFilling(HeldCandidates, CustomPolicy):
 
 
 class SpaceFillingPlan(Planner):
-    """The plan of one trial: it looks at all samples anew at each step."""
+    """The plan of one trial: it looks at all samples at each step."""
 
     def __init__(self, policy: SpaceFilling, system: System) -> None:
         self._policy, self._system = policy, system

@@ -14,7 +14,7 @@ from dopt.policies.base import Array, InformationPolicy, check_length
 from dopt.systems.base import System
 
 BLOCKS = 32
-"""Steps with random numbers of their own; the numbers of later steps are those of earlier ones."""
+"""Steps with random numbers of their own; later steps use the same numbers again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,11 +53,11 @@ class ICEM(InformationPolicy):
     elites : int
         Plans that an iteration hands on.
     criterion : {"joint", "sum", "variance", "task"}
-        ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` that of each state's
-        rows alone, summed over the path (the criterion of B. Sukhija et al., "Optimistic active
-        exploration of dynamical systems", 2023), ``variance`` the trace of J M⁻¹ Jᵀ (that of
-        ensembles), and ``task`` the decrease of the variance summed over states of the
-        evaluation box (:class:`dopt.policies.TaskOptimal`).
+        ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` the same of each
+        state's rows alone, summed over the path (the criterion of B. Sukhija et al.,
+        "Optimistic active exploration of dynamical systems", 2023), ``variance`` the trace
+        of J M⁻¹ Jᵀ (as for ensembles), and ``task`` the decrease of the variance summed over
+        states of the evaluation box (:class:`dopt.policies.TaskOptimal`).
     domain : {"everywhere", "box"}
         Where a state's rows count.
     samples : int
@@ -135,8 +135,8 @@ class ICEM(InformationPolicy):
 class Episodic(ICEM):
     """Search for the best sequence of held inputs, and carry it out before the next search.
 
-    The search is that of :class:`dopt.policies.icem.ICEM`, at step 1 and at the multiples of k.
-    Between two searches the inputs are those of the best plan, whatever is observed. With k = H
+    It searches as :class:`dopt.policies.icem.ICEM`, at step 1 and at the multiples of k.
+    Between two searches the best plan is followed, whatever is observed. With k = H
     whole plans are carried out, as by the episodic D-optimal agent of M. Blanke and M. Lelarge,
     "FLEX: an adaptive exploration algorithm for nonlinear systems" (2023); with k < H and
     ``criterion`` "joint" it is the planner of M. Schultheis et al., "Receding horizon curiosity"

@@ -114,7 +114,7 @@ class AtEigenfrequency(OpenLoop):
 class Periodic(AtEigenfrequency):
     """u_t = γ sin(ω t dt) e (section 3), with e the input direction that drives the mode most.
 
-    The mean square of the inputs over whole periods is γ²/2, half that of inputs of norm γ:
+    The mean square of the inputs over whole periods is γ²/2, half as much as for inputs of norm γ:
     ``periodic_square`` (:class:`PeriodicSquare`) has the same frequency and direction, and γ².
 
     Parameters
@@ -133,9 +133,9 @@ class Periodic(AtEigenfrequency):
 class PeriodicSquare(AtEigenfrequency):
     """u_t = ±γ e with the sign of sin(ω t dt), + at zero: the square wave of :class:`Periodic`.
 
-    Every input has the norm γ, so that the mean square of the inputs is γ², as that of D-optimal
+    Every input has the norm γ, so that the mean square of the inputs is γ², as for D-optimal
     ones. With the eigenfrequency it is one of the sequences of which the reachable set is made
-    (:func:`dopt.evaluation.reachable_states`), but for the steps where the sine is zero.
+    (:func:`dopt.evaluation.reachable_states`), except at the steps where the sine is zero.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ class Search(CandidatePolicy, InformationPolicy):
 
     From x_t the model runs x ← x + dt f_θ(x, u) without linearisation. The rows J at the states of
     the path, all r learned components of each, are what the plan would add to M; a score says what
-    they are worth. The plan is made anew at each step. Among plans of equal score a random
+    they are worth. The plan is made again at each step. Among plans of equal score a random
     direction decides, as it does where every path leaves the bounds of a state: such a path has no
     score. M⁻¹ is held as a q × q matrix.
 
@@ -300,17 +300,17 @@ class Lookahead(Search):
 
     One step is blind where an input acts through an integrator: a rotation moves a quadrotor
     sideways only later. The first input of the best of the C² plans is applied, and the plan is
-    made anew at the next step.
+    made again at the next step.
 
     Parameters
     ----------
     lookahead : int or None
         H; None takes 0.6 periods of the least damped oscillation about the stable equilibrium, and
-        10 steps where there is none. The period is the true system's, as that of the periodic
-        policy is: give H where it is unknown.
+        10 steps without an oscillation. The period is the true system's, as in the periodic
+        policy: give H where it is unknown.
     criterion : {"joint", "sum"}
-        ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` that of each state's
-        rows alone, summed over the path.
+        ``joint`` is log det(I + J M⁻¹ Jᵀ) of all rows along the path, ``sum`` the same of each
+        state's rows alone, summed over the path.
     stride : int or None
         Every how many steps a state's rows are taken; in ``joint`` each counts so many times. None
         takes a fifth of the plan's steps: neighbouring rows are nearly the same.

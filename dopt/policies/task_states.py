@@ -45,7 +45,7 @@ def _box(system: System, rng: np.random.Generator) -> Array:
 def domain_box(system: System, domain: str) -> Array:
     """Return half-widths and periods of the components of a state, (2, d).
 
-    With ``domain`` "box" the half-widths are those of the evaluation box, and ∞ for the components
+    With ``domain`` "box" the half-widths are the evaluation box's, and ∞ for the components
     that it leaves free; with "everywhere" all are ∞. The period is 2π for angles, 0 for all others.
     """
     out = np.zeros((2, system.n_states))

@@ -89,8 +89,8 @@ class BatchState:
     ) -> None:
         if len({spec.config_key for spec in specs}) != 1:
             raise SpecificationError(
-                f"{len(specs)} trials of different configurations were given, but those of a "
-                f"batch may differ in the seed alone: run one batch for each configuration."
+                f"{len(specs)} trials of different configurations were given, but the trials "
+                f"of a batch may differ in the seed alone: run one batch for each configuration."
             )
         self.specs, self.device = list(specs), device
         self.system, self.config = specs[0].system, specs[0].config
@@ -148,7 +148,7 @@ class BatchState:
     def observe(self, t: int, dt: float) -> None:
         """Store the accelerations observed from x_t to x_{t+1}, which came dt seconds later.
 
-        With the integrator of Runge and Kutta, the accelerations are those of
+        With the integrator of Runge and Kutta, the accelerations follow
         :func:`dopt.kernel.loop.observe`.
         """
         system, x, u = self.system, self.states[:, t], self.inputs[:, t]
@@ -261,7 +261,7 @@ def loss_gradient(model: BatchModel, theta: Tensor, states: Tensor, targets: Ten
     with torch.enable_grad():
         at = theta.detach().requires_grad_()
         squares = (model(at, states) - targets).square().sum(dim=-1)
-        # The gradient of a sum over trials holds that of each.
+        # The gradient of a sum over trials holds each trial's gradient.
         (gradient,) = torch.autograd.grad(squares.mean(dim=1).sum(), at)
     return gradient
 
@@ -386,7 +386,7 @@ class BatchSteps(BatchState):
 class Lockstep(BatchSteps):
     """A batch of n trials of one configuration that take each step together.
 
-    Parameters and errors are those of :class:`BatchState`.
+    Parameters and errors as in :class:`BatchState`.
     """
 
     def __init__(
@@ -422,7 +422,7 @@ class Lockstep(BatchSteps):
     def _step_episodes(self, t: int, u: Tensor) -> Tensor:
         """Let the runs of a black box go on; return what was applied, (n, m).
 
-        Where a run has begun anew, the state before the step becomes its start.
+        Where a run has restarted, the state before the step becomes its start.
         """
         applied = u.clone()
         for i, episode in enumerate(self._episodes):
@@ -479,9 +479,9 @@ class Lockstep(BatchSteps):
 def run_trials(
     specs: Sequence[TrialSpec], device: str = "cpu", module: nn.Module | None = None
 ) -> list[TrialResult]:
-    """Run trials of one configuration in lockstep; each result is that of the trial run alone.
+    """Run trials of one configuration in lockstep; each result equals the trial's run alone.
 
-    Parameters and errors are those of :class:`BatchState`. The seconds and microseconds of a
+    Parameters and errors as in :class:`BatchState`. The seconds and microseconds of a
     result are the batch's divided by its size.
     """
     wall, cpu = time.perf_counter(), time.process_time()

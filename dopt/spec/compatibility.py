@@ -95,7 +95,7 @@ def held_information(
 
 
 def is_fresh(policy: Policy) -> TypeGuard[InformationPolicy]:
-    """Tell whether M is summed from the rows of all states at the present parameters."""
+    """Return True if M is summed from the rows of all states at the present parameters."""
     return isinstance(policy, InformationPolicy) and policy.information == "fresh"
 
 
@@ -201,9 +201,9 @@ def _check_sensors(system: System, learner: Learner) -> None:
 
 
 def _teaches(learner: type[Learner], model: type[Model]) -> bool:
-    """Tell whether a learner can learn a model's parameters.
+    """Return True if a learner can learn a model's parameters.
 
-    A filter also learns those of physics, and a learner that fits anew the networks of an ensemble.
+    A filter also learns physical parameters, and a learner that refits also fits ensembles.
     """
     filtered = issubclass(learner, ExtendedKalman | JointKalman) and issubclass(model, Linear)
     fitted = issubclass(learner, GaussNewton) and issubclass(model, Ensemble)
@@ -292,7 +292,7 @@ def _check_inputs(system: System, policy: Policy, model: Model, learner: Learner
 
 @functools.lru_cache(maxsize=64)
 def without_known_effect(system: System) -> bool:
-    """Tell whether the known part of a measured plant leaves out an input."""
+    """Return True if the known part of a measured plant leaves out an input."""
     return isinstance(system, ExploredPlant) and bool(input_effect(system).without)
 
 
@@ -387,7 +387,7 @@ def _matrices(
 def _normal_matrix(system: System, policy: Policy, model: Model, learner: Learner) -> int:
     """Return the numbers of JᵀJ and of the pairs of units of the samples over which it is summed.
 
-    Where each sample is added by itself, there are none.
+    Both are 0 where each sample is added by itself.
     """
     T, p, q = system.horizon, len(model.features(system)), model.n_member_parameters(system)
     kept = T if is_fresh(policy) and model.structure == "gradient" else 0

@@ -116,9 +116,9 @@ class TrialConfig:
     ``path`` is the execution path, "kernel" or "reference". Both mean the same, but their numbers
     agree to rounding only, which grows over a trial: so it is part of the trial's identity.
     Networks in torch run on the reference alone, most other choices in the kernel alone
-    (:func:`dopt.spec.compatibility.check_reference`). ``task`` is what the trial is assessed by
-    on the way, and ``limits`` what its states and inputs heed; each is no part of its identity
-    where there is none.
+    (:func:`dopt.spec.compatibility.check_reference`). ``task`` assesses the trial on
+    the way, and ``limits`` bound its states and inputs; each is part of its identity only where
+    it is given.
     """
 
     system: System
@@ -167,7 +167,7 @@ class TrialConfig:
             raise mismatch("limits of measured states", expected, given)
 
     def _check_runnable(self) -> None:
-        """Refuse parts of a user's own that no path can run, and on the kernel what it lacks."""
+        """Refuse users' parts that no path can run, and on the kernel what it lacks."""
         for part, registry, bases in (
             (self.policy, POLICIES, (OpenLoop, CustomPolicy, CompiledPolicy)),
             (self.learner, LEARNERS, (CustomLearner, CompiledLearner)),
@@ -198,7 +198,7 @@ class TrialConfig:
 
     @functools.cached_property
     def goal(self) -> Goal:
-        """Goal of a policy that learns a task: that of the section, or else the system's own."""
+        """Goal of a policy that learns a task: from the section, or else the system's own."""
         return (self.task or Control()).on(self.system)
 
     @property
@@ -264,7 +264,7 @@ class TrialConfig:
         return content
 
     def _scales_criterion(self) -> bool:
-        """Tell whether plans are compared by a criterion that depends on ρ, and ρ is not 1."""
+        """Return True if plans are compared by a criterion that depends on ρ, and ρ is not 1."""
         if not isinstance(self.policy, (Search, GradientDOptimal)):
             return False
         learner = self.learner

@@ -20,7 +20,7 @@ from dopt.systems.properties import input_effect
 LARGEST = 100.0
 """Root mean square of the accelerations over the grid up to which a network learns them well.
 
-Those of the shipped systems are 2 to 60 in their units.
+In the shipped systems it is 2 to 60 in their units.
 """
 
 SMALLEST = 0.05
@@ -227,10 +227,10 @@ def check_system(system: System) -> None:
     Raises
     ------
     SpecificationError
-        If a declared index is none of a state's, or the equations fail, return something else than
-        was declared, are not finite where a trial begins or is evaluated, depend on the inputs or
-        the linear parameters in another way than an affine one, or have a wrong derivative by a
-        complex step; if a black box says so.
+        If a declared index is not the index of a state, or the equations fail, return something
+        else than was declared, are not finite where a trial begins or is evaluated, depend on the
+        inputs or the linear parameters in another way than an affine one, or have a wrong
+        derivative by a complex step; if a black box says so.
     """
     check_names(system)
     _check_indices(system)

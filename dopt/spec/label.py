@@ -74,8 +74,8 @@ def labels(configs: Sequence[Mapping[str, object]]) -> list[str]:
     """Return a different label for each configuration of an environment.
 
     It has the policy's title, where several are shown, and the settings that are not the default,
-    but for those that all configurations of the environment share. Limits and a loss of its own are
-    always named. Configurations that are alike in this are told apart by what else differs.
+    except settings that all configurations of the environment share. Limits and a loss of its own
+    are always named. Configurations that are alike in this are told apart by what else differs.
     """
     flats = [flatten(completed(config)) for config in configs]
     usual = [usual_values(config) for config in configs]
@@ -139,7 +139,7 @@ def value_label(path: str, value: object) -> str:
 def usual_values(config: Mapping[str, object]) -> dict[str, object]:
     """Return the defaults of what a configuration names, by dotted path.
 
-    Those of a user's class are known only where that class is loaded.
+    Defaults of a user's class are known only where that class is loaded.
     """
     classes = {key: section_class(config, key) for key in REGISTRIES}
     usual: dict[str, object] = {}

@@ -218,7 +218,7 @@ class TrialSpec(Validated):
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()
 
     def canonical_json(self) -> str:
-        """Return the compact JSON of the content: sorted, but for the seed, which comes last."""
+        """Return the compact JSON of the content: sorted, except the seed, which comes last."""
         return f'{self.config_json[:-1]},"seed":{self.seed}}}'
 
     def to_mapping(self) -> dict[str, object]:
@@ -300,7 +300,7 @@ MARK = {"loss": "prequential"}
 
 
 def is_prequential(config: Mapping[str, Any]) -> bool:
-    """Return whether a stored configuration is that of an exploration."""
+    """Return whether a stored configuration belongs to an exploration."""
     section = config.get("env")
     return isinstance(section, Mapping) and MARK.items() <= section.items()
 
@@ -308,7 +308,7 @@ def is_prequential(config: Mapping[str, Any]) -> bool:
 def stored_trial(config: Mapping[str, Any], seed: int = 0) -> TrialSpec:
     """Return the trial of a stored configuration; raise SpecificationError if none can be made.
 
-    Of classes of a user's own it runs the files of this machine, if they are the stored ones
+    It runs this machine's files of users' classes, if they are the stored ones
     (:func:`dopt.registry.check_stored`).
     """
     return TrialSpec.from_mapping({**without_versions(_checked(config)), "seed": seed})

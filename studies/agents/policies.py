@@ -178,13 +178,13 @@ class ActiveExploration(CustomPolicy):
     steps they learn on, and a soft actor-critic learns in runs that are imagined from the current
     state on, each transition by a network that is drawn for it. Its reward is the Jensen-Rényi
     divergence of the distributions at the state that is reached. The mean of the actor is then
-    applied until the next plan. The trial's own model is separate from these networks: any
-    model and learner go with the policy.
+    applied until the next plan. The trial's own model is none of these networks: any model and
+    learner go with the policy.
 
     The agent is the one of Stable-Baselines3. Reference: P. Shyam, W. Jaśkowski
     and F. Gomez, "Model-based active exploration" (ICML 2019), algorithm 1. There networks and
     agent are new at each plan and learn far longer; here they go on from the plan before, with the
-    transitions imagined again. :class:`dopt.policies.held_candidates.Disagreement` compares held
+    transitions imagined anew. :class:`dopt.policies.held_candidates.Disagreement` compares held
     inputs instead.
 
     Parameters
@@ -362,7 +362,7 @@ class Observation:
 def input_of(actions: Array, gamma: float, energy: str) -> Array:
     """Return inputs, (..., m), of norm γ or at most γ, for actions, (..., m), within ±1.
 
-    With the full energy the direction of the action counts alone; no action takes the first one.
+    With the full energy the direction of the action counts alone; that of no action is the first.
     """
     if energy == "below":
         return within_ball(gamma * actions, gamma)
@@ -454,7 +454,7 @@ def jensen_renyi_divergence(mean: Array, variance: Array) -> Array:
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of the learning, by their names in Stable-Baselines3 except ``units``.
+    """Settings of the learning, by their names in Stable-Baselines3 but for ``units``.
 
     Attributes
     ----------
@@ -596,7 +596,7 @@ class GlobalRandomness:
 
     @contextmanager
     def lent(self) -> Iterator[None]:
-        """Replace the global generators by the agent's; afterwards they are as before."""
+        """Make the global generators those of the agent; afterwards they are as before."""
         with _kept():
             _restore(self._states)
             yield

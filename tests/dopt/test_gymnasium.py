@@ -333,7 +333,7 @@ def test_nothing_is_taught_across_a_restart(identity: str) -> None:
     np.testing.assert_array_equal(inputs, result.inputs)
     jumps = np.flatnonzero(np.abs(np.diff(result.states[:, 1])) > 10)
     assert len(jumps) >= 2, "the pieces begin far apart"
-    with pytest.raises(SpecificationError, match="does not say where it began anew"):
+    with pytest.raises(SpecificationError, match="does not say where it restarted"):
         recorded_samples(spec.system, result.states, result.inputs)
 
 

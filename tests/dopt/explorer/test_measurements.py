@@ -121,7 +121,7 @@ class TestMeasurements:
                 explorer.tell([0.1, 0.1 * step], time=0.02 * step)
                 explorer.ask([0.1, 0.1 * step], time=0.02 * step)
             assert explorer.counts["out_of_order"] == 30
-        said = "call reset() if their clock began anew"
+        said = "call reset() if their clock restarted"
         assert len([r for r in caplog.records if said in r.message]) == 1
 
     @pytest.mark.parametrize("timed", [False, True])
