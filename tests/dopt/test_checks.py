@@ -7,13 +7,12 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
 
 from dopt.errors import ScaleWarning, SpecificationError
-from dopt.fields import parameter
 from dopt.kernel.state_from_spec import empty_record, initial_state
 from dopt.randomness import draw
 from dopt.spec.config import LARGEST_HORIZON
@@ -166,57 +165,11 @@ def test_what_is_shipped_is_sound(name: str) -> None:
     check_system(SYSTEMS[name]())
 
 
-@dataclass(frozen=True, kw_only=True)
-class Motor(System):
-    """DC motor: L di/dt = -R i - k ω + u, J dω/dt = k i - b ω; the current is i times ``unit``."""
-
-    name: ClassVar[str] = "motor"
-    physical: ClassVar[tuple[str, ...]] = (
-        "resistance",
-        "inductance",
-        "constant",
-        "inertia",
-        "unit",
-    )
-    state_labels: ClassVar[tuple[str, ...]] = ("i [A]", "ω [rad/s]")
-    input_labels: ClassVar[tuple[str, ...]] = ("u [V]",)
-    learned_rows: ClassVar[tuple[int, ...]] = (0, 1)
-    features: ClassVar[tuple[Feature, ...]] = (Feature("identity", 0), Feature("identity", 1))
-    phase_plane: ClassVar[tuple[int, int]] = (0, 1)
-    grid_indices: ClassVar[tuple[int, ...]] = (0, 1)
-
-    resistance: float = parameter(1.0, "Ω", "positive")
-    inductance: float = parameter(1e-3, "H", "positive")
-    constant: float = parameter(0.05, "N m/A", "positive")
-    inertia: float = parameter(5e-5, "kg m²", "positive")
-    unit: float = parameter(1.0, "A", "positive")
-    gamma: float = parameter(12.0, "V", "positive")
-    dt: float = parameter(2e-4, "s", "positive")
-    initial_state: tuple[float, ...] = parameter((0.0, 0.0))
-    grid_half_widths: tuple[float, ...] = parameter((8.0, 150.0), bound="positive")
-    grid_points: tuple[int, ...] = parameter((16, 16), bound="positive")
-
-    @staticmethod
-    def known(state: Any, inputs: Any, parameters: Any) -> tuple[Any, ...]:
-        _, inductance, _, _, unit = parameters
-        return inputs[0] / (inductance * unit), 0.0 * state[1]
-
-    @staticmethod
-    def accelerations(state: Any, parameters: Any) -> tuple[Any, ...]:
-        resistance, inductance, constant, inertia, unit = parameters
-        current = state[0] * unit
-        voltage = -resistance * current - constant * state[1]
-        return voltage / (inductance * unit), constant * current / inertia
-
-
 def test_the_number_and_the_unit_are_said() -> None:
-    config = trial("pendulum", "random").config
-    with pytest.warns(ScaleWarning) as caught:
-        dataclasses.replace(config, system=Motor())
-    current, speed = (str(warning.message) for warning in caught)
-    assert "i [A] in env 'motor' has a root mean square of 6.3" in current
-    assert "ω [rad/s]" in speed
-    assert all(text.endswith("times as large.") for text in (current, speed))
+    fast = broken_system(accelerations=lambda state, *_: (1e4 * state[1],))
+    with pytest.warns(ScaleWarning, match=r"\[rad/s\] in env 'pendulum' has a root mean") as caught:
+        dataclasses.replace(trial("pendulum", "random").config, system=fast)
+    assert str(caught[0].message).endswith("times as large.")
 
 
 @pytest.mark.parametrize("name", sorted(SYSTEMS))

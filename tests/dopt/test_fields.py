@@ -34,54 +34,23 @@ REGISTRIES: dict[str, dict[str, type[Any]]] = {
     "model": MODELS,
     "learner": LEARNERS,
 }
-POSITIVE = {
-    *("gamma", "dt", "horizon", "grid_half_widths", "grid_points", "state_limit"),
-    *("mass", "length", "cart_mass", "pole_mass", "mass_1", "mass_2", "length_1", "length_2"),
-    *("inertia", "half_span", "width", "depth", "learning_rate", "window", "epsilon"),
-    *("ensemble", "lookahead", "candidates", "starts", "n_features", "lengthscale", "amplitude"),
-    *("regularization", "sketch_size", "hold", "iterations", "frequency", "band"),
-    *("subspace", "count", "radius", "stride", "plans", "elites", "samples"),
-    *(
-        "n_links",
-        "n_pendulums",
-        "time_constant",
-        "capacity",
-        "refit_every",
-        "replan_every",
-        "members",
-        "refresh_every",
-        "batch",
-        "steps",
-        "noise_variance",
-        "forgetting",
-        "dry_rate",
-        "motor_gain",
-        "measurement_noise",
-        "velocity_cutoff",
-        *("front", "rear", "slip_speed", "motor", "steering", "steering_time", "amplitude"),
-        *("inertia_z", "propeller_torque", "slow_speed", "slow_rate"),
-        "core",
-        "period",
-        *("warm_up", "updates", "units", "fit_updates", "actors", "episodes", "entropy_weight"),
-    ),
-}
-NONNEGATIVE = {
-    *("noise", "gain", "gravity", "friction", "pivot_friction", "cart_friction", "drag"),
-    *("beta_1", "beta_2", "stiffness", "damping", "budget_us", "final_friction", "underweighting"),
-    "weight",
-    *(
-        "dry_friction",
-        "coupling",
-        "strength",
-        "orbit",
-        "spread",
-        "front_grip",
-        "rear_grip",
-        "turn_drag",
-    ),
-    "measured_states",
-    "discount",
-}
+POSITIVE_NAMES = """
+gamma dt horizon grid_half_widths grid_points state_limit mass length cart_mass pole_mass mass_1
+mass_2 length_1 length_2 inertia half_span width depth learning_rate window epsilon ensemble
+lookahead candidates starts n_features lengthscale amplitude regularization sketch_size hold
+iterations frequency band subspace count radius stride plans elites samples n_links n_pendulums
+time_constant capacity refit_every replan_every members refresh_every batch steps noise_variance
+forgetting dry_rate motor_gain measurement_noise velocity_cutoff core period front rear slip_speed
+motor steering steering_time inertia_z propeller_torque slow_speed slow_rate warm_up updates units
+fit_updates actors episodes entropy_weight
+"""
+POSITIVE = set(POSITIVE_NAMES.split())
+NONNEGATIVE_NAMES = """
+weight measured_states discount noise gain gravity friction pivot_friction cart_friction drag
+beta_1 beta_2 stiffness damping budget_us final_friction underweighting dry_friction coupling
+strength orbit spread front_grip rear_grip turn_drag
+"""
+NONNEGATIVE = set(NONNEGATIVE_NAMES.split())
 FRACTIONS = {"beta_1", "beta_2", "discount"}
 SHARES = {"forgetting", "band"}
 TEXTS = {"form", "criterion", "states", "information", "domain", "integrator"}

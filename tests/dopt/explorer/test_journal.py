@@ -35,26 +35,8 @@ def journal(tmp_path: Path) -> Path:
 
 SHORT = {"name": "icem", "lookahead": 8, "hold": 4, "stride": 4, "plans": 12}
 
-PARTS: dict[str, Any] = {"policy": SHORT, "learner": "gauss_newton"}
-"""A policy that remembers its last plan, and a learner that keeps all samples."""
 
 ABOUT: dict[str, Any] = {"format": 1, "trial": {}}
-
-
-def test_a_reopened_exploration_goes_on_as_an_undisturbed_one(journal: Path) -> None:
-    with Explorer(MOTOR, steps=40, **PARTS) as undisturbed:
-        explored(undisturbed, 40)
-    with Explorer(MOTOR, steps=40, journal=journal, **PARTS) as first:
-        x = explored(first, 15)
-        first.tell([np.nan, 0.0])
-        first.tell(x)  # from which it goes on
-        counts, parameters = first.counts, first.parameters
-    with Explorer(MOTOR, steps=40, journal=journal, **PARTS) as second:
-        assert second.counts == counts
-        assert np.array_equal(second.parameters, parameters)
-        explored(second, 25, x)
-        assert np.array_equal(second.parameters, undisturbed.parameters)
-        assert np.array_equal(second.inputs, undisturbed.inputs)
 
 
 def test_the_name_of_a_new_journal_is_on_the_disk(
@@ -73,15 +55,6 @@ def test_the_name_of_a_new_journal_is_on_the_disk(
     synced.clear()
     Journal(journal, True, ABOUT).close()
     assert synced == [str(journal)]  # as it is closed
-
-
-def test_an_answer_survives_that_was_not_followed_by_a_state(journal: Path) -> None:
-    with Explorer(MOTOR, steps=9, journal=journal, **PARTS) as first:
-        x = explored(first, 5)
-        u = first.ask(x)
-    with Explorer(MOTOR, steps=9, journal=journal, **PARTS) as second:
-        assert np.array_equal(second.ask(x), u)
-        assert second.tell(following(x, u))
 
 
 KILLED = """
@@ -309,14 +282,6 @@ def test_a_journal_without_newlines_is_kept(damaged: Path, end: bytes) -> None:
         SpecificationError, match=r"no journal of format 1 or 2 \(it has no whole line"
     ):
         Explorer(MOTOR, steps=9, journal=damaged)
-    assert damaged.read_bytes() == whole
-
-
-def test_a_first_line_that_lacks_its_end_alone_is_begun_again(damaged: Path) -> None:
-    Explorer(MOTOR, steps=9, journal=damaged).close()
-    whole = damaged.read_bytes()
-    damaged.write_bytes(whole[:-1])
-    Explorer(MOTOR, steps=9, journal=damaged).close()
     assert damaged.read_bytes() == whole
 
 

@@ -302,13 +302,6 @@ def test_an_exploration_by_a_policy_of_a_script_is_saved(sqlite_url: str) -> Non
     assert content(sqlite_url)["n_steps"] == 3
 
 
-def test_saved_twice_is_saved_once(url: str, run: Explorer) -> None:
-    run.save(url)
-    once = content(url)
-    run.save(url)
-    assert content(url) == once
-
-
 @pytest.mark.parametrize("closed", [False, True])
 def test_saved_while_it_grows_is_saved_at_the_end(
     closed: bool, url: str, tmp_path: Path, run: Explorer

@@ -32,7 +32,7 @@ from dopt.types import Vector
 from tests.dopt.custom_networks import model_of_one
 from tests.dopt.kernel.twin import relative_gap
 from tests.dopt.newcomers import kept
-from tests.dopt.trials import PAIRS, trial
+from tests.dopt.trials import trial
 from tests.paths import ROOT
 
 
@@ -279,16 +279,6 @@ def losses(spec: TrialSpec, theta: np.ndarray, step: int = 0) -> tuple[float, fl
     squares = ((found - spec.system.learned(points.states, step)) ** 2).sum(axis=1)
     means = squares[: points.n_grid].mean(), squares[points.n_grid :].mean()
     return float(np.sqrt(means[0])), float(np.sqrt(means[1]))
-
-
-@pytest.mark.parametrize(("env", "policy"), [p for p in PAIRS if p[1] in ("random", "oracle")])
-def test_the_loss_is_the_root_mean_square_over_the_points(env: str, policy: str) -> None:
-    spec = trial(env, policy, 1, env={"horizon": 3})
-    fast = KernelTrial(spec)
-    fast.advance(3)
-    grid, reachable = losses(spec, fast.state.theta, 2)
-    assert fast.record.loss[2] == pytest.approx(grid, rel=1e-5)
-    assert fast.record.reachable_loss[2] == pytest.approx(reachable, rel=1e-5)
 
 
 @pytest.mark.parametrize(("bend", "precision"), [(0.5, 1e-5), (0.1, 1e-8), (1e-3, 1e-6)])

@@ -272,20 +272,6 @@ def test_with_a_matrix_of_its_own_it_is_ridge_regression(regularization: float) 
     assert fast.state.theta == pytest.approx(expected, rel=1e-7)
 
 
-def test_planner_and_filter_hold_one_matrix_of_the_rows_before_each_step() -> None:
-    fast, parameters, J = filtered(EKF | {"noise_variance": 2.0})
-    M = 1e-3 * np.eye(J.shape[2])  # that of the policy
-    targets = observed(fast, len(J))
-    model = fast.spec.model
-    for t, rows in enumerate(J):
-        M = M + rows.T @ rows / 2.0
-        state = fast.record.states[t : t + 1]
-        residual = targets[t] - model.predict(fast.spec.system, parameters[t], state)[0]
-        step = np.linalg.solve(M, rows.T @ residual / 2.0)
-        assert parameters[t + 1] - parameters[t] == pytest.approx(step, rel=1e-5, abs=1e-7)
-    assert dense(fast.state.covariance) @ M == pytest.approx(np.eye(len(M)), abs=1e-8)
-
-
 def test_an_underweighted_sample_has_the_variance_of_its_prediction_as_well() -> None:
     fast, parameters, J = filtered(WEIGHED | {"forgetting": 0.9})
     k, weight = ExtendedKalman(forgetting=0.9).renewal(J.shape[2], 1e-3)

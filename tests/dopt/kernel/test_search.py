@@ -18,7 +18,6 @@ from dopt.policies.search import PERIOD_SHARE, STEPS_WITHOUT_PERIOD
 from dopt.policies.task_states import domain_box, goal_weights, task_states
 from dopt.randomness import draw
 from dopt.run import run_trial
-from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.systems import SYSTEMS
 from dopt.systems.properties import eigenmode
@@ -187,16 +186,6 @@ def test_the_torch_path_does_not_search() -> None:
     config = trial("pendulum", "lookahead").config
     with pytest.raises(IncompatibleError, match="'lookahead' runs in the compiled kernel alone"):
         dataclasses.replace(config, path="reference")
-
-
-def test_plans_along_a_model_in_the_physical_parametrisation() -> None:
-    """What searches runs with least squares of the physical parameters, as the oracle does."""
-    oracle = trial("pendulum", "oracle")
-    policy = Lookahead(lookahead=12, regularization=1e-6)
-    config = TrialConfig(oracle.system, policy, oracle.model, oracle.learner)
-    result = run_trial(dataclasses.replace(oracle, config=config))
-    assert np.isfinite(result.loss).all()
-    assert result.loss[-1] < 0.05 * result.loss[0]
 
 
 @pytest.mark.parametrize("policy", ["exact", "trace", "a_optimal", "e_optimal", "task"])

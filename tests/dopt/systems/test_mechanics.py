@@ -316,7 +316,7 @@ def test_numpy_torch_and_the_kernel_take_the_same_step(name: str, integrator: st
 
 
 @pytest.mark.parametrize("policy", ["d_optimal", "uniform", "random", "oracle"])
-@pytest.mark.parametrize("env", ["pendulum", "cartpole", "quadrotor", "drifting_pendulum"])
+@pytest.mark.parametrize("env", ["quadrotor", "drifting_pendulum"])
 def test_both_paths_agree(env: str, policy: str) -> None:
     spec = integrated(env, policy, horizon=15)
     fast, plain = run_trial(spec, "kernel"), run_trial(spec, "reference")
