@@ -21,7 +21,7 @@ from dopt.spec.label import config_label
 from dopt.spec.trial import TrialSpec
 from dopt.systems.black_box import delay, differentiated
 from dopt.types import Array
-from tests.dopt.trials import LEARNERS, MODELS, SMALL_GRIDS, SMALL_SEARCHES
+from tests.dopt.trials import trial
 
 RAIL: dict[str, Any] = {"bounds": {"y": [-2.0, 2.0]}}
 TIGHT: dict[str, Any] = {"bounds": {"y": [-0.3, 0.3], "u": [-5.0, 6.0]}, "rates": {"u": 150.0}}
@@ -29,17 +29,10 @@ TIGHT: dict[str, Any] = {"bounds": {"y": [-0.3, 0.3], "u": [-5.0, 6.0]}, "rates"
 
 def limited(
     env: str, limits: object, policy: str = "d_optimal", /, *, horizon: int = 60, seed: int = 0,
-    model: str | None = None, learner: str | None = None, **fields: Any,
+    **fields: Any,
 ) -> TrialSpec:  # fmt: skip
-    mapping = {
-        "env": {"name": env, "horizon": horizon, "grid_points": SMALL_GRIDS[env], **fields},
-        "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
-        "model": {"name": model or MODELS.get(policy, "mlp")},
-        "learner": {"name": learner or LEARNERS.get(policy, "adam_window")},
-        "limits": limits,
-        "seed": seed,
-    }
-    return TrialSpec.from_mapping(mapping)
+    spec = trial(env, policy, seed, env={"horizon": horizon, **fields})
+    return TrialSpec.from_mapping(spec.to_mapping() | {"limits": limits})
 
 
 def measures(result: TrialResult) -> dict[str, float]:
@@ -225,19 +218,20 @@ JOINTS = {"measured_states": [0, 2], "measurement_noise": [DEGREE, DEGREE]}
 
 def sensed(
     env: str, sensors: dict[str, Any], learner: str = "joint_ekf", policy: str = "d_optimal", /, *,
-    horizon: int = 30, model: str = "mlp", path: str = "kernel", seed: int = 0, **fields: Any,
+    horizon: int = 30, seed: int = 0, **fields: Any,
 ) -> TrialSpec:  # fmt: skip
-    fitted = learner == "joint_ekf"
-    planner = {"name": policy} | ({"regularization": 3.0} if policy == "d_optimal" else {})
-    return TrialSpec.from_mapping(
-        {
-            "env": {"name": env, "horizon": horizon, "grid_points": SMALL_GRIDS[env], **sensors},
-            "policy": planner,
-            "model": {"name": model},
-            "learner": {"name": learner, **({"refit_every": 12} if fitted else {}), **fields},
-            "path": path,
-            "seed": seed,
-        }
+    return trial(
+        env,
+        policy,
+        seed,
+        env={"horizon": horizon, **sensors},
+        policy={"regularization": 3.0} if policy == "d_optimal" else {},
+        model={"name": "mlp"},
+        learner={
+            "name": learner,
+            **({"refit_every": 12} if learner == "joint_ekf" else {}),
+            **fields,
+        },
     )
 
 

@@ -27,7 +27,7 @@ from dopt.systems import SYSTEMS
 from tests.dopt.kernel.twin import call, model_of_kernel
 from tests.dopt.oracles.traces import jacobian, observed, trace
 from tests.dopt.test_limits import ABSOLUTE, ANGLE, CART, DEGREE, JOINTS, sensed
-from tests.dopt.trials import SMALL_GRIDS, SMALL_SEARCHES, trial
+from tests.dopt.trials import trial
 
 LEARNERS = {"rff": "recursive_least_squares", "linear_state": "recursive_least_squares"} | {
     "gaussian_process": "conditioning"
@@ -186,10 +186,7 @@ GAUSS_NEWTON = {"name": "gauss_newton"}
 def make(
     model: dict[str, Any], policy: str = "d_optimal", learner: dict[str, Any] = GAUSS_NEWTON
 ) -> TrialSpec:
-    env = {"name": "arm", "horizon": STEPS, "grid_points": list(SMALL_GRIDS["arm"])}
-    section = {"name": policy, **SMALL_SEARCHES.get(policy, {})}
-    parts = {"env": env, "policy": section, "model": model, "learner": learner}
-    return TrialSpec.from_mapping({**parts, "seed": 5})
+    return trial("arm", policy, 5, env={"horizon": STEPS}, model=model, learner=learner)
 
 
 def members_of(parameters: np.ndarray) -> np.ndarray:
@@ -259,14 +256,14 @@ def small(
     env: str, model: str = "affine", policy: str = "d_optimal", learner: str = "adam_window",
     /, *, seed: int = 0, **sections: dict[str, Any],
 ) -> TrialSpec:  # fmt: skip
+    """Return a small trial with a model that reads inputs."""
+    width = {"width": 6} if model in READERS else {}
     parts: dict[str, dict[str, Any]] = {
-        "env": {"name": env, "horizon": 12, "grid_points": SMALL_GRIDS[env]},
-        "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
-        "model": {"name": model} | ({"width": 6} if model in READERS else {}),
-        "learner": {"name": learner},
-    }
-    merged = {key: part | sections.get(key, {}) for key, part in parts.items()}
-    return TrialSpec.from_mapping(merged | {"seed": seed})
+        "env": {"horizon": 12}, "model": {"name": model} | width, "learner": {"name": learner},
+    }  # fmt: skip
+    keys = {*parts, *sections}
+    merged = {key: parts.get(key, {}) | sections.get(key, {}) for key in keys}
+    return trial(env, policy, seed, **merged)
 
 
 @pytest.mark.parametrize("model", READERS)

@@ -224,11 +224,11 @@ def test_a_black_box_is_fitted_to_transitions_of_runs_of_its_own() -> None:
 
 def limited(
     limits: dict[str, Any] | None, policy: str = "d_optimal", /, *, horizon: int = 20,
-    seed: int = 0, path: str = "kernel", learner: str = "joint_ekf", **env: Any,
+    seed: int = 0, learner: str = "joint_ekf", **env: Any,
 ) -> TrialSpec:  # fmt: skip
     """Return a trial of the cartpole of which angle and place are measured."""
     spec = sensed(
-        "cartpole", CART | env, learner, policy, horizon=horizon, path=path, seed=seed,
+        "cartpole", CART | env, learner, policy, horizon=horizon, seed=seed,
         **({"refit_every": 1000} if learner == "joint_ekf" else {}),
     )  # fmt: skip
     return TrialSpec.from_mapping(spec.to_mapping() | {"limits": limits})

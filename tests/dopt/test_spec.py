@@ -255,13 +255,6 @@ def test_which_learners_a_model_takes_and_which_models_a_learner_is_said(
     assert str(caught.value).startswith(sentence)
 
 
-def test_the_linear_model_also_goes_with_d_optimal_inputs() -> None:
-    spec = trial("pendulum", "oracle")
-    mapping: dict[str, Any] = spec.to_mapping()
-    mixed = TrialSpec.from_mapping(mapping | {"policy": {"name": "d_optimal"}})
-    assert mixed.columns()["width"] is None
-
-
 def test_the_key_of_a_stored_periodic_trial_stays() -> None:
     """Its section has held these entries since the first release."""
     spec = TrialSpec.from_names(env="pendulum", policy="periodic")

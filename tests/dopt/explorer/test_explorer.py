@@ -272,6 +272,12 @@ class TestRefusals:
             ({"fallback": [np.nan]}, "fallback is"),
             ({"fallback": [7.0]}, "at most 6"),
             ({"fallback": [1.0, 1.0]}, "1 real number is expected"),
+            ({"policy": None}, "'policy' is None"),
+            ({"learner": None}, "'learner' is None"),
+            ({"model": 5}, "'model' is 5"),
+            ({"journal": 5}, "journal is 5, but the path of a file"),
+            ({"deadline": 1e12}, "deadline is 1000000000000.0, but a number above 0 and below"),
+            ({"deadline": [1.0, [2.0]]}, "deadline is"),
         ],
     )
     def test_settings_outside_their_bounds(self, given: dict[str, Any], said: str) -> None:
@@ -332,22 +338,6 @@ def test_steps_that_are_no_number_of_steps(steps: Any) -> None:
 def test_a_plant_that_is_none(plant: Any) -> None:
     with pytest.raises(SpecificationError, match=r"^plant is .*, but a plant or a system"):
         Explorer(plant)
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"policy": None}, "'policy' is None"),
-        ({"learner": None}, "'learner' is None"),
-        ({"model": 5}, "'model' is 5"),
-        ({"journal": 5}, "journal is 5, but the path of a file"),
-        ({"deadline": 1e12}, "deadline is 1000000000000.0, but a number above 0 and below"),
-        ({"deadline": [1.0, [2.0]]}, "deadline is"),
-    ],
-)
-def test_settings_of_another_type(given: dict[str, Any], said: str) -> None:
-    with pytest.raises(SpecificationError, match=said):
-        Explorer(MOTOR, **given)
 
 
 STATES = np.cumsum(np.ones((101, 2)), axis=0)

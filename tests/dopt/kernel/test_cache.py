@@ -24,7 +24,7 @@ from numba.core.cpu import CPUContext
 from numba.core.dispatcher import Dispatcher
 
 from dopt.errors import UnusableEnvironmentError
-from dopt.kernel import cache, equations, pointers, warm_up, warming
+from dopt.kernel import cache, compiler, equations, warm_up, warming
 from dopt.kernel.compiler import compiled, contracted
 from dopt.kernel.warming import leave_callees_out
 from dopt.systems import SYSTEMS
@@ -66,9 +66,9 @@ def triple(tmp_path: Path) -> FunctionType:
 
 def found(function: FunctionType) -> bool:
     """Return whether a new process finds the code of a function, which gives the right number."""
-    pointers._dispatcher.cache_clear()
+    compiler._dispatcher.cache_clear()
     cache._intact.clear()
-    compiled = pointers.compiled_own(function, SIGNATURE)
+    compiled = compiler.compiled_own(function, SIGNATURE)
     out = np.zeros(1)
     compiled(2.0, out)
     assert out[0] == 6.0

@@ -209,8 +209,8 @@ def test_a_function_compiled_for_another_or_called_with_one_is_not_stored(tmp_pa
     """Whoever opened the second would compile its argument, without what its module prepares."""
     (tmp_path / "pair.py").write_text(
         "from pathlib import Path\n"
-        "from dopt.kernel import stored_code\n"
-        "stored_code._PACKAGE = Path(__file__).parent\n"
+        "from dopt.kernel import compiler\n"
+        "compiler._PACKAGE = Path(__file__).parent\n"
         "from dopt.kernel.compiler import compiled\n"
         "@compiled\n"
         "def inner(x):\n"

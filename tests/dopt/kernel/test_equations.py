@@ -19,7 +19,7 @@ from numba.core.errors import TypingError
 
 from dopt.errors import IncompatibleError
 from dopt.evaluation import evaluation_set
-from dopt.kernel import cache, pointers, run
+from dopt.kernel import cache, run
 from dopt.kernel.equations import compiled_equations
 from dopt.kernel.held import HeldTrial, pointer_to, trial_in
 from dopt.kernel.pointers import compiled_for, held_kind, kind_of, path_of
@@ -195,26 +195,6 @@ def test_a_pointer_s_type_is_that_of_its_structure() -> None:
     assert pickle.loads(pickle.dumps(pointer_to(short))) == pointer_to(short)
     assert pointer_to(short) != pointer_to(short.types[0])
     assert len(str(pointer_to(short))) < 40  # names of machine code are made of it
-
-
-@pytest.mark.parametrize(
-    ("fields", "others"),
-    [
-        ({}, set()),
-        ({"limits": {"bounds": {"φ": [-4.0, 4.0]}}}, {"limit_input", "note_error"}),
-        ({"env": {"integrator": "rk4"}}, {"observe"}),
-        ({"env": {"measured_states": [0], "measurement_noise": [0.01]}}, {"estimate_state"}),
-    ],
-)
-def test_a_trial_calls_the_steps_that_it_consists_of(
-    fields: dict[str, dict[str, object]], others: set[str]
-) -> None:
-    mapping = trial("pendulum", "d_optimal").to_mapping()
-    for section, changes in fields.items():
-        mapping[section] = mapping.get(section, {}) | changes
-    chosen = pointers.other_steps(KernelTrial(TrialSpec.from_mapping(mapping)).trial)
-    for name, (usual, other) in pointers.OTHER_STEPS.items():
-        assert chosen[name] is (other if name in others else usual)
 
 
 SMALL = {"hold": 3, "stride": 2, "plans": 9, "iterations": 2, "elites": 3, "samples": 6}

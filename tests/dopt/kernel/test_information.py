@@ -365,14 +365,9 @@ def test_a_filter_that_loses_its_numbers_ends_the_trial() -> None:
     assert result.final_loss is None
 
 
-def process(
-    env: str, policy: str = "gaussian_process", seed: int = 3, /, **fields: Any
-) -> TrialSpec:
+def process(env: str, seed: int = 3, /, **fields: Any) -> TrialSpec:
     """Return a small trial that learns a Gaussian process."""
-    sections = {"model": {"name": "gaussian_process"}, "learner": {"name": "conditioning"}}
-    for key, entries in fields.items():
-        sections[key] = sections.get(key, {}) | entries
-    return trial(env, policy, seed, **sections)
+    return trial(env, "gaussian_process", seed, **fields)
 
 
 def covariance(spec: TrialSpec, states: np.ndarray) -> np.ndarray:
@@ -395,7 +390,7 @@ def test_the_growing_factor_is_that_of_a_fresh_factorisation(
 ) -> None:
     sizes = {"horizon": 40, "noise": noise}
     model = {"lengthscale": lengthscale, "amplitude": amplitude}
-    fast = KernelTrial(process("pendulum", "gaussian_process", seed, env=sizes, model=model))
+    fast = KernelTrial(process("pendulum", seed, env=sizes, model=model))
     fast.advance(40)
     K = covariance(fast.spec, fast.states[:40])
     factor = np.tril(fast.state.posterior.factor)

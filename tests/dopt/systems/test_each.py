@@ -279,7 +279,7 @@ def test_equations_that_do_not_compile_are_refused_in_a_sentence() -> None:
     with pytest.raises(SpecificationError, match="does not compile") as caught:
         compiled_equations(system)
     message = str(caught.value)
-    assert "unknown_to_the_compiler of test_elementary.py" in message
+    assert "unknown_to_the_compiler of test_each.py" in message
     assert "\n" not in message
     assert len(message) < 500
 

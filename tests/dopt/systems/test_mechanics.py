@@ -43,7 +43,7 @@ from tests.dopt.systems.mechanics import (
     Mechanics,
 )
 from tests.dopt.systems.strategies import NAMES, inputs, states, systems
-from tests.dopt.trials import LEARNERS, MODELS, SMALL_GRIDS, SMALL_SEARCHES
+from tests.dopt.trials import trial
 from tests.pages import PAGES
 from tests.paths import CONF
 
@@ -266,20 +266,10 @@ def test_every_euler_step_from_a_turning_point_raises_the_energy(name: str) -> N
 
 
 def integrated(
-    env: str, policy: str = "d_optimal", /, *, model: str | None = None,
-    learner: str | None = None, horizon: int = 25, seed: int = 0, **fields: Any,
-) -> TrialSpec:  # fmt: skip
+    env: str, policy: str = "d_optimal", seed: int = 0, /, *, horizon: int = 25, **fields: Any
+) -> TrialSpec:
     """Return a small trial with Runge-Kutta steps."""
-    env_fields = {"horizon": horizon, "grid_points": SMALL_GRIDS[env], "integrator": "rk4"}
-    own = "affine" if SYSTEMS[env].reads_inputs else "mlp"
-    mapping = {
-        "env": {"name": env, **env_fields, **fields},
-        "policy": {"name": policy, **SMALL_SEARCHES.get(policy, {})},
-        "model": {"name": model or MODELS.get(policy, own)},
-        "learner": {"name": learner or LEARNERS.get(policy, "adam_window")},
-        "seed": seed,
-    }
-    return TrialSpec.from_mapping(mapping)
+    return trial(env, policy, seed, env={"horizon": horizon, "integrator": "rk4", **fields})
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("euler", 1), ("rk4", 4)])
