@@ -56,18 +56,6 @@ def test_inputs_of_several_axes_stay_within_the_ball() -> None:
     assert np.abs(np.diff(result.inputs[:, 0])).max() <= 3.0 * spec.system.dt * (1 + 1e-9)
 
 
-@pytest.mark.parametrize("policy", ["d_optimal", "random_held"])
-def test_the_cart_stays_on_its_rail(policy: str) -> None:
-    """Without limits it leaves it, also under inputs that know nothing of the model."""
-    free, kept = (
-        [run_trial(limited("cartpole", RAIL | {"enforced": on}, policy, horizon=300, seed=seed))
-         for seed in range(3)]
-        for on in (False, True)
-    )  # fmt: skip
-    assert min(np.abs(result.states[:, 0]).max() for result in free) > 2.0
-    assert sum(measures(result)["violations"] for result in kept) <= 0.01 * 3 * 300
-
-
 def test_a_model_that_is_right_breaks_no_bound() -> None:
     """The oracle's model is exact after a few samples, so that no margin is needed."""
     limits = {"bounds": {"y": [-1.5, 1.5]}, "margin": 0.0}
@@ -93,14 +81,6 @@ def test_bounds_that_nothing_reaches_change_nothing() -> None:
     wide_trial, plain = (run_trial(limited("cartpole", given)) for given in (wide, None))
     assert np.array_equal(wide_trial.inputs, plain.inputs)
     assert np.array_equal(wide_trial.parameters, plain.parameters)
-
-
-def test_a_start_beyond_the_bounds_comes_back() -> None:
-    start = (1.5, 0.0, np.pi, 0.0)
-    spec = limited("cartpole", {"bounds": {"y": [-1.0, 1.0]}}, horizon=150, initial_state=start)
-    places = run_trial(spec).states[:, 0]
-    assert places[0] == 1.5
-    assert np.abs(places[100:]).max() <= 1.0
 
 
 def test_an_explorer_fed_the_states_of_a_trial_chooses_its_inputs() -> None:

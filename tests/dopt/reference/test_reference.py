@@ -33,7 +33,6 @@ from dopt.reference.planning import (
 )
 from dopt.run import run_trial
 from dopt.spec.trial import TrialSpec
-from dopt.sphere import maximize_on_sphere
 from dopt.systems import SYSTEMS
 from tests.dopt.custom_networks import for_one
 from tests.dopt.reference.batch import Situation, situation, step_from
@@ -102,24 +101,6 @@ def test_the_problem_is_made_of_finite_differences_of_the_gradient(
         scale = float((DB.mT @ inverse @ DB).abs().max() + (DB.mT @ inverse @ g).abs().max())
         assert torch.allclose(Q, DB.mT @ inverse @ DB, rtol=0.0, atol=1e-6 * scale)
         assert torch.allclose(v, -DB.mT @ inverse @ g, rtol=0.0, atol=1e-6 * scale)
-
-
-def test_each_trial_of_a_batch_has_its_own_problem() -> None:
-    spec = trial("arm", "d_optimal")
-    several = [situation(spec, seed) for seed in range(3)]
-    theta, x = (torch.stack([now[i] for now in several]) for i in (1, 2))
-    columns = planning_columns(spec.system, several[0].model, theta, x, torch.tensor([0, 1, 1]))
-    information = Solved(torch.stack([now.information for now in several]))
-    problem = quadratic_problem(columns, information)
-    ties = torch.ones(3, 2, dtype=torch.float64)
-    inputs = d_optimal_inputs(problem, spec.system.gamma, ties)
-    for i, component in enumerate((0, 1, 1)):
-        Q, v, u = solve(spec, several[i], component)
-        assert torch.allclose(problem.Q[i], Q, rtol=1e-12)
-        assert torch.allclose(problem.v[i], v, rtol=1e-12)
-        expected = maximize_on_sphere(Q.numpy(), v.numpy(), spec.system.gamma, ties[i].numpy())
-        assert inputs[i].numpy() == pytest.approx(expected, rel=1e-9)
-        assert u.numpy() == pytest.approx(expected)
 
 
 MODELS = ["mlp", "linear"]
