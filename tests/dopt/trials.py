@@ -50,7 +50,7 @@ def trial(env: str, policy: str, seed: int = 0, /, **fields: Mapping[str, Any]) 
 
 
 def compatible(env: str, policy: str) -> bool:
-    """Tell whether a policy makes sense for a system."""
+    """Return whether a policy makes sense for a system."""
     try:
         trial(env, policy)
     except IncompatibleError:

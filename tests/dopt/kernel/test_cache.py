@@ -422,7 +422,7 @@ class TestReports:
 
 
 def has_code(function: CompiledFunction) -> bool:
-    """Tell whether the compiler's back end has made code of the one signature of a function."""
+    """Return whether the compiler's back end has made code of the one signature of a function."""
     [result] = function.overloads.values()
     return result.library._compiled_object is not None
 

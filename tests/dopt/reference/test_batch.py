@@ -15,7 +15,7 @@ from dopt.reference.batch import Lockstep, run_trials
 from dopt.reference.planning import uniform_inputs
 from tests.close import assert_close
 from tests.dopt.custom_networks import for_one
-from tests.dopt.reference.batch import situation, sphere, step_from
+from tests.dopt.reference.test_reference import situation, sphere, step_from
 from tests.dopt.trials import KNOWN_EFFECT, PAIRS, trial
 
 
