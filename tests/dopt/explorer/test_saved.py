@@ -395,26 +395,28 @@ def test_fewer_steps_of_the_same_run_are_left_out(sqlite_url: str, run: Explorer
     assert run.save(sqlite_url) is False, "the other one has gone further"
 
 
-def test_after_a_kill_the_journal_goes_on_with_the_same_trial(url: str, tmp_path: Path) -> None:
+def test_after_a_kill_the_journal_goes_on_with_the_same_trial(
+    sqlite_url: str, tmp_path: Path
+) -> None:
     program = f"""
 import os, signal
 from tests.dopt.explorer.plants import drive, explorer
 one = explorer(journal={str(tmp_path / "run.jsonl")!r})
 for _ in range(3):
     drive(one, 20)
-    one.save({url!r})
+    one.save({sqlite_url!r})
 os.kill(os.getpid(), signal.SIGKILL)
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False)
     assert done.returncode == -signal.SIGKILL
-    before = content(url)
+    before = content(sqlite_url)
     with explorer(journal=tmp_path / "run.jsonl") as again:
         assert again.n_steps == before["n_steps"] == 60
-        again.save(url)
-        assert content(url) == before
+        again.save(sqlite_url)
+        assert content(sqlite_url) == before
         drive(again, 10)
-        again.save(url)
-        after = content(url)
+        again.save(sqlite_url)
+        after = content(sqlite_url)
     assert after["trial_key"] == before["trial_key"]
     assert after["steps"][:60] == before["steps"]
     assert after["n_steps"] == 70

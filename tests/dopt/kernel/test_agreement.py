@@ -295,8 +295,10 @@ def test_the_same_trial_gives_the_same_bits_whatever_ran_before() -> None:
 
 def test_another_process_gives_the_same_bits() -> None:
     program = (
-        "from tests.dopt.kernel.test_agreement import numbers, trial, run_trial\n"
-        "print(numbers(run_trial(trial('cartpole', 'd_optimal', 8))).hex())"
+        "from dopt.run import run_trial\n"
+        "from tests.dopt.trials import trial\n"
+        "result = run_trial(trial('cartpole', 'd_optimal', 8))\n"
+        f"print(b''.join(getattr(result, name).tobytes() for name in {NUMBERS}).hex())"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True

@@ -336,7 +336,7 @@ def decrease(J: Array, C: Array, noise_variance: float) -> Array:
 MEASURES = {"exact": growth, "a_optimal": decrease}
 
 
-@pytest.mark.parametrize("noise_variance", [0.01, 0.1, 30.0])
+@pytest.mark.parametrize("noise_variance", [0.01, 30.0])
 @pytest.mark.parametrize("policy", MEASURES)
 def test_the_input_is_the_best_for_the_matrix_itself(policy: str, noise_variance: float) -> None:
     fast, judged_otherwise = KernelTrial(noisy(policy, noise_variance)), 0

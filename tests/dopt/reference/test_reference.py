@@ -147,15 +147,12 @@ def solve(spec: TrialSpec, now: Situation, component: int) -> tuple[Tensor, Tens
     return problem.Q[0], problem.v[0], u[0]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize(("env", "policy"), CASES)
-def test_the_problem_is_made_of_finite_differences_of_the_gradient(
-    env: str, policy: str, seed: int
-) -> None:
+def test_the_problem_is_made_of_finite_differences_of_the_gradient(env: str, policy: str) -> None:
     spec = trial(env, policy)
-    now = situation(spec, seed)
+    now = situation(spec, 0)
     inverse = torch.linalg.inv(now.information)
-    for component, (g, DB) in enumerate(zip(*pieces(spec, seed), strict=True)):
+    for component, (g, DB) in enumerate(zip(*pieces(spec, 0), strict=True)):
         Q, v, _ = solve(spec, now, component)
         # Difference quotients of |v| v and of products lose half of the digits.
         scale = float((DB.mT @ inverse @ DB).abs().max() + (DB.mT @ inverse @ g).abs().max())
