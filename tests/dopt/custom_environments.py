@@ -120,7 +120,7 @@ class Blurred(Point):
 
 
 PIECE = 7
-"""Steps after which :class:`Restarting` begins anew."""
+"""Steps after which :class:`Restarting` restarts."""
 
 
 class Whole(PointEnv):
@@ -167,7 +167,7 @@ class Truncating(PointEnv):
 
 
 class Restarting(Truncating):
-    """Begins anew by itself, and shows the new start in place of the last state."""
+    """Restarts by itself, and shows the new start in place of the last state."""
 
     def after_step(self, observation: Any, over: bool) -> Any:
         return self.reset()[0] if over else observation

@@ -1,4 +1,4 @@
-"""Policies and learners of a user's own, written in numpy: copies of shipped ones, and bad ones."""
+"""Users' policies and learners, written in numpy: copies of shipped ones, and bad ones."""
 
 from __future__ import annotations
 

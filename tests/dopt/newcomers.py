@@ -19,9 +19,9 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def kept(function: F) -> F:
-    """Compile a function as those of the package, and keep its machine code as that of a user's.
+    """Compile a function as the package does, and store its machine code as for a user's.
 
-    The cache keeps functions of the package and those of a user's classes; here it would be
+    The cache keeps functions of the package and of users' classes; here it would be
     compiled in every process, for seconds.
     """
     dispatcher = compiled(function)

@@ -235,7 +235,7 @@ def test_no_visited_state_is_drawn_twice(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["pendulum", "cartpole", "arm"])
 def test_the_reachable_set_has_states_that_the_square_wave_visits(name: str) -> None:
-    """One of its eight sequences is that of the policy, but for steps where the sine is zero."""
+    """One of its eight sequences is the policy's, except at steps where the sine is zero."""
     system = SYSTEMS[name]()
     mode = eigenmode(system)
     assert mode is not None

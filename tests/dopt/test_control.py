@@ -225,7 +225,7 @@ def test_what_is_held_out_depends_on_the_system_alone() -> None:
 
 
 def test_it_starts_all_along_the_reachable_trajectories() -> None:
-    """Those of the first steps alone are slow: the system was still gaining energy."""
+    """States of the first steps are slow: the system was still gaining energy."""
     system = SYSTEMS["cartpole"]()
     reachable = reachable_states(system)
     starts = held_out(system, 5).starts
@@ -312,7 +312,7 @@ def test_no_sequence_that_was_tried_is_better_than_the_plan(seed: int) -> None:
     costs: list[float] = []
 
     def cost(plans: np.ndarray) -> np.ndarray:
-        found = np.cos(7 * plans).sum(axis=(1, 2))  # the mean of two optima is none
+        found = np.cos(7 * plans).sum(axis=(1, 2))  # the mean of two optima is not one
         costs.extend(found)
         return np.asarray(found)
 

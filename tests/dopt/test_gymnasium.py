@@ -257,7 +257,7 @@ def test_what_was_applied_is_recorded_and_learned_from(gamma: float) -> None:
     spec = rough("Whole", "uniform", gamma=gamma)
     TAKEN.clear()
     result = run_trial(spec)
-    # Other runs are those of the evaluation, where it is not known yet.
+    # Other runs belong to the evaluation, where it is not known yet.
     assert any(np.array_equal(result.inputs, np.array(taken, float)) for taken in TAKEN)
     assert set(result.inputs.ravel()) <= {-2.0, -1.0, 0.0, 1.0, 2.0}
     assert np.abs(result.inputs).max() <= gamma

@@ -363,7 +363,7 @@ def test_inputs_fill_the_ball_where_their_effect_is_not_affine(env: str) -> None
 
 
 def test_trials_with_other_plans_have_other_keys() -> None:
-    """Those of an earlier version took inputs of norm γ alone."""
+    """Trials of an earlier version took inputs of norm γ alone."""
 
     def version(model: str, policy: str) -> object:
         return json.loads(small("arm", model, policy).config_json).get("plan_version")

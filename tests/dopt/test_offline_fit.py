@@ -263,7 +263,7 @@ def test_the_true_cart_stays_on_its_rail() -> None:
 
 
 def test_a_plant_of_which_the_angle_is_measured_stays_within_its_stops() -> None:
-    """Also while its rate is unknown at first; ``violations`` are those of the estimates."""
+    """Also while its rate is unknown at first; ``violations`` count the estimates."""
     places, counts = [], []
     for enforced in (True, False):
         limits = {"bounds": {"angle": [-1.0, 1.0]}, "steps": 15, "enforced": enforced}
@@ -476,7 +476,7 @@ def test_what_has_no_covariance_has_a_fit_alone(policy: str, sections: dict[str,
 
 
 def test_accelerations_that_depend_on_no_parameter_do_not_count() -> None:
-    """As those of the quadrotor, whose drags are unknown, at rest: with them the mean is NaN."""
+    """Such as the quadrotor's at rest, whose drags are unknown: with them the mean is NaN."""
     spec = trial("quadrotor", "random", **LINEAR)
     result, points = run_trial(spec), evaluation_set(spec.system)
     rows = jacobian(spec, result.parameters, evaluated(spec))

@@ -423,7 +423,7 @@ def reasons_of(name: str) -> str:
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_the_euler_map_is_stable_where_the_system_is(name: str) -> None:
-    """Where motions about rest grow, those of the map grow alike up to O(dt²)."""
+    """Where motions about rest grow, the map's grow alike up to O(dt²)."""
     system = SYSTEMS[name]()
     rest = system.equilibrium or system.initial_state
     values = np.linalg.eigvals(jacobians(system, rest, np.zeros(system.n_inputs))[0])
@@ -458,7 +458,7 @@ def test_the_least_friction_of_a_stable_euler_map_is_the_stated_one(name: str, f
 
 @pytest.mark.parametrize("name", [name for name in SYSTEMS if name != "moving_star"])
 def test_a_trial_starts_close_to_rest(name: str) -> None:
-    """All but that of the star, which pushes at once."""
+    """All except the star's, which pushes at once."""
     system = SYSTEMS[name]()
     rest = np.array(system.equilibrium or np.zeros(system.n_states))
     rest[[i for i, label in enumerate(system.state_labels) if label.startswith("e₀")]] = 1.0

@@ -70,7 +70,7 @@ def drive(one: Explorer, steps: int) -> None:
 
 
 def content(url: str) -> dict[str, Any]:
-    """Return what a database holds of its only trial, but for times."""
+    """Return what a database holds of its only trial, except times."""
     with Reader.open(url) as reader, reader.moment() as moment:
         [trial] = moment.rows("SELECT * FROM v_trial")
         stored = moment.trajectory(trial.config_key, trial.seed)

@@ -107,7 +107,7 @@ def test_a_warm_cache_is_seen_without_the_compiler_and_a_trial_runs_without_its_
 
 
 def test_everything_is_what_any_shipped_choice_calls() -> None:
-    """That is beside what stands for parts of a user's own in numpy."""
+    """Beside them stand the functions that call users' parts in numpy."""
     chosen = choices(everything=True)
     plans = {one.kernel_function for one in POLICIES.values() if one.compiled}
     learns = {one.kernel_function for one in LEARNERS.values() if one.compiled}
@@ -119,7 +119,7 @@ def test_everything_is_what_any_shipped_choice_calls() -> None:
 
 
 def test_a_trial_loads_what_other_processes_compile(tmp_path: Path) -> None:
-    """Where a trial compiles a part itself, its numbers can differ from those of later trials."""
+    """Where a trial compiles a part itself, its numbers can differ from later trials."""
     program = (
         "from dopt.kernel.cache import compile_missing\n"
         "from dopt.kernel.information import add_nothing\n"

@@ -75,7 +75,7 @@ def test_equations_from_elsewhere_are_compiled_but_not_cached() -> None:
 
 
 def symbols(system: System) -> list[str]:
-    """Return the symbols of the compiled equations without Numba's number, which starts anew."""
+    """Return the symbols of the compiled equations without Numba's running number."""
     names = [
         code.fndesc.mangled_name
         for function in compiled_equations(system)

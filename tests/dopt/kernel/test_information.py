@@ -101,7 +101,7 @@ def summed(fast: KernelTrial, last: int) -> Array:
 
 
 def check_inverse(fast: KernelTrial, M: Array) -> None:
-    """See that a trial holds M⁻¹, but for rounding."""
+    """Check that a trial holds M⁻¹ up to rounding."""
     assert_close(dense(fast.state.covariance) @ M, np.eye(len(M)), abs=1e-13 * np.linalg.cond(M))
 
 

@@ -61,7 +61,7 @@ def linearized(fast: KernelTrial, theta: Array, first: int = 0) -> tuple[Array, 
 
 
 def check_inverse(fast: KernelTrial, M: Array) -> None:
-    """See that a trial holds M⁻¹, but for rounding, or nothing where no policy reads it."""
+    """Check that a trial holds M⁻¹ up to rounding, or nothing where no policy reads it."""
     if not isinstance(fast.spec.policy, InformationPolicy):
         assert fast.state.covariance.upper.size == 0
         return
@@ -84,7 +84,7 @@ def test_a_step_is_that_of_the_dense_normal_equations_and_leaves_their_matrix(
     before, after = (advanced(learner, steps, env, policy, width, depth) for steps in (24, 25))
     J, e = linearized(after, before.state.theta)
     assert J.shape[1] == 2 * BLOCK or (env, width) != ("pendulum", 19)
-    ridge = 1e-3 if policy == "d_optimal" else 0.02  # that of the policy where it plans by M
+    ridge = 1e-3 if policy == "d_optimal" else 0.02  # the policy's where it plans by M
     M = ridge * np.eye(J.shape[1]) + J.T @ J / noise_variance
     check_inverse(after, M)
     gradient = J.T @ e / noise_variance + ridge * (after.state.prior - before.state.theta)
@@ -210,7 +210,7 @@ def features(env: str, policy: str = "d_optimal", /, **fields: Any) -> TrialSpec
 
 @pytest.mark.parametrize("policy", ["d_optimal", "random_held"])
 def test_the_inverse_information_is_that_of_all_rows_of_the_learned_parameters(policy: str) -> None:
-    """With the ridge of a policy that plans by it, or that of the learner."""
+    """With the ridge of a policy that plans by it, or the learner's."""
     ridges = {"learner": {"regularization": 3e-2}}
     if policy == "d_optimal":
         ridges["policy"] = {"regularization": 1e-2}

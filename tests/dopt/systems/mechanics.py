@@ -75,7 +75,7 @@ class Mechanics(ABC):
         return self.kinetic(q, rates) + self.potential(q)
 
     def power(self, state: Tensor, u: Tensor) -> Tensor:
-        """Return the power of the input less that of friction [W]."""
+        """Return the power of the input less the power of friction [W]."""
         q, rates = self.split(state)
         return (self.driving(q, rates, u) + self.friction(rates)) @ rates
 
@@ -146,7 +146,7 @@ class CarMechanics(Mechanics):
 class DroneMechanics(Mechanics):
     """Masses along the three axes of the body, with the moments of inertia of the system.
 
-    The coordinates are those of the centre and a quaternion of any norm, which the positions do not
+    The coordinates are the centre's and a quaternion of any norm, which the positions do not
     depend on. A kinetic energy of the norm's own keeps it as it is.
     """
 

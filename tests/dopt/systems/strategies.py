@@ -46,7 +46,7 @@ def vectors(size: int, bound: float) -> st.SearchStrategy[np.ndarray]:
 
 
 def assert_compiled_equations_agree(system: System, x: np.ndarray, u: np.ndarray) -> None:
-    """Compare f(x, u) of the compiled equations with that of the system."""
+    """Compare f(x, u) of the compiled equations with the system's."""
     equations = compiled_equations(system)
     p, flow = np.array(system.parameters), np.empty(system.n_states)
     learned = np.empty(system.n_learned)

@@ -48,7 +48,7 @@ def test_without_steering_it_drives_straight_on_to_its_terminal_speed() -> None:
 
 
 def test_a_slow_car_with_grip_turns_about_the_point_where_its_axles_meet() -> None:
-    """The yaw rate is that of wheels that do not slip: vₓ tan δ by the distance of the axles."""
+    """The yaw rate without slip is vₓ tan δ divided by the distance of the axles."""
     car = Car(front_grip=600.0, rear_grip=600.0, dt=1e-3)
     path = simulate(car, np.tile([0.05, 0.5], (6000, 1, 1)))[-1, 0]
     assert path[6] == pytest.approx(0.3, rel=1e-6)

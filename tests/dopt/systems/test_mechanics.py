@@ -336,7 +336,7 @@ def test_the_oracle_learns_the_parameters_themselves(env: str) -> None:
 
 @pytest.mark.parametrize("learner", ["adam", "adam_window"])
 def test_a_reset_changes_no_sample_before_it(learner: str) -> None:
-    """The state in which a plant starts anew takes the place of the one that was reached."""
+    """The state in which a plant restarts replaces the one that was reached."""
     spec = integrated("pendulum", "random", horizon=40)
     explorers = [
         Explorer(spec.system, policy="random", learner=learner, path=path)

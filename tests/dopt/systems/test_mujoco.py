@@ -32,7 +32,7 @@ MASS = 2.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Block(MuJoCo):
-    """A block on a rail, with a motor that may push with ±3 N, of a user's own model."""
+    """A block on a rail, with a motor that may push with ±3 N, by a user's model."""
 
     name: ClassVar[str] = "block"
     start: ClassVar[tuple[float, ...]] = (0.0,)
