@@ -67,7 +67,7 @@ def test_every_registered_system_with_inertia_is_held_against_masses() -> None:
 
 
 @mechanical
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_energy_changes_by_input_power_less_friction_power(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
@@ -78,7 +78,7 @@ def test_energy_changes_by_input_power_less_friction_power(name: str, data: st.D
 
 
 @closed
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_nothing_is_gained_or_lost_without_friction_and_input(
     name: str, data: st.DataObject
@@ -90,7 +90,7 @@ def test_nothing_is_gained_or_lost_without_friction_and_input(
 
 
 @pytest.mark.parametrize("name", sorted(set(FRICTION) - {*SELF_EXCITED, *HOVERING}))
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_friction_never_feeds_energy(name: str, data: st.DataObject) -> None:
     system, x = data.draw(systems(name)), data.draw(states(name))
@@ -99,7 +99,7 @@ def test_friction_never_feeds_energy(name: str, data: st.DataObject) -> None:
 
 
 @mechanical
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(data=st.data())
 def test_equations_are_those_of_euler_and_lagrange(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))
@@ -114,7 +114,7 @@ def test_equations_are_those_of_euler_and_lagrange(name: str, data: st.DataObjec
 
 
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_jacobians_are_the_slopes_of_the_flow(name: str, data: st.DataObject) -> None:
     system = data.draw(systems(name))

@@ -239,7 +239,7 @@ def test_the_grid_fills_its_box_evenly(name: str, data: st.DataObject) -> None:
     assert not grid[:, others].any()
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(st.integers(1, 4), st.integers(0, 9))
 def test_a_low_discrepancy_set_takes_every_midpoint_of_every_axis_once(
     n_links: int, exponent: int
@@ -280,7 +280,7 @@ def regressors(system: System, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray
 
 
 @EACH_SYSTEM
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_accelerations_are_affine_in_the_linear_parameters(name: str, data: st.DataObject) -> None:
     system, x, u = data.draw(systems(name)), data.draw(states(name)), data.draw(inputs(name))
@@ -306,7 +306,7 @@ def test_the_linear_parameters_can_be_told_apart_on_the_grid(name: str) -> None:
 
 
 @EACH_SYSTEM
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_the_input_enters_linearly(name: str, data: st.DataObject) -> None:
     system, x = data.draw(systems(name)), data.draw(states(name))
@@ -318,7 +318,7 @@ def test_the_input_enters_linearly(name: str, data: st.DataObject) -> None:
 
 
 @EACH_SYSTEM
-@settings(max_examples=50)
+@settings(max_examples=15)
 @given(data=st.data())
 def test_accelerations_depend_on_the_state_through_the_features_alone(
     name: str, data: st.DataObject
@@ -345,7 +345,7 @@ def test_features_are_of_order_one_on_the_grid(name: str) -> None:
 
 
 @EACH_SYSTEM
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(data=st.data())
 def test_one_state_and_many_states_give_the_same_accelerations(
     name: str, data: st.DataObject
