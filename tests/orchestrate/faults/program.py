@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import faulthandler
-import itertools
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,9 +23,7 @@ import psycopg
 from orchestrate.config.launch_settings import LaunchSettings
 from orchestrate.errors import ExitCode
 from orchestrate.executors import local
-from orchestrate.executors import worker as worker_process
 from orchestrate.runner import scheduler, start, worker
-from orchestrate.runner.progress import undisturbed
 from orchestrate.runner.run_grid import Output, Work
 from orchestrate.runner.worker import WorkerSettings, run_worker
 from orchestrate.store import Store, StoreUnavailableError
@@ -109,7 +104,6 @@ def _launch(order: Order) -> int:
         lean_ray.leave_services_out()
     # The counter is of the whole machine: another test may add a kill at any moment.
     local._kills_for_memory = lambda: 0
-    local._start = ForkedWorker  # type: ignore[assignment]
     scheduler.MAX_LONE_LOSSES = order.lone_losses or scheduler.MAX_LONE_LOSSES
     run = Gated(Standin(order.seconds, order.trouble), Gate(Path(order.gate)))
     work = Work(run, prepare=lambda: None)
@@ -123,53 +117,6 @@ def _launch(order: Order) -> int:
         return start.run(request, grid_of(order.trials), settings)
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
-
-
-class ForkedWorker:
-    """Worker process of the pool, forked from its driver, which has imported everything.
-
-    It has what a process of its own would have: three descriptors, and its own group.
-    """
-
-    def __init__(self, *descriptors: int) -> None:
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()
-        self.returncode: int | None = None
-        with undisturbed():  # an interrupt in a function that runs around a fork would be ignored
-            self.pid = os.fork()
-            if self.pid == 0:
-                try:
-                    self._work(*descriptors)
-                    os._exit(0)
-                finally:
-                    os._exit(1)
-
-    @staticmethod
-    def _work(connection: int, crash_report: int, errors: int) -> None:
-        os.setpgid(0, 0)
-        for stream in (1, 2):
-            os.dup2(crash_report, stream)
-        kept = sorted({connection, crash_report, errors})
-        for low, high in itertools.pairwise([2, *kept, os.sysconf("SC_OPEN_MAX")]):
-            os.closerange(low + 1, high)
-        with suppress(EOFError, ConnectionError):  # as when it is a program
-            worker_process.main(connection, crash_report, errors)
-
-    def wait(self, seconds: float | None = None) -> int:
-        end = None if seconds is None else time.monotonic() + seconds
-        while self.returncode is None:
-            pid, status = os.waitpid(self.pid, 0 if end is None else os.WNOHANG)
-            if pid:
-                self.returncode = os.waitstatus_to_exitcode(status)
-            elif end is not None and time.monotonic() > end:
-                raise subprocess.TimeoutExpired("worker", seconds or 0.0)
-            else:
-                rest(0.005)
-        return self.returncode
-
-    def kill(self) -> None:
-        if self.returncode is None:
-            os.kill(self.pid, signal.SIGKILL)
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,24 @@ def test_a_diverged_trial_is_a_result_that_is_kept(launches: Launches) -> None:
     assert launches.statuses()[BROKEN_SEED] == "done"
 
 
+def test_rows_do_not_depend_on_the_executor(launches: Launches) -> None:
+    launches(quick)
+    here = launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t")
+    launches.url = launches.url.replace("results.db", "other.db")
+    launches(quick, executor="local", chunk_seconds=1e-9)
+    assert launches.query("SELECT seed, t, loss FROM v_curve ORDER BY seed, t") == here
+    assert launches.query("SELECT state, host FROM launch") == [("done", "here")]
+
+
+def test_the_trials_of_a_dead_launch_are_taken_over(launches: Launches) -> None:
+    with Store.open(launches.url) as store:
+        dead = store.begin_launch(RECORD)
+        store.register(dead, [specification(0)])
+        assert len(store.claim(dead, [specification(0).trial_key])) == 1
+    assert launches(quick) == ExitCode.DONE
+    assert set(launches.statuses().values()) == {"done"}
+
+
 def test_a_launch_waits_for_the_trials_of_a_living_one(launches: Launches) -> None:
     with Store.open(launches.url) as store:
         other = store.begin_launch(RECORD)
