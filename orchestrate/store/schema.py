@@ -40,7 +40,7 @@ from sqlalchemy.types import TypeEngine
 from orchestrate.store.errors import SchemaVersionError
 
 SCHEMA_VERSION = 7
-"""Number of the newest script in ``migrations/versions``."""
+"""Number of the newest schema, the last of :data:`orchestrate.store.upgrade.STATEMENTS`."""
 
 LOCK_TABLE = "store_lock"
 """Empty table on PostgreSQL whose lock keeps other launches from registering or recovering."""
@@ -109,7 +109,8 @@ class Outcome:
     """Columns of a trial that its outcome fills; None before.
 
     The table of trials and the views, what a launch writes, the rows of a reader, exports and
-    bundles are made from these fields: a column is added here, with a migration.
+    bundles are made from these fields, by their names: a column is added here, with statements
+    in :data:`orchestrate.store.upgrade.STATEMENTS`.
     """
 
     n_steps: Annotated[

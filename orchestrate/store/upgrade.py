@@ -35,7 +35,10 @@ STATEMENTS = {
     ),
     7: ("DROP TABLE live_step",),
 }
-"""Statements that make each schema of the one before it; ``{whole}`` is a 64-bit integer."""
+"""Statements that make each schema of the one before it.
+
+``{whole}`` is a 64-bit integer and ``{real}`` a double, which the databases call by other names.
+"""
 
 
 @dataclass(frozen=True)
@@ -136,9 +139,13 @@ def migrate(connection: Connection, version: int) -> None:
     The views are dropped and created again: not every database can change a table below a view.
     """
     drop_views(connection)
-    whole = "INTEGER" if connection.dialect.name == "sqlite" else "BIGINT"
+    sqlite_names = connection.dialect.name == "sqlite"
+    kinds = {
+        "whole": "INTEGER" if sqlite_names else "BIGINT",
+        "real": "REAL" if sqlite_names else "DOUBLE PRECISION",
+    }
     for number in range(version + 1, SCHEMA_VERSION + 1):
         for statement in STATEMENTS[number]:
-            connection.execute(text(statement.format(whole=whole)))
+            connection.execute(text(statement.format(**kinds)))
     connection.execute(update(alembic_version).values(version_num=str(SCHEMA_VERSION)))
     create_views(connection)
