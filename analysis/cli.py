@@ -143,7 +143,7 @@ def parser() -> Parser:
     add_database(animate)
     animate.add_argument("env", metavar="ENV", help="environment of the trial")
     animate.add_argument("policy", metavar="POLICY", help="policy of the trial")
-    animate.add_argument("--seed", type=int, help="seed (that of the median final loss)")
+    animate.add_argument("--seed", type=int, help="seed (default: of the median final loss)")
     animate.add_argument("--out", type=path("--out"), help=".gif or .mp4 (figures/ENV_POLICY.gif)")
     for option, default, what in (("--frames", 150, "pictures in all"), ("--fps", 15, "a second")):
         number = positive(option, int)

@@ -62,15 +62,14 @@ NOTE = (
     "Success: share of trials whose planned episode reached its goal, with the Wilson interval; "
     f"with a star where the adjusted p is below {SIGNIFICANCE}: exact McNemar test against the "
     "first row, paired over seeds, the false discovery rate of all variants and numbers of steps "
-    "of the report (Benjamini-Hochberg). Cost: geometric mean of the episode's cost by that of the "
-    "true model under the same planner, noise and draws, with Student's interval. True "
-    "model: what the "
-    "same planner achieves that predicts with the true system, on the same seeds; no explored step "
-    "changes it, and its cost is the unit. Lost: episodes in no mean of costs, as theirs or that "
-    "of the true model is not finite; they are in the success. Loss: that on the grid after as "
-    "many steps, geometric mean. Free run: root mean square error of predictions that run free, by "
-    "that of the prediction that nothing changes, mean at the end of the trial without those lost "
-    "as the error is not finite."
+    "of the report (Benjamini-Hochberg). Cost: geometric mean of the episode's cost divided by the "
+    "true model's under the same planner, noise and draws, with Student's interval. True model: "
+    "the same planner with predictions of the true system, on the same seeds; no explored step "
+    "changes it, and its cost is the unit. Lost: episodes left out of the mean of costs, as their "
+    "cost or the true model's is not finite; they are in the success. Loss: on the grid after as "
+    "many steps, geometric mean. Free run: root mean square error of predictions that run free, "
+    "divided by the error of the prediction that nothing changes, mean at the end of the trial "
+    "without trials whose error is not finite."
 )
 
 CAPTION = (

@@ -230,7 +230,7 @@ MEASURES = {
     "free_run_error": "relative root mean square error of predictions over n steps",
     "coverage": "share of the phase plane's box that the states up to t have visited",
     VIOLATIONS: "number of states up to t that are beyond a bound of the limits",
-    WORST: "farthest distance beyond a bound up to t, in the unit of the state; 0 if there is none",
+    WORST: "farthest distance beyond a bound up to t, in the unit of the state; 0 within bounds",
 }
 """Every measure with its meaning; t is the number of steps explored, 0 the untrained model."""
 

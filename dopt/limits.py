@@ -37,7 +37,7 @@ class Limits(Validated):
     Parameters
     ----------
     bounds : tuple of (name, lower, upper)
-        Bounds of states and inputs by name, in their units; infinite where there is none. An
+        Bounds of states and inputs by name, in their units; infinite without a bound. An
         input's bounds include 0.
     rates : tuple of (name, rate)
         Largest change of inputs, in their unit per second.

@@ -240,11 +240,6 @@ def fit_offline(
     return OfflineFit(parameters, grid_loss(spec, parameters), residual, steps, converged)
 
 
-def can_be_fitted(model: Model) -> bool:
-    """Return True if a model has an offline fit."""
-    return is_network(model) or model.structure == "least_squares"
-
-
 def is_network(model: Model) -> bool:
     """Return True if a model is the kernel's network, or an ensemble of such networks."""
     return isinstance(model, MLP) and model.compiled

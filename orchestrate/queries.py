@@ -159,7 +159,7 @@ class TrialReport:
     attempts
         One for each claim, with its error if there was one.
     loss
-        The loss curve, with None for values that are not finite; empty if there is none.
+        The loss curve, with None for values that are not finite; empty without one.
     beyond_limits
         ``violations`` and ``worst`` of a trial with limits (:data:`dopt.assessment.MEASURES`).
     exploration

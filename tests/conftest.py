@@ -16,7 +16,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 # a fifth of the time in which the tests are collected.
 gc.set_threshold(100_000, 20, 50)
 
-# Otherwise pytest rewrites every test anew, and each process that a test starts compiles the
+# Otherwise pytest rewrites every test again, and each process that a test starts compiles the
 # sources of its libraries, for seconds.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

@@ -351,7 +351,7 @@ def source_notes(configs: Iterable[ConfigRow], chosen: Sequence[ConfigRow]) -> I
         ways = " or ".join(f"--where {path}={_argument(digest)}" for digest in sorted(digests))
         yield (
             f"{env}: {path} differs, as the file of {target} was edited: these trials have {here}, "
-            f"those of other states of the file are not part of this (see {ways})"
+            f"trials of other states of the file are left out (see {ways})"
         )
 
 

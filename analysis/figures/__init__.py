@@ -1,1 +1,1 @@
-"""Figures: numbers and drawing of each, in one file."""
+"""Figures: selection and drawing of each in one file; means and intervals come from stats."""

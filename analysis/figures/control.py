@@ -97,8 +97,8 @@ def caption_control(curves: Curves) -> str:
         "(cross-entropy method) on the true system with its noise: swing-up of the pendulum and "
         "the cartpole, a set-point of the arm and the quadrotor. Above: share of successful "
         "episodes with 95 % Wilson intervals; dashed: of the same planner with the true model, on "
-        f"the same seeds ({_truths(curves)}). Below: cost of the episode by that of the true "
-        "model under the same planner, noise and draws (dashed: equal), geometric mean over "
+        f"the same seeds ({_truths(curves)}). Below: cost of the episode divided by the true "
+        "model's under the same planner, noise and draws (dashed: equal), geometric mean over "
         "trials with 95 % t-intervals of the mean logarithm. At 0 steps the model is untrained. "
         f"Points of a number of steps are drawn side by side. {_lost(curves)}{counts}."
     )

@@ -317,7 +317,7 @@ def caption(panels: Panels) -> str:
     return (
         f"States with bounds against time, {policy_title(panels[0].policy)}, a line for each "
         f"trial; {sides if len(kinds) > 1 else only}. Dashed: bounds. At most "
-        f"{MOST_SEEDS} trials are drawn, those of the first seeds; drawn seeds: {seeds}. The axis "
+        f"{MOST_SEEDS} trials are drawn, of the first seeds; drawn seeds: {seeds}. The axis "
         f"shows at most {WIDTHS:g} widths of the bounds, lines beyond it are cut off; angles are "
         f"not wrapped. Percentage: steps after which any state is beyond a bound, mean over n "
         f"trials ± 2 standard errors; of a trial that diverged, the steps before."

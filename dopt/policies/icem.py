@@ -166,10 +166,6 @@ class Episodic(ICEM):
                 f"{self.lookahead}: make it smaller, or policy.lookahead larger."
             )
 
-    def last_search(self, t: int) -> int:
-        """Return the last step up to t ≥ 1 at which plans are drawn."""
-        return max(1, t - t % self.replan_every)
-
     def kernel_numbers(self, n_parameters: int, regularization: float) -> tuple[float, ...]:
         numbers = super().kernel_numbers(n_parameters, regularization)
         return *numbers, float(self.replan_every)

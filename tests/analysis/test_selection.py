@@ -233,7 +233,7 @@ def test_the_trials_of_the_edited_file_are_shown(
         new,
         (
             f"boat: env.source differs, as the file of vehicle.Boat was edited: these trials have "
-            f"{NEW}, those of other states of the file are not part of this "
+            f"{NEW}, trials of other states of the file are left out "
             f"(see --where env.source={OLD})",
         ),
     )
