@@ -5,10 +5,10 @@ docstrings, or strings that stand alone below a name.
 
 The walk of a specification: one short trial is run twice by ``dopt.run.run_trial``, and the second
 run is followed by ``sys.setprofile``. A room is a module of the packages in which a function is
-called with a ``TrialSpec`` among its arguments, except the module of ``TrialSpec``: reading an
-attribute of the specification takes it nowhere. A return is the end of such a call whose caller
-lies in another module of the packages. Beside them stand all modules of the packages of which a
-function ran. Functions that are compiled are not seen.
+called with a ``TrialSpec`` among its arguments. A return is the end of such a call whose caller
+lies in another module of the packages. The first two numbers leave out the module of ``TrialSpec``
+itself, whose attributes the others read; the numbers in brackets count it. Beside them stand all
+modules of the packages of which a function ran. Functions that are compiled are not seen.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from types import FrameType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("dopt", "orchestrate", "analysis", "hydra_plugins")
+PACKAGES = ("dopt", "orchestrate", "analysis")
 LONGEST = 700
 """Lines above which a file is counted as long."""
 
@@ -86,8 +86,11 @@ def words(paths: Iterable[Path], written: bool = False) -> int:
     return sum(len((GENERATED.sub("", text) if written else text).split()) for text in texts)
 
 
-def walk() -> tuple[int, int, int]:
-    """Return rooms and returns of a specification through ``run_trial``, and modules that ran."""
+def walk() -> tuple[int, int, int, int, int]:
+    """Return rooms and returns of a specification through ``run_trial``, and modules that ran.
+
+    Rooms and returns come twice: without the module of ``TrialSpec``, and with it.
+    """
     from dopt.run import run_trial
     from dopt.spec.trial import TrialSpec
 
@@ -103,26 +106,25 @@ def walk() -> tuple[int, int, int]:
     run_trial(spec)
     rooms, ran = set[str](), set[str]()
     calls: list[tuple[FrameType, bool]] = []
-    returns = 0
+    returns = {False: 0, True: 0}
+    home = TrialSpec.__module__
 
     def follow(frame: FrameType, event: str, _: Any) -> None:
-        nonlocal returns
         if event == "call" and _own(frame):
             ran.add(_module(frame))
         if event == "call" and _own(frame) and _is_given(frame, TrialSpec):
-            if _module(frame) == TrialSpec.__module__:
-                return
             rooms.add(_module(frame))
             calls.append((frame, _comes_from_another(frame)))
         elif event == "return" and calls and calls[-1][0] is frame:
-            returns += calls.pop()[1]
+            returns[_module(frame) == home] += calls.pop()[1]
 
     sys.setprofile(follow)
     try:
         run_trial(spec)
     finally:
         sys.setprofile(None)
-    return len(rooms), returns, len(ran)
+    others = rooms - {home}
+    return len(others), returns[False], len(rooms), sum(returns.values()), len(ran)
 
 
 def _module(frame: FrameType) -> str:
@@ -178,7 +180,10 @@ def rows(with_cases: bool) -> Iterator[tuple[str, str]]:
     for name in PACKAGES:
         own = files([name], "py")
         yield f"  {name}: lines, files", f"{lines(own):,}, {len(own)}"
-    yield "rooms, returns of a specification; modules that ran", "{}, {}; {}".format(*walk())
+    yield (
+        "rooms, returns of a specification; modules that ran",
+        "{}, {} ({}, {}); {}".format(*walk()),
+    )
     for name in ("studies", "benchmarks"):
         own = files([name], "py")
         yield f"{name}: lines, files", f"{lines(own):,}, {len(own)}"

@@ -293,7 +293,7 @@ class StoredChunks(Chunks):
         self._next_look = 0.0
 
     def look(self) -> None:
-        """Read the configurations that have open trials, after freeing the trials of dead launches."""
+        """Read the configurations that have open trials, after freeing trials of dead launches."""
         start = time.monotonic()
         self._store.recover()
         open_configs = self._store.open_configs()

@@ -30,6 +30,11 @@ SMALL_SEARCHES = {"lookahead": {"lookahead": 6, "candidates": 4}, "task": {"coun
 SMALL_SEARCHES |= {"icem": {"lookahead": 6, "hold": 2, "stride": 2, "plans": 8, "elites": 3}}
 SMALL_SEARCHES |= {"episodic": SMALL_SEARCHES["icem"] | {"replan_every": 5}}
 SMALL_GRIDS |= {"mass_spring": (2, 2, 2, 2)}
+for name, system in SYSTEMS.items():
+    SMALL_GRIDS.setdefault(name, (2,) * len(system().grid_points))
+SMALL_GRIDS = {
+    name: (2,) * len(system().grid_points) for name, system in SYSTEMS.items()
+} | SMALL_GRIDS
 SIZES = {"chain": {"n_links": 3}, "coupled_pendulums": {"n_pendulums": 3}}
 """Systems of any size: as small as an end, a middle and a start can be."""
 MODELS = {"oracle": "linear", "linear": "linear_state", "gaussian_process": "gaussian_process"}
