@@ -23,6 +23,7 @@ sys.dont_write_bytecode = False
 
 import shutil  # noqa: E402  all of these after the threads are set
 import signal  # noqa: E402
+import time  # noqa: E402
 import uuid  # noqa: E402
 from collections.abc import Iterator  # noqa: E402
 from pathlib import Path  # noqa: E402
@@ -55,6 +56,16 @@ MEMORY_BYTES = 2 * 2**30
 # SQLite waits for the disk at every commit.
 if os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MEMORY_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
+
+BEGAN = time.monotonic()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Print what the run took; its CPU seconds include all processes that it has waited for."""
+    if not hasattr(config, "workerinput"):
+        cpu, wall = sum(os.times()[:4]), time.monotonic() - BEGAN
+        print(f"{cpu:.0f} CPU seconds, {wall:.0f} s, load {os.getloadavg()[0]:.1f}")  # noqa: T201
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -149,7 +149,7 @@ def test_an_output_on_a_full_disk_is_a_sentence_and_lost_errors_end_nothing(
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_hang_up_is_a_request_to_end(number: signal.Signals) -> None:
-    with waiting() as running:
+    with waiting(lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as running:  # under nohup
         running.send_signal(number)
         out, err = running.communicate()
     assert running.returncode == 5, out + err
