@@ -2,8 +2,8 @@
 
     python studies/trackers/mlflow_runs.py BUNDLE DATABASE
 
-needs the package mlflow-skinny. Each system is an experiment; a run has the configuration as
-parameters, and losses and assessments as metrics with steps. Read it with
+needs the packages mlflow-skinny, alembic and sqlalchemy. Each system is an experiment; a run has
+the configuration as parameters, and losses and assessments as metrics with steps. Read it with
 ``mlflow ui --backend-store-uri sqlite:///DATABASE``.
 """
 
