@@ -83,7 +83,7 @@ def test_workers_survive_a_preemption_every_second_or_two(
     laboratory.check()
     assert laboratory.count("status = 'failed'") == 0
     tell(f"{TRIALS // 2:,} trials, signals {dict(sent)}, attempts {dict(attempts(laboratory))}")
-    assert sent.total() >= min(10, TRIALS // 500)
+    assert sent.total() >= 10
 
 
 def attempts(laboratory: Laboratory) -> list[tuple[str, int]]:
