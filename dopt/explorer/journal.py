@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import json
 import math
 import os
@@ -146,13 +147,27 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _lock(file: int, path: Path) -> None:
+    """Lock a file that no explorer writes, also if one has it open that was forgotten.
+
+    Exceptions that Numba has caught while it compiled refer to themselves, and through their frames
+    to the explorer for which it did: without the collector of garbage it may stay for long.
+    """
+    if not _locked(file):
+        gc.collect()
+        if not _locked(file):
+            raise SpecificationError(
+                f"the journal {path} is written by another explorer, here or in another process, "
+                f"but one at a time may do so: close() it, or give another file."
+            )
+
+
+def _locked(file: int) -> bool:
+    """Lock a file, and return whether that was possible at once."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise SpecificationError(
-            f"the journal {path} is written by another explorer, here or in another process, but "
-            f"one at a time may do so: close() it, or give another file."
-        ) from error
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _read(path: Path, beginning: bytes) -> tuple[int, int, list[dict[str, Any]]]:
