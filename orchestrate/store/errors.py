@@ -31,7 +31,7 @@ class NoDatabaseError(StoreError):
 
 
 class SchemaVersionError(StoreError):
-    """Database of an older or a newer version of the program."""
+    """Database of an older or a newer version of the program, or of something else."""
 
 
 class LaunchAliveError(StoreError):

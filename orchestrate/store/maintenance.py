@@ -32,7 +32,8 @@ def back_up(url: str, target: Path) -> int:
     The copy of SQLite is a database file, checked and complete in itself; of PostgreSQL it is an
     archive for ``pg_restore`` with the tables and views of the schema. The file gets its name when
     it is complete. Raises ``StoreError`` if the file exists, ``OutputError`` if it cannot be
-    written, and ``StoreUnavailableError`` if the database cannot be read.
+    written, ``SchemaVersionError`` if the database is none, and ``StoreUnavailableError`` if it
+    cannot be read.
     """
     if target.exists():
         raise StoreError(f"The file {target} exists, a new one is expected: give another name.")
@@ -47,7 +48,7 @@ def _copy(parsed: URL, url: str, partial: Path) -> None:
             ((schema,),) = reader.rows("SELECT quote_ident(current_schema())")
         dump(parsed, schema, partial)
         return
-    with translated(database_url.safe(parsed)):
+    with translated(database_url.safe(parsed), opening=True):
         copy_checked(existing_path(parsed), partial)
 
 

@@ -125,6 +125,7 @@ class Reader:
         self._url = url
         self._engine = engine
         self._moment = moment
+        self._opening = moment is None
         self._kind = _kind(url)
         self.safe_url = database_url.safe(url)
 
@@ -138,6 +139,7 @@ class Reader:
         except BaseException:
             reader.close()
             raise
+        reader._opening = False
         return reader
 
     def __enter__(self) -> Self:
@@ -280,7 +282,7 @@ class Reader:
 
     @contextmanager
     def _snapshot(self) -> Iterator[Connection]:
-        with translated(self.safe_url):
+        with translated(self.safe_url, opening=self._opening):
             if self._moment is not None:
                 yield self._moment
                 return

@@ -25,7 +25,7 @@ from orchestrate.commands import COMMANDS
 from orchestrate.program import SUCCESSORS
 from orchestrate.runner import run_grid
 from orchestrate.runner.run_grid import Work
-from orchestrate.store import Reader, StoreError, default_url
+from orchestrate.store import Reader, Store, StoreError, default_url
 from orchestrate.store.backends.sqlite_engine import existing_path
 from orchestrate.store.database_url import parse
 from tests.orchestrate.standins import quick, raising, unusable
@@ -469,6 +469,73 @@ def test_an_empty_variable_counts_as_unset(
     assert (code, errors) == (0, "")
     assert "sqlite:///results/results.db" in output
     assert default_url() == "sqlite:///results/results.db"
+
+
+ARGUMENTS = {
+    "show": ["0"],
+    "retry": ["failed"],
+    "query": ["SELECT 1"],
+    "export": ["trials", "trials.csv"],
+    "merge": ["other.db"],
+    "backup": ["copy.db"],
+    "prune": ["--env", "arm", "--yes"],
+    "animate": ["arm", "random"],
+}
+"""Arguments that the commands need beside their options."""
+
+ANALYSES = ("figures", "summary", "compare", "aggregate", "calibration", "report", "animate")
+
+
+@pytest.fixture
+def notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a file that is no database, in the working folder beside one that is."""
+    monkeypatch.chdir(tmp_path)
+    with Store.open("sqlite:///other.db"):
+        pass
+    path = tmp_path / "notes.toml"
+    path.write_text("[project]\nname = 'something else'\n")
+    return path
+
+
+NO_DATABASE = (
+    "error: sqlite:///{} is not a SQLite database, but a results database of this program is "
+    "expected: give the URL of another one, or of a new one, or restore a copy if it was one.\n"
+)
+
+
+@pytest.mark.parametrize("name", [command.name for command in COMMANDS])
+def test_a_file_of_something_else_is_refused_by_every_command(
+    name: str, notes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = notes.read_bytes()
+    code = orchestrate([name, *ARGUMENTS.get(name, []), "--db", "sqlite:///notes.toml"])
+    assert (code, *capsys.readouterr()) == (2, "", NO_DATABASE.format("notes.toml"))
+    assert notes.read_bytes() == before
+
+
+def test_a_merge_refuses_a_file_of_something_else(
+    notes: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert orchestrate(["merge", "notes.toml", "--db", "sqlite:///other.db"]) == 2
+    assert capsys.readouterr() == ("", NO_DATABASE.format(notes))
+
+
+@pytest.mark.usefixtures("notes")
+@pytest.mark.parametrize("name", ANALYSES)
+def test_a_file_of_something_else_is_refused_by_the_analysis(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = analysis([name, *ARGUMENTS.get(name, []), "--db", "sqlite:///notes.toml"])
+    assert (code, *capsys.readouterr()) == (2, "", NO_DATABASE.format("notes.toml"))
+
+
+@pytest.mark.usefixtures("notes")
+@pytest.mark.parametrize("words", [[], ["-m", "seed=0,1"], ["launch.dry_run=true"]])
+def test_a_file_of_something_else_is_refused_by_a_launch(
+    command_line: Command, words: list[str]
+) -> None:
+    answer = command_line(*words, *SHORT, "store.url=sqlite:///notes.toml")
+    assert answer == (2, "", NO_DATABASE.format("notes.toml"))
 
 
 TRIAL = ("env=pendulum", "policy=random", *SHORT)

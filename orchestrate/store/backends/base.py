@@ -53,7 +53,9 @@ class Backend(ABC):
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
         """Run the block in one writing transaction."""
-        with translated(self.safe_url, self._has_answered), self.engine.begin() as connection:
+        opening = not self._has_answered
+        errors = translated(self.safe_url, known_host=not opening, opening=opening)
+        with errors, self.engine.begin() as connection:
             self._has_answered = True
             yield connection
 

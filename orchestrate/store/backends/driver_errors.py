@@ -10,7 +10,12 @@ from contextlib import contextmanager
 from sqlalchemy.exc import DBAPIError
 
 from orchestrate.store.backends.transient_errors import is_transient
-from orchestrate.store.errors import QueryError, StoreError, StoreUnavailableError
+from orchestrate.store.errors import (
+    QueryError,
+    SchemaVersionError,
+    StoreError,
+    StoreUnavailableError,
+)
 
 _SQLITE = {
     "SQLITE_BUSY": "another process has locked it for too long; find the process that has it open",
@@ -20,7 +25,8 @@ _SQLITE = {
     "SQLITE_CORRUPT": "the file is damaged; restore a copy, or move it away and run again",
     "SQLITE_FULL": "the disk is full; make room and run the same command again",
     "SQLITE_IOERR": "reading or writing the disk failed; check the disk and run again",
-    "SQLITE_NOTADB": "the file is not a SQLite database; give another path",
+    "SQLITE_NOTADB": "the file is not a SQLite database any more; restore a copy, or move it away "
+    "and run again",
     "SQLITE_READONLY": "the file is read-only; make it writable or give another path",
 }
 _STATES = {
@@ -54,11 +60,13 @@ _ELSEWHERE = "check that its server runs and answers, then run the same command 
 
 
 @contextmanager
-def translated(safe_url: str, known_host: bool = False) -> Iterator[None]:
+def translated(safe_url: str, known_host: bool = False, opening: bool = False) -> Iterator[None]:
     """Raise ``StoreUnavailableError`` for errors of the database, not of the program.
 
-    ``known_host`` is True if the server has answered this process before. Errors are wrapped by
-    SQLAlchemy, or raised directly by the driver in COPY and in backups.
+    ``known_host`` is True if the server has answered this process before. While a database is
+    opened, ``opening``, a file of something else is the mistake of whoever has named it: a
+    ``SchemaVersionError`` is raised. Errors are wrapped by SQLAlchemy, or raised directly by the
+    driver in COPY and in backups.
     """
     try:
         yield
@@ -66,6 +74,12 @@ def translated(safe_url: str, known_host: bool = False) -> Iterator[None]:
         original = error.orig if isinstance(error, DBAPIError) else error
         if original is None or not _is_infrastructure(original):
             raise
+        if opening and _code(original) == "SQLITE_NOTADB":
+            raise SchemaVersionError(
+                f"{safe_url} is not a SQLite database, but a results database of this program is "
+                "expected: give the URL of another one, or of a new one, or restore a copy if it "
+                "was one."
+            ) from error
         raise StoreUnavailableError(
             f"The results database {safe_url} cannot be used: {_advice(original)} "
             f"({_first_line(original)}).",

@@ -459,12 +459,6 @@ def test_a_lock_that_another_process_holds(tmp_path: Path) -> None:
         assert store.begin_launch(LAUNCH) == 1
 
 
-def test_a_file_that_is_no_database(tmp_path: Path) -> None:
-    path = tmp_path / "results.db"
-    path.write_text("Some notes, long enough to be taken for a header of a database. " * 4)
-    assert not _transient(f"sqlite:///{path}")
-
-
 @pytest.mark.parametrize("transient", [False, True])
 def test_the_error_travels_between_processes(transient: bool) -> None:
     error = StoreUnavailableError("The database is gone.", transient=transient)

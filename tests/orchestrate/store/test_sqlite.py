@@ -8,6 +8,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -207,9 +208,25 @@ def test_refuses_a_file_that_is_no_database(tmp_path: Path, side: type[Store | R
     path = tmp_path / "notes.db"
     path.write_text("Some notes, long enough to be taken for a header of a database. " * 4)
     before = path.read_bytes()
-    with pytest.raises(StoreUnavailableError, match="not a SQLite database"):
+    with pytest.raises(SchemaVersionError, match="is not a SQLite database, but a results"):
         side.open(f"sqlite:///{path}")
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("side", ["store", "reader"])
+def test_a_file_that_is_no_database_any_more_is_damaged(tmp_path: Path, side: str) -> None:
+    """Whoever has opened it gave the right file: it is damaged, which another copy may mend."""
+    path = tmp_path / "results.db"
+    url = f"sqlite:///{path}"
+    with Store.open(url) as store, Reader.open(url) as reader:
+        begin(store)
+        with closing(sqlite3.connect(path)) as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        with path.open("r+b") as file:
+            file.write(b"notes" * 1000)
+        with pytest.raises(StoreUnavailableError, match="not a SQLite database any more") as lost:
+            begin(store) if side == "store" else reader.configs()
+    assert not lost.value.transient
 
 
 @pytest.mark.parametrize("side", [Store, Reader])
