@@ -252,9 +252,18 @@ class Laboratory:
 
 def alive(pid: int) -> bool:
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        return _state(Path(f"/proc/{pid}/stat")) != "Z"
     except OSError:
         return False
+
+
+def stands_still(pid: int) -> bool:
+    """Return whether all threads of a process are stopped."""
+    return {*map(_state, Path(f"/proc/{pid}/task").glob("*/stat"))} == {"T"}
+
+
+def _state(file: Path) -> str:
+    return file.read_text().rpartition(")")[2].split()[0]
 
 
 def children(pid: int) -> list[int]:

@@ -19,7 +19,7 @@ from sqlalchemy.engine import make_url
 
 from orchestrate.runner import progress
 from orchestrate.runner.progress import FINISHING, Interrupt, undisturbed
-from tests.orchestrate.faults.laboratory import Laboratory, Launched, alive
+from tests.orchestrate.faults.laboratory import Laboratory, Launched, alive, stands_still
 from tests.waiting import PATIENCE_SECONDS, until
 
 At = Callable[..., Laboratory]
@@ -208,17 +208,15 @@ LOST = "SELECT trial_id FROM attempt WHERE outcome = 'lost'"
 
 
 def stop_between_transactions(sleeper: Launched, laboratory: Laboratory) -> None:
-    """Stop it while it does not hold the lock of the file, for which everybody would wait."""
-    path = make_url(laboratory.url).database
-    while True:
+    """Stop it while it does not hold the lock of the file, for which everybody would wait.
+
+    We hold the lock until all its threads stand: a signal does not end what they ask of the kernel.
+    """
+    path, patience = str(make_url(laboratory.url).database), PATIENCE_SECONDS
+    with closing(sqlite3.connect(path, patience, isolation_level=None)) as connection:
+        connection.execute("BEGIN IMMEDIATE")
         sleeper.send(signal.SIGSTOP)
-        with closing(sqlite3.connect(str(path), timeout=0.5, isolation_level=None)) as connection:
-            try:
-                connection.execute("BEGIN IMMEDIATE")
-            except sqlite3.OperationalError:
-                sleeper.send(signal.SIGCONT)
-            else:
-                return
+        until(lambda: stands_still(sleeper.pid))
 
 
 def test_another_launch_takes_over_and_late_results_are_refused(
