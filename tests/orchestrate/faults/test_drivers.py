@@ -130,6 +130,7 @@ def test_one_interrupt_ends_what_runs_and_frees_the_rest(
 def test_two_interrupts_stop_at_once_and_lose_nothing_committed(laboratory: Laboratory) -> None:
     laboratory.gate.let(20)
     with laboratory.launched() as launched:
+        launched.until(lambda: len(laboratory.gate.waiting()) == 2)  # one interrupt ends none
         launched.until(lambda: laboratory.count() >= 5)
         workers = launched.workers()
         assert len(workers) == 2
