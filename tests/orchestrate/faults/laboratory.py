@@ -259,7 +259,10 @@ def alive(pid: int) -> bool:
 
 def stands_still(pid: int) -> bool:
     """Return whether all threads of a process are stopped."""
-    return {*map(_state, Path(f"/proc/{pid}/task").glob("*/stat"))} == {"T"}
+    try:
+        return {*map(_state, Path(f"/proc/{pid}/task").glob("*/stat"))} == {"T"}
+    except OSError:  # one has just ended
+        return False
 
 
 def _state(file: Path) -> str:
