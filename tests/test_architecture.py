@@ -188,7 +188,7 @@ def test_what_is_compiled_is_made_of_sources_that_name_its_cache() -> None:
     annotations = "dopt.types"  # which numba never reads
     for path in sources("dopt/kernel"):
         text = path.read_text(encoding="utf-8")
-        compiles = re.search("^@(compiled|called_from_python|contracted|vectorized)$", text, re.M)
+        compiles = re.search("^@(compiled|called_from_python)$", text, re.M)
         if compiles and path.name != "compiler.py":
             own = {name for name in imports(path) if name.startswith("dopt.")}
             assert all(name.startswith((*folders, annotations)) for name in own), path

@@ -121,29 +121,15 @@ def called_from_python(function: F) -> F:
     return _njit(function, nogil=True)
 
 
-def contracted(function: F) -> F:
-    """Compile a function whose products and sums may be fused: a·b + c rounds once.
+def _njit(function: F, *, nogil: bool = False) -> F:
+    """Compile a function without liberties: it rounds as it is written, on every processor.
 
-    Write x·x with :func:`squared`: Numba compiles the operator ``**`` as a function of its own,
-    with the liberties of whichever function uses it first in a process.
-    """
-    return _njit(function, fastmath={"contract"})
-
-
-def vectorized(function: F) -> F:
-    """Compile a function whose sums may also be taken in another order, as vector lanes need."""
-    return _njit(function, fastmath={"contract", "reassoc"})
-
-
-def _njit(function: F, *, fastmath: bool | set[str] = False, nogil: bool = False) -> F:
-    """Compile a function whose rounding does not depend on which function calls it first.
-
-    Numba compiles a function once, and hands it the liberties of the caller for which it does so
-    unless ``fastmath`` is given, if only as False.
+    A product and a sum are fused where they are written so (:mod:`dopt.kernel.vectors`). Numba
+    hands a function the liberties of its caller unless ``fastmath`` is given, if only as False.
     """
     if plain.PLAIN:
         return function
-    options = {"error_model": "numpy", "fastmath": fastmath, "nogil": nogil}
+    options = {"error_model": "numpy", "fastmath": False, "nogil": nogil}
     return cast(F, stored(numba.njit(**options)(function)))
 
 

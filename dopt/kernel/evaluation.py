@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel.compiler import compiled, squared, vectorized
+from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.model_kinds import kernel_value, mean_weights, write_values
 from dopt.kernel.network import features_at, mean_forward
 from dopt.kernel.structs import Evaluation, Network, Plant
+from dopt.kernel.vectors import inner, multiply
 from dopt.types import Matrix, Real, Singles, Vector
 
 BLOCK = 256
@@ -115,7 +116,7 @@ def _combination_error(
     """Return the error of a linear combination, (r, n), of the first n functions of the basis."""
     total, count = 0.0, 0
     for block in range(start, stop):
-        np.dot(W, points.basis[block, : W.shape[1]], outputs)
+        multiply(W, points.basis[block], outputs)
         used = points.block_sizes[block]
         total += _squared_errors(outputs, points.block_targets[block], used)
         count += used
@@ -141,15 +142,15 @@ def _grey_box_error(
     return float(np.sqrt(total / count)) if count else np.nan
 
 
-@vectorized
+@compiled
 def _squared_errors(outputs: Real, targets: Matrix, n: int) -> float:
     """Return Σ (output - target)² over the first n columns."""
-    total = 0.0
+    total, errors = 0.0, np.empty(n)
     for k in range(outputs.shape[0]):
         values, truth = outputs[k, :n], targets[k, :n]
         for i in range(values.shape[0]):
-            error = values[i] - truth[i]
-            total += error * error
+            errors[i] = values[i] - truth[i]
+        total += inner(errors, errors)
     return total
 
 

@@ -26,26 +26,36 @@ import numpy as np
 
 from dopt.algorithm import ModelKind
 from dopt.kernel import model_kinds
-from dopt.kernel.compiler import compiled, contracted, vectorized
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.linear_algebra import (
     factorize,
-    inner,
-    quadratic_forms,
-    rank_update,
+    multiply_planned,
+    replaced,
+    settle,
     solve_lower,
     write_inverse,
 )
 from dopt.kernel.model import (
     all_components,
-    gradients_along_inputs,
     linearization_at,
-    network_jacobian,
-    parameter_gradients,
     parameter_rows,
+    write_jacobian,
+    write_model_gradients,
+    write_network_gradients,
 )
-from dopt.kernel.network import features_at, output_inputs_along, output_inputs_at
+from dopt.kernel.network import features_at, multiply_vector, output_inputs_along, output_inputs_at
 from dopt.kernel.normal_equations import normal_matrix
-from dopt.kernel.structs import Dual, Information, Linearization, Network, Plant, Sketch, State
+from dopt.kernel.structs import (
+    Covariance,
+    Dual,
+    Information,
+    Linearization,
+    Network,
+    Plant,
+    Sketch,
+    State,
+)
+from dopt.kernel.vectors import inner, inner_products
 from dopt.types import Matrix, Stack, Vector
 
 
@@ -68,12 +78,38 @@ def undefined_forms(
 
 
 @compiled
+def deferred(covariance: Covariance, r: int) -> Matrix:
+    """Return the place for r rows, (r, Q), that are added to M before it is read next."""
+    settle(covariance)
+    covariance.n_deferred[0] = r
+    return covariance.rows[:r]
+
+
+@compiled
+def planned(covariance: Covariance, k: int) -> Matrix:
+    """Return the place for k rows, (k, Q), whose products with M⁻¹ a plan needs."""
+    first = covariance.n_deferred[0]
+    return covariance.rows[first : first + k]
+
+
+@compiled
+def planned_forms(covariance: Covariance, G: Matrix) -> Matrix:
+    """Return xᵀM⁻¹y for x and y among the planned rows, the first ones of x where m = 1."""
+    products = multiply_planned(covariance, 1 if G.shape[0] == 2 else G.shape[0])
+    forms = np.empty((products.shape[0], G.shape[0]))
+    inner_products(products, G, forms)
+    return forms
+
+
+@compiled
 def add_model_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
     """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
     r = plant.learned_rows.shape[0]
     rows = np.empty((r, state.theta.shape[0]))
     parameter_rows(plant, network, state.theta, x, rows, np.empty(r))
-    rank_update(state.covariance, rows, np.zeros(r), np.empty(rows.shape))
+    places = deferred(state.covariance, r)
+    for k in range(r):
+        copy_into(rows[k], places[k])
 
 
 @compiled
@@ -86,27 +122,31 @@ def model_forms(
     component: int,
 ) -> Matrix:
     """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
-    m = columns.shape[0]
-    G = parameter_gradients(plant, network, state.theta, bar, columns, component)
-    return quadratic_forms(state.covariance, G[: 1 if m == 1 else 1 + m], G)
+    G = planned(state.covariance, 1 + columns.shape[0])
+    write_model_gradients(plant, network, state.theta, bar, columns, component, G)
+    return planned_forms(state.covariance, G)
 
 
 @compiled
 def add_network_rows(plant: Plant, network: Network, state: State, x: Vector) -> None:
     """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
-    value = np.zeros(plant.learned_rows.shape[0])
-    rows = network_jacobian(network, state.theta, x, value)
-    rank_update(state.covariance, rows, value, np.empty(rows.shape))  # no residuals: θ stays
+    r = plant.learned_rows.shape[0]
+    write_jacobian(network, state.theta, x, deferred(state.covariance, r), np.empty(r))
 
 
 @compiled
 def network_forms(
-    plant: Plant, network: Network, state: State, bar: Vector, columns: Matrix, component: int
+    plant: Plant,  # noqa: ARG001
+    network: Network,
+    state: State,
+    bar: Vector,
+    columns: Matrix,
+    component: int,
 ) -> Matrix:
     """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
-    m = columns.shape[0]
-    G = gradients_along_inputs(plant, network, state.theta, bar, columns, component)
-    return quadratic_forms(state.covariance, G[: 1 if m == 1 else 1 + m], G)
+    G = planned(state.covariance, 1 + columns.shape[0])
+    write_network_gradients(network, state.theta, bar, columns, component, G)
+    return planned_forms(state.covariance, G)
 
 
 @compiled
@@ -142,7 +182,8 @@ def add_fresh_rows(plant: Plant, network: Network, state: State, x: Vector) -> N
         normal[i, i] += visited.regularization
     if not (factorize(normal) and write_inverse(normal, covariance.upper)):
         state.theta[:] = np.nan
-    covariance.n_pending[0] = 0
+    replaced(covariance)
+    covariance.n_deferred[0] = 0
 
 
 @compiled
@@ -258,7 +299,7 @@ def _store(dual: Dual, n: int, phi: Vector, hidden: Matrix, deltas: Stack) -> No
 
 @compiled
 def _block(dual: Dual) -> int:
-    """Return the number of states in a block; BLAS takes four at a time."""
+    """Return the number of states in a block."""
     states: int = BLOCK_BYTES // (8 * dual.hidden.shape[2])
     return max(4, states // 4 * 4)
 
@@ -268,7 +309,8 @@ def _values(dual: Dual, start: int, stop: int, phi: Vector, hidden: Matrix) -> M
     """Return h · h' of each layer, (L + 1, n), of a state with n of those seen."""
     out = np.empty((hidden.shape[0] + 1, stop - start))
     for index in range(out.shape[0]):
-        out[index] = np.dot(stored_below(dual, start, stop, index), below(phi, hidden, index))
+        stored = stored_below(dual, start, stop, index)
+        multiply_vector(stored, below(phi, hidden, index), out[index])
     return out
 
 
@@ -283,11 +325,11 @@ def _add_products(
     """
     r, depth, m = dual.deltas.shape[0], dual.deltas.shape[1], point.phi_dots.shape[0]
     stop = start + values.shape[1]
-    slopes = np.empty((m, values.shape[1]))
+    slopes, back = np.empty((m, values.shape[1])), np.empty(values.shape[1])
     for index in range(depth + 1):
         stored = stored_below(dual, start, stop, index)
         for j in range(m):
-            slopes[j] = np.dot(stored, below_along(point, j, index))
+            multiply_vector(stored, below_along(point, j, index), slopes[j])
         if index == depth:
             first = start * r + component
             _add_spread(values[index], 1.0, first, r, out[0])
@@ -297,22 +339,22 @@ def _add_products(
         for k in range(r):
             first = start * r + k
             signals = dual.deltas[k, index, start:stop]
-            back = np.dot(signals, point.deltas[index])
+            multiply_vector(signals, point.deltas[index], back)
             _add_layer(back, values[index], 1.0, first, r, out[0])
             for j in range(m):
                 _add_layer(back, slopes[j], 0.0, first, r, out[1 + j])
-                back_dot = np.dot(signals, point.deltas_dots[j, index])
-                _add_layer(back_dot, values[index], 1.0, first, r, out[1 + j])
+                multiply_vector(signals, point.deltas_dots[j, index], back)
+                _add_layer(back, values[index], 1.0, first, r, out[1 + j])
 
 
-@vectorized
+@compiled
 def _add_layer(a: Vector, b: Vector, one: float, first: int, stride: int, out: Vector) -> None:
     """Add a (b + one) to every ``stride``-th entry."""
     for s in range(a.shape[0]):
         out[first + s * stride] += a[s] * (b[s] + one)
 
 
-@vectorized
+@compiled
 def _add_spread(values: Vector, one: float, first: int, stride: int, out: Vector) -> None:
     """Add values + one to every ``stride``-th entry."""
     for s in range(values.shape[0]):
@@ -358,10 +400,10 @@ def add_sketched_rows(plant: Plant, network: Network, state: State, x: Vector) -
     """Add JᵀJ at a state (:data:`dopt.kernel.structs.AddRows`)."""
     value = np.zeros(plant.learned_rows.shape[0])
     phi, hidden, deltas = all_components(network, state.theta, x, value)
-    rows = np.zeros((deltas.shape[0], state.sketch.size))
+    rows = deferred(state.covariance, deltas.shape[0])
+    rows[:] = 0.0
     for k in range(rows.shape[0]):
         _add_gradient(state.sketch, network, phi, hidden, deltas[k], k, rows[k])
-    rank_update(state.covariance, rows, value, np.empty(rows.shape))  # no residuals: θ stays
 
 
 @compiled
@@ -371,11 +413,12 @@ def sketched_forms(
     """Return xᵀM⁻¹y at a state (:data:`dopt.kernel.structs.PlanningForms`)."""
     m, value = columns.shape[0], np.empty(plant.learned_rows.shape[0])
     at = linearization_at(network, state.theta, bar, columns, component, value)
-    G = np.zeros((1 + m, state.sketch.size))
+    G = planned(state.covariance, 1 + m)
+    G[:] = 0.0
     _add_gradient(state.sketch, network, at.phi, at.hidden, at.deltas, component, G[0])
     for j in range(m):
         _add_gradient_along(state.sketch, network, at, j, component, G[1 + j])
-    return quadratic_forms(state.covariance, G[: 1 if m == 1 else 1 + m], G)
+    return planned_forms(state.covariance, G)
 
 
 @compiled
@@ -411,7 +454,7 @@ def _add_gradient_along(
     _add_output_layer(sketch, network, component, top_dot, 0.0, out)
 
 
-@contracted
+@compiled
 def _add_sketched_layer(
     sketch: Sketch, network: Network, index: int, delta: Vector, h: Vector, out: Vector
 ) -> None:
@@ -425,7 +468,7 @@ def _add_sketched_layer(
     _add(sketch, start, delta, out)
 
 
-@contracted
+@compiled
 def _add_layer_along(
     sketch: Sketch,
     network: Network,

@@ -1,24 +1,38 @@
 """The inverse M⁻¹ of the information matrix, and Cholesky factors, in compiled code.
 
-M⁻¹ = A - VᵀV, with A a symmetric matrix of which only the upper triangle is stored and read, and V
-a few pending rows, (n, q). A step adds r rows to V; when V is full it is subtracted from A in one
-pass over the memory of A, which costs less than a pass in every step. All results are symmetric by
-construction.
+M⁻¹ = A - VᵀV, with A a symmetric matrix of which the upper triangle is stored and read, in blocks
+of eight rows and columns, and V a few pending rows, (n, q). A step adds r rows to V; when V is full
+it is subtracted from A in one pass over the memory of A, which costs less than a pass in every
+step. All results are symmetric by construction.
 
-The loops take two or four rows of A at a time: each entry of a vector is then loaded once for
-several products. They run over slices, whose indices the compiler knows to be within bounds.
+The rows that a state adds to M may be deferred: they are multiplied by M⁻¹ in the pass that the
+next plan needs anyway. Whatever reads M⁻¹ settles them first. A product has the same bits whichever
+rows share its pass (:mod:`dopt.kernel.vectors`).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from dopt.kernel.compiler import compiled, vectorized
+from dopt.kernel.compiler import compiled, copy_into
 from dopt.kernel.structs import Covariance
-from dopt.types import Matrix, Stack, Vector
+from dopt.kernel.vectors import (
+    GROUP,
+    LANES,
+    add_multiple,
+    add_symmetric,
+    aligned_zeros,
+    inner,
+    inner_products,
+    padded,
+    subtract_product,
+    subtract_symmetric,
+    symmetric_products,
+)
+from dopt.types import Matrix, Vector
 
 PENDING_ROWS = 16
-"""Rows that ``pending`` has room for; a multiple of 4 because the loops take 4 rows at a time."""
+"""Rows that ``pending`` has room for, unless a state adds more."""
 
 SMALL = 32
 """Largest q for which ``pending`` has room for 4 rows only.
@@ -27,158 +41,120 @@ Such a matrix fits into the first-level cache, where a pass over it is fast.
 """
 
 
-@vectorized
-def inner(a: Vector, b: Vector) -> float:
-    """Return aᵀb."""
-    total = 0.0
-    for i in range(a.shape[0]):
-        total += a[i] * b[i]
-    return total
+def initial_covariance(q: int, regularization: float, n_rows: int, n_planned: int) -> Covariance:
+    """Return M⁻¹ = I/λ, (q, q), where a state adds so many rows and a plan multiplies so many."""
+    upper = aligned_zeros(padded(q), padded(q))
+    upper[range(q), range(q)] = 1.0 / regularization
+    room, together = max(PENDING_ROWS if q > SMALL else 4, n_rows), max(n_rows + n_planned, GROUP)
+    places = (aligned_zeros(n, padded(q)) for n in (room, together, together))
+    counts = (np.zeros(1, dtype=np.int64) for _ in range(2))
+    return Covariance(upper, *places, *counts, q)
 
 
-@vectorized
-def add_multiple(y: Vector, factor: float, x: Vector) -> None:
-    """Add factor x to y."""
-    for i in range(x.shape[0]):
-        y[i] += factor * x[i]
+@compiled
+def multiply_planned(covariance: Covariance, k: int) -> Matrix:
+    """Return M⁻¹ times the k rows behind the deferred ones, as a view, (k, padded q).
+
+    The deferred ones are added to M before, in the same pass over A.
+    """
+    return _multiply_and_add(covariance, k, np.zeros(covariance.n_deferred[0]))
 
 
-@vectorized
-def symmetric_product(upper: Matrix, x: Vector, y: Vector) -> None:
-    """Write y = A x, (q,), four rows of the upper triangle of A at a time."""
-    q = x.shape[0]
-    y[:] = 0.0
-    blocked = q - q % 4
-    for i in range(0, blocked, 4):
-        _four_rows(
-            upper[i, i + 4 :],
-            upper[i + 1, i + 4 :],
-            upper[i + 2, i + 4 :],
-            upper[i + 3, i + 4 :],
-            x[i : i + 4],
-            x[i + 4 :],
-            y[i : i + 4],
-            y[i + 4 :],
-        )
-        _triangle(upper, x, y, i, i + 4)
-    _triangle(upper, x, y, blocked, q)
+@compiled
+def settle(covariance: Covariance) -> None:
+    """Add the deferred rows to M."""
+    if covariance.n_deferred[0] > 0:
+        multiply_planned(covariance, 0)
 
 
-@vectorized
-def _triangle(upper: Matrix, x: Vector, y: Vector, start: int, stop: int) -> None:
-    """Add the product with the diagonal block from ``start`` to ``stop``."""
-    for i in range(start, stop):
-        y[i] += upper[i, i] * x[i]
-        for j in range(i + 1, stop):
-            y[i] += upper[i, j] * x[j]
-            y[j] += upper[i, j] * x[i]
+@compiled
+def _multiply_and_add(covariance: Covariance, k: int, residuals: Vector) -> Matrix:
+    """Do what :func:`multiply_planned` does; the residuals e of the deferred rows become L⁻¹e."""
+    n = covariance.n_deferred[0]
+    _make_room(covariance, n)
+    rows, products = covariance.rows[: n + k], covariance.products[: n + k]
+    _multiply(covariance, rows, products)
+    for i in range(n):
+        if inner(products[i], rows[i]) < 0.0:
+            restore(covariance)
+            _multiply(covariance, rows, products)
+            break
+    first = covariance.n_pending[0]
+    if n > 0:
+        _add_pending(covariance, residuals)
+        _subtract_pending(covariance.pending[first : first + n], rows[n:], products[n:])
+    return products[n:]
 
 
-@vectorized
-def _four_rows(
-    row_0: Vector,
-    row_1: Vector,
-    row_2: Vector,
-    row_3: Vector,
-    factors: Vector,
-    x: Vector,
-    sums: Vector,
-    y: Vector,
-) -> None:
-    """Add rowᵀx to the sums of four rows and the rows' multiples to y."""
-    factor_0, factor_1, factor_2, factor_3 = factors[0], factors[1], factors[2], factors[3]
-    sum_0, sum_1, sum_2, sum_3 = 0.0, 0.0, 0.0, 0.0
-    for j in range(x.shape[0]):
-        entry_0, entry_1, entry_2, entry_3 = row_0[j], row_1[j], row_2[j], row_3[j]
-        sum_0 += entry_0 * x[j]
-        sum_1 += entry_1 * x[j]
-        sum_2 += entry_2 * x[j]
-        sum_3 += entry_3 * x[j]
-        y[j] += entry_0 * factor_0 + entry_1 * factor_1 + entry_2 * factor_2 + entry_3 * factor_3
-    sums[0] += sum_0
-    sums[1] += sum_1
-    sums[2] += sum_2
-    sums[3] += sum_3
+@compiled
+def _multiply(covariance: Covariance, rows: Matrix, products: Matrix) -> None:
+    """Write M⁻¹ times each row of ``rows``, (k, padded q)."""
+    symmetric_products(covariance.upper, rows, products)
+    _subtract_pending(covariance.pending[: covariance.n_pending[0]], rows, products)
 
 
-@vectorized
-def symmetric_products(upper: Matrix, x: Vector, z: Vector, y: Vector, w: Vector) -> None:
-    """Write y = A x and w = A z, (q,), in one pass over the upper triangle of A."""
-    q = x.shape[0]
-    y[:] = 0.0
-    w[:] = 0.0
-    blocked = q - q % 2
-    for i in range(0, blocked, 2):
-        x_0, x_1, z_0, z_1 = x[i], x[i + 1], z[i], z[i + 1]
-        first, second = upper[i, i + 2 :], upper[i + 1, i + 2 :]
-        below = (x[i + 2 :], z[i + 2 :], y[i + 2 :], w[i + 2 :])
-        sum_x0, sum_x1, sum_z0, sum_z1 = _two_rows(first, second, x_0, x_1, z_0, z_1, *below)
-        a, b, c = upper[i, i], upper[i, i + 1], upper[i + 1, i + 1]
-        y[i] += sum_x0 + a * x_0 + b * x_1
-        y[i + 1] += sum_x1 + b * x_0 + c * x_1
-        w[i] += sum_z0 + a * z_0 + b * z_1
-        w[i + 1] += sum_z1 + b * z_0 + c * z_1
-    _triangle(upper, x, y, blocked, q)
-    _triangle(upper, z, w, blocked, q)
+@compiled
+def _subtract_pending(pending: Matrix, rows: Matrix, products: Matrix) -> None:
+    """Subtract VᵀV times each row, (k, padded q), from its product."""
+    parts = np.empty((pending.shape[0], rows.shape[0]))
+    inner_products(pending, rows, parts)
+    subtract_product(parts.T, pending, products)
 
 
-@vectorized
-def _two_rows(
-    row_0: Vector,
-    row_1: Vector,
-    x_0: float,
-    x_1: float,
-    z_0: float,
-    z_1: float,
-    x: Vector,
-    z: Vector,
-    y: Vector,
-    w: Vector,
-) -> tuple[float, float, float, float]:
-    """Do for two rows and two vectors what :func:`_four_rows` does; return the four sums."""
-    sum_x0, sum_x1, sum_z0, sum_z1 = 0.0, 0.0, 0.0, 0.0
-    for j in range(x.shape[0]):
-        entry_0, entry_1 = row_0[j], row_1[j]
-        sum_x0 += entry_0 * x[j]
-        sum_x1 += entry_1 * x[j]
-        sum_z0 += entry_0 * z[j]
-        sum_z1 += entry_1 * z[j]
-        y[j] += entry_0 * x_0 + entry_1 * x_1
-        w[j] += entry_0 * z_0 + entry_1 * z_1
-    return sum_x0, sum_x1, sum_z0, sum_z1
+@compiled
+def _add_pending(covariance: Covariance, residuals: Vector) -> None:
+    """Add the deferred rows J, whose products are known, to M, and turn e into L⁻¹e.
+
+    With V = J M⁻¹ and the Cholesky factor L of I + V Jᵀ, the rows of L⁻¹V become pending.
+    """
+    r, first = residuals.shape[0], covariance.n_pending[0]
+    rows, added = covariance.products[:r], covariance.pending[first : first + r]
+    L = np.empty((r, r))
+    inner_products(rows, covariance.rows[:r], L)
+    for k in range(r):
+        L[k, k] += 1.0
+    definite = factorize(L)
+    for k in range(r):
+        row = added[k]
+        copy_into(rows[k], row)
+        for i in range(k):
+            residuals[k] -= L[k, i] * residuals[i]
+            add_multiple(row, -L[k, i], added[i])
+        pivot = L[k, k] if definite else np.nan
+        residuals[k] /= pivot if np.isfinite(pivot) else np.nan
+        scale = 1.0 / pivot
+        for j in range(row.shape[0]):
+            row[j] *= scale
+    covariance.n_pending[0] = first + r
+    covariance.n_deferred[0] = 0
 
 
-@vectorized
+@compiled
 def multiply_rows(covariance: Covariance, rows: Matrix, out: Matrix) -> None:
     """Write M⁻¹ times each row of ``rows``, (k, q)."""
+    settle(covariance)
     k = rows.shape[0]
-    for i in range(0, k - 1, 2):
-        symmetric_products(covariance.upper, rows[i], rows[i + 1], out[i], out[i + 1])
-    if k % 2:
-        symmetric_product(covariance.upper, rows[k - 1], out[k - 1])
-    for n in range(covariance.n_pending[0]):
-        pending = covariance.pending[n]
-        for i in range(k):
-            add_multiple(out[i], -inner(pending, rows[i]), pending)
+    for first in range(0, k, GROUP):
+        n = min(GROUP, k - first)
+        for i in range(n):
+            copy_into(rows[first + i], covariance.rows[i])
+        products = multiply_planned(covariance, n)
+        for i in range(n):
+            copy_into(products[i, : covariance.size], out[first + i])
 
 
-@vectorized
+@compiled
 def quadratic_forms(covariance: Covariance, left: Matrix, right: Matrix) -> Matrix:
     """Return left M⁻¹ rightᵀ for ``left`` (k, q) and ``right`` (n, q)."""
-    products = np.empty(left.shape)
+    products, out = np.empty(left.shape), np.empty((left.shape[0], right.shape[0]))
     multiply_rows(covariance, left, products)
-    out = np.empty((left.shape[0], right.shape[0]))
-    for i in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[i, j] = inner(products[i], right[j])
+    inner_products(products, right, out)
     return out
 
 
-@vectorized
-def rank_update(covariance: Covariance, rows: Matrix, residuals: Vector, scratch: Matrix) -> None:
-    """Turn M⁻¹ into (M + JᵀJ)⁻¹ and the residuals e into L⁻¹e (Woodbury identity).
-
-    With V = J M⁻¹ and the Cholesky factor L of I + V Jᵀ, the update is M⁻¹ - (L⁻¹V)ᵀ(L⁻¹V).
+@compiled
+def rank_update(covariance: Covariance, rows: Matrix, residuals: Vector) -> Vector:
+    """Turn M⁻¹ into (M + JᵀJ)⁻¹ (Woodbury identity); return the least-squares correction of θ.
 
     Parameters
     ----------
@@ -187,127 +163,142 @@ def rank_update(covariance: Covariance, rows: Matrix, residuals: Vector, scratch
     rows : (r, q)
         J.
     residuals : (r,)
-        e, overwritten by L⁻¹e: ``scratch.T @ residuals`` is then the least-squares correction of θ.
-        NaN where the variance J M⁻¹ Jᵀ overflows: division by infinity would give a
+        e, overwritten by what the rows before have left of it, over its deviation.
+
+    Returns
+    -------
+    (q,)
+        (M + JᵀJ)⁻¹Jᵀe. NaN where the variance J M⁻¹ Jᵀ overflows: division by infinity would give a
         correction of 0, as if θ had converged.
-    scratch : (r, q)
-        Overwritten by L⁻¹V.
     """
-    r = rows.shape[0]
-    multiply_rows(covariance, rows, scratch)
-    for k in range(r):
-        if inner(scratch[k], rows[k]) < 0.0:
-            restore(covariance)
-            multiply_rows(covariance, rows, scratch)
-            break
-    L = np.zeros((r, r))
-    for k in range(r):
-        for i in range(k + 1):
-            L[k, i] = inner(scratch[k], rows[i]) + (1.0 if i == k else 0.0)
-    _factorize(L)
-    for k in range(r):
-        row = scratch[k]
-        for i in range(k):
-            residuals[k] -= L[k, i] * residuals[i]
-            add_multiple(row, -L[k, i], scratch[i])
-        residuals[k] /= L[k, k] if np.isfinite(L[k, k]) else np.nan
-        for j in range(row.shape[0]):
-            row[j] /= L[k, k]
-        append_row(covariance, row)
+    settle(covariance)
+    r, room = rows.shape[0], min(covariance.pending.shape[0], covariance.rows.shape[0])
+    correction = np.zeros(covariance.size)
+    for first in range(0, r, room):
+        n = min(room, r - first)
+        for i in range(n):
+            copy_into(rows[first + i], covariance.rows[i])
+            residuals[first + i] -= inner(rows[first + i], correction)
+        covariance.n_deferred[0] = n
+        _multiply_and_add(covariance, 0, residuals[first : first + n])
+        last = covariance.n_pending[0]
+        for i in range(n):
+            row = covariance.pending[last - n + i, : covariance.size]
+            add_multiple(correction, residuals[first + i], row)
+    return correction
 
 
-@vectorized
+@compiled
+def append_row(covariance: Covariance, row: Vector) -> None:
+    """Subtract wᵀw from M⁻¹ for a row w, (q,)."""
+    settle(covariance)
+    _make_room(covariance, 1)
+    n = covariance.n_pending[0]
+    copy_into(row, covariance.pending[n])
+    covariance.n_pending[0] = n + 1
+
+
+@compiled
+def _make_room(covariance: Covariance, n: int) -> None:
+    """Subtract VᵀV from A unless V has room for n more rows."""
+    if covariance.n_pending[0] + n > covariance.pending.shape[0]:
+        pending = covariance.pending[: covariance.n_pending[0]]
+        subtract_symmetric(pending.T, pending, covariance.upper)
+        covariance.n_pending[0] = 0
+
+
+@compiled
 def restore(covariance: Covariance) -> None:
-    """Make M⁻¹ positive semidefinite again, by a fresh eigendecomposition.
+    """Make M⁻¹ positive semidefinite again, by a fresh eigendecomposition; rows stay deferred.
 
     A negative variance jᵀM⁻¹j is the cheap sign that rounding has destroyed it, which takes a
     regularisation near the resolution of float64.
     """
-    upper, pending = covariance.upper, covariance.pending
-    q = upper.shape[0]
-    full = np.empty((q, q))
-    for i in range(q):
-        for j in range(i, q):
-            value = upper[i, j]
-            for k in range(covariance.n_pending[0]):
-                value -= pending[k, i] * pending[k, j]
-            full[i, j] = value
-            full[j, i] = value
+    q = covariance.size
+    full, upper = np.empty((q, q)), covariance.upper
+    _write_dense(covariance, full)
     values, axes = np.linalg.eigh(full)
-    for i in range(q):
-        for j in range(i, q):
-            upper[i, j] = 0.0
+    upper[:] = 0.0
     for k in range(q):
         if values[k] > 0.0:
             for i in range(q):
                 for j in range(i, q):
                     upper[i, j] += values[k] * axes[i, k] * axes[j, k]
+    replaced(covariance)
+
+
+@compiled
+def replaced(covariance: Covariance) -> None:
+    """Let M⁻¹ be what its upper triangle has become, without pending rows."""
+    upper = covariance.upper
+    for i in range(upper.shape[0]):
+        for j in range(i - i % LANES, i):
+            upper[i, j] = upper[j, i]
     covariance.n_pending[0] = 0
 
 
-@vectorized
-def _factorize(L: Matrix) -> None:
-    """Replace the lower triangle of a positive definite matrix, (r, r), by its Cholesky factor."""
-    for k in range(L.shape[0]):
-        for i in range(k + 1):
-            value = L[k, i]
-            for j in range(i):
-                value -= L[k, j] * L[i, j]
-            L[k, i] = np.sqrt(value) if i == k else value / L[i, i]
+@compiled
+def write_dense(covariance: Covariance, out: Matrix) -> None:
+    """Write M⁻¹ as a full matrix, (q, q)."""
+    settle(covariance)
+    _write_dense(covariance, out)
 
 
-@vectorized
-def append_row(covariance: Covariance, row: Vector) -> None:
-    """Add a row to V, and subtract VᵀV from A when that fills it."""
-    n = covariance.n_pending[0]
-    pending = covariance.pending
-    target = pending[n]
-    for j in range(row.shape[0]):
-        target[j] = row[j]
-    n += 1
-    if n == pending.shape[0]:
-        for i in range(row.shape[0]):
-            for k in range(0, n, 4):
-                _subtract_four(
-                    covariance.upper[i, i:],
-                    pending[k : k + 4, i],
-                    pending[k, i:],
-                    pending[k + 1, i:],
-                    pending[k + 2, i:],
-                    pending[k + 3, i:],
-                )
-        n = 0
-    covariance.n_pending[0] = n
+MIRRORED = 16
+"""Rows and columns that are copied to their mirror image at a time."""
 
 
-@vectorized
-def _subtract_four(
-    row: Vector, factors: Vector, v_0: Vector, v_1: Vector, v_2: Vector, v_3: Vector
-) -> None:
-    factor_0, factor_1, factor_2, factor_3 = factors[0], factors[1], factors[2], factors[3]
-    for j in range(row.shape[0]):
-        row[j] -= factor_0 * v_0[j] + factor_1 * v_1[j] + factor_2 * v_2[j] + factor_3 * v_3[j]
+@compiled
+def _write_dense(covariance: Covariance, out: Matrix) -> None:
+    q, pending = out.shape[0], covariance.pending[: covariance.n_pending[0], : out.shape[0]]
+    for i in range(q):
+        copy_into(covariance.upper[i, i:q], out[i, i:])
+    subtract_symmetric(pending.T, pending, out)
+    for first in range(0, q, MIRRORED):
+        for i in range(first, q):
+            for j in range(first, min(first + MIRRORED, i)):
+                out[i, j] = out[j, i]
 
 
 def dense(covariance: Covariance) -> Matrix:
-    """Return M⁻¹ as a full matrix, (q, q)."""
-    upper = np.triu(covariance.upper)
-    pending = covariance.pending[: covariance.n_pending[0]]
+    """Return M⁻¹ as a full matrix, (q, q); deferred rows stay so."""
+    q, J = covariance.size, covariance.rows[: covariance.n_deferred[0], : covariance.size]
+    upper = np.triu(covariance.upper[:q, :q])
+    pending = covariance.pending[: covariance.n_pending[0], :q]
     full: Matrix = upper + np.triu(upper, 1).T - pending.T @ pending
+    products = J @ full
+    full -= products.T @ np.linalg.solve(np.eye(len(J)) + products @ J.T, products)
     return full
 
 
-BLOCK = 48
-"""Rows and columns of a block: three of them fit into the first-level cache."""
+PANEL = 32
+"""Rows of a factor that are eliminated together; a multiple of the lanes of a vector."""
 
 
 @compiled
 def factorize(matrix: Matrix) -> bool:
-    """Replace a matrix, (q, q), by its factor C; tell whether it is positive definite."""
-    try:
-        matrix[:] = np.linalg.cholesky(matrix)
-    except Exception:  # compiled code catches all exceptions or none
-        return False
+    """Replace a symmetric matrix, (q, q), by its factor C; tell whether it is positive definite.
+
+    The upper triangle is read. It becomes Cᵀ, panel by panel, before C takes its place.
+    """
+    q = matrix.shape[0]
+    for start in range(0, q, PANEL):
+        stop = min(start + PANEL, q)
+        for k in range(start, stop):
+            row = matrix[k, k:]
+            if not row[0] > 0.0:
+                return False
+            pivot = np.sqrt(row[0])
+            for j in range(row.shape[0]):
+                row[j] /= pivot
+            for i in range(k + 1, stop):
+                add_multiple(matrix[i, i:], -row[i - k], row[i - k :])
+        panel = matrix[start:stop, stop:]
+        subtract_symmetric(panel.T, panel, matrix[stop:, stop:])
+    for i in range(q):
+        for j in range(i):
+            matrix[i, j] = matrix[j, i]
+            matrix[j, i] = 0.0
     return True
 
 
@@ -320,7 +311,7 @@ def solve_lower(factor: Matrix, n_rows: int, right: Matrix) -> None:
             right[k, i] = (right[k, i] - inner(row[:i], right[k, :i])) / row[i]
 
 
-@vectorized
+@compiled
 def solve_lower_transposed(factor: Matrix, n_rows: int, right: Matrix) -> None:
     """Replace right-hand sides, (k, n), by C⁻ᵀ times them, with C the first n rows and columns."""
     for i in range(n_rows - 1, -1, -1):
@@ -330,7 +321,7 @@ def solve_lower_transposed(factor: Matrix, n_rows: int, right: Matrix) -> None:
             add_multiple(right[k, :i], -right[k, i], row[:i])
 
 
-@vectorized
+@compiled
 def solve(factor: Matrix, right: Vector) -> None:
     """Replace a right-hand side, (q,), by (C Cᵀ)⁻¹ times it."""
     q = right.shape[0]
@@ -340,26 +331,31 @@ def solve(factor: Matrix, right: Vector) -> None:
 
 @compiled
 def solve_columns(factor: Matrix, right: Matrix) -> None:
-    """Replace right-hand sides, (q, k), by C⁻¹ times them, block by block."""
+    """Replace right-hand sides, (q, k), by C⁻¹ times them."""
     q = factor.shape[0]
-    for start in range(0, q, BLOCK):
-        stop = min(start + BLOCK, q)
-        if start > 0:
-            right[start:stop] -= np.dot(factor[start:stop, :start].copy(), right[:start])
-        for i in range(start, stop):
-            for j in range(start, i):
-                add_multiple(right[i], -factor[i, j], right[j])
-            _divide(right[i], factor[i, i])
+    for start in range(0, q, PANEL):
+        stop = min(start + PANEL, q)
+        subtract_product(factor[start:stop, :start], right[:start], right[start:stop])
+        _solve_panel(factor, start, stop, right, right.shape[1])
+
+
+@compiled
+def _solve_panel(factor: Matrix, start: int, stop: int, right: Matrix, k: int) -> None:
+    """Eliminate rows of k right-hand sides by each other, those from ``start`` to ``stop``."""
+    for i in range(start, stop):
+        row = right[i, :k]
+        for j in range(start, i):
+            add_multiple(row, -factor[i, j], right[j, :k])
+        _divide(row, factor[i, i])
 
 
 @compiled
 def solve_transposed_columns(factor: Matrix, right: Matrix) -> None:
-    """Replace right-hand sides, (q, k), by C⁻ᵀ times them, block by block."""
+    """Replace right-hand sides, (q, k), by C⁻ᵀ times them."""
     q = factor.shape[0]
-    for start in range((q - 1) // BLOCK * BLOCK, -1, -BLOCK):
-        stop = min(start + BLOCK, q)
-        if stop < q:
-            right[start:stop] -= np.dot(factor[stop:, start:stop].T.copy(), right[stop:])
+    for start in range((q - 1) // PANEL * PANEL, -1, -PANEL):
+        stop = min(start + PANEL, q)
+        subtract_product(factor[stop:, start:stop].T, right[stop:], right[start:stop])
         for i in range(stop - 1, start - 1, -1):
             for j in range(i + 1, stop):
                 add_multiple(right[i], -factor[j, i], right[j])
@@ -373,69 +369,23 @@ def _divide(row: Vector, by: float) -> None:
 
 
 @compiled
-def write_inverse(factor: Matrix, upper: Matrix) -> bool:
-    """Write the upper triangle of (C Cᵀ)⁻¹, (q, q); tell whether it is finite.
+def write_inverse(factor: Matrix, out: Matrix) -> bool:
+    """Write the upper triangle of (C Cᵀ)⁻¹ into a matrix of at least (q, q).
 
-    X = C⁻¹ and XᵀX, block by block, without the blocks that are zero: q³/3 multiplications.
+    Tells whether it is finite. With X = C⁻¹ it is XᵀX; neither is multiplied where X is zero.
     """
-    n = (factor.shape[0] + BLOCK - 1) // BLOCK
-    X = np.zeros((n, n, BLOCK, BLOCK))
-    _invert_blocks(factor, X)
-    for i in range(n):
-        for j in range(i, n):
-            block = np.zeros((BLOCK, BLOCK))
-            for k in range(j, n):
-                block += np.dot(X[k, i].T, X[k, j])
-            _write_block(block, i * BLOCK, j * BLOCK, upper)
-    return bool(np.isfinite(np.diag(upper)).all())
-
-
-@compiled
-def _invert_blocks(factor: Matrix, X: Stack) -> None:
-    """Write the blocks of C⁻¹ on and below the diagonal, padded by the identity."""
-    n = X.shape[0]
-    C = np.zeros(X.shape)
-    for i in range(n):
-        for j in range(i + 1):
-            _read_block(factor, i * BLOCK, j * BLOCK, C[i, j])
-        _invert_triangle(C[i, i], X[i, i])
-    for j in range(n):
-        for i in range(j + 1, n):
-            total = np.zeros((BLOCK, BLOCK))
-            for k in range(j, i):
-                total += np.dot(C[i, k], X[k, j])
-            X[i, j] = -np.dot(X[i, i], total)
-
-
-@compiled
-def _read_block(factor: Matrix, first: int, left: int, block: Matrix) -> None:
     q = factor.shape[0]
-    for i in range(BLOCK):
-        for j in range(BLOCK):
-            if first + i < q and left + j < q and left + j <= first + i:
-                block[i, j] = factor[first + i, left + j]
-        if first == left and first + i >= q:
-            block[i, i] = 1.0
-
-
-@vectorized
-def _invert_triangle(C: Matrix, X: Matrix) -> None:
-    """Write the inverse of a lower triangular block, row by row."""
-    for i in range(C.shape[0]):
-        row = X[i]
-        for k in range(i):
-            other, factor = X[k], C[i, k]
-            for j in range(k + 1):
-                row[j] -= factor * other[j]
-        for j in range(i):
-            row[j] /= C[i, i]
-        row[i] = 1.0 / C[i, i]
-
-
-@compiled
-def _write_block(block: Matrix, first: int, left: int, upper: Matrix) -> None:
-    q = upper.shape[0]
-    for i in range(min(BLOCK, q - first)):
-        for j in range(min(BLOCK, q - left)):
-            if left + j >= first + i:
-                upper[first + i, left + j] = block[i, j]
+    X = np.zeros((q, q))
+    out[:] = 0.0
+    for start in range(0, q, PANEL):
+        stop = min(start + PANEL, q)
+        for i in range(start, stop):
+            X[i, i] = 1.0
+        rows = X[start:stop, :stop]
+        subtract_product(factor[start:stop, :start], X[:start, :start], rows[:, :start])
+        _solve_panel(factor, start, stop, X, stop)
+        add_symmetric(rows.T, rows, out[:stop, :stop])
+    finite = True
+    for i in range(q):
+        finite = finite and bool(np.isfinite(out[i, i]))
+    return finite

@@ -24,12 +24,12 @@ from dopt.kernel.held import HeldTrial, trial_in
 from dopt.kernel.integration import input_columns, next_model_state, next_true_state
 from dopt.kernel.learners.adam import sampled_point
 from dopt.kernel.model import (
-    gradients_along_inputs,
     model_accelerations,
-    parameter_gradients,
     rows_at,
     sampled_state,
     within,
+    write_model_gradients,
+    write_network_gradients,
 )
 from dopt.kernel.sensors import has_sensors, measure, output_error
 from dopt.kernel.structs import Evaluation, Learn, Plant, State, Steps, Trial
@@ -297,11 +297,12 @@ def write_jacobian_change(held: HeldTrial, point: Vector, directions: Matrix, ou
     """Write the derivative of ∂a_θ/∂θ along directions, (k, ·), of a point, (k, r, q)."""
     trial = trial_in(held)
     plant, network, theta = trial.plant, trial.network, trial.state.theta
+    rows = np.empty((1 + directions.shape[0], theta.shape[0]))
     for i in range(out.shape[1]):
         if network.kind == ModelKind.MLP:
-            rows = gradients_along_inputs(plant, network, theta, point, directions, i)
+            write_network_gradients(network, theta, point, directions, i, rows)
         else:
-            rows = parameter_gradients(plant, network, theta, point, directions, i)
+            write_model_gradients(plant, network, theta, point, directions, i, rows)
         for j in range(directions.shape[0]):
             copy_into(rows[1 + j], out[j, i])
 

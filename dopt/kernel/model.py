@@ -314,40 +314,11 @@ def all_components(
 
 
 @compiled
-def network_gradients(network: Network, point: Linearization, component: int, q: int) -> Matrix:
-    """Return g and the columns of D B as rows, (1 + m, q)."""
-    m = point.phi_dots.shape[0]
-    out = np.empty((1 + m, q))
-    backward.parameter_gradient(network, point.phi, point.hidden, point.deltas, component, out[0])
-    for j in range(m):
-        tangents.gradient_along(
-            network,
-            point.phi,
-            point.phi_dots[j],
-            point.hidden,
-            point.hidden_dots[j],
-            point.deltas,
-            point.deltas_dots[j],
-            component,
-            out[1 + j],
-        )
-    return out
-
-
-@compiled
-def network_rows(network: Network, phi: Vector, hidden: Matrix, deltas: Stack, q: int) -> Matrix:
-    """Return the learned rows of J, (r, q)."""
-    rows = np.empty((deltas.shape[0], q))
-    for k in range(deltas.shape[0]):
-        backward.parameter_gradient(network, phi, hidden, deltas[k], k, rows[k])
-    return rows
-
-
-@compiled
-def network_jacobian(network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
-    """Return the learned rows of J, (r, q), at a state, and write a_θ(x), (r,)."""
+def write_jacobian(network: Network, theta: Vector, x: Vector, rows: Matrix, value: Vector) -> None:
+    """Write the learned rows of J, (r, at least q), and a_θ(x), (r,), at a point."""
     phi, hidden, deltas = all_components(network, theta, x, value)
-    return network_rows(network, phi, hidden, deltas, theta.shape[0])
+    for k in range(rows.shape[0]):
+        backward.parameter_gradient(network, phi, hidden, deltas[k], k, rows[k])
 
 
 @compiled
@@ -359,35 +330,46 @@ def rows_at(plant: Plant, network: Network, theta: Vector, states: Matrix) -> Ma
         if network.kind != ModelKind.MLP:
             parameter_rows(plant, network, theta, states[i], rows[r * i : r * (i + 1)], value)
         else:
-            rows[r * i : r * (i + 1)] = network_jacobian(network, theta, states[i], value)
+            write_jacobian(network, theta, states[i], rows[r * i : r * (i + 1)], value)
     return rows
 
 
 @compiled
-def gradients_along_inputs(
-    plant: Plant, network: Network, theta: Vector, bar: Vector, columns: Matrix, component: int
-) -> Matrix:
-    """Return g at a state and D B along the columns of B, (m, d), as rows, (1 + m, q)."""
-    value = np.empty(plant.learned_rows.shape[0])
-    point = linearization_at(network, theta, bar, columns, component, value)
-    return network_gradients(network, point, component, theta.shape[0])
+def write_network_gradients(
+    network: Network, theta: Vector, bar: Vector, columns: Matrix, component: int, out: Matrix
+) -> None:
+    """Write g at a point and D B along the columns of B, (m, d), as rows, (1 + m, at least q)."""
+    value = np.empty(network.sizes[network.sizes.shape[0] - 1])
+    at = linearization_at(network, theta, bar, columns, component, value)
+    backward.parameter_gradient(network, at.phi, at.hidden, at.deltas, component, out[0])
+    for j in range(columns.shape[0]):
+        tangents.gradient_along(
+            network,
+            at.phi,
+            at.phi_dots[j],
+            at.hidden,
+            at.hidden_dots[j],
+            at.deltas,
+            at.deltas_dots[j],
+            component,
+            out[1 + j],
+        )
 
 
 @compiled
-def parameter_gradients(
+def write_model_gradients(
     plant: Plant,
     network: Network,
     theta: Vector,
     x: Vector,
     directions: Matrix,
     component: int,
-) -> Matrix:
-    """Return g and the columns of D B of any model but a network as rows, (1 + m, q)."""
-    m, r, q = directions.shape[0], plant.learned_rows.shape[0], theta.shape[0]
-    out, rows = np.empty((1 + m, q)), np.empty((r, q))
+    out: Matrix,
+) -> None:
+    """Do what :func:`write_network_gradients` does for any model but a network."""
+    r, q = plant.learned_rows.shape[0], theta.shape[0]
+    rows = np.empty((r, q))
     parameter_rows(plant, network, theta, x, rows, np.empty(r))
-    for i in range(q):
-        out[0, i] = rows[component, i]
-    for j in range(m):
-        row_along(plant, network, theta, x, directions[j], component, out[1 + j])
-    return out
+    copy_into(rows[component], out[0])
+    for j in range(directions.shape[0]):
+        row_along(plant, network, theta, x, directions[j], component, out[1 + j, :q])

@@ -21,8 +21,15 @@ from numba import types
 from numba.extending import overload
 
 from dopt.algorithm import FeatureKind
-from dopt.kernel.compiler import compiled, contracted, copy_into, power_of_two, vectorized
+from dopt.kernel.compiler import compiled, copy_into, power_of_two
 from dopt.kernel.structs import Network
+from dopt.kernel.vectors import (
+    add_multiple,
+    inner_products,
+    multiply,
+    multiply_add,
+    multiply_and_shift,
+)
 from dopt.types import Matrix, NumbaType, Real, Scalar, Vector
 
 # Double precision. Adding 1.5 * 2^52 leaves the nearest integer in the low bits; the high part of
@@ -56,38 +63,38 @@ def _tanh(x: NumbaType) -> NumbaType:
     return lambda x: _tanh_double(x)
 
 
-@contracted
+@compiled
 def _tanh_double(x: float) -> float:
     size = abs(x)
     size = SATURATION if size > SATURATION else size
     y = -2.0 * size
-    shifted = y * LOG2_E + ROUND
+    shifted = multiply_add(y, LOG2_E, ROUND)
     k = shifted - ROUND
-    r = (y - k * LN2_HIGH) - k * LN2_LOW
+    r = multiply_add(k, -LN2_LOW, multiply_add(k, -LN2_HIGH, y))
     p = C[13]
     for n in (12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2):
-        p = p * r + C[n]
-    p = p * r * r + r
+        p = multiply_add(p, r, C[n])
+    p = multiply_add(p * r, r, r)
     power: float = power_of_two(shifted)
-    e: float = power * p + (power - 1.0)
+    e: float = multiply_add(power, p, power - 1.0)
     value = -e / (2.0 + e)
     return value if x >= 0.0 else -value
 
 
-@contracted
+@compiled
 def _tanh_single(x: np.float32) -> np.float32:
     size = abs(x)
     size = SATURATION_SINGLE if size > SATURATION_SINGLE else size
     y = -TWO * size
-    shifted = y * LOG2_E_SINGLE + ROUND_SINGLE
+    shifted = multiply_add(y, LOG2_E_SINGLE, ROUND_SINGLE)
     k = shifted - ROUND_SINGLE
-    r = (y - k * LN2_HIGH_SINGLE) - k * LN2_LOW_SINGLE
+    r = multiply_add(k, -LN2_LOW_SINGLE, multiply_add(k, -LN2_HIGH_SINGLE, y))
     p = C_SINGLE[8]
     for n in (7, 6, 5, 4, 3, 2):
-        p = p * r + C_SINGLE[n]
-    p = p * r * r + r
+        p = multiply_add(p, r, C_SINGLE[n])
+    p = multiply_add(p * r, r, r)
     power: np.float32 = power_of_two(shifted)
-    e: np.float32 = power * p + (power - ONE)
+    e: np.float32 = multiply_add(power, p, power - ONE)
     value: np.float32 = -e / (TWO + e)
     return value if x >= ZERO else -value
 
@@ -137,14 +144,16 @@ def output_inputs_at(network: Network, hidden: Vector, phi: Vector) -> Vector:
     return output_inputs(network, hidden.reshape(-1, 1), phi.reshape(-1, 1))[:, 0].copy()
 
 
-@contracted
-def output_slope(network: Network, W: Matrix, phi: Vector, component: int, i: int) -> float:
-    """Return the derivative of output k by unit i of the last hidden layer; W is its weights."""
-    m, w = network.n_factors, network.sizes[1]
-    slope: float = W[component, i]
+@compiled
+def output_slopes(
+    network: Network, theta: Vector, phi: Vector, component: int, out: Vector
+) -> None:
+    """Write the derivatives of output k by the last hidden layer, (w,)."""
+    m, w = network.n_factors, out.shape[0]
+    weights = layer(network, theta, network.offsets.shape[0] - 1)[0][component]
+    copy_into(weights[:w], out)
     for j in range(m):
-        slope += phi[phi.shape[0] - m + j] * W[component, (1 + j) * w + i]
-    return slope
+        add_multiple(out, phi[phi.shape[0] - m + j], weights[(1 + j) * w : (2 + j) * w])
 
 
 @compiled
@@ -201,12 +210,12 @@ def layer(network: Network, theta: Real, index: int) -> tuple[Real, Real]:
     return theta[start:middle].reshape(n_out, n_in), theta[middle : middle + n_out]
 
 
-@contracted
-def _activate(values: Real, bias: Real) -> None:
+@compiled
+def _activate(values: Real) -> None:
     for i in range(values.shape[0]):
-        row, shift = values[i], bias[i]
+        row = values[i]
         for n in range(row.shape[0]):
-            row[n] = tanh(row[n] + shift)
+            row[n] = tanh(row[n])
 
 
 @compiled
@@ -223,21 +232,15 @@ def forward(network: Network, theta: Real, inputs: Real, hidden: Real, outputs: 
     two are written.
     """
     n, depth, width = inputs.shape[1], network.offsets.shape[0] - 1, network.sizes[1]
-    W, b = layer(network, theta, 0)
-    values = units_by_points(hidden[0], width, n)
-    np.dot(W, inputs[: W.shape[1]], values)
-    _activate(values, b)
-    for index in range(1, depth):
+    values = inputs
+    for index in range(depth):
         W, b = layer(network, theta, index)
         above = units_by_points(hidden[index], width, n)
-        np.dot(W, values, above)
-        _activate(above, b)
+        multiply_and_shift(W, values, b, above)
+        _activate(above)
         values = above
     W, b = layer(network, theta, depth)
-    np.dot(W, output_inputs(network, values, inputs), outputs)
-    for k in range(b.shape[0]):
-        for i in range(n):
-            outputs[k, i] += b[k]
+    multiply_and_shift(W, output_inputs(network, values, inputs), b, outputs)
 
 
 @compiled
@@ -261,16 +264,7 @@ def mean_forward(
             outputs[i, n] /= thetas.shape[0]
 
 
-@vectorized
-def _row_sums(values: Matrix, out: Vector) -> None:
-    for i in range(out.shape[0]):
-        row, total = values[i], 0.0
-        for n in range(row.shape[0]):
-            total += row[n]
-        out[i] = total
-
-
-@contracted
+@compiled
 def through_tanh(delta: Matrix, activations: Matrix) -> None:
     """Multiply δ, (w, n), by the derivative of tanh, given the activations, (w, n)."""
     for i in range(delta.shape[0]):
@@ -300,27 +294,29 @@ def loss_gradient(
     for k in range(errors.shape[0]):
         for i in range(n):
             errors[k, i] = 2.0 / n * (errors[k, i] - targets[k, i])
-    delta = errors
+    delta, ones = errors, np.ones((1, n))
     for index in range(depth, -1, -1):
         dW, db = layer(network, gradient, index)
-        _row_sums(delta, db)
+        inner_products(delta, ones, db.reshape(-1, 1))
         if index == 0:
-            np.dot(delta, inputs[: dW.shape[1]].T, dW)
+            inner_products(delta, inputs, dW)
         else:
             W, _ = layer(network, theta, index)
             values = units_by_points(hidden[index - 1], width, n)
             below = units_by_points(deltas[index % 2], width, n)
             if index == depth and network.n_factors > 0:
-                np.dot(delta, output_inputs(network, values, inputs).T, dW)
-                sum_over_factors(network.n_factors, np.dot(W.T, delta), inputs, below)
+                inner_products(delta, output_inputs(network, values, inputs), dW)
+                slopes = np.empty((W.shape[1], n))
+                multiply(W.T, delta, slopes)
+                sum_over_factors(network.n_factors, slopes, inputs, below)
             else:
-                np.dot(delta, values.T, dW)
-                np.dot(W.T, delta, below)
+                inner_products(delta, values, dW)
+                multiply(W.T, delta, below)
             through_tanh(below, values)
             delta = below
 
 
-@contracted
+@compiled
 def activations_at(
     network: Network, theta: Vector, phi: Vector, hidden: Matrix, output: Vector
 ) -> None:
@@ -330,31 +326,17 @@ def activations_at(
     for index in range(depth):
         W, b = layer(network, theta, index)
         values = hidden[index]
-        copy_into(b, values)
-        add_product(W, below, values)
+        multiply_vector(W, below, values)
         for i in range(values.shape[0]):
-            values[i] = tanh(values[i])
+            values[i] = tanh(values[i] + b[i])
         below = values
     W, b = layer(network, theta, depth)
-    copy_into(b, output)
-    add_product(W, output_inputs_at(network, below, phi), output)
+    multiply_vector(W, output_inputs_at(network, below, phi), output)
+    for k in range(b.shape[0]):
+        output[k] += b[k]
 
 
-@contracted
-def add_product(W: Matrix, x: Vector, out: Vector) -> None:
-    """Add W x, each sum in the order of x.
-
-    Four sums are taken at once, as the next term of one has to wait for the last.
-    """
-    whole = out.shape[0] - out.shape[0] % 4
-    for i in range(0, whole, 4):
-        sum_0, sum_1, sum_2, sum_3 = out[i], out[i + 1], out[i + 2], out[i + 3]
-        for j in range(W.shape[1]):
-            sum_0 += W[i, j] * x[j]
-            sum_1 += W[i + 1, j] * x[j]
-            sum_2 += W[i + 2, j] * x[j]
-            sum_3 += W[i + 3, j] * x[j]
-        out[i], out[i + 1], out[i + 2], out[i + 3] = sum_0, sum_1, sum_2, sum_3
-    for i in range(whole, out.shape[0]):
-        for j in range(W.shape[1]):
-            out[i] += W[i, j] * x[j]
+@compiled
+def multiply_vector(W: Matrix, x: Vector, out: Vector) -> None:
+    """Write W x, (n,), for the first entries of x."""
+    inner_products(W, x.reshape(1, -1), out.reshape(-1, 1))

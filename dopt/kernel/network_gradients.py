@@ -11,52 +11,37 @@ import math
 import numpy as np
 
 from dopt.algorithm import FeatureKind
-from dopt.kernel.compiler import compiled, contracted, squared
+from dopt.kernel.compiler import compiled, copy_into, squared
 from dopt.kernel.network import (
-    add_product,
     layer,
+    multiply_vector,
     output_inputs_along,
     output_inputs_at,
-    output_slope,
+    output_slopes,
     through_tanh,
     units_by_points,
 )
 from dopt.kernel.structs import Network
+from dopt.kernel.vectors import add_multiple, add_product, multiply
 from dopt.types import Matrix, Stack, Vector
 
 
-@contracted
+@compiled
 def output_signal(
     network: Network, theta: Vector, phi: Vector, hidden: Matrix, component: int, delta: Vector
 ) -> None:
     """Write δ, (w,), of the last hidden layer: the derivative of output k."""
-    depth = network.offsets.shape[0] - 1
-    W, _ = layer(network, theta, depth)
+    output_slopes(network, theta, phi, component, delta)
+    _through_tanh(delta, hidden[hidden.shape[0] - 1])
+
+
+@compiled
+def _through_tanh(delta: Vector, h: Vector) -> None:
     for i in range(delta.shape[0]):
-        slope = output_slope(network, W, phi, component, i)
-        delta[i] = slope * (1.0 - squared(hidden[depth - 1, i]))
+        delta[i] *= 1.0 - squared(h[i])
 
 
-@contracted
-def signals_through(network: Network, theta: Vector, index: int, signals: Stack) -> None:
-    """Write Wᵀ δ below a layer for each of several δ, (n, L, w), each sum in the order of δ.
-
-    The weights are read once.
-    """
-    W, _ = layer(network, theta, index)
-    for k in range(signals.shape[0]):
-        below = signals[k, index - 1]
-        for j in range(below.shape[0]):
-            below[j] = 0.0
-    for i in range(W.shape[0]):
-        weights = W[i]
-        for k in range(signals.shape[0]):
-            delta, below = signals[k, index, i], signals[k, index - 1]
-            for j in range(below.shape[0]):
-                below[j] += delta * weights[j]
-
-
-@contracted
+@compiled
 def back_signals(
     network: Network, theta: Vector, phi: Vector, hidden: Matrix, signals: Stack
 ) -> None:
@@ -65,10 +50,10 @@ def back_signals(
     for k in range(signals.shape[0]):
         output_signal(network, theta, phi, hidden, k, signals[k, depth - 1])
     for index in range(depth - 1, 0, -1):
-        signals_through(network, theta, index, signals)
+        W, _ = layer(network, theta, index)
+        multiply(signals[:, index], W, signals[:, index - 1])
         for k in range(signals.shape[0]):
-            for i in range(signals.shape[2]):
-                signals[k, index - 1, i] *= 1.0 - squared(hidden[index - 1, i])
+            _through_tanh(signals[k, index - 1], hidden[index - 1])
 
 
 @compiled
@@ -94,12 +79,12 @@ def batch_back_signals(
                         signal[i] += inputs[p - m + j] * last[k, (1 + j) * width + i]
             else:
                 W, _ = layer(network, theta, index + 1)
-                np.dot(W.T, out[k * depth + index + 1], signal)
+                multiply(W.T, out[k * depth + index + 1], signal)
             through_tanh(signal, h)
     return out
 
 
-@contracted
+@compiled
 def parameter_gradient(
     network: Network, phi: Vector, hidden: Matrix, deltas: Matrix, component: int, out: Vector
 ) -> None:
@@ -108,18 +93,24 @@ def parameter_gradient(
     for index in range(depth):
         below = phi if index == 0 else hidden[index - 1]
         dW, db = layer(network, out, index)
-        for i in range(db.shape[0]):
-            delta = deltas[index, i]
-            db[i] = delta
-            for j in range(dW.shape[1]):
-                dW[i, j] = delta * below[j]
-    dW, db = layer(network, out, depth)
+        multiply(deltas[index].reshape(-1, 1), below.reshape(1, -1), dW)
+        copy_into(deltas[index], db)
     top = output_inputs_at(network, hidden[depth - 1], phi)
+    _write_output_row(network, top, 1.0, component, out)
+
+
+@compiled
+def _write_output_row(
+    network: Network, top: Vector, one: float, component: int, out: Vector
+) -> None:
+    """Write the part of the output layer, (top, one) in the row of output k and zeros elsewhere."""
+    dW, db = layer(network, out, network.offsets.shape[0] - 1)
     for k in range(db.shape[0]):
-        chosen = 1.0 if k == component else 0.0
-        db[k] = chosen
-        for j in range(dW.shape[1]):
-            dW[k, j] = chosen * top[j]
+        db[k] = one if k == component else 0.0
+        if k != component:
+            for j in range(dW.shape[1]):
+                dW[k, j] = 0.0
+    copy_into(top, dW[component])
 
 
 @compiled
@@ -136,7 +127,7 @@ def features_along(network: Network, x: Vector, direction: Vector, out: Vector) 
         out[i] = slope * direction[index] / network.feature_scales[i]
 
 
-@contracted
+@compiled
 def activations_along(
     network: Network, theta: Vector, phi_dot: Vector, hidden: Matrix, hidden_dot: Matrix
 ) -> None:
@@ -144,15 +135,12 @@ def activations_along(
     below = phi_dot
     for index in range(hidden.shape[0]):
         W, _ = layer(network, theta, index)
-        for i in range(hidden.shape[1]):
-            hidden_dot[index, i] = 0.0
-        add_product(W, below, hidden_dot[index])
-        for i in range(hidden.shape[1]):
-            hidden_dot[index, i] *= 1.0 - squared(hidden[index, i])
+        multiply_vector(W, below, hidden_dot[index])
+        _through_tanh(hidden_dot[index], hidden[index])
         below = hidden_dot[index]
 
 
-@contracted
+@compiled
 def output_signal_along(
     network: Network,
     theta: Vector,
@@ -165,17 +153,21 @@ def output_signal_along(
 ) -> None:
     """Write the derivative of δ, (w,), of the last hidden layer along a direction."""
     depth, width, m = network.offsets.shape[0] - 1, hidden.shape[1], network.n_factors
-    W, _ = layer(network, theta, depth)
+    h, h_dot = hidden[depth - 1], hidden_dot[depth - 1]
+    output_slopes(network, theta, phi, component, delta_dot)
     for i in range(width):
-        h = hidden[depth - 1, i]
-        bend = -2.0 * h * hidden_dot[depth - 1, i]
-        delta_dot[i] = output_slope(network, W, phi, component, i) * bend
-        for j in range(m):
-            slope = phi_dot[phi_dot.shape[0] - m + j] * W[component, (1 + j) * width + i]
-            delta_dot[i] += slope * (1.0 - h * h)
+        delta_dot[i] *= -2.0 * h[i] * h_dot[i]
+    if m == 0:
+        return
+    weights, slopes = layer(network, theta, depth)[0][component], np.zeros(width)
+    for j in range(m):
+        u_dot = phi_dot[phi_dot.shape[0] - m + j]
+        add_multiple(slopes, u_dot, weights[(1 + j) * width : (2 + j) * width])
+    for i in range(width):
+        delta_dot[i] += slopes[i] * (1.0 - squared(h[i]))
 
 
-@contracted
+@compiled
 def signals_below(
     network: Network,
     theta: Vector,
@@ -185,19 +177,18 @@ def signals_below(
 ) -> None:
     """Write δ and its derivatives along m directions, (1 + m, L, w), given the last layer's."""
     for index in range(hidden.shape[0] - 1, 0, -1):
-        signals_through(network, theta, index, signals)
-        back = signals[0, index - 1]
+        W, _ = layer(network, theta, index)
+        multiply(signals[:, index], W, signals[:, index - 1])
+        back, h = signals[0, index - 1], hidden[index - 1]
         for k in range(hidden_dots.shape[0]):
             delta_dot, hidden_dot = signals[1 + k, index - 1], hidden_dots[k, index - 1]
+            _through_tanh(delta_dot, h)
             for j in range(back.shape[0]):
-                h = hidden[index - 1, j]
-                bend = -2.0 * h * hidden_dot[j]
-                delta_dot[j] = delta_dot[j] * (1.0 - h * h) + back[j] * bend
-        for j in range(back.shape[0]):
-            back[j] *= 1.0 - squared(hidden[index - 1, j])
+                delta_dot[j] += back[j] * (-2.0 * h[j] * hidden_dot[j])
+        _through_tanh(back, h)
 
 
-@contracted
+@compiled
 def gradient_along(
     network: Network,
     phi: Vector,
@@ -215,15 +206,8 @@ def gradient_along(
         below = phi if index == 0 else hidden[index - 1]
         below_dot = phi_dot if index == 0 else hidden_dot[index - 1]
         dW, db = layer(network, out, index)
-        for i in range(db.shape[0]):
-            delta, delta_dot = deltas[index, i], deltas_dot[index, i]
-            db[i] = delta_dot
-            for j in range(dW.shape[1]):
-                dW[i, j] = delta_dot * below[j] + delta * below_dot[j]
-    dW, db = layer(network, out, depth)
+        multiply(deltas_dot[index].reshape(-1, 1), below.reshape(1, -1), dW)
+        add_product(deltas[index].reshape(-1, 1), below_dot.reshape(1, -1), dW)
+        copy_into(deltas_dot[index], db)
     top_dot = output_inputs_along(network, hidden[depth - 1], hidden_dot[depth - 1], phi, phi_dot)
-    for k in range(db.shape[0]):
-        chosen = 1.0 if k == component else 0.0
-        db[k] = 0.0
-        for j in range(dW.shape[1]):
-            dW[k, j] = chosen * top_dot[j]
+    _write_output_row(network, top_dot, 0.0, component, out)

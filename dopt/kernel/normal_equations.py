@@ -16,10 +16,11 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.kernel import network as nn
-from dopt.kernel.compiler import compiled, contracted, squared
+from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.network import output_inputs
 from dopt.kernel.network_gradients import batch_back_signals
 from dopt.kernel.structs import Network
+from dopt.kernel.vectors import inner_products
 from dopt.types import Matrix, Stack, Vector
 
 
@@ -120,7 +121,7 @@ def _write_slope(
     _write_layer(network, errors, below[depth], depth, slope)
 
 
-@contracted
+@compiled
 def _add_weighted(signal: Matrix, weights: Vector, out: Matrix) -> None:
     for i in range(out.shape[0]):
         row, values = out[i], signal[i]
@@ -134,7 +135,8 @@ def _write_layer(
 ) -> None:
     dW, db = nn.layer(network, slope, index)
     units = network.layer_inputs[index]
-    products = np.dot(signal, below[: units + 1].T)
+    products = np.empty((signal.shape[0], units + 1))
+    inner_products(signal, below[: units + 1], products)
     for i in range(db.shape[0]):
         db[i] = products[i, units]
         for j in range(units):
@@ -149,7 +151,7 @@ def _place(network: Network, index: int, i: int, j: int) -> int:
     return place
 
 
-@contracted
+@compiled
 def _pairs(first: Matrix, second: Matrix, symmetric: bool, add: bool, out: Matrix) -> None:
     """Write, or add, the products of all rows of two matrices, (pairs, N)."""
     pair = 0
@@ -179,7 +181,8 @@ def _hidden_block(
     for k in range(r):
         _pairs(signals[k * depth + a], signals[k * depth + b], symmetric, k > 0, left)
     _pairs(below[a, :lower], below[b, :upper], symmetric, False, right)
-    products = np.dot(left, right.T)
+    products = np.empty((n_units, n_below))
+    inner_products(left, right, products)
     row = 0
     for i in range(width):
         for j in range(i if symmetric else 0, width):
@@ -205,7 +208,8 @@ def _output_blocks(network: Network, below: Stack, signals: Stack, normal: Matri
     depth, width, n = network.offsets.shape[0] - 1, network.sizes[1], below.shape[2]
     r, top = signals.shape[0] // depth, network.layer_inputs[depth] + 1
     last = below[depth, :top]
-    own = np.dot(last, last.T)
+    own = np.empty((top, top))
+    inner_products(last, last, own)
     start, stop = network.offsets[depth], normal.shape[0]
     for i in range(start, stop):
         for j in range(i, stop):
@@ -219,7 +223,8 @@ def _output_blocks(network: Network, below: Stack, signals: Stack, normal: Matri
             units = network.layer_inputs[index] + 1
             rows = np.empty((width * units, n))
             _pairs(signals[k * depth + index], below[index, :units], False, False, rows)
-            products = np.dot(rows, last.T)
+            products = np.empty((width * units, top))
+            inner_products(rows, last, products)
             for i in range(width):
                 for s in range(units):
                     for v in range(top):

@@ -16,7 +16,7 @@ import numpy as np
 from dopt.algorithm import TIE_MARGIN
 from dopt.kernel.compiler import compilable, compiled, squared
 from dopt.kernel.integration import learned_columns, point_columns, predicted_state
-from dopt.kernel.linear_algebra import factorize, inner, solve_lower
+from dopt.kernel.linear_algebra import factorize, solve_lower
 from dopt.kernel.model import euler_step, model_point
 from dopt.kernel.model_kinds import (
     mean_weights,
@@ -27,6 +27,7 @@ from dopt.kernel.model_kinds import (
 )
 from dopt.kernel.network import features_at
 from dopt.kernel.structs import Network, Trial
+from dopt.kernel.vectors import inner
 from dopt.sphere import sphere_maximizer
 from dopt.types import Matrix, Vector
 

@@ -22,8 +22,8 @@ import numpy as np
 
 from dopt.kernel.compiler import compiled
 from dopt.kernel.integration import next_model_state
-from dopt.kernel.linear_algebra import add_multiple, inner
 from dopt.kernel.structs import Network, Plant, Sensors, Trial
+from dopt.kernel.vectors import add_multiple, inner, product
 from dopt.types import Integers, Matrix, Vector
 
 
@@ -144,7 +144,7 @@ def begin(trial: Trial, t: int, P: Matrix, sensitivity: Matrix) -> bool:
 @compiled
 def move_covariance(A: Matrix, noise: Matrix, rows: Integers, dt: float, P: Matrix) -> None:
     """Write A P Aᵀ + dt² E R Eᵀ, given the covariance R of the accelerations, (r, r)."""
-    P[:] = np.dot(np.dot(A, P), A.T.copy())
+    P[:] = product(product(A, P), A.T.copy())
     for k in range(rows.shape[0]):
         for i in range(rows.shape[0]):
             P[rows[k], rows[i]] += dt * dt * noise[k, i]
@@ -153,7 +153,7 @@ def move_covariance(A: Matrix, noise: Matrix, rows: Integers, dt: float, P: Matr
 @compiled
 def move_sensitivity(A: Matrix, J: Matrix, rows: Integers, dt: float, sensitivity: Matrix) -> None:
     """Write A Ψ + dt E J, given J, (r, q)."""
-    sensitivity[:] = np.dot(A, sensitivity)
+    sensitivity[:] = product(A, sensitivity)
     for k in range(rows.shape[0]):
         add_multiple(sensitivity[rows[k]], dt, J[k])
 

@@ -7,7 +7,7 @@ import numpy as np
 from dopt.algorithm import FeatureKind, Form, ModelKind
 from dopt.errors import SpecificationError
 from dopt.kernel import structs as args
-from dopt.kernel.linear_algebra import PENDING_ROWS, SMALL
+from dopt.kernel.linear_algebra import initial_covariance
 from dopt.kernel.structs import Members, Network
 from dopt.learning import GaussNewton, JointKalman, Learner
 from dopt.models import (
@@ -141,10 +141,8 @@ def _information(spec: TrialSpec, q: int) -> tuple[args.Covariance, Matrix, args
     elif form == Form.SKETCH and isinstance(policy, DOptimal):
         size = policy.sketch_size
         projection = count_sketch(q, size)
-    covariance = args.Covariance(
-        np.eye(size) / regularization_of(spec.config),
-        np.zeros((PENDING_ROWS if size > SMALL else 4, size)),
-        np.zeros(1, dtype=np.int64),
+    covariance = initial_covariance(
+        size, regularization_of(spec.config), spec.system.n_learned, 1 + spec.system.n_inputs
     )
     factor = np.eye(factored) * regularization_of(spec.config) ** 0.5
     return covariance, factor, rows, args.Sketch(*projection, size)

@@ -162,7 +162,7 @@ class KernelTrialView(TrialView):
 
     @property
     def covariance(self) -> Array:
-        if not self._covariance.upper.shape[0]:
+        if not self._covariance.size:
             raise SpecificationError(
                 "a plan asked for the covariance of the parameters, but the trial holds no matrix "
                 "M of all of them: derive the policy from InformationPolicy with the form 'primal'."

@@ -27,9 +27,13 @@ from dopt.types import (
 class Covariance(NamedTuple):
     """M⁻¹ = A - VᵀV (:mod:`dopt.kernel.information`); all empty where nothing needs it."""
 
-    upper: Matrix  # (q, q), A in the upper triangle
-    pending: Matrix  # (PENDING_ROWS, q), V in the first n_pending rows
+    upper: Matrix  # (Q, Q), A in the blocks on and above the diagonal; Q is q padded with zeros
+    pending: Matrix  # (·, Q), V in the first n_pending rows
+    rows: Matrix  # (·, Q), the deferred ones, then those that a plan multiplies
+    products: Matrix  # (·, Q), M⁻¹ times the rows
     n_pending: Integers  # (1,)
+    n_deferred: Integers  # (1,)
+    size: int  # q
 
 
 class Dual(NamedTuple):

@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel.compiler import compiled, contracted
+from dopt.kernel.compiler import compiled
 from dopt.kernel.model import model_point, sampled_state
 from dopt.kernel.model_kinds import write_normal_equations
 from dopt.kernel.network import features_at, loss_gradient
 from dopt.kernel.structs import Network, Trial
+from dopt.kernel.vectors import multiply_add
 from dopt.types import Matrix, Vector
 
 
@@ -62,19 +63,25 @@ def adam_step(trial: Trial, step: int, features: Matrix, targets: Matrix) -> Non
     adam_update(trial.algorithm.learner, step, theta, state.moment_1, state.moment_2, gradient)
 
 
-@contracted
+@compiled
 def adam_update(
     numbers: Vector, t: int, theta: Vector, moment_1: Vector, moment_2: Vector, gradient: Vector
 ) -> None:
     """Move θ, (q,), and the moments, (q,), along a gradient: step t + 1."""
     learning_rate, beta_1, beta_2, epsilon = numbers[0], numbers[1], numbers[2], numbers[3]
     correction_1, correction_2 = _sum_of_weights(beta_1, t + 1), _sum_of_weights(beta_2, t + 1)
+    rest_1, rest_2, rate, scale = (
+        1.0 - beta_1,
+        1.0 - beta_2,
+        learning_rate / correction_1,
+        1.0 / correction_2,
+    )
     for i in range(gradient.shape[0]):
         g = gradient[i]
-        moment_1[i] = beta_1 * moment_1[i] + (1.0 - beta_1) * g
-        moment_2[i] = beta_2 * moment_2[i] + (1.0 - beta_2) * g * g
-        deviation = np.sqrt(moment_2[i] / correction_2)
-        theta[i] -= learning_rate * (moment_1[i] / correction_1) / (deviation + epsilon)
+        moment_1[i] = multiply_add(beta_1, moment_1[i], rest_1 * g)
+        moment_2[i] = multiply_add(beta_2, moment_2[i], rest_2 * g * g)
+        deviation = np.sqrt(moment_2[i] * scale)
+        theta[i] -= rate * moment_1[i] / (deviation + epsilon)
 
 
 @compiled

@@ -33,9 +33,10 @@ from dopt.kernel import model_kinds
 from dopt.kernel.compiler import called_from_python, compiled, squared
 from dopt.kernel.learners.adam import sampled_point, store_sample
 from dopt.kernel.learners.kalman import filter_sample
-from dopt.kernel.linear_algebra import factorize, solve, write_inverse
+from dopt.kernel.linear_algebra import factorize, replaced, solve, write_inverse
 from dopt.kernel.normal_equations import errors_of, normal_equations, write_products
 from dopt.kernel.structs import Network, Plant, State, Trial
+from dopt.kernel.vectors import inner
 from dopt.types import Matrix, Vector
 
 
@@ -70,10 +71,10 @@ def _write_information(state: State, factor: Matrix, noise_variance: float) -> b
     finite, covariance = True, state.covariance
     if state.factor.shape[0] > 0:
         state.factor[:] = factor / np.sqrt(noise_variance)
-    if covariance.upper.shape[0] > 0:
+    if covariance.size > 0:
         finite = write_inverse(factor, covariance.upper)
         _scale(covariance.upper, noise_variance)
-        covariance.n_pending[0] = 0
+        replaced(covariance)
     return finite
 
 
@@ -185,12 +186,12 @@ def fit(problem: Problem, theta: Vector, max_steps: int) -> tuple[int, bool]:
         fall = -1.0
         if _write_step(problem, theta, normal, slope, damping, factor, step, candidate):
             fall = value - _objective(problem, candidate)
-        size = np.sqrt(np.dot(step, step) / np.dot(theta, theta))
+        size = np.sqrt(inner(step, step) / inner(theta, theta))
         if fall > 0.0:
             theta[:] = candidate
             if fall <= SMALL_FALL * value and size <= SMALL_STEP:
                 return done, True
-            foreseen = np.dot(step, slope) + damping * np.dot(step, step)
+            foreseen = inner(step, slope) + damping * inner(step, step)
             excess = 2.0 * fall / foreseen - 1.0
             damping *= max(1.0 / 3.0, 1.0 - excess * squared(excess))
             growth = 2.0
@@ -245,8 +246,8 @@ def _write_step(
     correction = candidate
     _write_curvature(problem, theta, step, correction)
     solve(factor, correction)
-    longest = LARGEST_CORRECTION * np.sqrt(np.dot(step, step))
-    short = bool(0.5 * np.sqrt(np.dot(correction, correction)) <= longest)
+    longest = LARGEST_CORRECTION * np.sqrt(inner(step, step))
+    short = bool(0.5 * np.sqrt(inner(correction, correction)) <= longest)
     for i in range(step.shape[0]):
         candidate[i] = theta[i] + step[i] + 0.5 * correction[i]
     return short

@@ -19,7 +19,13 @@ from dopt.kernel.integration import next_model_state
 from dopt.kernel.learners.adam import sampled_point
 from dopt.kernel.learners.gauss_newton import squared_distance
 from dopt.kernel.learners.kalman import filter_step, model_rows
-from dopt.kernel.linear_algebra import factorize, inner, quadratic_forms, solve, write_inverse
+from dopt.kernel.linear_algebra import (
+    factorize,
+    quadratic_forms,
+    replaced,
+    solve,
+    write_inverse,
+)
 from dopt.kernel.model import model_point, state_between
 from dopt.kernel.sensors import (
     begin,
@@ -32,6 +38,7 @@ from dopt.kernel.sensors import (
     state_jacobian,
 )
 from dopt.kernel.structs import Trial
+from dopt.kernel.vectors import add_symmetric, inner, multiply
 from dopt.types import Matrix, Vector
 
 
@@ -131,19 +138,21 @@ def fit(trial: Trial, n: int, regularization: float, steps: int, fits_noise: boo
             _fit_noise(trial, n)
         before = run_filter(trial, n, rows, errors)
         before += regularization * squared_distance(theta, prior)
-        normal[:] = np.dot(rows.T, rows)
+        normal[:] = 0.0
+        add_symmetric(rows.T, rows, normal)
         for i in range(q):
             normal[i, i] += regularization
         definite = definite and factorize(normal)
         if not definite:
             break
         if turn < steps:
-            step[:] = np.dot(errors, rows) + regularization * (prior - theta)
+            multiply(errors.reshape(1, -1), rows, step.reshape(1, -1))
+            step += regularization * (prior - theta)
             solve(normal, step)
             _take_step(trial, n, regularization, before, step)
     if not (definite and write_inverse(normal, state.covariance.upper)):
         theta[:] = np.nan
-    state.covariance.n_pending[0] = 0
+    replaced(state.covariance)
 
 
 @compiled

@@ -18,56 +18,55 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.algorithm import ModelKind
-from dopt.kernel.compiler import compiled, vectorized
+from dopt.kernel.compiler import compiled
 from dopt.kernel.learners.adam import sampled_point
 from dopt.kernel.linear_algebra import (
-    add_multiple,
     append_row,
     factorize,
-    inner,
     quadratic_forms,
     rank_update,
+    settle,
     solve_columns,
     solve_lower,
     solve_lower_transposed,
 )
-from dopt.kernel.model import network_jacobian, parameter_rows, sampled_state
+from dopt.kernel.model import parameter_rows, sampled_state, write_jacobian
 from dopt.kernel.model_kinds import mean_weights, sample_features, write_kernel
 from dopt.kernel.network import features_at
 from dopt.kernel.structs import Covariance, Network, Plant, Posterior, Trial
+from dopt.kernel.vectors import LANES, add_multiple, inner
 from dopt.types import Matrix, Vector
 
 
 @compiled
 def model_rows(plant: Plant, network: Network, theta: Vector, x: Vector, value: Vector) -> Matrix:
     """Return J, (r, q), at a point, and write a_θ, (r,), there."""
-    if network.kind != ModelKind.MLP:
-        rows = np.empty((value.shape[0], theta.shape[0]))
+    rows = np.empty((value.shape[0], theta.shape[0]))
+    if network.kind == ModelKind.MLP:
+        write_jacobian(network, theta, x, rows, value)
+    else:
         parameter_rows(plant, network, theta, x, rows, value)
-        return rows
-    return network_jacobian(network, theta, x, value)
+    return rows
 
 
 @compiled
 def filter_step(covariance: Covariance, theta: Vector, rows: Matrix, residuals: Vector) -> None:
     """Add JᵀJ to M for J, (r, q), and correct θ by the residuals, (r,), which are overwritten."""
-    scratch = np.empty(rows.shape)
-    rank_update(covariance, rows, residuals, scratch)
-    for k in range(residuals.shape[0]):
-        for i in range(theta.shape[0]):
-            theta[i] += residuals[k] * scratch[k, i]
+    correction = rank_update(covariance, rows, residuals)
+    for i in range(theta.shape[0]):
+        theta[i] += correction[i]
 
 
-@vectorized
+@compiled
 def forget(covariance: Covariance, forgetting: float, t: int, renewed: int, renewal: float) -> None:
     """Turn M⁻¹ into (f M + D)⁻¹ at step t (:class:`dopt.learning.ExtendedKalman`).
 
     D has the entry ``renewal`` at the ``renewed`` diagonal places whose turn it is.
     """
-    upper, pending = covariance.upper, covariance.pending
-    q = upper.shape[0]
+    settle(covariance)
+    upper, pending, q = covariance.upper, covariance.pending, covariance.size
     for i in range(q):
-        row = upper[i, i:]
+        row = upper[i, i - i % LANES :]
         for j in range(row.shape[0]):
             row[j] /= forgetting
     for k in range(covariance.n_pending[0]):
@@ -83,14 +82,14 @@ def forget(covariance: Covariance, forgetting: float, t: int, renewed: int, rene
         append_row(covariance, column)
 
 
-@vectorized
+@compiled
 def _read_column(covariance: Covariance, i: int, out: Vector) -> None:
     """Write column i of M⁻¹, (q,)."""
-    upper, pending = covariance.upper, covariance.pending
+    upper, pending, q = covariance.upper, covariance.pending, covariance.size
     for j in range(out.shape[0]):
         out[j] = upper[min(i, j), max(i, j)]
     for k in range(covariance.n_pending[0]):
-        add_multiple(out, -pending[k, i], pending[k])
+        add_multiple(out, -pending[k, i], pending[k, :q])
 
 
 @compiled

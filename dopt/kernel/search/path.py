@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dopt.algorithm import INVARIANT, Score
-from dopt.kernel.compiler import compiled, squared, vectorized
-from dopt.kernel.linear_algebra import add_multiple, inner, multiply_rows
+from dopt.kernel.compiler import compiled, squared
+from dopt.kernel.linear_algebra import multiply_rows, write_dense
 from dopt.kernel.model import (
     accelerations_at,
     euler_step,
@@ -24,6 +24,7 @@ from dopt.kernel.model import (
     within,
 )
 from dopt.kernel.structs import Covariance, Network, Plant, Search
+from dopt.kernel.vectors import add_multiple, inner, multiply, product
 from dopt.types import Booleans, Matrix, Stack, Vector
 
 
@@ -43,7 +44,7 @@ def krylov_space(covariance: Covariance, starts: Matrix, size: int) -> tuple[Mat
             row[i] = starts[j, i] if j < b else images[j - b, i]
         _orthogonalize(basis, j)
         multiply_rows(covariance, basis[j : j + 1], images[j : j + 1])
-    return basis, np.dot(basis, images.T)
+    return basis, product(basis, images.T.copy())
 
 
 @compiled
@@ -63,7 +64,7 @@ def _orthogonalize(basis: Matrix, j: int) -> None:
 @compiled
 def largest_eigenvalue(projected: Matrix, basis: Matrix, removed: Matrix) -> float:
     """Return the largest eigenvalue of M⁻¹ - WᵀW in the space, W = ``removed``, (r, q)."""
-    W, K = np.dot(removed, basis.T), projected.shape[0]
+    W, K = product(removed, basis.T.copy()), projected.shape[0]
     left = projected.copy()
     for k in range(W.shape[0]):
         for i in range(K):
@@ -74,9 +75,6 @@ def largest_eigenvalue(projected: Matrix, basis: Matrix, removed: Matrix) -> flo
 
 FEW_ROWS = 40
 """Up to so many products a step, a full copy of M⁻¹ for the linear algebra library does not pay."""
-
-BLOCK = 16
-"""Rows and columns of M⁻¹ that are copied to their mirror image at a time."""
 
 
 class Path(NamedTuple):
@@ -101,13 +99,13 @@ class Place(NamedTuple):
 @compiled
 def new_path(plant: Plant, network: Network, search: Search, covariance: Covariance) -> Path:
     """Return an empty path."""
-    q, R, C = covariance.upper.shape[0], rows_of_state(plant, network), search.candidates.shape[0]
+    q, R, C = covariance.size, rows_of_state(plant, network), search.candidates.shape[0]
     n, shared = search.steps // search.stride, switch_of(search) // search.stride
     starts = C if shared > 0 else 1
     size = q if R * starts * (shared + C * (n - shared)) > FEW_ROWS else 0
     inverse, count = np.empty((size, size)), R * (shared + C * (n - shared))
     if size > 0:
-        _write_dense(covariance, inverse)
+        write_dense(covariance, inverse)
     return Path(np.empty((count, q)), np.empty((count, q)), np.zeros((R * n, R * n)), inverse)
 
 
@@ -116,22 +114,6 @@ def switch_of(search: Search) -> int:
     """Return the step at which the input switches, 0 where it never does."""
     step: int = search.switch if search.switch < search.steps else 0
     return step
-
-
-@vectorized
-def _write_dense(covariance: Covariance, out: Matrix) -> None:
-    """Write M⁻¹ as a full matrix, (q, q)."""
-    q = out.shape[0]
-    for i in range(q):
-        row = out[i, i:]
-        for j in range(row.shape[0]):
-            row[j] = covariance.upper[i, i + j]
-        for n in range(covariance.n_pending[0]):
-            add_multiple(row, -covariance.pending[n, i], covariance.pending[n, i:])
-    for first in range(0, q, BLOCK):
-        for i in range(first, q):
-            for j in range(first, min(first + BLOCK, i)):
-                out[i, j] = out[j, i]
 
 
 @compiled
@@ -188,7 +170,7 @@ def _apply_inverse(covariance: Covariance, path: Path, first: int, last: int) ->
     if path.inverse.shape[0] == 0:
         multiply_rows(covariance, path.rows[first:last], path.products[first:last])
     elif last > first:
-        np.dot(path.rows[first:last], path.inverse, path.products[first:last])
+        multiply(path.rows[first:last], path.inverse, path.products[first:last])
 
 
 @compiled
@@ -197,7 +179,7 @@ def row_at(place: Place, i: int) -> int:
     return i if i < place.shared else i + place.offset
 
 
-@vectorized
+@compiled
 def log_determinant(path: Path, place: Place, first: int, last: int, block: int) -> float:
     """Extend the factor L by rows ``first`` to ``last`` of a path; return the growth of log det.
 
@@ -216,7 +198,7 @@ def log_determinant(path: Path, place: Place, first: int, last: int, block: int)
     return total
 
 
-@vectorized
+@compiled
 def whitened(path: Path, place: Place) -> Matrix:
     """Return L⁻¹ J M⁻¹, (R n, q), of a path whose factor is known."""
     n = path.factor.shape[0]
@@ -298,7 +280,7 @@ class ScoreContext(NamedTuple):
     projected: Matrix  # (K, K), M⁻¹ in the Krylov space
 
 
-@vectorized
+@compiled
 def score_of_path(score: int, path: Path, place: Place, context: ScoreContext) -> float:
     """Return the score of a whole path whose factor is known, if it is not a determinant."""
     n, total = path.factor.shape[0], 0.0

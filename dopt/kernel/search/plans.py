@@ -14,6 +14,7 @@ import numpy as np
 from dopt.algorithm import TIE_MARGIN, Score
 from dopt.kernel.compiler import compiled, monotonic_microseconds
 from dopt.kernel.model import n_next_points
+from dopt.kernel.network import multiply_vector
 from dopt.kernel.search.path import (
     Path,
     Place,
@@ -30,6 +31,7 @@ from dopt.kernel.search.path import (
     switch_of,
 )
 from dopt.kernel.structs import Covariance, Network, Plant, Search, Trial
+from dopt.kernel.vectors import inner
 from dopt.types import Booleans, Integers, Matrix, Vector
 
 
@@ -81,7 +83,9 @@ def _order(candidates: Matrix, tie: Vector) -> Integers:
     The first is that nearest to a random direction, so that haste prefers no input to another.
     """
     C = candidates.shape[0]
-    ranks = np.argsort(-np.dot(candidates, tie), kind="mergesort")
+    along = np.empty(C)
+    multiply_vector(candidates, -tie, along)
+    ranks = np.argsort(along, kind="mergesort")
     order = np.empty_like(ranks)
     order[::2], order[1::2] = ranks[: C - C // 2], ranks[::-1][: C // 2]
     return order
@@ -252,7 +256,7 @@ def _choose(values: Matrix, candidates: Matrix, tie: Vector, u: Vector) -> None:
     """Write the candidate that begins the best plan; ``tie`` decides among equal ones."""
     best, preferred = np.max(values), -np.inf
     for c in range(values.shape[0]):
-        along = np.dot(candidates[c], tie)
+        along = inner(candidates[c], tie)
         if np.max(values[c]) >= best - TIE_MARGIN * abs(best) and along > preferred:
             preferred = along
             u[:] = candidates[c]

@@ -20,19 +20,26 @@ import numpy as np
 
 from dopt.algorithm import DOMAIN_MARGIN, SPREAD_KEPT, TIE_MARGIN, ModelKind, Score
 from dopt.kernel import network as nn
-from dopt.kernel.compiler import compiled, contracted, squared, vectorized
+from dopt.kernel.compiler import compiled, squared
 from dopt.kernel.linear_algebra import (
-    add_multiple,
     factorize,
-    inner,
     solve_columns,
     solve_transposed_columns,
+    write_dense,
 )
 from dopt.kernel.model import n_next_points, next_points, parameter_rows, rows_at, write_features
-from dopt.kernel.network import output_inputs
+from dopt.kernel.network import multiply_vector, output_inputs
 from dopt.kernel.network_gradients import batch_back_signals
 from dopt.kernel.search.path import advance_paths, keep_points, paths_from
 from dopt.kernel.structs import Covariance, Network, Plant, State, Trial
+from dopt.kernel.vectors import (
+    add_multiple,
+    inner,
+    multiply,
+    multiply_and_shift,
+    product,
+    subtract_product,
+)
 from dopt.types import Booleans, Integers, Matrix, Stack, Vector
 
 
@@ -73,7 +80,7 @@ def directions(state: State, normals: Matrix, chosen: Matrix) -> tuple[bool, Dir
     if g > 0:
         Q, R = np.linalg.qr(_transposed_products(root, chosen.T.copy()))
         basis = Q.copy()
-        random -= np.dot(basis, np.dot(basis.T, random))
+        subtract_product(basis, product(basis.T, random), random)
         Z[:, :g] = basis
         found.exact[:] = R
     Z[:, g:] = random
@@ -85,8 +92,7 @@ def directions(state: State, normals: Matrix, chosen: Matrix) -> tuple[bool, Dir
 def _transposed_products(root: Root, columns: Matrix) -> Matrix:
     """Return Uᵀ times columns, (q, k)."""
     if root.of_inverse:
-        reversed_products: Matrix = np.dot(root.factor.T, columns[::-1].copy())
-        return reversed_products[::-1].copy()
+        return product(root.factor.T, columns[::-1].copy())[::-1].copy()
     solve_columns(root.factor, columns)
     return columns
 
@@ -95,8 +101,7 @@ def _transposed_products(root: Root, columns: Matrix) -> Matrix:
 def _products(root: Root, columns: Matrix) -> Matrix:
     """Return U times columns, (q, k)."""
     if root.of_inverse:
-        reversed_products: Matrix = np.dot(root.factor, columns[::-1].copy())
-        return reversed_products[::-1].copy()
+        return product(root.factor, columns[::-1].copy())[::-1].copy()
     solve_transposed_columns(root.factor, columns)
     return columns
 
@@ -104,14 +109,8 @@ def _products(root: Root, columns: Matrix) -> Matrix:
 @compiled
 def _write_reversed(covariance: Covariance, out: Matrix) -> None:
     """Write M⁻¹ with its rows and columns in reverse order, (q, q)."""
-    q = out.shape[0]
-    for i in range(q):
-        for j in range(i, q):
-            value = covariance.upper[i, j]
-            for n in range(covariance.n_pending[0]):
-                value -= covariance.pending[n, i] * covariance.pending[n, j]
-            out[q - 1 - i, q - 1 - j] = value
-            out[q - 1 - j, q - 1 - i] = value
+    write_dense(covariance, out)
+    out[:] = out[::-1, ::-1].copy()
 
 
 @compiled
@@ -122,10 +121,12 @@ def changes_along(
     N, r = states.shape[0], out.shape[0]
     if network.kind != ModelKind.MLP:
         rows, value = np.empty((r, theta.shape[0])), np.empty(r)
+        change = np.empty(along.shape[0])
         for n in range(N):
             parameter_rows(plant, network, theta, states[n], rows, value)
             for k in range(r):
-                out[k, :, n] = np.dot(along, rows[k])
+                multiply_vector(along, rows[k], change)
+                out[k, :, n] = change
         return
     depth, width = network.offsets.shape[0] - 1, network.sizes[1]
     features, outputs = np.empty((network.feature_kinds.shape[0], N)), np.empty((r, N))
@@ -135,22 +136,19 @@ def changes_along(
     signals = batch_back_signals(network, theta, features, hidden, r)
     last = nn.units_by_points(hidden[depth - 1], width, N)
     top = output_inputs(network, last, features)
-    change = np.empty((width, N))
+    changes = np.empty((width, N))
     for j in range(along.shape[0]):
         dW, db = nn.layer(network, along[j], depth)
-        np.dot(dW, top, outputs)
-        for k in range(r):
-            for n in range(N):
-                out[k, j, n] = outputs[k, n] + db[k]
+        multiply_and_shift(dW, top, db, out[:, j])
         for index in range(depth):
             dW, db = nn.layer(network, along[j], index)
             below = features if index == 0 else nn.units_by_points(hidden[index - 1], width, N)
-            np.dot(dW, below[: dW.shape[1]], change)
+            multiply(dW, below, changes)
             for k in range(r):
-                _add_products(signals[k * depth + index], change, db, out[k, j])
+                _add_products(signals[k * depth + index], changes, db, out[k, j])
 
 
-@contracted
+@compiled
 def _add_products(signal: Matrix, change: Matrix, shift: Vector, out: Vector) -> None:
     """Add the sum over the units of δ (change + shift), (N,)."""
     for i in range(signal.shape[0]):
@@ -353,7 +351,7 @@ def domain_weight(domain: Matrix, x: Vector) -> float:
     return weight
 
 
-@vectorized
+@compiled
 def score_of_rows(score: int, rows: Matrix, exact: Matrix, r: int, factor: Matrix) -> float:
     """Return the score of a path from J W, (N, g + s), r rows for each state.
 
@@ -381,7 +379,7 @@ def score_of_rows(score: int, rows: Matrix, exact: Matrix, r: int, factor: Matri
             add_multiple(row, -factor[i, j], rows[j, :g])
         for j in range(g):
             row[j] /= factor[i, i]
-    products = np.dot(rows[:, :g].copy(), exact)
+    products = product(rows[:, :g], exact)
     total = 0.0
     for i in range(N):
         share = 1.0 - (i // r) / (N // r)
