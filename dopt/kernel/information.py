@@ -325,7 +325,8 @@ def _add_products(
     """
     r, depth, m = dual.deltas.shape[0], dual.deltas.shape[1], point.phi_dots.shape[0]
     stop = start + values.shape[1]
-    slopes, back = np.empty((m, values.shape[1])), np.empty(values.shape[1])
+    slopes = np.empty((m, stop - start))
+    back, back_dot = np.empty(stop - start), np.empty(stop - start)
     for index in range(depth + 1):
         stored = stored_below(dual, start, stop, index)
         for j in range(m):
@@ -343,8 +344,8 @@ def _add_products(
             _add_layer(back, values[index], 1.0, first, r, out[0])
             for j in range(m):
                 _add_layer(back, slopes[j], 0.0, first, r, out[1 + j])
-                multiply_vector(signals, point.deltas_dots[j, index], back)
-                _add_layer(back, values[index], 1.0, first, r, out[1 + j])
+                multiply_vector(signals, point.deltas_dots[j, index], back_dot)
+                _add_layer(back_dot, values[index], 1.0, first, r, out[1 + j])
 
 
 @compiled

@@ -267,7 +267,8 @@ def dense(covariance: Covariance) -> Matrix:
     pending = covariance.pending[: covariance.n_pending[0], :q]
     full: Matrix = upper + np.triu(upper, 1).T - pending.T @ pending
     products = J @ full
-    full -= products.T @ np.linalg.solve(np.eye(len(J)) + products @ J.T, products)
+    added = np.linalg.solve(np.linalg.cholesky(np.eye(len(J)) + products @ J.T), products)
+    full -= added.T @ added
     return full
 
 
@@ -284,15 +285,12 @@ def factorize(matrix: Matrix) -> bool:
     q = matrix.shape[0]
     for start in range(0, q, PANEL):
         stop = min(start + PANEL, q)
-        for k in range(start, stop):
-            row = matrix[k, k:]
-            if not row[0] > 0.0:
+        for i in range(start, stop):
+            above = matrix[start:i, i:]
+            subtract_product(above[:, :1].T, above, matrix[i : i + 1, i:])
+            if not matrix[i, i] > 0.0:
                 return False
-            pivot = np.sqrt(row[0])
-            for j in range(row.shape[0]):
-                row[j] /= pivot
-            for i in range(k + 1, stop):
-                add_multiple(matrix[i, i:], -row[i - k], row[i - k :])
+            _divide(matrix[i, i:], np.sqrt(matrix[i, i]))
         panel = matrix[start:stop, stop:]
         subtract_symmetric(panel.T, panel, matrix[stop:, stop:])
     for i in range(q):
@@ -343,10 +341,8 @@ def solve_columns(factor: Matrix, right: Matrix) -> None:
 def _solve_panel(factor: Matrix, start: int, stop: int, right: Matrix, k: int) -> None:
     """Eliminate rows of k right-hand sides by each other, those from ``start`` to ``stop``."""
     for i in range(start, stop):
-        row = right[i, :k]
-        for j in range(start, i):
-            add_multiple(row, -factor[i, j], right[j, :k])
-        _divide(row, factor[i, i])
+        subtract_product(factor[i : i + 1, start:i], right[start:i, :k], right[i : i + 1, :k])
+        _divide(right[i, :k], factor[i, i])
 
 
 @compiled
@@ -357,8 +353,8 @@ def solve_transposed_columns(factor: Matrix, right: Matrix) -> None:
         stop = min(start + PANEL, q)
         subtract_product(factor[stop:, start:stop].T, right[stop:], right[start:stop])
         for i in range(stop - 1, start - 1, -1):
-            for j in range(i + 1, stop):
-                add_multiple(right[i], -factor[j, i], right[j])
+            below = factor[i + 1 : stop, i : i + 1].T
+            subtract_product(below, right[i + 1 : stop], right[i : i + 1])
             _divide(right[i], factor[i, i])
 
 

@@ -45,6 +45,9 @@ def or_plain(plain: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callab
     """Let ``plain`` stand in the interpreter for a function that only the compiler has."""
 
     def chosen(compiled: Callable[..., Any]) -> Callable[..., Any]:
-        return plain if PLAIN else compiled
+        if PLAIN:
+            return plain
+        compiled.plain = plain  # type: ignore[attr-defined]
+        return compiled
 
     return chosen

@@ -277,10 +277,10 @@ def _write_product(
 
     def rows(i: Any, count: int) -> None:
         first = builder.and_(i, code.index(-LANES)) if upper else zero
-        step = vectors * code.lanes
-        middle = code.whole(first, n_columns, step)
-        with code.loop(first, middle, step) as j:
-            tile(i, j, count, vectors, None)
+        across = vectors if count > 1 else 2 * vectors
+        middle = code.whole(first, n_columns, across * code.lanes)
+        with code.loop(first, middle, across * code.lanes) as j:
+            tile(i, j, count, across, None)
         with code.loop(middle, n_columns, code.lanes) as j:
             tile(i, j, count, 1, code.first(builder.sub(n_columns, j)))
 

@@ -68,12 +68,8 @@ def _is_callee() -> bool:
 
 
 def _optimize_outermost(library: Any) -> None:
-    """Optimize a library; not a callee's, which is optimized as part of its callers.
-
-    A callee that takes liberties with rounding is optimized: which products and sums are fused
-    would otherwise depend on what surrounds them in a caller.
-    """
-    if not _is_callee() or ConfigStack().top().fastmath:
+    """Optimize a library; not a callee's, which is optimized as part of its callers."""
+    if not _is_callee():
         _optimize(library)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.rows import Row
 from benchmarks.trials import cartpole, cost, run_in_turn
-from dopt.kernel.model import linearization_at, network_gradients
+from dopt.kernel.model import write_network_gradients
 from dopt.kernel.plugin import (
     Trial,
     adam_step,
@@ -45,9 +45,8 @@ class OwnDOptimal(CompiledPolicy, InformationPolicy):
         component, tie = trial.randomness.components[t], trial.randomness.ties[t]
         bar = predicted_state(plant, trial.network, theta, trial.record.states[t])
         columns = input_columns(plant, bar)
-        value = np.empty(plant.learned_rows.shape[0])
-        point = linearization_at(trial.network, theta, bar, columns, component, value)
-        G = network_gradients(trial.network, point, component, theta.shape[0])
+        G = np.empty((2, theta.shape[0]))
+        write_network_gradients(trial.network, theta, bar, columns, component, G)
         S = quadratic_forms(trial.state.covariance, G[:1], G)
         up = S[0, 1] > 0.0 or (S[0, 1] == 0.0 and tie[0] > 0.0)
         u[0] = plant.gamma if up else -plant.gamma

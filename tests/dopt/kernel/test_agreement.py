@@ -14,7 +14,7 @@ import pytest
 
 from dopt.algorithm import Form
 from dopt.errors import IncompatibleError, SpecificationError
-from dopt.kernel.linear_algebra import dense, rank_update, restore
+from dopt.kernel.linear_algebra import dense, initial_covariance, rank_update, restore
 from dopt.kernel.run import KernelTrial
 from dopt.kernel.structs import Covariance
 from dopt.learning import LEARNERS
@@ -458,7 +458,9 @@ def test_many_steps_at_a_tiny_regularization_drift_little() -> None:
 
 def covariance(matrix: np.ndarray) -> Covariance:
     q = len(matrix)
-    return Covariance(np.triu(matrix), np.zeros((4, q)), np.zeros(1, dtype=np.int64))
+    made = initial_covariance(q, 1.0, n_rows=1, n_planned=1)
+    made.upper[:q, :q] = matrix
+    return made
 
 
 def test_a_negative_variance_is_mended() -> None:
@@ -466,7 +468,7 @@ def test_a_negative_variance_is_mended() -> None:
     axes, _ = np.linalg.qr(rng.standard_normal((6, 6)))
     broken = axes @ np.diag([2.0, 1.0, 0.5, 0.1, 1e-3, -1e-6]) @ axes.T
     carried = covariance(broken)
-    interpreted(rank_update)(carried, axes[:, 5:].T.copy(), np.zeros(1), np.zeros((1, 6)))
+    interpreted(rank_update)(carried, axes[:, 5:].T.copy(), np.zeros(1))
     assert np.linalg.eigvalsh(dense(carried))[0] >= -1e-15
     assert np.linalg.norm(dense(carried) - broken, 2) < 2e-6
 
@@ -475,7 +477,7 @@ def test_restoring_keeps_what_is_definite() -> None:
     rng = np.random.default_rng(1)
     A = rng.standard_normal((7, 7))
     carried = covariance(A @ A.T)
-    carried.pending[0] = 1e-2 * rng.standard_normal(7)
+    carried.pending[0, :7] = 1e-2 * rng.standard_normal(7)
     carried.n_pending[0] = 1
     before = dense(carried)
     interpreted(restore)(carried)

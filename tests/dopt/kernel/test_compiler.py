@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import os
 import shutil
@@ -10,7 +9,6 @@ import subprocess
 import sys
 import threading
 import types
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,7 +22,7 @@ from dopt.errors import SpecificationError
 from dopt.fields import LEARN_IN_NUMPY, PLAN_IN_NUMPY
 from dopt.kernel import cache, pointers, warm_up
 from dopt.kernel.cache import one_compiler_at_a_time
-from dopt.kernel.compiler import compiled, content_digest, contracted, squared, vectorized
+from dopt.kernel.compiler import content_digest
 from dopt.kernel.from_spec import network_of
 from dopt.kernel.information import FORMS
 from dopt.kernel.pointers import function_of
@@ -229,47 +227,6 @@ def test_a_function_compiled_for_another_or_called_with_one_is_not_stored(tmp_pa
     assert found == ["pair.outer"]
 
 
-ROUNDED = 1.0 + 2.0**-27
-"""A number whose square is not a double: fused, x² - fl(x²) is not zero."""
-
-
-@pytest.mark.parametrize("liberal", [contracted, vectorized])
-def test_rounding_does_not_depend_on_which_function_calls_first(
-    liberal: Callable[[Callable[..., float]], Callable[..., float]],
-) -> None:
-    """Numba compiles a function once, and would hand it the liberties of its first caller."""
-
-    @compiled
-    def difference(x: float, z: float) -> float:
-        return x * x - z
-
-    @liberal
-    def first(x: float, z: float) -> float:
-        return difference(x, z)
-
-    assert first(ROUNDED, ROUNDED * ROUNDED) == 0.0
-    assert difference(ROUNDED, ROUNDED * ROUNDED) == 0.0
-
-
-def test_a_square_is_rounded_before_it_enters_a_sum() -> None:
-    @contracted
-    def with_square(x: float, z: float) -> float:
-        return squared(x) - z
-
-    assert with_square(ROUNDED, ROUNDED * ROUNDED) == 0.0
-
-
-def test_no_function_that_may_fuse_uses_the_operator_of_powers() -> None:
-    """It is compiled as a function of its own, with the liberties of whichever uses it first."""
-    for path in (ROOT / "dopt" / "kernel").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.FunctionDef):
-                names = {d.id for d in node.decorator_list if isinstance(d, ast.Name)}
-                if names & {"contracted", "vectorized"}:
-                    powers = [n for n in ast.walk(node) if isinstance(n, ast.Pow)]
-                    assert not powers, f"{path.name}: {node.name}"
-
-
 def test_a_cache_that_cannot_be_written_is_one_folder_for_all_processes(tmp_path: Path) -> None:
     """And is gone with the process that made it."""
     program = (
@@ -293,7 +250,7 @@ def test_a_cache_that_cannot_be_written_is_one_folder_for_all_processes(tmp_path
 MODULE = """
 import math
 import numpy as np
-from dopt.kernel.linear_algebra import inner
+from dopt.kernel.vectors import inner
 
 FACTOR = {factor}
 TABLE = np.array([1.0, 2.0])

@@ -15,9 +15,8 @@ from torch.func import jacrev, vmap
 from dopt.assessment import model_forecast
 from dopt.errors import IncompatibleError
 from dopt.kernel.learners.kalman import filter_step, whiten
-from dopt.kernel.linear_algebra import PENDING_ROWS, dense
+from dopt.kernel.linear_algebra import dense, initial_covariance
 from dopt.kernel.run import KernelTrial
-from dopt.kernel.structs import Covariance
 from dopt.learning import LEARNERS, ExtendedKalman
 from dopt.models import GaussianProcess
 from dopt.policies import POLICIES, InformationPolicy
@@ -298,9 +297,7 @@ def test_a_step_removes_at_most_a_share_of_an_error_and_of_its_variance(
     """Of a linear model, with any λ; and nearly all that the plain filter does where λ is large."""
     rng = np.random.default_rng(seed)
     J, e, theta = rng.standard_normal((1, 5)), rng.standard_normal(1), np.zeros(5)
-    covariance = Covariance(
-        np.eye(5) / regularization, np.zeros((PENDING_ROWS, 5)), np.zeros(1, np.int64)
-    )
+    covariance = initial_covariance(5, regularization, n_rows=1, n_planned=1)
     before = float(J[0] @ J[0]) / regularization
     rows, residuals = J.copy(), e.copy()
     interpreted(whiten)(covariance, rows, residuals, noise_variance, underweighting)
@@ -354,7 +351,7 @@ def test_a_filter_needs_the_primal_form() -> None:
 def test_auto_is_primal_for_a_filter_of_any_size() -> None:
     spec = trial("arm", "d_optimal", learner=EKF, model={"width": 30}, env={"horizon": 3})
     fast = KernelTrial(spec)
-    assert fast.state.covariance.upper.shape == (1202, 1202)
+    assert fast.state.covariance.size == 1202
     assert spec.config.memory > 2 * 8 * 1202**2
 
 

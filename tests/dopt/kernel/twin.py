@@ -54,6 +54,7 @@ def interpreted(function: CompiledFunction) -> Any:
     plain: FunctionType = function.py_func
     used = {name: plain.__globals__.get(name) for name in plain.__code__.co_names}
     called = {name: interpreted(one) for name, one in used.items() if isinstance(one, Dispatcher)}
+    called |= {name: one.plain for name, one in used.items() if hasattr(one, "plain")}
     copy = FunctionType(plain.__code__, {**plain.__globals__, **called}, plain.__name__)
     copy.__defaults__, copy.__kwdefaults__ = plain.__defaults__, plain.__kwdefaults__
     return copy

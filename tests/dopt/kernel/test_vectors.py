@@ -1,0 +1,231 @@
+"""Products whose sums have one order, against dense ones, for this processor and for others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dopt.kernel import vectors
+from dopt.kernel.vectors import GROUP, LANES, aligned_zeros, padded
+from dopt.types import Array
+
+ROOT = Path(__file__).parents[3]
+
+SIZES = st.integers(1, 40)
+PRECISIONS = st.sampled_from([(np.float64, 1e-13), (np.float32, 1e-5)])
+
+
+def compiled(routine: Callable[..., object], n_arguments: int) -> Callable[..., object]:
+    """Return a routine as Python can call it."""
+    names = ", ".join("abcd"[:n_arguments])
+    space: dict[str, Callable[..., object]] = {"routine": routine}
+    exec(f"def call({names}):\n    return routine({names})", space)
+    return numba.njit(space["call"])
+
+
+multiply = compiled(vectors.multiply, 3)
+multiply_and_shift = compiled(vectors.multiply_and_shift, 4)
+add_product = compiled(vectors.add_product, 3)
+subtract_product = compiled(vectors.subtract_product, 3)
+add_symmetric = compiled(vectors.add_symmetric, 3)
+subtract_symmetric = compiled(vectors.subtract_symmetric, 3)
+inner_products = compiled(vectors.inner_products, 3)
+inner = compiled(vectors.inner, 2)
+add_multiple = compiled(vectors.add_multiple, 3)
+symmetric_products = compiled(vectors.symmetric_products, 3)
+
+
+def framed(values: Array) -> tuple[Array, Array]:
+    """Return a copy of a matrix inside a larger one, and the larger one, whose frame is NaN."""
+    whole = np.full(np.add(values.shape, 2 * LANES), np.nan, values.dtype)
+    inside = whole[LANES:-LANES, LANES:-LANES]
+    inside[:] = values
+    return inside, whole
+
+
+def is_written_inside_alone(whole: Array) -> bool:
+    """Return True if all of the frame is still NaN and nothing inside is."""
+    inside = np.zeros(whole.shape, bool)
+    inside[LANES:-LANES, LANES:-LANES] = True
+    return bool((np.isnan(whole) != inside).all())
+
+
+@given(SIZES, SIZES, SIZES, PRECISIONS, st.integers(0, 99))
+def test_products_of_matrices_are_those_of_numpy_and_touch_nothing_else(
+    n: int, k: int, m: int, precision: tuple[type, float], seed: int
+) -> None:
+    kind, error = precision
+    rng = np.random.default_rng(seed)
+    a, b, c = (rng.normal(size=size).astype(kind) for size in ((n, k), (k, m), (n, m)))
+    left, right = framed(a)[0], framed(b)[0]
+    shift, size = rng.normal(size=n).astype(kind), np.abs(a) @ np.abs(b) + 4.0
+    exact = a.astype(float) @ b
+    expected: tuple[tuple[Callable[..., object], list[Array], Array], ...] = (
+        (multiply, [], exact),
+        (multiply_and_shift, [shift], exact + shift[:, None]),
+        (add_product, [], c + exact),
+        (subtract_product, [], c - exact),
+    )
+    for routine, others, value in expected:
+        for factor in (left, np.asfortranarray(a)):
+            out, whole = framed(c)
+            routine(factor, right, *others, out)
+            assert (np.abs(out - value) <= error * size).all(), routine
+            assert is_written_inside_alone(whole)
+
+
+def sums_in_order(left: Array, right: Array, start: Array, fused: bool) -> Array:
+    """Return start + left right, term after term, with products that are rounded or not."""
+    sums = np.empty((len(left), right.shape[1]))
+    for (i, j), _ in np.ndenumerate(sums):
+        total = float(start[i])
+        for a, b in zip(left[i].tolist(), right[:, j].tolist(), strict=True):
+            product = Fraction(a) * Fraction(b) if fused else Fraction(a * b)
+            total = float(Fraction(total) + product)
+        sums[i, j] = total
+    return sums
+
+
+@pytest.mark.parametrize("n", range(1, 10))
+@pytest.mark.parametrize("k", [1, 5, 16])
+def test_each_sum_of_a_product_is_taken_in_order(n: int, k: int) -> None:
+    """Bit for bit: the losses of stored trials depend on it."""
+    rng = np.random.default_rng(n)
+    left, right, start = rng.normal(size=(n, k)), rng.normal(size=(k, 11)), rng.normal(size=n)
+    out = np.empty((n, 11))
+    multiply_and_shift(left, right, start, out)
+    orders = [sums_in_order(left, right, start, fused) for fused in (True, False)]
+    assert out.tolist() in [order.tolist() for order in orders]
+
+
+@given(SIZES, SIZES, SIZES, PRECISIONS, st.integers(0, 99))
+def test_inner_products_are_those_of_numpy_and_touch_nothing_else(
+    n: int, m: int, k: int, precision: tuple[type, float], seed: int
+) -> None:
+    kind, error = precision
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(n, k)).astype(kind), rng.normal(size=(m, k)).astype(kind)
+    size = np.abs(a).astype(float) @ np.abs(b).T
+    out, whole = framed(np.zeros((n, m), kind))
+    inner_products(framed(a)[0], framed(b)[0], out)
+    assert (np.abs(out - a.astype(float) @ b.T) <= error * size).all()
+    assert is_written_inside_alone(whole)
+    assert abs(inner(a[0].copy(), b[0].copy()) - out[0, 0]) <= error * size[0, 0]
+
+
+@given(SIZES, PRECISIONS, st.integers(0, 99))
+def test_a_multiple_is_added_to_a_vector_alone(
+    n: int, precision: tuple[type, float], seed: int
+) -> None:
+    kind, error = precision
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(size=(2, n)).astype(kind)
+    whole = np.concatenate([y, np.full(LANES, np.nan, kind)])
+    add_multiple(whole[:n], kind(-1.5), x)
+    assert (np.abs(whole[:n] - (y - 1.5 * x)) <= error * (np.abs(x) + np.abs(y))).all()
+    assert np.isnan(whole[n:]).all()
+
+
+@given(st.integers(1, 70), st.integers(1, 2 * GROUP + 1), st.integers(0, 99))
+def test_products_with_a_symmetric_matrix_read_its_upper_blocks_alone(
+    q: int, k: int, seed: int
+) -> None:
+    """And a product has the same bits whichever others share the pass."""
+    rng = np.random.default_rng(seed)
+    Q = padded(q)
+    A = aligned_zeros(Q, Q)
+    A[:q, :q] = rng.normal(size=(q, q))
+    A += A.T.copy()
+    whole, x, y = A.copy(), aligned_zeros(k, Q), aligned_zeros(k, Q)
+    x[:, :q] = rng.normal(size=(k, q))
+    i, j = np.indices(A.shape)
+    A[j < i // LANES * LANES] = np.nan
+    symmetric_products(A, x, y)
+    assert (np.abs(y - x @ whole) <= 1e-13 * (np.abs(x) @ np.abs(whole))).all()
+    for n in range(k):
+        alone = np.full((1, Q), np.nan)
+        symmetric_products(A, x[n : n + 1], alone)
+        assert np.array_equal(alone[0], y[n])
+
+
+@given(st.integers(1, 40), st.integers(1, 20), st.integers(0, 99))
+def test_a_symmetric_product_changes_the_upper_blocks_alone(q: int, n: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    V, A = rng.normal(size=(n, q)), rng.normal(size=(q, q))
+    A += A.T.copy()
+    i, j = np.indices(A.shape)
+    upper = j >= i // LANES * LANES
+    for routine, sign in ((add_symmetric, 1.0), (subtract_symmetric, -1.0)):
+        out = A.copy()
+        routine(V.T, V, out)
+        assert np.array_equal(out[~upper], A[~upper])
+        assert out[upper] == pytest.approx((A + sign * V.T @ V)[upper], rel=1e-12, abs=1e-12)
+        assert np.array_equal(out[upper & upper.T], out.T[upper & upper.T])
+
+
+PROGRAM = """
+import hashlib, sys
+import numpy as np
+import tests.dopt.kernel.test_vectors as t
+rng, digest = np.random.default_rng(0), hashlib.sha256()
+for kind in (np.float64, np.float32):
+    for n, k, m in ((16, 4, 100), (2, 16, 33), (9, 7, 8), (386, 16, 386)):
+        a, b = rng.normal(size=(n, k)).astype(kind), rng.normal(size=(k, m)).astype(kind)
+        out, square = np.zeros((n, m), kind), np.zeros((n, n), kind)
+        t.multiply_and_shift(a, b, a[:, 0].copy(), out)
+        t.subtract_product(a, b, out)
+        t.inner_products(a, a, square)
+        digest.update(out.tobytes() + square.tobytes())
+        digest.update(np.array(t.inner(out[0], out[-1])).tobytes())
+A, x, y = t.aligned_zeros(392, 392), rng.normal(size=(7, 392)), np.zeros((7, 392))
+A[:] = rng.normal(size=A.shape)
+A += A.T.copy()
+t.subtract_symmetric(x.T, x, A)
+t.symmetric_products(A, x, y)
+assert np.abs(y - x @ (np.triu(A) + np.triu(A, 1).T)).max() < 1e-9
+for test in sys.argv[1:]:
+    getattr(t, test)()
+digest.update(A.tobytes() + y.tobytes())
+print(digest.hexdigest())
+"""
+
+
+def digest_on(processor: str | None, *tests: str) -> str:
+    """Return a digest of all products on a processor, after some tests there; None: this one."""
+    forced = {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": ""} if processor else {}
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *tests],
+        env={**os.environ, **forced, "PYTHONPATH": str(ROOT)},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+ROUTINES = [
+    test_products_of_matrices_are_those_of_numpy_and_touch_nothing_else,
+    test_inner_products_are_those_of_numpy_and_touch_nothing_else,
+    test_a_multiple_is_added_to_a_vector_alone,
+    test_products_with_a_symmetric_matrix_read_its_upper_blocks_alone,
+    test_a_symmetric_product_changes_the_upper_blocks_alone,
+]
+
+
+@pytest.mark.skipif(os.uname().machine != "x86_64", reason="the other processors are x86-64 too")
+def test_other_processors_give_the_same_bits() -> None:
+    """With registers of 32 bytes; without fused multiply-add products are right up to rounding."""
+    names = [test.__name__ for test in ROUTINES]
+    assert digest_on("x86-64-v3", *names) == digest_on(None)
+    digest_on("x86-64-v2", *names)
