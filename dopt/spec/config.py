@@ -74,7 +74,7 @@ def completed(config: Mapping[str, object]) -> dict[str, object]:
     return whole
 
 
-CODE_VERSION = 1
+CODE_VERSION = 2
 """Version of the numbers of trials, part of every key: increased by a change that alters them."""
 
 ASSESSMENT_VERSION = 2
