@@ -19,7 +19,7 @@ from dopt.systems.black_box import BlackBox
 from dopt.trial_view import TrialView
 from dopt.types import Buckets, Signs
 
-SMALL_PRIMAL = 400
+SMALL_PRIMAL = 600
 EQUAL_COST = 0.9
 """Parameters for each row of the whole trial at which primal and dual steps take the same time."""
 

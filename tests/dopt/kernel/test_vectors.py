@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from fractions import Fraction
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -18,8 +17,7 @@ from hypothesis import strategies as st
 from dopt.kernel import vectors
 from dopt.kernel.vectors import GROUP, LANES, aligned_zeros, padded
 from dopt.types import Array
-
-ROOT = Path(__file__).parents[3]
+from tests.paths import ROOT
 
 SIZES = st.integers(1, 40)
 PRECISIONS = st.sampled_from([(np.float64, 1e-13), (np.float32, 1e-5)])
@@ -176,6 +174,9 @@ def test_a_symmetric_product_changes_the_upper_blocks_alone(q: int, n: int, seed
 PROGRAM = """
 import hashlib, sys
 import numpy as np
+from hypothesis import settings
+settings.register_profile("alone", deadline=None, database=None)
+settings.load_profile("alone")
 import tests.dopt.kernel.test_vectors as t
 rng, digest = np.random.default_rng(0), hashlib.sha256()
 for kind in (np.float64, np.float32):

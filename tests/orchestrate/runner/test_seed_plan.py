@@ -40,9 +40,9 @@ def grid(policies: Sequence[str] = tuple(SPREADS), seeds: int = SEEDS) -> Grid:
 
 
 def lossy(spec: TrialSpec) -> TrialResult:
-    """Return a loss of its policy, drawn by the key of the trial."""
+    """Return a loss of its policy, drawn by the policy and the seed of the trial."""
     result = quick(spec)
-    noise = np.random.default_rng(int(spec.trial_key[:12], 16)).standard_normal()
+    noise = np.random.default_rng([*spec.policy.name.encode(), spec.seed]).standard_normal()
     loss = np.exp(SPREADS[spec.policy.name] * noise)
     return dataclasses.replace(result, loss=np.full_like(result.loss, loss))
 
