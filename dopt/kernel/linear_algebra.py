@@ -46,9 +46,9 @@ def initial_covariance(q: int, regularization: float, n_rows: int, n_planned: in
     upper = aligned_zeros(padded(q), padded(q))
     upper[range(q), range(q)] = 1.0 / regularization
     room, together = max(PENDING_ROWS if q > SMALL else 4, n_rows), max(n_rows + n_planned, GROUP)
-    places = (aligned_zeros(n, padded(q)) for n in (room, together, together))
-    counts = (np.zeros(1, dtype=np.int64) for _ in range(2))
-    return Covariance(upper, *places, *counts, q)
+    pending, rows, products = (aligned_zeros(n, padded(q)) for n in (room, together, together))
+    n_pending, n_deferred = np.zeros((2, 1), dtype=np.int64)
+    return Covariance(upper, pending, rows, products, n_pending, n_deferred, q)
 
 
 @compiled
