@@ -41,7 +41,9 @@ def test_the_step_is_measured_beside_its_targets(tmp_path: Path) -> None:
     assert "machine: " in done.stdout
     assert "numba " in done.stdout
     (run,) = read(history)
-    assert [f"step: {row['what']}" for row in rows] == list(run.rows)
+    timed, ratios = rows[:4], rows[4:]
+    assert [f"step: {row['what']}" for row in timed] == list(run.rows)
+    assert [row["measured"].split()[1] for row in ratios] == 2 * ["products"]
 
 
 def test_a_question_that_fails_is_said_and_the_others_are_asked(
