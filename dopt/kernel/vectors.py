@@ -12,7 +12,8 @@ splits where registers are shorter, and every sum has one order:
 
 Results are therefore the same bit for bit on all processors with fused multiply-add. The entries
 that are computed at a time, a tile of the result, depend on how many registers there are; no sum
-does. Rows of matrices have to be contiguous but for the left factor of :func:`add_product`.
+does. Rows of matrices have to be contiguous; only the left factor of :func:`add_product` may have
+any strides.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def back_up(url: str, target: Path) -> int:
     The copy of SQLite is a database file, checked and complete in itself; of PostgreSQL it is an
     archive for ``pg_restore`` with the tables and views of the schema. The file gets its name when
     it is complete. Raises ``StoreError`` if the file exists, ``OutputError`` if it cannot be
-    written, ``SchemaVersionError`` if the database is none, and ``StoreUnavailableError`` if it
+    written, ``SchemaVersionError`` if it is no database, and ``StoreUnavailableError`` if it
     cannot be read.
     """
     if target.exists():
