@@ -17,6 +17,8 @@ shows the equations, units and defaults of one.
 ``run_trial``           run one trial, in compiled code where there is some for its parts
 ``Explorer``            explore a plant that is measured: which input next, and what followed
 ``Plant``               names, units, bounds and the known part of such a plant
+``unknown``             a constant, delay or lag of a plant that a fit estimates
+``encoder``             how an angle of a plant is measured
 ``fit_offline``         fit the model of a trial to samples, all at once
 ``TrialSpec``           one trial: system, policy, model, learner and seed
 ``TrialResult``         losses, states, inputs and model parameters of one trial
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
     from dopt.spec.trial import TrialSpec as TrialSpec
     from dopt.systems import SYSTEMS as SYSTEMS
     from dopt.systems.plant import Plant as Plant
+    from dopt.systems.plant import encoder as encoder
+    from dopt.systems.plant import unknown as unknown
 
 __version__ = "0.1.0"  # also where nothing is installed, as beside PYTHONPATH in the image
 
@@ -58,8 +62,10 @@ __all__ = [
     "TrialResult",
     "TrialSpec",
     "__version__",
+    "encoder",
     "fit_offline",
     "run_trial",
+    "unknown",
 ]
 
 _MODULES = {
@@ -71,8 +77,10 @@ _MODULES = {
     "SYSTEMS": "dopt.systems",
     "TrialResult": "dopt.result",
     "TrialSpec": "dopt.spec.trial",
+    "encoder": "dopt.systems.plant",
     "fit_offline": "dopt.offline_fit",
     "run_trial": "dopt.run",
+    "unknown": "dopt.systems.plant",
 }
 
 

@@ -206,9 +206,124 @@ def _refused(what: str, text: object, reason: str, instead: str = "") -> Specifi
 NAME = "plant"
 """Name of every plant in configurations and in the results database."""
 
+
+@dataclasses.dataclass(frozen=True)
+class Unknown:
+    """A number that a fit estimates, with what is known of it before (:func:`unknown`).
+
+    Attributes
+    ----------
+    value : float
+        First guess.
+    factor : float
+        The logarithm of the number by the guess has this factor's for a standard deviation, so that
+        the number keeps its sign; 0 where ``spread`` is given.
+    spread : float
+        Standard deviation of the number about the guess, in its unit.
+    """
+
+    value: float
+    factor: float = 0.0
+    spread: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what, number in dataclasses.asdict(self).items():
+            if not _is_number(number):
+                raise SpecificationError(
+                    f"{what} of an unknown is {number!r}, but a finite number is expected: "
+                    f"correct it."
+                )
+        if (self.factor > 0) == (self.spread > 0) or min(self.factor, self.spread) < 0:
+            raise SpecificationError(
+                f"an unknown has the factor {self.factor:g} and the spread {self.spread:g}, but "
+                f"one of the two above 0 is expected: give a factor, or a spread in its unit."
+            )
+        if self.factor > 0 and (self.factor <= 1 or self.value == 0):
+            raise SpecificationError(
+                f"an unknown has the value {self.value:g} and the factor {self.factor:g}, but a "
+                f"value other than 0 and a factor above 1 are expected: give a spread in its unit, "
+                f"if it may be 0 or of either sign."
+            )
+
+    def at(self, z: float) -> float:
+        """Return the number z standard deviations above the guess."""
+        if self.factor:
+            return self.value * math.exp(math.log(self.factor) * z)
+        return self.value + self.spread * z
+
+
+def unknown(value: float, factor: float | None = None, *, spread: float | None = None) -> Unknown:
+    """Return a number that a fit estimates: a first guess, and how far off it may be.
+
+    Parameters
+    ----------
+    value : float
+        First guess, in the unit of the number.
+    factor : float, optional
+        Factor by which the guess may be wrong, one standard deviation of the logarithm; 2 unless a
+        spread is given.
+    spread : float, optional
+        Standard deviation of a number that may be 0 or change its sign, in its unit.
+
+    Raises
+    ------
+    SpecificationError
+        If both are given, a number is not finite, or the guess of a factor is 0.
+    """
+    if factor is None and spread is None:
+        factor = 2.0
+    return Unknown(value, factor or 0.0, spread or 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Encoder:
+    """An angle that is measured in steps of a turn (:func:`encoder`)."""
+
+    counts: float
+
+    @property
+    def quantum(self) -> float:
+        """Step of the measured angle [rad]."""
+        return 2.0 * math.pi / self.counts
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the rounding, quantum/√12 [rad]."""
+        return self.quantum / math.sqrt(12.0)
+
+
+def encoder(counts: float) -> Encoder:
+    """Return an encoder of so many counts a turn, four for each line in quadrature."""
+    if not _is_number(counts) or counts <= 0:
+        raise SpecificationError(
+            f"counts of an encoder is {counts!r}, but a positive number a turn is expected: "
+            f"correct it."
+        )
+    return Encoder(float(counts))
+
+
+def _noise(given: float | Encoder) -> float:
+    return given.noise if isinstance(given, Encoder) else float(given)
+
+
+def _section_of(given: Any) -> Any:
+    """Return a number, or a mapping for an unknown or an encoder."""
+    if isinstance(given, Unknown | Encoder):
+        return {name: float(value) for name, value in dataclasses.asdict(given).items() if value}
+    return float(given)
+
+
+def _from_section(given: Any) -> Any:
+    if isinstance(given, Mapping):
+        return Encoder(**given) if "counts" in given else Unknown(**given)
+    return given
+
+
 _MAPPINGS = ("states", "inputs", "known", "box", "constants", "measured")
 
 _LISTS = ("learned", "angles")
+
+_TIMES = ("delay", "lag")
 
 _ORDERED = ("states", "inputs")
 """Mappings whose order counts, which sections hold as lists of pairs."""
@@ -257,11 +372,12 @@ class Plant:
     angles : sequence of str
         States in radians of which a(x) is a function of period 2π. They may be measured over one
         turn or over many: each is followed from one state to the next.
-    constants : mapping of str to float
-        Known numbers that the expressions name.
-    measured : mapping of str to float
-        Standard deviation of the noise of each state that is measured; without any, all states are
-        measured, and their noise is left to the learner.
+    constants : mapping of str to float or Unknown
+        Numbers that the expressions name. :func:`dopt.fit` estimates what is
+        :func:`dopt.unknown`; an exploration takes its first guess.
+    measured : mapping of str to float or Encoder
+        Standard deviation of the noise of each state that is measured, or :func:`dopt.encoder`;
+        without any, all states are measured, and their noise is left to the learner.
     velocity_cutoff : float
         Cutoff of the filter of these states and their differences [Hz], with a learner that does
         not estimate states.
@@ -271,6 +387,12 @@ class Plant:
     integrator : {"euler", "rk4"}
         How the model's accelerations are compared with two states: as that at the first one, or
         integrated over the step by the method of Runge and Kutta.
+    delay : float or Unknown
+        Time from an input to its effect [s], fractions of a step included.
+    lag : float or Unknown
+        Time constant of the actuator, which follows an input as a filter of first order [s].
+    supply : float
+        Largest magnitude of each input that the actuator can apply; what is beyond is cut.
 
     Raises
     ------
@@ -286,11 +408,14 @@ class Plant:
     learned: Sequence[str]
     box: Mapping[str, float]
     angles: Sequence[str] = ()
-    constants: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    constants: Mapping[str, float | Unknown] = dataclasses.field(default_factory=dict)
     limit: float = 1e4
     integrator: str = "euler"
-    measured: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    measured: Mapping[str, float | Encoder] = dataclasses.field(default_factory=dict)
     velocity_cutoff: float = 2.0
+    delay: float | Unknown = 0.0
+    lag: float | Unknown = 0.0
+    supply: float = math.inf
 
     def __post_init__(self) -> None:
         self._check_types()
@@ -332,15 +457,25 @@ class Plant:
     def _check_numbers(self) -> None:
         positive = {"dt": self.dt, "gamma": self.gamma, "limit": self.limit}
         positive["velocity_cutoff"] = self.velocity_cutoff
-        for what in ("box", "measured"):
-            named = getattr(self, what)
+        measured = {k: v for k, v in self.measured.items() if not isinstance(v, Encoder)}
+        for what, named in (("box", self.box), ("measured", measured)):
             positive |= {f"{what}['{name}']": number for name, number in named.items()}
-        for what, value in positive.items():
-            if not _is_number(value) or value <= 0:
-                raise _unlike(what, value, "a positive number")
+        for what, number in positive.items():
+            if not _is_number(number) or number <= 0:
+                raise _unlike(what, number, "a positive number")
         for name, value in self.constants.items():
-            if not _is_number(value):
-                raise _unlike(f"constants['{name}']", value, "a finite number")
+            if not (_is_number(value) or isinstance(value, Unknown)):
+                raise _unlike(f"constants['{name}']", value, "a finite number or dopt.unknown()")
+        for name, noise in self.measured.items():
+            if isinstance(noise, Encoder) and name not in self.angles:
+                raise _unlike(f"measured['{name}']", noise, "an encoder of one of the angles")
+        for what in _TIMES:
+            given = getattr(self, what)
+            first = given.value if isinstance(given, Unknown) else given
+            if not _is_number(first) or first < 0:
+                raise _unlike(what, given, "a number of seconds, at least 0, or dopt.unknown()")
+        if not (_is_number(self.supply) or self.supply == math.inf) or self.supply <= 0:
+            raise _unlike("supply", self.supply, "a positive number")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the declaration, and not the class that was made of it."""
@@ -353,15 +488,22 @@ class Plant:
         lists = {key: list(getattr(self, key)) for key in _LISTS}
         numbers = {key: float(getattr(self, key)) for key in ("dt", "gamma", "limit")}
         named = {
-            key: {name: float(value) for name, value in getattr(self, key).items()}
+            key: {name: _section_of(value) for name, value in getattr(self, key).items()}
             for key in ("box", "constants")
         }
         section = {"name": NAME, **ordered, "known": self.known, **named, **lists, **numbers}
         if self.integrator != "euler":  # explorations were stored before there was another one
             section["integrator"] = self.integrator
         if self.measured:
-            section["measured"] = {name: float(value) for name, value in self.measured.items()}
+            section["measured"] = {
+                name: _section_of(value) for name, value in self.measured.items()
+            }
             section["velocity_cutoff"] = float(self.velocity_cutoff)
+        section |= {
+            what: _section_of(getattr(self, what)) for what in _TIMES if getattr(self, what)
+        }
+        if self.supply < math.inf:
+            section["supply"] = float(self.supply)
         return section
 
     @classmethod
@@ -372,7 +514,11 @@ class Plant:
         for key in given:
             if key not in fields:
                 raise unknown_name("field of a plant", key, fields)
-        ordered = {key: dict(given[key]) for key in _ORDERED}
+        ordered: dict[str, Any] = {key: dict(given[key]) for key in _ORDERED}
+        for key in ("constants", "measured"):
+            named = given.get(key, {})
+            ordered[key] = {name: _from_section(value) for name, value in named.items()}
+        ordered |= {key: _from_section(given[key]) for key in _TIMES if key in given}
         return cls(**(given | ordered)).system(section["horizon"])
 
     def system(self, horizon: int) -> ExploredPlant:
@@ -387,12 +533,20 @@ class Plant:
             integrator=self.integrator,
             measured_states=tuple(i for i, name in enumerate(self.states) if name in self.measured),
             measurement_noise=tuple(
-                float(self.measured[name]) for name in self.states if name in self.measured
+                _noise(self.measured[name]) for name in self.states if name in self.measured
             ),
             velocity_cutoff=self.velocity_cutoff,
             grid_half_widths=tuple(half_widths[name] for name in axes),
             grid_points=(GRID_POINTS,) * len(axes),
         )
+
+    @property
+    def guesses(self) -> dict[str, float]:
+        """The constants, each unknown one by its first guess."""
+        return {
+            name: float(value.value if isinstance(value, Unknown) else value)
+            for name, value in self.constants.items()
+        }
 
     @functools.cached_property
     def _class(self) -> type[ExploredPlant]:
@@ -404,7 +558,7 @@ class Plant:
         features = [one for i in axes for one in _features(i, names[i] in self.angles)]
         declared: dict[str, Any] = {
             "plant": self,
-            "_constants": tuple(float(value) for value in self.constants.values()),
+            "_constants": tuple(self.guesses.values()),
             "physical": tuple(self.constants),
             "state_labels": tuple(f"{name} [{unit}]" for name, unit in self.states.items()),
             "input_labels": tuple(f"{name} [{unit}]" for name, unit in self.inputs.items()),
@@ -413,7 +567,7 @@ class Plant:
             "features": tuple(features),
             "grid_indices": tuple(axes),
             "phase_plane": _phase_plane(axes, names),
-            "known": staticmethod(compiled_text(known, groups, self.constants)),
+            "known": staticmethod(compiled_text(known, groups, self.guesses)),
             "accelerations": staticmethod(unknown_accelerations(len(self.learned))),
         }
         return dataclasses.dataclass(frozen=True, kw_only=True)(
