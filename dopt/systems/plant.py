@@ -251,6 +251,10 @@ class Unknown:
             return self.value * math.exp(math.log(self.factor) * z)
         return self.value + self.spread * z
 
+    def slope(self, z: float) -> float:
+        """Return the derivative of :meth:`at`."""
+        return math.log(self.factor) * self.at(z) if self.factor else self.spread
+
 
 def unknown(value: float, factor: float | None = None, *, spread: float | None = None) -> Unknown:
     """Return a number that a fit estimates: a first guess, and how far off it may be.

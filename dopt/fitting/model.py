@@ -1,0 +1,331 @@
+"""The simulated model of a plant: which parameters there are, and their values."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+from dopt.errors import SpecificationError
+from dopt.fitting.simulation import COMPLEX_KNOWN, Data, Structure, Values, Work, work_for
+from dopt.kernel.compiler import compilable
+from dopt.kernel.equations import KNOWN, as_tuple
+from dopt.kernel.plain import PLAIN
+from dopt.log import Log, Piece
+from dopt.systems.black_box import differentiated
+from dopt.systems.plant import Encoder, Plant, Unknown, compiled_text
+from dopt.types import Array, CompiledFunction, Equation
+
+_KINDS = {"identity": 0, "cos": 1, "sin": 2}
+
+HOLDS = ("zero", "linear")
+
+FINEST = 0.004
+"""Longest part of a sample over which a linearly interpolated input is taken as constant [s]."""
+
+
+@functools.lru_cache(maxsize=64)
+def compiled_known(plant_key: PlantKey) -> tuple[CompiledFunction, CompiledFunction, Equation]:
+    """Compile the known part of a plant for real and for complex numbers."""
+    plant = plant_key.plant
+    groups = {"states": [*plant.states], "inputs": [*plant.inputs], "constants": [*plant.constants]}
+    texts = {f"known['{name}']": plant.known.get(name, "0.0") for name in plant.states}
+    equation = compiled_text(texts, groups, plant.guesses)
+    d, m, c = (len(group) for group in groups.values())
+    function = compilable(equation)
+
+    def into(x: Array, u: Array, p: Array, out: Array) -> None:
+        values = function(as_tuple(x, d), as_tuple(u, m), as_tuple(p, c))
+        for i in range(len(values)):
+            out[i] = values[i]
+
+    if PLAIN:
+        return into, into, equation
+    both = []
+    for signature in (KNOWN, COMPLEX_KNOWN):
+        code = numba.njit(error_model="numpy", fastmath=False)(into)
+        code.compile(signature.args)
+        code.disable_compile()
+        both.append(code)
+    return both[0], both[1], equation
+
+
+class PlantKey:
+    """A plant as the key of a cache: equal where its known part is."""
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+        groups = (plant.states, plant.inputs, plant.constants)
+        self._key = (*map(tuple, groups), tuple(plant.known.items()))
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, PlantKey) and self._key == other._key
+
+
+class Layout(NamedTuple):
+    """How the inputs and outputs of a network are scaled: seen ranges of a fit without one."""
+
+    centers: Array  # (p,)
+    scales: Array  # (p,)
+    sizes: Array  # (r,)
+
+
+class Model:
+    """A plant as it is simulated.
+
+    The parameters p are the unknown constants, the weights of the network, and where they are
+    unknown the delay and the lag, each in standard deviations of its prior.
+
+    Attributes
+    ----------
+    prior : (q,)
+        Centre of the prior, at which a fit begins.
+    names : tuple of str
+        The n parameters that have a name, which come first, and delay and lag, which come last.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        width: int = 0,
+        layout: Layout | None = None,
+        delay: float = 0.0,
+        free_delay: bool = False,
+        free_lag: bool = False,
+        seed: int = 0,
+        longest_step: float | None = None,
+    ) -> None:
+        self.plant, self.width, self.layout, self.delay = plant, width, layout, delay
+        system = plant.system(1)
+        self.d, self.m, self.c = len(plant.states), len(plant.inputs), len(plant.constants)
+        real, complex_, self.equation = compiled_known(PlantKey(plant))
+        constants = list(plant.constants.items())
+        self.unknown = {k: v for k, v in constants if isinstance(v, Unknown)}
+        places = [i for i, (_, value) in enumerate(constants) if isinstance(value, Unknown)]
+        features = system.features
+        p, r = len(features), len(system.learned_rows)
+        layout = layout or Layout(np.zeros(p), np.ones(p), np.ones(r))
+        measured = [i for i, name in enumerate(plant.states) if name in measured_names(plant)]
+        self.rates = rates_of(plant, measured)
+        self.structure = Structure(
+            known=real,
+            complex_known=complex_,
+            unknown=np.array(places, np.int64),
+            learned=np.array(system.learned_rows, np.int64),
+            feature_kinds=np.array([_KINDS[f.kind] for f in features], np.int64),
+            feature_indices=np.array([f.index for f in features], np.int64),
+            feature_centers=layout.centers,
+            feature_scales=layout.scales,
+            measured=np.array(measured, np.int64),
+            width=width,
+            free_delay=free_delay,
+            free_lag=free_lag,
+            longest_step=longest_step or plant.dt,
+            limit=float(plant.limit),
+        )
+        self.sizes = layout.sizes
+        self._guesses = np.array([*plant.guesses.values()], float)
+        n_weights = (p + 1) * width + (width + 1) * r if width else 0
+        weights = np.zeros(n_weights)
+        drawn = np.random.default_rng(seed).standard_normal((p + 1) * width)
+        weights[: len(drawn)] = drawn  # the output layer begins at zero
+        self.n_named, self.n_weights = len(places), n_weights
+        times = np.zeros(int(free_delay) + int(free_lag))
+        self.prior = np.concatenate([np.zeros(len(places)), weights, times])
+        last = ["delay"] * free_delay + ["lag"] * free_lag
+        self.names = (*self.unknown, *last)
+        self.named = [*range(len(places)), *range(len(self.prior) - len(times), len(self.prior))]
+
+    @property
+    def q(self) -> int:
+        """Number of parameters."""
+        return len(self.prior)
+
+    def with_network(self, width: int, layout: Layout, seed: int) -> Model:
+        """Return the same model with a network beside the known part."""
+        s = self.structure
+        return Model(
+            self.plant,
+            width=width,
+            layout=layout,
+            delay=self.delay,
+            free_delay=s.free_delay,
+            free_lag=s.free_lag,
+            seed=seed,
+            longest_step=s.longest_step,
+        )
+
+    def extended(self, p: Array, other: Model) -> Array:
+        """Return the parameters of another model without a network in the places of this one."""
+        out = self.prior.copy()
+        out[self.named] = p[other.named]
+        return out
+
+    def values(self, p: Array) -> Values:
+        """Return the values of the parameters."""
+        constants = self._guesses.copy()
+        slopes = np.empty(len(self.unknown))
+        for j, (at, unknown) in enumerate(
+            zip(self.structure.unknown, self.unknown.values(), strict=True)
+        ):
+            constants[at] = unknown.at(p[j])
+            slopes[j] = unknown.slope(p[j])
+        at = self.n_named + self.n_weights
+        delay, lag, lag_slope = self.delay, self.plant.lag, 0.0
+        if self.structure.free_delay:
+            delay += self.plant.dt * p[at]
+            at += 1
+        if isinstance(lag, Unknown):
+            z = p[at] if self.structure.free_lag else 0.0
+            lag, lag_slope = lag.at(z), lag.slope(z)
+        weights = np.ascontiguousarray(p[self.n_named : self.n_named + self.n_weights])
+        sizes = np.ascontiguousarray(self.sizes)
+        numbers = (float(delay), float(lag), float(self.plant.dt), float(lag_slope))
+        return Values(constants, slopes, weights, sizes, *numbers)
+
+    def named_values(self, p: Array) -> tuple[dict[str, float], Array]:
+        """Return the named parameters, and the derivative of each by its entry of p."""
+        values = self.values(p)
+        found = {
+            name: float(values.constants[at])
+            for name, at in zip(self.unknown, self.structure.unknown, strict=True)
+        }
+        slopes = [*values.slopes]
+        if self.structure.free_delay:
+            found["delay"] = values.delay
+            slopes.append(values.delay_slope)
+        if self.structure.free_lag:
+            found["lag"] = values.lag
+            slopes.append(values.lag_slope)
+        return found, np.array(slopes)
+
+    def derivative(self, p: Array, states: Array, inputs: Array) -> Array:
+        """Return dx/dt, (N, d), at states, (N, d), under inputs that act, (N, m)."""
+        values = self.values(p)
+        rows = self.equation(tuple(states.T), tuple(inputs.T), tuple(values.constants))
+        out = np.stack(np.broadcast_arrays(*rows, states[:, 0])[:-1], axis=-1).astype(float)
+        if self.width:
+            out[:, self.structure.learned] += self.network(values.weights, states)
+        return out
+
+    def network(self, weights: Array, states: Array) -> Array:
+        """Return the accelerations of the network, (N, r), at states, (N, d)."""
+        s, w = self.structure, self.width
+        p, r = len(s.feature_kinds), len(s.learned)
+        x = states[:, s.feature_indices]
+        scaled = (x - s.feature_centers) / s.feature_scales
+        phi = np.select([s.feature_kinds == 1, s.feature_kinds == 2], [np.cos(x), np.sin(x)], scaled)
+        W1, b1 = weights[: w * p].reshape(w, p), weights[w * p : w * p + w]
+        W2 = weights[w * p + w : w * p + w + r * w].reshape(r, w)
+        out: Array = (np.tanh(phi @ W1.T + b1) @ W2.T + weights[-r:]) * self.sizes
+        return out
+
+    def work(self, sensitive: bool) -> Work:
+        """Return arrays of one simulation."""
+        sizes = (len(self.structure.feature_kinds), self.structure.width)
+        return work_for(self.d, self.m, self.q if sensitive else 0, self.c, *sizes)
+
+
+def measured_names(plant: Plant) -> tuple[str, ...]:
+    """Return the states that are measured, all where none is named."""
+    return tuple(name for name in plant.states if name in plant.measured) or tuple(plant.states)
+
+
+def rates_of(plant: Plant, measured: Sequence[int]) -> dict[int, int]:
+    """Return which state is the rate of which measured one."""
+    noise = {name: plant.measured.get(name, 1.0) for name in measured_names(plant)}
+    found = differentiated(_with(plant, noise).system(1))
+    return {i: of for i, of in enumerate(found) if of >= 0 and i not in measured}
+
+
+def _with(plant: Plant, measured: Mapping[str, float | Encoder]) -> Plant:
+    import dataclasses
+
+    return dataclasses.replace(plant, measured=measured)
+
+
+def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | None = None) -> Data:
+    """Return the pieces of logs one after the other.
+
+    With a linear hold each sample is divided into parts of constant input, so that the input is
+    interpolated between two rows; the rows in between have no measurement.
+
+    Raises
+    ------
+    SpecificationError
+        If a log has other states or inputs than the plant.
+    """
+    if hold not in HOLDS:
+        raise SpecificationError(
+            f"hold is {hold!r}, but one of {', '.join(HOLDS)} is expected: choose 'zero' for "
+            f"inputs that are held between two rows, 'linear' for inputs that were measured."
+        )
+    wanted = measured_names(plant)
+    pieces: list[Piece] = []
+    for log in logs:
+        missing = [name for name in (*wanted, *plant.inputs) if name not in (*log.states, *log.inputs)]
+        if missing:
+            raise SpecificationError(
+                f"a log has the states {', '.join(log.states)} and the inputs "
+                f"{', '.join(log.inputs)}, but {missing[0]} of the plant is expected as well: name "
+                f"its column, or leave it out of 'measured'."
+            )
+        columns = [log.states.index(name) for name in wanted]
+        given = [log.inputs.index(name) for name in plant.inputs]
+        for piece in log.pieces:
+            one = Piece(piece.time, piece.measured[:, columns], piece.inputs[:, given])
+            pieces.append(_interpolated(one) if hold == "linear" else one)
+    pieces = [piece for piece in pieces if len(piece.time) > 1]
+    if not pieces:
+        raise SpecificationError(
+            "the logs have no two rows in a row, but pieces of some hundred rows are expected: "
+            "see the notes of the logs."
+        )
+    sizes = np.array([len(piece.time) for piece in pieces])
+    ends = np.cumsum(sizes)
+    cut = np.clip(np.concatenate([piece.inputs for piece in pieces]), -plant.supply, plant.supply)
+    measured = np.ascontiguousarray(np.concatenate([piece.measured for piece in pieces]))
+    return Data(
+        np.concatenate([piece.time for piece in pieces]),
+        measured,
+        np.ascontiguousarray(cut),
+        np.repeat(ends - sizes, sizes),
+        np.repeat(ends - 1, sizes),
+        _first_deviations(plant, measured) if deviations is None else deviations,
+    )
+
+
+def _first_deviations(plant: Plant, measured: Array) -> Array:
+    """Return declared standard deviations of the noise, or a thousandth of what was seen."""
+    out = []
+    for name, column in zip(measured_names(plant), measured.T, strict=True):
+        noise = plant.measured.get(name)
+        if isinstance(noise, Encoder):
+            out.append(noise.noise)
+        elif noise is not None:
+            out.append(float(noise))
+        else:
+            out.append(max(1e-3 * float(np.nanstd(column)), 1e-300))
+    return np.array(out)
+
+
+def _interpolated(piece: Piece) -> Piece:
+    t, y, u = piece
+    parts = max(1, math.ceil(float(np.median(np.diff(t))) / FINEST))
+    if parts == 1:
+        parts = 2
+    share = np.arange(parts) / parts
+    time = np.concatenate([(t[:-1, None] + np.diff(t)[:, None] * share).ravel(), t[-1:]])
+    middle = (share + 0.5 / parts)[None, :, None]
+    between = u[:-1, None] + np.diff(u, axis=0)[:, None] * middle
+    measured = np.full((len(time), y.shape[1]), np.nan)
+    measured[::parts] = y
+    return Piece(time, measured, np.concatenate([between.reshape(-1, u.shape[1]), u[-1:]]))

@@ -1,0 +1,297 @@
+"""Least squares of simulated windows: rows of a log, parameters with priors, damped steps.
+
+What is minimised over the parameters p and the initial states is
+
+    Σ_k ρ(‖e_k‖²) / s² + ‖(p - p₀)/σ‖²
+
+with e_k the residuals of window k in standard deviations, ρ(r) = c log(1 + r/c) the loss of Cauchy
+(windows that nothing fits count little), and s the factor by which the residuals are larger than
+their deviations say: they are smooth curves, so that a window has few that are independent. A step is
+taken by the method of Levenberg and Marquardt.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import blas, cho_factor, cho_solve
+
+from dopt.fitting import simulation
+from dopt.fitting.simulation import Data, Structure, Values, Work, work_for
+from dopt.types import Array, Integers
+
+BATCH_ROWS = 1200
+"""Rows that are multiplied at once: as many as stay in the processor's cache."""
+
+ROBUSTNESS = 4.0
+"""c of ρ, by the median of ‖e_k‖²."""
+
+STUCK = 1e12
+"""What a window that leaves the limit counts for, by c."""
+
+
+class Linear(NamedTuple):
+    """The problem at p, linearised; windows one after the other."""
+
+    normal: Array  # (q, q) Σ RᵀR of the windows, weighted
+    slope: Array  # (q,) Σ Rᵀe
+    squares: Array  # (k,) ‖e‖²
+    T: Array  # (k, d, d)
+    C: Array  # (k, d, q)
+    g: Array  # (k, d)
+    scores: Array | None  # (k, q) Rᵀe of each window
+
+
+class Model:
+    """A plant as it is simulated: which parameters there are, and their values.
+
+    Attributes
+    ----------
+    structure : Structure
+    names : tuple of str
+        The parameters that have a name: unknown constants, delay, lag.
+    q : int
+        Number of parameters.
+    prior : (q,)
+        Where the parameters begin; their prior standard deviations are 1.
+    """
+
+    def __init__(self, structure: Structure, make: Any, prior: Array, d: int, m: int, c: int):
+        self.structure, self.values, self.prior = structure, make, prior
+        self.q, self.d, self.m, self.c = len(prior), d, m, c
+
+    def work(self, sensitive: bool) -> Work:
+        s = self.structure
+        sizes = (len(s.feature_kinds), s.width)
+        return work_for(self.d, self.m, self.q if sensitive else 0, self.c, *sizes)
+
+
+class Windows(NamedTuple):
+    """Windows of a log, by their first and last rows, and their initial states."""
+
+    rows: Integers  # (k, 2)
+    starts: Array  # (k, d)
+
+    def counts(self, data: Data) -> Array:
+        """Return how many numbers were measured in each."""
+        seen = np.concatenate([[0], np.cumsum(np.isfinite(data.measured).sum(axis=1))])
+        return (seen[self.rows[:, 1] + 1] - seen[self.rows[:, 0]]).astype(float)
+
+
+@dataclass
+class Simulator:
+    """Simulations of one model over one set of data."""
+
+    model: Model
+    data: Data
+
+    def __post_init__(self) -> None:
+        self.tolerance = simulation.TOGETHER * float(np.median(np.diff(self.data.time)))
+        self._dull, self._sharp = self.model.work(False), self.model.work(True)
+
+    @property
+    def channels(self) -> int:
+        return len(self.model.structure.measured)
+
+    def filtered(self, values: Values) -> tuple[Array, Array]:
+        N, m = self.data.inputs.shape
+        v, dv = np.empty((N, m)), np.empty((N, m, 2))
+        call(simulation.filter_inputs, self.data, values, self.tolerance, v, dv)
+        return v, dv
+
+    def squares(self, p: Array, windows: Windows) -> Array:
+        values = self.model.values(p)
+        out = np.empty(len(windows.rows))
+        call(
+            *(simulation.write_squares, self.model.structure, values, self.data),
+            *(windows.rows, windows.starts, *self.filtered(values), self.tolerance),
+            *(self._dull, out),
+        )
+        return out
+
+    def states(self, p: Array, first: int, last: int, start: Array) -> Array:
+        """Return simulated states, (rows, d), NaN from where they leave the limit."""
+        values = self.model.values(p)
+        out = np.full((last - first + 1, self.model.d), np.nan)
+        nothing = np.empty((0, self.model.d, 0))
+        call(
+            *(simulation.run, self.model.structure, values, self.data, first, last, start),
+            *(*self.filtered(values), self.tolerance, self._dull, False, out, nothing),
+        )
+        return out
+
+    def linear(self, p: Array, windows: Windows, weights: Array, scores: bool = False) -> Linear:
+        """Return the problem linearised at p, with a weight for each window's squares."""
+        model, data, q, d = self.model, self.data, self.model.q, self.model.d
+        values, k = model.values(p), len(windows.rows)
+        v, dv = self.filtered(values)
+        normal, slope = np.zeros((q, q), order="F"), np.zeros(q)
+        squares = np.empty(k)
+        T, C, g = np.empty((k, d, d)), np.empty((k, d, q)), np.empty((k, d))
+        each = np.zeros((k, q)) if scores else None
+        roots = np.sqrt(weights)
+        sizes = (windows.rows[:, 1] - windows.rows[:, 0] + 1) * self.channels
+        for first, last in _batches(sizes):
+            n = int(sizes[first:last].sum())
+            R, e = np.empty((n, q)), np.empty(n)
+            part = slice(first, last)
+            call(
+                *(simulation.write_rows, model.structure, values, data, windows.rows[part]),
+                *(windows.starts[part], roots[part], v, dv, self.tolerance, self._sharp),
+                *(R, e, T[part], C[part], g[part], squares[part]),
+            )
+            normal = blas.dsyrk(1.0, R.T, beta=1.0, c=normal, overwrite_c=True)
+            slope += e @ R
+            if each is not None:
+                ends = np.concatenate([[0], np.cumsum(sizes[part])])
+                for i in range(last - first):
+                    own = slice(ends[i], ends[i + 1])
+                    each[first + i] = e[own] @ R[own]
+        normal = np.triu(normal) + np.triu(normal, 1).T
+        return Linear(normal, slope, squares, T, C, g, each)
+
+
+def _batches(sizes: Integers) -> list[tuple[int, int]]:
+    """Return ranges of windows of about ``BATCH_ROWS`` rows each."""
+    out, first, total = [], 0, 0
+    for k, size in enumerate(sizes):
+        total += size
+        if total >= BATCH_ROWS:
+            out.append((first, k + 1))
+            first, total = k + 1, 0
+    if first < len(sizes):
+        out.append((first, len(sizes)))
+    return out
+
+
+class Solution(NamedTuple):
+    """A minimum."""
+
+    p: Array
+    windows: Windows
+    squares: Array  # (k,)
+    scale: Array  # (k,) c of each window
+    steps: int
+    converged: bool
+
+
+def robust(squares: Array, scale: Array) -> Array:
+    """Return ρ of each window."""
+    return scale * np.log1p(np.minimum(squares / scale, STUCK))
+
+
+def robust_scale(squares: Array, counts: Array) -> Array:
+    """Return c of each window."""
+    finite = np.isfinite(squares)
+    share = squares[finite] / counts[finite]
+    typical = float(np.median(share)) if len(share) else 1.0
+    return ROBUSTNESS * max(typical, 1e-300) * counts
+
+
+def solve(
+    simulator: Simulator,
+    windows: Windows,
+    p: Array,
+    s: float,
+    *,
+    most: int = 30,
+    scale: Array | None = None,
+    tolerance: float = 1e-4,
+    deviations: Array | float = 1.0,
+    say: Any = None,
+) -> Solution:
+    """Minimise over p and the initial states, from given ones."""
+    model, counts = simulator.model, windows.counts(simulator.data)
+    squares = simulator.squares(p, windows)
+    scale = robust_scale(squares, counts) if scale is None else scale
+    precision = np.broadcast_to(1.0 / np.square(deviations), (model.q,))
+
+    def cost(squares: Array, p: Array) -> float:
+        prior = np.sum(precision * (p - model.prior) ** 2)
+        return float(robust(squares, scale).sum() / s**2 + prior)
+
+    value, damping, calm, steps = cost(squares, p), 1e-3, 0, 0
+    converged = False
+    while steps < most and not converged:
+        steps += 1
+        weights = 1.0 / (1.0 + squares / scale)
+        linear = simulator.linear(p, windows, weights / s**2)
+        H = linear.normal + np.diag(precision)
+        b = linear.slope - precision * (p - model.prior)
+        D = np.diag(H).copy()
+        while True:
+            try:
+                step = cho_solve(cho_factor(H + np.diag(damping * D), check_finite=False), b, check_finite=False)
+            except np.linalg.LinAlgError:
+                damping = max(10 * damping, 1e-6)
+                continue
+            trial = p + step
+            moved = windows._replace(starts=_moved(windows.starts, linear, step))
+            after = simulator.squares(trial, moved)
+            new = cost(after, trial)
+            if new < value:
+                break
+            damping *= 8.0
+            if damping > 1e8:
+                break
+        if not new < value:
+            converged = True
+            break
+        fall = (value - new) / value
+        p, windows, squares, value = trial, moved, after, new
+        if say:
+            say(f"  step {steps}: cost {value:.6g}, fall {fall:.1e}, damping {damping:.0e}")
+        damping = max(damping / 8.0, 1e-9)
+        calm = calm + 1 if fall < tolerance else 0
+        converged = calm >= 2
+    return Solution(p, windows, squares, scale, steps, converged)
+
+
+def _moved(starts: Array, linear: Linear, step: Array) -> Array:
+    """Return the initial states after a step of the parameters."""
+    right = linear.g - linear.C @ step
+    d = starts.shape[1]
+    delta = np.zeros_like(starts)
+    for i in range(d - 1, -1, -1):  # back substitution, a column without a pivot stays
+        rest = right[:, i] - np.einsum("kj,kj->k", linear.T[:, i, i + 1 :], delta[:, i + 1 :])
+        pivot = linear.T[:, i, i]
+        delta[:, i] = np.divide(rest, pivot, out=np.zeros_like(rest), where=pivot != 0)
+    return starts + delta
+
+
+def call(function: Any, *arguments: Any) -> Any:
+    """Call a compiled function with its functions as pointers."""
+    from dopt.kernel.plain import PLAIN
+
+    if PLAIN:
+        return function(*arguments)
+    return _code(function, tuple(map(_kind, arguments)))(*arguments)
+
+
+@functools.cache
+def _code(function: Any, kinds: tuple[Any, ...]) -> Any:
+    return function.compile(kinds)
+
+
+def _kind(value: Any) -> Any:
+    import numba
+    from numba import types
+
+    if isinstance(value, Structure):
+        from dopt.kernel.equations import KNOWN
+
+        functions = [types.FunctionType(KNOWN), types.FunctionType(simulation.COMPLEX_KNOWN)]
+        return types.NamedTuple([*functions, *map(_kind, value[2:])], Structure)
+    if isinstance(value, tuple):
+        return types.NamedTuple([*map(_kind, value)], type(value))
+    if isinstance(value, bool):
+        return types.boolean
+    if isinstance(value, (int, np.integer)):
+        return types.int64
+    if isinstance(value, float):
+        return types.float64
+    return numba.typeof(value)
