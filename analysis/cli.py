@@ -22,6 +22,7 @@ from analysis.data.matching import REFERENCE, Filter, read_condition
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
 from analysis.errors import AnalysisError, IncompleteError
+from analysis.logs import report as log_report
 from analysis.outputs import NAMES, partial_warning
 from analysis.serve import is_loopback
 from analysis.stats.curves import Axis, PlotOptions, Spread
@@ -148,6 +149,9 @@ def parser() -> Parser:
     for option, default, what in (("--frames", 150, "pictures in all"), ("--fps", 15, "a second")):
         number = positive(option, int)
         animate.add_argument(option, type=number, default=default, help=f"{what} ({default})")
+    recorded = commands.add_parser("log", help=log_report.HELP, description=log_report.HELP)
+    log_report.add_arguments(recorded)
+    recorded.set_defaults(alone=log_report.run)
     _add_serve(commands)
     return top
 

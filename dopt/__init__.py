@@ -19,6 +19,7 @@ shows the equations, units and defaults of one.
 ``Plant``               names, units, bounds and the known part of such a plant
 ``unknown``             a constant, delay or lag of a plant that a fit estimates
 ``encoder``             how an angle of a plant is measured
+``Log``                 a recorded run of a plant, in pieces without gaps
 ``fit_offline``         fit the model of a trial to samples, all at once
 ``TrialSpec``           one trial: system, policy, model, learner and seed
 ``TrialResult``         losses, states, inputs and model parameters of one trial
@@ -39,6 +40,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from dopt.explorer import Explorer as Explorer
     from dopt.learning import LEARNERS as LEARNERS
+    from dopt.log import Log as Log
     from dopt.models import MODELS as MODELS
     from dopt.offline_fit import fit_offline as fit_offline
     from dopt.policies import POLICIES as POLICIES
@@ -58,6 +60,7 @@ __all__ = [
     "POLICIES",
     "SYSTEMS",
     "Explorer",
+    "Log",
     "Plant",
     "TrialResult",
     "TrialSpec",
@@ -71,6 +74,7 @@ __all__ = [
 _MODULES = {
     "Explorer": "dopt.explorer",
     "LEARNERS": "dopt.learning",
+    "Log": "dopt.log",
     "MODELS": "dopt.models",
     "POLICIES": "dopt.policies",
     "Plant": "dopt.systems.plant",

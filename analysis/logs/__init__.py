@@ -1,0 +1,1 @@
+"""Recorded runs: reading, and a report of their health."""
