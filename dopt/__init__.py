@@ -20,6 +20,7 @@ shows the equations, units and defaults of one.
 ``unknown``             a constant, delay or lag of a plant that a fit estimates
 ``encoder``             how an angle of a plant is measured
 ``Log``                 a recorded run of a plant, in pieces without gaps
+``fit``                 fit a plant's unknown constants and a network to recorded logs
 ``fit_offline``         fit the model of a trial to samples, all at once
 ``TrialSpec``           one trial: system, policy, model, learner and seed
 ``TrialResult``         losses, states, inputs and model parameters of one trial
@@ -39,6 +40,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dopt.explorer import Explorer as Explorer
+    from dopt.fitting.fit import fit as fit
     from dopt.learning import LEARNERS as LEARNERS
     from dopt.log import Log as Log
     from dopt.models import MODELS as MODELS
@@ -66,6 +68,7 @@ __all__ = [
     "TrialSpec",
     "__version__",
     "encoder",
+    "fit",
     "fit_offline",
     "run_trial",
     "unknown",
@@ -82,6 +85,7 @@ _MODULES = {
     "TrialResult": "dopt.result",
     "TrialSpec": "dopt.spec.trial",
     "encoder": "dopt.systems.plant",
+    "fit": "dopt.fitting.fit",
     "fit_offline": "dopt.offline_fit",
     "run_trial": "dopt.run",
     "unknown": "dopt.systems.plant",

@@ -29,9 +29,9 @@ FINEST = 0.004
 
 
 @functools.lru_cache(maxsize=64)
-def compiled_known(plant_key: PlantKey) -> tuple[CompiledFunction, CompiledFunction, Equation]:
+def compiled_known(key: PlantKey) -> tuple[CompiledFunction, CompiledFunction, Equation]:
     """Compile the known part of a plant for real and for complex numbers."""
-    plant = plant_key.plant
+    plant = key.plant
     groups = {"states": [*plant.states], "inputs": [*plant.inputs], "constants": [*plant.constants]}
     texts = {f"known['{name}']": plant.known.get(name, "0.0") for name in plant.states}
     equation = compiled_text(texts, groups, plant.guesses)
@@ -166,7 +166,9 @@ class Model:
     def extended(self, p: Array, other: Model) -> Array:
         """Return the parameters of another model without a network in the places of this one."""
         out = self.prior.copy()
-        out[self.named] = p[other.named]
+        places = dict(zip(self.names, self.named, strict=True))
+        for name, at in zip(other.names, other.named, strict=True):
+            out[places[name]] = p[at]
         return out
 
     def values(self, p: Array) -> Values:
@@ -222,16 +224,18 @@ class Model:
         p, r = len(s.feature_kinds), len(s.learned)
         x = states[:, s.feature_indices]
         scaled = (x - s.feature_centers) / s.feature_scales
-        phi = np.select([s.feature_kinds == 1, s.feature_kinds == 2], [np.cos(x), np.sin(x)], scaled)
+        phi = np.select(
+            [s.feature_kinds == 1, s.feature_kinds == 2], [np.cos(x), np.sin(x)], scaled
+        )
         W1, b1 = weights[: w * p].reshape(w, p), weights[w * p : w * p + w]
         W2 = weights[w * p + w : w * p + w + r * w].reshape(r, w)
         out: Array = (np.tanh(phi @ W1.T + b1) @ W2.T + weights[-r:]) * self.sizes
         return out
 
-    def work(self, sensitive: bool) -> Work:
-        """Return arrays of one simulation."""
+    def work(self, columns: int) -> Work:
+        """Return arrays of one simulation, with so many columns of S."""
         sizes = (len(self.structure.feature_kinds), self.structure.width)
-        return work_for(self.d, self.m, self.q if sensitive else 0, self.c, *sizes)
+        return work_for(self.d, self.m, columns, self.c, *sizes)
 
 
 def measured_names(plant: Plant) -> tuple[str, ...]:
@@ -271,7 +275,9 @@ def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | No
     wanted = measured_names(plant)
     pieces: list[Piece] = []
     for log in logs:
-        missing = [name for name in (*wanted, *plant.inputs) if name not in (*log.states, *log.inputs)]
+        missing = [
+            name for name in (*wanted, *plant.inputs) if name not in (*log.states, *log.inputs)
+        ]
         if missing:
             raise SpecificationError(
                 f"a log has the states {', '.join(log.states)} and the inputs "

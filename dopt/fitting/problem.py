@@ -13,21 +13,25 @@ taken by the method of Levenberg and Marquardt.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
+from numba import types
 from scipy.linalg import blas, cho_factor, cho_solve
 
 from dopt.fitting import simulation
-from dopt.fitting.simulation import Data, Structure, Values, Work, work_for
+from dopt.fitting.model import Model
+from dopt.fitting.simulation import COMPLEX_KNOWN, Data, Structure, Values
+from dopt.kernel.equations import KNOWN
+from dopt.kernel.plain import PLAIN
 from dopt.types import Array, Integers
 
 BATCH_ROWS = 1200
 """Rows that are multiplied at once: as many as stay in the processor's cache."""
 
-ROBUSTNESS = 4.0
+ROBUSTNESS = 1.0
 """c of ρ, by the median of ‖e_k‖²."""
 
 STUCK = 1e12
@@ -46,30 +50,6 @@ class Linear(NamedTuple):
     scores: Array | None  # (k, q) Rᵀe of each window
 
 
-class Model:
-    """A plant as it is simulated: which parameters there are, and their values.
-
-    Attributes
-    ----------
-    structure : Structure
-    names : tuple of str
-        The parameters that have a name: unknown constants, delay, lag.
-    q : int
-        Number of parameters.
-    prior : (q,)
-        Where the parameters begin; their prior standard deviations are 1.
-    """
-
-    def __init__(self, structure: Structure, make: Any, prior: Array, d: int, m: int, c: int):
-        self.structure, self.values, self.prior = structure, make, prior
-        self.q, self.d, self.m, self.c = len(prior), d, m, c
-
-    def work(self, sensitive: bool) -> Work:
-        s = self.structure
-        sizes = (len(s.feature_kinds), s.width)
-        return work_for(self.d, self.m, self.q if sensitive else 0, self.c, *sizes)
-
-
 class Windows(NamedTuple):
     """Windows of a log, by their first and last rows, and their initial states."""
 
@@ -82,20 +62,15 @@ class Windows(NamedTuple):
         return (seen[self.rows[:, 1] + 1] - seen[self.rows[:, 0]]).astype(float)
 
 
-@dataclass
 class Simulator:
-    """Simulations of one model over one set of data."""
+    """Simulations of one model over one set of data; not to be shared by threads."""
 
-    model: Model
-    data: Data
-
-    def __post_init__(self) -> None:
-        self.tolerance = simulation.TOGETHER * float(np.median(np.diff(self.data.time)))
-        self._dull, self._sharp = self.model.work(False), self.model.work(True)
-
-    @property
-    def channels(self) -> int:
-        return len(self.model.structure.measured)
+    def __init__(self, model: Model, data: Data) -> None:
+        self.model, self.data = model, data
+        self.tolerance = simulation.TOGETHER * float(np.median(np.abs(np.diff(data.time))))
+        self._dull, self._sharp = model.work(0), model.work(model.q + model.d)
+        self._starts = model.work(model.d)
+        self.channels = len(model.structure.measured)
 
     def filtered(self, values: Values) -> tuple[Array, Array]:
         N, m = self.data.inputs.shape
@@ -124,9 +99,58 @@ class Simulator:
         )
         return out
 
-    def linear(self, p: Array, windows: Windows, weights: Array, scores: bool = False) -> Linear:
-        """Return the problem linearised at p, with a weight for each window's squares."""
-        model, data, q, d = self.model, self.data, self.model.q, self.model.d
+    def residuals(self, p: Array, windows: Windows) -> Array:
+        """Return measured less simulated, (rows, n), in standard deviations."""
+        measured, out = self.model.structure.measured, []
+        for (first, last), start in zip(*windows, strict=True):
+            states = self.states(p, first, last, start)[:, measured]
+            out.append((self.data.measured[first : last + 1] - states) / self.data.deviations)
+        return np.concatenate(out)
+
+    def slopes(self, p: Array, first: int, last: int, start: Array) -> tuple[Array, Array]:
+        """Return simulated states, (rows, d), and S, (rows, d, q + d)."""
+        values, rows = self.model.values(p), last - first + 1
+        states = np.full((rows, self.model.d), np.nan)
+        S = np.full((rows, self.model.d, self.model.q + self.model.d), np.nan)
+        call(
+            *(simulation.run, self.model.structure, values, self.data, first, last, start),
+            *(*self.filtered(values), self.tolerance, self._sharp, True, states, S),
+        )
+        return states, S
+
+    def settled(self, p: Array, windows: Windows, steps: int = 8) -> Windows:
+        """Return the windows with the initial states that fit them best at p."""
+        ones = np.ones(len(windows.rows))
+        before = self.squares(p, windows)
+        for _ in range(steps):
+            linear = self.linear(p, windows, ones, starts_only=True)
+            moved = windows._replace(starts=_moved(windows.starts, linear, np.zeros(0)))
+            after = self.squares(p, moved)
+            better = after < before
+            if not better.any():
+                break
+            starts = np.where(better[:, None], moved.starts, windows.starts)
+            fall = float(np.max(1.0 - after[better] / before[better]))
+            windows, before = windows._replace(starts=starts), np.minimum(before, after)
+            if fall < 1e-4:
+                break
+        return windows
+
+    def linear(
+        self,
+        p: Array,
+        windows: Windows,
+        weights: Array,
+        *,
+        scores: bool = False,
+        starts_only: bool = False,
+    ) -> Linear:
+        """Return the problem linearised at p, with a weight for each window's squares.
+
+        With ``starts_only`` it is linearised by the initial states alone, q = 0.
+        """
+        model, data, d = self.model, self.data, self.model.d
+        q, work = (0, self._starts) if starts_only else (model.q, self._sharp)
         values, k = model.values(p), len(windows.rows)
         v, dv = self.filtered(values)
         normal, slope = np.zeros((q, q), order="F"), np.zeros(q)
@@ -141,11 +165,12 @@ class Simulator:
             part = slice(first, last)
             call(
                 *(simulation.write_rows, model.structure, values, data, windows.rows[part]),
-                *(windows.starts[part], roots[part], v, dv, self.tolerance, self._sharp),
+                *(windows.starts[part], roots[part], v, dv, self.tolerance, work),
                 *(R, e, T[part], C[part], g[part], squares[part]),
             )
-            normal = blas.dsyrk(1.0, R.T, beta=1.0, c=normal, overwrite_c=True)
-            slope += e @ R
+            if q:
+                normal = blas.dsyrk(1.0, R.T, beta=1.0, c=normal, overwrite_c=True)
+                slope += e @ R
             if each is not None:
                 ends = np.concatenate([[0], np.cumsum(sizes[part])])
                 for i in range(last - first):
@@ -225,7 +250,9 @@ def solve(
         D = np.diag(H).copy()
         while True:
             try:
-                step = cho_solve(cho_factor(H + np.diag(damping * D), check_finite=False), b, check_finite=False)
+                step = cho_solve(
+                    cho_factor(H + np.diag(damping * D), check_finite=False), b, check_finite=False
+                )
             except np.linalg.LinAlgError:
                 damping = max(10 * damping, 1e-6)
                 continue
@@ -264,9 +291,7 @@ def _moved(starts: Array, linear: Linear, step: Array) -> Array:
 
 
 def call(function: Any, *arguments: Any) -> Any:
-    """Call a compiled function with its functions as pointers."""
-    from dopt.kernel.plain import PLAIN
-
+    """Call a compiled function, with the known part as a pointer: it is compiled once for all."""
     if PLAIN:
         return function(*arguments)
     return _code(function, tuple(map(_kind, arguments)))(*arguments)
@@ -278,20 +303,68 @@ def _code(function: Any, kinds: tuple[Any, ...]) -> Any:
 
 
 def _kind(value: Any) -> Any:
-    import numba
-    from numba import types
-
     if isinstance(value, Structure):
-        from dopt.kernel.equations import KNOWN
-
-        functions = [types.FunctionType(KNOWN), types.FunctionType(simulation.COMPLEX_KNOWN)]
+        functions = [types.FunctionType(KNOWN), types.FunctionType(COMPLEX_KNOWN)]
         return types.NamedTuple([*functions, *map(_kind, value[2:])], Structure)
     if isinstance(value, tuple):
         return types.NamedTuple([*map(_kind, value)], type(value))
-    if isinstance(value, bool):
+    if isinstance(value, bool | np.bool_):
         return types.boolean
-    if isinstance(value, (int, np.integer)):
+    if isinstance(value, int | np.integer):
         return types.int64
-    if isinstance(value, float):
-        return types.float64
-    return numba.typeof(value)
+    return types.float64 if isinstance(value, float) else numba.typeof(value)
+
+
+def windows_of(
+    data: Data, model: Model, first: int, last: int, seconds: float, *, skip: float, ahead: float
+) -> Integers:
+    """Return windows of so many seconds, (k, 2), one after the other within some rows.
+
+    Each begins ``skip`` seconds after its piece does, so that the input that acts is known, and
+    ends ``ahead`` seconds before the piece does.
+    """
+    out, row = [], first
+    measured = np.flatnonzero(np.isfinite(data.measured[first : last + 1]).any(axis=1)) + first
+    while row <= last:
+        at = np.searchsorted(measured, row)
+        if at >= len(measured):
+            break
+        row = int(measured[at])
+        begin, end = data.firsts[row], min(data.lasts[row], last)
+        if data.time[row] - data.time[begin] < skip:
+            row += 1
+            continue
+        stop = row + int(np.searchsorted(data.time[row : end + 1], data.time[row] + seconds))
+        late = stop > end or data.time[stop] + ahead > data.time[data.lasts[row]]
+        if late:
+            row = int(data.lasts[row]) + 1
+            continue
+        out.append((row, stop))
+        row = stop
+    return np.array(out, np.int64).reshape(-1, 2)
+
+
+AROUND = 7
+"""Measurements from which an initial state is first estimated, by a parabola."""
+
+
+def first_states(data: Data, model: Model, rows: Integers) -> Array:
+    """Return first estimates of the initial states of windows, (k, d)."""
+    starts, measured = np.zeros((len(rows), model.d)), model.structure.measured
+    rate = {of: i for i, of in model.rates.items()}
+    for k, (row, end) in enumerate(rows):
+        low = max(int(data.firsts[row]), row - 60)
+        near = slice(low, min(int(data.lasts[row]), max(end, row + 60)) + 1)
+        t = data.time[near] - data.time[row]
+        for c, i in enumerate(measured):
+            seen = np.flatnonzero(np.isfinite(data.measured[near, c]))
+            seen = seen[np.argsort(np.abs(t[seen]), kind="stable")[:AROUND]]
+            if not len(seen):
+                continue
+            span = max(float(np.abs(t[seen]).max()), 1e-300)
+            degree = min(2, len(seen) - 1)
+            found = np.polyfit(t[seen] / span, data.measured[near, c][seen], degree)
+            starts[k, i] = found[-1]
+            if int(i) in rate and degree:
+                starts[k, rate[int(i)]] = found[-2] / span
+    return starts

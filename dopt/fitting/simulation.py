@@ -35,10 +35,9 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numba import boolean, float64, int64, types
+from numba import types
 
 from dopt.kernel.compiler import StoredCode
-from dopt.kernel.equations import KNOWN
 from dopt.kernel.network import tanh
 from dopt.kernel.plain import PLAIN
 from dopt.types import CompiledFunction, Integers, Matrix, Vector
@@ -134,9 +133,12 @@ class Work(NamedTuple):
     hidden: Vector
 
 
-def work_for(d: int, m: int, q: int, c: int, p: int, w: int) -> Work:
-    """Return arrays of one simulation; q is 0 without sensitivities."""
-    n = q + d if q else 0
+def work_for(d: int, m: int, columns: int, c: int, p: int, w: int) -> Work:
+    """Return arrays of one simulation.
+
+    S has q + d columns, d for the initial state alone, or 0 without sensitivities.
+    """
+    n = columns
     vectors = [np.zeros(d) for _ in range(5)]
     matrices = [np.zeros((d, n)) for _ in range(5)]
     complexes = [np.zeros(size, np.complex128) for size in (d, m, c, d)]
@@ -185,14 +187,18 @@ def _network(structure: Structure, values: Values, work: Work, sensitive: bool) 
         if not sensitive:
             continue
         out = work.P[row]
-        out[first + last + k] = size
+        of_all = out.shape[0] > work.xs.shape[0]
+        if of_all:
+            out[first + last + k] = size
         for j in range(w):
-            out[first + second + k * w + j] = size * h[j]
             slope = size * theta[second + k * w + j] * (1.0 - h[j] * h[j])
-            out[first + biases + j] = slope
             for i in range(p):
-                out[first + j * p + i] = slope * phi[i]
                 work.A[row, structure.feature_indices[i]] += slope * theta[j * p + i] * dphi[i]
+            if of_all:
+                out[first + second + k * w + j] = size * h[j]
+                out[first + biases + j] = slope
+                for i in range(p):
+                    out[first + j * p + i] = slope * phi[i]
 
 
 @_compiled
@@ -219,7 +225,7 @@ def _rates(structure: Structure, values: Values, work: Work, sensitive: bool) ->
             work.zv[j] = work.v[j]
             for i in range(d):
                 work.B[i, j] = work.zf[i].imag / STEP
-        for j in range(structure.unknown.shape[0]):
+        for j in range(structure.unknown.shape[0] if work.P.shape[1] > d else 0):
             at = structure.unknown[j]
             work.zc[at] += 1j * STEP
             structure.complex_known(work.zx, work.zv, work.zc, work.zf)
@@ -250,7 +256,9 @@ def _combine(work: Work, through_lag: Matrix, first: int, n_times: int) -> None:
 
 
 @_compiled
-def _held(values: Values, u: Vector, v: Vector, dv: Matrix, s: float, at: Vector, dat: Matrix) -> None:
+def _held(
+    values: Values, u: Vector, v: Vector, dv: Matrix, s: float, at: Vector, dat: Matrix
+) -> None:
     """Write v and its derivatives by delay and lag, (m, 2), s seconds later under u held."""
     if values.lag <= 0.0:
         for j in range(u.shape[0]):
@@ -281,7 +289,7 @@ def _integrate(
     steps = max(1, int(math.ceil(seconds / structure.longest_step - 1e-9)))
     h = seconds / steps
     q = n - d
-    n_times = int(structure.free_delay) + int(structure.free_lag)
+    n_times = int(structure.free_delay) + int(structure.free_lag) if q > 0 else 0
     first = q - n_times
     dat, picked = np.zeros((m, 2)), np.zeros((m, 2))
     for step in range(steps):
@@ -349,9 +357,9 @@ def _switched(
         for j in range(before.shape[0]):
             dv[j, 0] += (before[j] - after[j]) / values.lag
         return
-    if not sensitive:
-        return
     d, n = work.S.shape
+    if not sensitive or n == d:
+        return
     column = n - d - 1 - int(structure.free_lag)
     for i in range(d):
         work.xs[i] = work.x[i]

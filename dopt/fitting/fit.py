@@ -1,0 +1,475 @@
+"""A plant fitted to logs: windows, delay, network and weight of the prior chosen by validation.
+
+1. The unknown constants are fitted to short windows, with the delay tried from two samples too early
+   to three too late where it is unknown, and then to longer ones. Which length of windows
+   predicts held-out blocks best is kept.
+2. A network is added, with the weight of the data against the prior in stages; it is kept only where it
+   predicts the held-out blocks better than the constants alone by more than one standard error.
+3. What was chosen is fitted to all logs. Standard errors of the constants come from the fit without
+   a network, with each window as one cluster: the residuals inside are one curve.
+
+Blocks are logs, or equal parts of fewer logs. A held-out window is predicted from an initial state that
+is fitted to its first third.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dopt.errors import SpecificationError
+from dopt.fitting.fitted import Estimate, Fitted, Predicted, Selection, predicted
+from dopt.fitting.model import Layout, Model, data_of, measured_names
+from dopt.fitting.problem import Simulator, Solution, Windows, first_states, solve, windows_of
+from dopt.fitting.simulation import Data
+from dopt.log import Log
+from dopt.systems.plant import Encoder, Plant, Unknown
+from dopt.types import Array, Integers
+
+BLOCKS = 5
+"""Parts into which logs are cut for the validation."""
+
+LENGTHS = (0.2, 0.4, 0.8, 1.6)
+"""Lengths of windows that are tried, by the time scale of the log."""
+
+FEWEST_ROWS = 12
+"""Fewest rows of a window."""
+
+WEIGHTS = (30.0, 10.0, 3.0)
+"""s that are tried, one after the other, by the root mean square of the residuals."""
+
+SCANNED = (-2, -1, 0, 1, 2, 3)
+"""Delays that are tried first, in samples from the guess."""
+
+MOST_VALIDATED = 200
+"""Held-out windows of a block that are predicted."""
+
+MOST_SCANNED = 150
+"""Windows over which delays are tried."""
+
+
+def fit(
+    plant: Plant,
+    logs: Any,
+    *,
+    validate: Any = None,
+    width: int = 16,
+    hold: str = "zero",
+    window: float | None = None,
+    weights: Sequence[float] = WEIGHTS,
+    seed: int = 0,
+    workers: int = 2,
+    progress: Callable[[str], None] | None = None,
+) -> Fitted:
+    """Fit a plant's unknown constants, and a network if it helps, to logs by simulation.
+
+    Parameters
+    ----------
+    plant : Plant
+        With :func:`dopt.unknown` constants, delay or lag. Its ``learned`` rows get a network.
+    logs : Log, DataFrame, mapping or sequence of them
+        Recorded runs (:class:`dopt.Log`); a table is read with the names of the plant.
+    validate : the same, optional
+        Other runs, on which the report's errors are taken; without them they are those of
+        held-out blocks.
+    width : int
+        Units of the network that is tried; 0 for none.
+    hold : {"zero", "linear"}
+        What an input is between two rows: that of the first one, as a controller holds it, or
+        interpolated, where it was measured.
+    window : float, optional
+        Length of the windows [s], instead of one that is chosen.
+    weights : sequence of float
+        Values of s that are tried, in decreasing order: how many times larger than they are the
+        residuals count as. A small one trusts the data more.
+    seed : int
+        Seed of the initial weights of the network.
+    workers : int
+        Blocks that are fitted at the same time.
+    progress : callable, optional
+        Called with a sentence after each stage.
+
+    Raises
+    ------
+    SpecificationError
+        If nothing is to be fitted, or the logs do not fit the plant or are too short.
+    """
+    runs, tests = _logs(plant, logs), [] if validate is None else _logs(plant, validate)
+    _check(plant, width, weights, workers)
+    plant = _measuring(plant, runs)
+    data = data_of(plant, runs, hold)
+    work = _Selection(plant, data, _blocks(data, runs, hold), workers, progress or (lambda _: None))
+    lengths = work.lengths(window)
+    work.scan_delay(lengths[0])
+    work.choose_window(lengths)
+    physics = work.finish(work.model, work.solution, 1.0)
+    chosen = physics
+    if width and (found := work.choose_network(width, weights, seed)) is not None:
+        chosen = work.finish(*found)
+    return Fitted(plant, hold, work.data, chosen, physics, work.held_out, work.selection(), tests)
+
+
+class _Selection:
+    """What validation over blocks has chosen so far."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        data: Data,
+        blocks: list[tuple[int, int]],
+        workers: int,
+        say: Callable[[str], None],
+    ) -> None:
+        self.plant, self.data, self.blocks, self.say = plant, data, blocks, say
+        self.workers = workers
+        self.delay = plant.delay.value if isinstance(plant.delay, Unknown) else plant.delay
+        self.model = self._model(self.delay, free=True)
+        self.step = float(np.median(_steps(data)))
+        self.scale = time_scale(data)
+        self.table: list[tuple[str, float, float]] = []
+        self.notes: list[str] = []
+        self.scan: dict[float, float] = {}
+        self.window = math.nan
+        self._typical: float | None = None
+        self.held_out: list[Predicted] = []
+
+    def _model(self, delay: float, *, free: bool) -> Model:
+        return Model(
+            self.plant,
+            delay=delay,
+            free_delay=free and isinstance(self.plant.delay, Unknown),
+            free_lag=isinstance(self.plant.lag, Unknown),
+        )
+
+    def selection(self) -> Selection:
+        return Selection(tuple(self.table), self.window, dict(self.scan), tuple(self.notes))
+
+    def lengths(self, window: float | None) -> list[float]:
+        """Return the lengths of windows that are tried [s], the shortest first."""
+        longest = max(self.data.time[b] - self.data.time[a] for a, b in self._pieces())
+        if window is not None:
+            if not (math.isfinite(window) and 2 * self.step < window < longest):
+                raise SpecificationError(
+                    f"window is {window!r}, but more than two samples of {self.step:g} s and less "
+                    f"than the longest piece, {longest:g} s, are expected: correct it."
+                )
+            return [float(window)]
+        least = FEWEST_ROWS * self.step
+        tried = sorted({max(share * self.scale, least) for share in LENGTHS})
+        fitting = [length for length in tried if 4.0 * length <= longest]
+        if not fitting and longest <= 2.0 * least:
+            raise SpecificationError(
+                f"the longest piece of the logs has {longest:g} s, but at least {2 * least:g} s, "
+                f"{2 * FEWEST_ROWS} samples, are expected: give a longer run."
+            )
+        return fitting or [least]
+
+    def _pieces(self) -> list[tuple[int, int]]:
+        firsts = np.unique(self.data.firsts)
+        return [(int(first), int(self.data.lasts[first])) for first in firsts]
+
+    def _windows(self, seconds: float, block: int | None = None) -> Windows:
+        """Return the windows of one block, or of all."""
+        margin = {"skip": self._latest(), "ahead": 2.0 * self.step}
+        chosen = range(len(self.blocks)) if block is None else [block]
+        rows = np.concatenate(
+            [windows_of(self.data, self.model, *self.blocks[i], seconds, **margin) for i in chosen]
+        )
+        return Windows(rows, first_states(self.data, self.model, rows))
+
+    def _latest(self) -> float:
+        """Return the longest time from an input to its effect that is tried [s]."""
+        lag = self.plant.lag.value if isinstance(self.plant.lag, Unknown) else self.plant.lag
+        return max(self.delay, 0.0) + max(SCANNED) * self.step + 3.0 * lag
+
+    def scan_delay(self, seconds: float) -> None:
+        """Fit the constants to some windows with each delay, and begin from the best one."""
+        windows = self._windows(seconds)
+        if len(windows.rows) < 2:
+            raise SpecificationError(
+                f"the logs have {len(windows.rows)} windows of {seconds:g} s, but at least 2 are "
+                f"expected: give longer runs, or a shorter window."
+            )
+        every = max(1, len(windows.rows) // MOST_SCANNED)
+        some = Windows(*(np.ascontiguousarray(part[::every]) for part in windows))
+        fits = {}
+        shifts = [shift for shift in SCANNED if self.delay + shift * self.step >= -2.5 * self.step]
+
+        def one(shift: int) -> tuple[float, Model, Solution]:
+            model = self._model(self.delay + shift * self.step, free=False)
+            found = solve(
+                Simulator(model, self.data), some, model.prior, 1.0, most=12, tolerance=1e-3
+            )
+            counts = some.counts(self.data)
+            return float(np.sqrt(np.median(found.squares / counts))), model, found
+
+        for shift, result in zip(shifts, self._map(one, shifts), strict=True):
+            fits[shift] = result
+            self.scan[self.delay + shift * self.step] = result[0]
+        best = min(shifts, key=lambda shift: fits[shift][0])
+        self.say(f"delay: {best:+d} samples from the guess fit best")
+        if isinstance(self.plant.delay, Unknown):
+            self.delay += best * self.step
+            found = fits[best]
+        else:
+            found = fits[0]
+            if best and fits[best][0] < 0.8 * fits[0][0]:
+                self.notes.append(
+                    f"with the inputs {best:+d} samples later the constants fit {fits[0][0] / fits[best][0]:.1f} "
+                    f"times as well: declare delay=dopt.unknown({abs(best) * self.step:g})"
+                )
+        self.model = self._model(self.delay, free=True)
+        self._rescale(found[1], found[2])
+        p = self.model.extended(found[2].p, found[1])
+        self.solution = found[2]._replace(p=p)
+
+    def _rescale(self, model: Model, found: Solution) -> None:
+        """Take the standard deviation of each measured state from what a fit has left."""
+        residuals = Simulator(model, self.data).residuals(found.p, found.windows)
+        floors = [
+            noise.noise
+            if isinstance(noise, Encoder)
+            else 1e-9 * max(float(np.nanstd(column)), 1e-300)
+            for noise, column in zip(
+                (self.plant.measured.get(n, 0.0) for n in measured_names(self.plant)),
+                self.data.measured.T,
+                strict=True,
+            )
+        ]
+        typical = 1.4826 * np.nanmedian(np.abs(residuals), axis=0)
+        deviations = self.data.deviations * np.maximum(
+            typical, np.array(floors) / self.data.deviations
+        )
+        self.data = self.data._replace(deviations=deviations)
+
+    def choose_window(self, lengths: list[float]) -> None:
+        """Fit the constants to windows of each length, and keep the one that predicts best."""
+        judged = lengths[len(lengths) // 2]
+        self._judged = [self._tested(judged, block) for block in range(len(self.blocks))]
+        best, p = math.inf, self.solution.p
+        for length in lengths:
+            windows = self._windows(length)
+            whole = solve(Simulator(self.model, self.data), windows, p, 1.0)
+            p = whole.p
+            scores, held_out = self._validate(self.model, whole, 1.0)
+            self._note(f"constants, windows of {length:.3g} s", scores)
+            if scores.mean() < best:
+                best, self.window = float(scores.mean()), length
+                self.solution, self._scores, self.held_out = whole, scores, held_out
+
+    def choose_network(
+        self, width: int, weights: Sequence[float], seed: int
+    ) -> tuple[Model, Solution, float] | None:
+        """Return the network that predicts best with its weight; None if the constants do."""
+        model = self.model.with_network(width, self._layout(), seed)
+        counts = self.solution.windows.counts(self.data)
+        size = float(np.sqrt(np.median(self.solution.squares / counts)))
+        start = self.solution._replace(p=model.extended(self.solution.p, self.model))
+        best: tuple[float, Any] = (math.inf, None)
+        for weight in sorted(weights, reverse=True):
+            s = weight * size
+            start = solve(
+                *(Simulator(model, self.data), start.windows, start.p, s), scale=start.scale
+            )
+            scores, held_out = self._validate(model, start, s)
+            self._note(f"and {width} units, s = {weight:g}", scores)
+            if scores.mean() >= best[0]:
+                break
+            best = float(scores.mean()), (start, s, scores, held_out)
+        start, s, scores, held_out = best[1]
+        gain = self._scores - scores
+        error = float(gain.std(ddof=1) / math.sqrt(len(gain))) if len(gain) > 1 else math.inf
+        if not gain.mean() > error:
+            self.notes.append(
+                f"no network: it predicts held-out blocks better by {gain.mean():.3f} ± {error:.3f} "
+                f"of log-loss only"
+            )
+            return None
+        self.held_out = held_out
+        return model, start, s
+
+    def _layout(self) -> Layout:
+        """Return scales of the network's features and outputs from what was simulated."""
+        simulator, found = Simulator(self.model, self.data), self.solution
+        states = np.concatenate(
+            [
+                simulator.states(found.p, first, last, start)
+                for (first, last), start in zip(*found.windows, strict=True)
+            ]
+        )
+        rows = np.concatenate([np.arange(a, b + 1) for a, b in found.windows.rows])
+        keep = np.isfinite(states).all(axis=1)
+        states, rows = states[keep], rows[keep]
+        flow = self.model.derivative(found.p, states, self.data.inputs[rows])
+        at = self.model.structure.feature_indices
+        linear = self.model.structure.feature_kinds == 0
+        centers = np.where(linear, np.median(states[:, at], axis=0), 0.0)
+        spread = np.quantile(np.abs(states[:, at] - centers), 0.95, axis=0) / 2.0
+        scales = np.where(linear, np.maximum(spread, 1e-300), 1.0)
+        sizes = np.sqrt(np.median(flow[:, self.model.structure.learned] ** 2, axis=0)) / 2.0
+        return Layout(centers, scales, np.maximum(sizes, 1e-300))
+
+    def _tested(self, seconds: float, block: int) -> Integers:
+        """Return first row, last row of the history, and last row of held-out predictions."""
+        rows = windows_of(
+            *(self.data, self.model, *self.blocks[block], 1.5 * seconds),
+            skip=self._latest(),
+            ahead=2.0 * self.step,
+        )
+        rows = rows[:: max(1, len(rows) // MOST_VALIDATED)]
+        ends = self.data.time[rows[:, 0]] + 0.5 * seconds
+        history = [
+            first + int(np.searchsorted(self.data.time[first : last + 1], end))
+            for (first, last), end in zip(rows, ends, strict=True)
+        ]
+        return np.array([(a, h, b) for (a, b), h in zip(rows, history, strict=True)]).reshape(-1, 3)
+
+    def _validate(self, model: Model, whole: Solution, s: float) -> tuple[Array, list[Predicted]]:
+        """Return for each block how a fit to the others predicts it, and the predictions.
+
+        Each fit begins from the fit to all blocks, which shortens it.
+        """
+
+        def one(block: int) -> Predicted:
+            low, high = self.blocks[block]
+            rows = whole.windows.rows
+            others = (rows[:, 1] < low) | (rows[:, 0] > high)
+            windows = Windows(*(np.ascontiguousarray(part[others]) for part in whole.windows))
+            simulator = Simulator(model, self.data)
+            found = solve(simulator, windows, whole.p, s, scale=whole.scale[others], tolerance=1e-3)
+            return predicted(simulator, found.p, self._judged[block])
+
+        found = list(self._map(one, range(len(self.blocks))))
+        shares = [each.mean_squares() for each in found]
+        if self._typical is None:
+            known = [share for each in shares for share in each if np.isfinite(share)]
+            self._typical = max(float(np.median(known)), 1e-300) if known else 1.0
+        worst = math.log1p(1e12)
+        scores = [
+            float(
+                np.mean(
+                    np.minimum(np.log1p(np.nan_to_num(each, nan=np.inf) / self._typical), worst)
+                )
+            )
+            for each in shares
+        ]
+        return np.array(scores), found
+
+    def _map(self, function: Callable[[int], Any], over: Iterable[int]) -> Iterable[Any]:
+        with ThreadPoolExecutor(self.workers) as pool:
+            return list(pool.map(function, over))
+
+    def _note(self, what: str, scores: Array) -> None:
+        error = float(scores.std(ddof=1) / math.sqrt(len(scores))) if len(scores) > 1 else math.nan
+        self.table.append((what, float(scores.mean()), error))
+        self.say(f"{what}: held-out loss {scores.mean():.4f}")
+
+    def finish(self, model: Model, found: Solution, s: float) -> Estimate:
+        """Return the minimum with the covariance of its parameters."""
+        simulator = Simulator(model, self.data)
+        found = solve(simulator, found.windows, found.p, s, scale=found.scale)
+        weights = 1.0 / (1.0 + found.squares / found.scale)
+        linear = simulator.linear(found.p, found.windows, weights / s**2, scores=True)
+        assert linear.scores is not None
+        inverse = np.linalg.inv(linear.normal + np.eye(model.q))
+        middle = linear.scores.T @ linear.scores + np.eye(model.q)
+        covariance = inverse @ middle @ inverse
+        return Estimate(model, found, s, 0.5 * (covariance + covariance.T))
+
+
+def time_scale(data: Data) -> float:
+    """Return the time in which what is measured changes by as much as it does at all [s].
+
+    It is 2π std(y)/std(dy/dt) with differences over so many rows that they are larger than the
+    noise, the shortest over the measured states.
+    """
+    found = []
+    for column in data.measured.T:
+        seen = np.flatnonzero(np.isfinite(column))
+        spread = float(np.std(column[seen]))
+        k = 1
+        while len(seen) > 4 * k and spread > 0.0:
+            same = data.firsts[seen[k:]] == data.firsts[seen[:-k]]
+            change = (column[seen[k:]] - column[seen[:-k]])[same]
+            seconds = (data.time[seen[k:]] - data.time[seen[:-k]])[same]
+            if len(change) and float(np.std(change)) > 0.2 * spread:
+                found.append(
+                    2.0 * math.pi * spread * float(np.mean(seconds)) / float(np.std(change))
+                )
+                break
+            k *= 2
+    return min(found) if found else 40.0 * float(np.median(_steps(data)))
+
+
+def _steps(data: Data) -> Array:
+    """Return the times between two measured rows [s]."""
+    seen = np.flatnonzero(np.isfinite(data.measured).any(axis=1))
+    same = data.firsts[seen[1:]] == data.firsts[seen[:-1]]
+    steps: Array = np.diff(data.time[seen])[same]
+    return steps if len(steps) else np.ones(1)
+
+
+def _blocks(data: Data, runs: Sequence[Log], hold: str) -> list[tuple[int, int]]:
+    """Return first and last rows of the blocks: logs, or equal parts of fewer than three."""
+    N = len(data.time)
+    cuts = np.linspace(0, N, BLOCKS + 1).astype(int)
+    if len(runs) >= 3:
+        sizes = [len(data_of_log) for data_of_log in _rows_of_logs(data, runs)]
+        ends = np.cumsum([0, *sizes])
+        parts = min(len(runs), BLOCKS + 1)
+        cuts = ends[np.linspace(0, len(runs), parts + 1).round().astype(int)]
+    return [(int(a), int(b) - 1) for a, b in zip(cuts[:-1], cuts[1:], strict=True) if b > a]
+
+
+def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Array]:
+    pieces = np.split(np.arange(len(data.time)), np.unique(data.firsts)[1:])
+    out, at = [], 0
+    for run in runs:
+        n = sum(len(piece.time) > 1 for piece in run.pieces)
+        out.append(np.concatenate(pieces[at : at + n]) if n else np.arange(0))
+        at += n
+    return out
+
+
+def _logs(plant: Plant, given: Any) -> list[Log]:
+    """Return logs of what was given: logs or tables, one or several."""
+    several = given if isinstance(given, list | tuple) else [given]
+    if not several:
+        raise SpecificationError("no log was given, but at least one is expected: give one.")
+    return [one if isinstance(one, Log) else Log.for_plant(one, plant) for one in several]
+
+
+def _measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
+    """Return the plant with the states of the logs as measured ones, if it names none."""
+    if plant.measured:
+        return plant
+    measured = {}
+    for name in plant.states:
+        if all(name in run.states for run in runs):
+            at = [run.states.index(name) for run in runs]
+            columns = [
+                piece.measured[:, i] for run, i in zip(runs, at, strict=True) for piece in run.pieces
+            ]
+            measured[name] = max(1e-3 * float(np.nanstd(np.concatenate(columns))), 1e-300)
+    return dataclasses.replace(plant, measured=measured)
+
+
+def _check(plant: Plant, width: int, weights: Sequence[float], workers: int) -> None:
+    if not isinstance(plant, Plant):
+        raise SpecificationError(f"plant is {plant!r}, but a dopt.Plant is expected: declare one.")
+    for what, value, least in (("width", width, 0), ("workers", workers, 1)):
+        if not isinstance(value, int) or value < least:
+            raise SpecificationError(
+                f"{what} is {value!r}, but a whole number of at least {least} is expected: "
+                f"correct it."
+            )
+    if width and not (len(weights) and all(np.isfinite(w) and w > 0 for w in weights)):
+        raise SpecificationError(
+            f"weights is {weights!r}, but positive numbers are expected: give for instance "
+            f"{list(WEIGHTS)}."
+        )
