@@ -13,7 +13,6 @@ taken by the method of Levenberg and Marquardt.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
@@ -316,7 +315,7 @@ def _kind(value: Any) -> Any:
 
 
 def windows_of(
-    data: Data, model: Model, first: int, last: int, seconds: float, *, skip: float, ahead: float
+    data: Data, first: int, last: int, seconds: float, *, skip: float, ahead: float
 ) -> Integers:
     """Return windows of so many seconds, (k, 2), one after the other within some rows.
 
