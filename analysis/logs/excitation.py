@@ -22,7 +22,7 @@ LAGS = np.arange(-3, 9)
 """Samples by which the effect may come after the input."""
 
 WINDOWS = (2, 4, 8, 16, 32)
-"""Samples p to each side of the polynomials; the one that tells most is taken."""
+"""Samples p to each side of the polynomials; the one in which most is explained is taken."""
 
 MOST_ROWS = 100_000
 """Rows that are examined, the first ones of a longer log."""
@@ -33,14 +33,20 @@ FOLLOWS = 0.005
 TOLD_APART = 1.15
 """Factor by which the next lags leave more unexplained, where a delay is told apart."""
 
-STEADY = 4.0
-"""Effect by its standard error, below which an input has no effect."""
+OWN = 0.2
+"""Share of an input's variance that the state leaves open, above which it varies on its own."""
+
+STEADY = 4.5
+"""Effect by its standard error, below which none is told apart."""
 
 FEEDBACK = 0.05
 """Share of what an input's past leaves open that measurements explain, above which there is one."""
 
 PREDICTED = 0.9999
 """Share of an input that its past tells, above which feedback is not told apart."""
+
+Response = tuple[float, int, Vector, float]
+"""Steadiness, state, explained shares (lags,) and open share of an input in one window."""
 
 _BLOCKS = 16
 _PAST = 10  # samples of an input's past
@@ -85,9 +91,14 @@ class Effect:
         return self.open < FOLLOWS
 
     @property
+    def has_effect(self) -> bool:
+        """Whether an effect on the motion is told apart."""
+        return not self.follows_state and self.steadiness >= STEADY
+
+    @property
     def explains_nothing(self) -> bool:
-        """Whether the motion says nothing of this input."""
-        return self.follows_state or self.steadiness < STEADY
+        """Whether it follows the state, or varies on its own without an effect on the motion."""
+        return self.follows_state or (self.open > OWN and not self.has_effect)
 
     @property
     def closed_loop(self) -> bool:
@@ -108,13 +119,15 @@ def effects(log: Log) -> list[Effect]:
             one for p in WINDOWS if (one := _best_response(pieces, are_rates, j, p)) is not None
         ]
         if tried:
-            steadiness, i, explained, share = max(tried, key=lambda one: one[0])
+            steady = [one for one in tried if one[0] >= STEADY]
+            most = max(steady or tried, key=lambda one: one[2].max() if steady else one[0])
+            steadiness, i, explained, share = most
             seen = (name, log.states[i], explained, share, steadiness)
             found.append(Effect(*seen, _delays(tried), *_feedback(pieces, j)))
     return found
 
 
-def _delays(tried: Sequence[tuple[float, int, Vector, float]]) -> tuple[int, int] | None:
+def _delays(tried: Sequence[Response]) -> tuple[int, int] | None:
     """Return the lags of the narrowest window that tells them apart: wide ones blur them."""
     for steadiness, _, explained, share in tried:
         left = 1.0 - explained
@@ -165,7 +178,7 @@ def _filtered(values: Array, weight: Vector) -> Array:
 
 def _best_response(
     pieces: Sequence[Piece], are_rates: Sequence[bool], j: int, p: int
-) -> tuple[float, int, Vector, float] | None:
+) -> Response | None:
     """Return steadiness, state, explained shares by lag and open share of one input."""
     only_rates = all(are_rates)
     used = [i for i, rate in enumerate(are_rates) if only_rates or not rate]
@@ -198,7 +211,8 @@ def _best_response(
 
 def _alike(two: Array) -> bool:
     """Return whether two inputs, (rows, 2), are the same apart from noise."""
-    return bool((np.ptp(two, axis=0) == 0).any() or abs(np.corrcoef(two.T)[0, 1]) > 0.9)
+    still = (two.max(axis=0) == two.min(axis=0)).any()
+    return bool(still or abs(np.corrcoef(two.T)[0, 1]) > 0.9)
 
 
 def _rows(
