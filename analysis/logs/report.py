@@ -15,7 +15,8 @@ from analysis.logs.excitation import MOST_ROWS, Effect
 from analysis.logs.health import Health, Signal, examine
 from analysis.logs.tables import is_flag, log_of, read_table
 from analysis.style import number
-from dopt.log import TURN, Log
+from dopt.log import Log
+from dopt.log_columns import TURN
 from orchestrate.program import UsageError, path, positive, tell
 
 HELP = "how healthy a recorded run is: sampling, noise, limits, delay, feedback, units"
