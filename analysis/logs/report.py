@@ -49,13 +49,13 @@ def run(options: argparse.Namespace) -> int:
     table = read_table(options.file).rename(columns=str)
     log = log_of(
         table,
-        _names("--states", options.states),
-        _names("--inputs", options.inputs),
+        names_of("--states", options.states),
+        names_of("--inputs", options.inputs),
         time=options.time,
         dt=options.dt,
         gap=options.gap,
-        angles=tuple(_names("--angles", options.angles) or ()),
-        units=_names("--units", options.units),
+        angles=tuple(names_of("--angles", options.angles) or ()),
+        units=names_of("--units", options.units),
     )
     health, file = examine(log), Path(options.file)
     guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _names(option: str, text: str | None) -> dict[str, str] | None:
+def names_of(option: str, text: str | None) -> dict[str, str] | None:
     """Return the columns that an option names, by state or input."""
     if text is None:
         return None

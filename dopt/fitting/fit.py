@@ -1,15 +1,15 @@
-"""A plant fitted to logs: windows, delay, network and weight of the prior chosen by validation.
+"""A plant fitted to logs: windows, delay, network and weight of the data chosen by validation.
 
-1. The unknown constants are fitted to short windows, with the delay tried from two samples too early
-   to three too late where it is unknown, and then to longer ones. Which length of windows
-   predicts held-out blocks best is kept.
-2. A network is added, with the weight of the data against the prior in stages; it is kept only where it
+1. The unknown constants are fitted to short windows, with each delay from two samples too early to
+   three too late, and then to longer ones. The length of windows that predicts held-out blocks best
+   is kept.
+2. A network is added, with growing weight of the data against the prior. It is kept only where it
    predicts the held-out blocks better than the constants alone by more than one standard error.
 3. What was chosen is fitted to all logs. Standard errors of the constants come from the fit without
    a network, with each window as one cluster: the residuals inside are one curve.
 
-Blocks are logs, or equal parts of fewer logs. A held-out window is predicted from an initial state that
-is fitted to its first third.
+Blocks are logs, or equal parts of fewer than three logs. A held-out window is predicted from an
+initial state that is fitted to what comes before it, half a window long.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Predictions of parts of a log that nothing was fitted to, and of a linear model for comparison."""
+"""Predictions of parts of a log, and by a linear model for comparison."""
 
 from __future__ import annotations
 
