@@ -203,7 +203,7 @@ def stamps_of(
     """Return the stamps of all rows [s], NaN where there is none."""
     n_rows = len(next(iter(table.values())))
     if dt is not None:
-        return np.arange(n_rows) * float(dt)
+        return np.arange(n_rows, dtype=np.float64) * dt
     values, name = (_column(time), "time") if clock is None else (table[clock], clock)
     if values.shape != (n_rows,):
         raise SpecificationError(
@@ -215,7 +215,9 @@ def stamps_of(
         there = ~np.isnat(values)
         elapsed = (values - values[there][:1]) if there.any() else values - values
         notes.append(f"Column {name!r} holds dates: times count from the first of them.")
-        return np.where(there, elapsed.astype("timedelta64[ns]").astype(np.int64) * 1e-9, np.nan)
+        seconds: Array = elapsed.astype("timedelta64[ns]").astype(np.float64) * 1e-9
+        seconds[~there] = np.nan
+        return seconds
     _check_resolution(name, values)
     factor = 1.0 if unit == 1.0 else _factor(name, unit, SECONDS)
     if factor != 1.0:
