@@ -40,7 +40,7 @@ def save(log: Log, health: Health, target: Path, title: str) -> None:
         _draw_lags(figure.add_axes((0.59, low, 0.39, tall)), health)
         figure.suptitle(title, fontsize=8.5, y=0.99)
         with whole(target) as part:
-            figure.savefig(part, format=target.suffix.lstrip(".") or "png", dpi=130)
+            figure.savefig(part, format=target.suffix[1:], dpi=130)
 
 
 def _draw_signal(panel: Axes, log: Log, signal: Signal, health: Health) -> None:

@@ -21,6 +21,8 @@ from orchestrate.program import UsageError, path, positive, tell
 
 HELP = "how healthy a recorded run is: sampling, noise, limits, delay, feedback, units"
 
+PICTURES = (".png", ".pdf", ".svg")
+
 RESTS = 0.2
 """Share of a log at rest from which the report says so."""
 
@@ -49,6 +51,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the report of a log and save its picture."""
+    target = options.out or Path("figures") / f"{Path(options.file).name.split('.')[0]}.png"
+    if target.suffix not in PICTURES:
+        raise UsageError(
+            f"--out is {str(target)!r}, but a name with one of the endings {', '.join(PICTURES)} "
+            f"is expected: give one."
+        )
     table = read_table(options.file).rename(columns=str)
     log = log_of(
         table,
@@ -66,7 +74,6 @@ def run(options: argparse.Namespace) -> int:
         tell(sys.stdout, f"{line}\n")
     from analysis.figures.log_health import save  # Matplotlib: other commands do without it
 
-    target = options.out or Path("figures") / f"{file.name.split('.')[0]}.png"
     save(log, health, target, file.name)
     tell(sys.stdout, f"picture: {target}\n")
     return 0

@@ -316,6 +316,8 @@ def test_the_command_prints_and_draws(
     assert cli.main(["log", "run.csv", *words, "--inputs", "u=", "--out", "a.pdf"]) == 2
     assert "--inputs is 'u=', but names" in capsys.readouterr().err
     assert cli.main(["log", "none.csv"]) == 2
+    assert cli.main(["log", "run.csv", "--out", "a.xyz"]) == 2
+    assert "endings .png, .pdf, .svg" in capsys.readouterr().err
 
 
 # Recorded runs of real plants (their sources and licences: README.md in the folder of DOPT_DATA)
