@@ -86,7 +86,7 @@ def _extremes(values: Any, n_rows: int) -> Any:
 
 def _draw_steps(panel: Axes, log: Log) -> None:
     steps = 1e3 * np.concatenate([np.diff(piece.time) for piece in log.pieces])
-    span = max(float(np.ptp(steps)), 1e-3 * float(steps.max()))
+    span = max(float(np.ptp(steps)), 0.1 * float(steps.max()))
     low = float(steps.min()) - 0.05 * span
     panel.hist(steps, bins=60, range=(low, low + 1.1 * span), color=BLUE, log=True)
     panel.set(xlabel="step [ms]", ylabel="rows")

@@ -103,8 +103,11 @@ def lines(log: Log, health: Health, table: pd.DataFrame) -> Iterator[str]:
         yield from _units(one)
     for one in health.inputs:
         yield f"{one.name}: {_signal(one)}{_limits(one)}"
-    for effect in health.effects:
-        yield from _effect(effect, health)
+    wrapped = [one.name for one in health.states if not math.isnan(one.period)]
+    if wrapped:
+        yield f"effects of the inputs: not judged while {', '.join(wrapped)} wraps"
+    else:
+        yield from (line for effect in health.effects for line in _effect(effect, health))
     if health.effects and health.irregular > UNEVEN:
         yield "effects of the inputs: as if all steps were of the median length"
     unseen = {*log.inputs} - {effect.input for effect in health.effects}
@@ -227,7 +230,7 @@ def _rest(log: Log, health: Health) -> Iterator[str]:
     )
     yield (
         f"rest: nothing moves in {100 * rests.mean():.0f} % of the log, in {longest} % of it on "
-        f"end, with {acts} there: dry friction, or it is held; little is learned there"
+        f"end, with {acts} there: dry friction, held or without power; little is learned there"
     )
 
 
