@@ -43,7 +43,7 @@ class Piece(NamedTuple):
     measured : (N, n) array
         Measured states, NaN where a value is missing. Angles are unwrapped.
     inputs : (N, m) array
-        Inputs; that of row k is held from ``time[k]`` to ``time[k + 1]``.
+        Inputs; the input of row k is held from ``time[k]`` to ``time[k + 1]``.
     """
 
     time: Array

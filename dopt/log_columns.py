@@ -114,7 +114,7 @@ def clock_column(
 
 
 def _factor(name: str, unit: str | float, known: Mapping[str, float]) -> float:
-    """Return what a unit is in that of the plant."""
+    """Return the factor from a unit to the one of the plant."""
     if isinstance(unit, int | float | np.number) and math.isfinite(unit) and unit != 0:
         return float(unit)
     text = str(unit).strip()
@@ -200,7 +200,7 @@ def stamps_of(
     unit: str | float,
     notes: list[str],
 ) -> Array:
-    """Return the stamps of all rows [s], NaN where there is none."""
+    """Return the stamps of all rows [s], NaN where one is missing."""
     n_rows = len(next(iter(table.values())))
     if dt is not None:
         return np.arange(n_rows, dtype=np.float64) * dt
