@@ -51,6 +51,12 @@ SCANNED = (-2, -1, 0, 1, 2, 3)
 MOST_VALIDATED = 200
 """Held-out windows of a block that are predicted."""
 
+RATIO = 1.8
+"""Least ratio of the changes over 2k and k rows at which k is short beside the period."""
+
+MOST_LOSS = 1e12
+"""Largest mean square of a held-out window, by the typical one, that counts."""
+
 MOST_SCANNED = 150
 """Windows over which delays are tried."""
 
@@ -163,6 +169,7 @@ class _Selection:
             return [float(window)]
         least = FEWEST_ROWS * self.step
         tried = sorted({max(share * self.scale, least) for share in LENGTHS})
+        longest = min(longest, self._longest_block())
         fitting = [length for length in tried if 4.0 * length <= longest]
         if not fitting and longest <= 2.0 * least:
             raise SpecificationError(
@@ -174,6 +181,15 @@ class _Selection:
     def _pieces(self) -> list[tuple[int, int]]:
         firsts = np.unique(self.data.firsts)
         return [(int(first), int(self.data.lasts[first])) for first in firsts]
+
+    def _longest_block(self) -> float:
+        """Return the longest time of a block without a gap [s]."""
+        data, spans = self.data, []
+        for first, last in self.blocks:
+            for begin in np.unique(data.firsts[first : last + 1]):
+                ends = max(first, int(begin)), min(last, int(data.lasts[begin]))
+                spans.append(float(data.time[ends[1]] - data.time[ends[0]]))
+        return max(spans)
 
     def _windows(self, seconds: float, block: int | None = None) -> Windows:
         """Return the windows of one block, or of all."""
@@ -252,7 +268,15 @@ class _Selection:
     def choose_window(self, lengths: list[float]) -> None:
         """Fit the constants to windows of each length, and keep the one that predicts best."""
         judged = lengths[len(lengths) // 2]
-        self._judged = [self._tested(judged, block) for block in range(len(self.blocks))]
+        tested = [self._tested(judged, block) for block in range(len(self.blocks))]
+        keep = [block for block, rows in enumerate(tested) if len(rows)]
+        if not keep:
+            raise SpecificationError(
+                f"no held-out block has a window of {1.5 * judged:g} s, by which the fit is judged: "
+                f"give longer runs, or a shorter window."
+            )
+        self.blocks = [self.blocks[block] for block in keep]  # the rest is fitted to, always
+        self._judged = [tested[block] for block in keep]
         best, p = math.inf, self.solution.p
         for length in lengths:
             windows = self._windows(length)
@@ -353,13 +377,10 @@ class _Selection:
         if self._typical is None:
             known = [share for each in shares for share in each if np.isfinite(share)]
             self._typical = max(float(np.median(known)), 1e-300) if known else 1.0
-        worst = math.log1p(1e12)
         scores = [
-            float(
-                np.mean(
-                    np.minimum(np.log1p(np.nan_to_num(each, nan=np.inf) / self._typical), worst)
-                )
-            )
+            float(np.mean(np.log1p(np.minimum(each / self._typical, MOST_LOSS))))
+            if len(each)
+            else math.nan
             for each in shares
         ]
         return np.array(scores), [p for _, p in found]
@@ -408,27 +429,36 @@ class _Selection:
 
 
 def time_scale(data: Data) -> float:
-    """Return the time in which what is measured changes by as much as it does at all [s].
+    """Return the shortest period that dominates what is measured [s].
 
-    It is 2π std(y)/std(dy/dt) with differences over so many rows that they are larger than the
-    noise, the shortest over the measured states.
+    The change over 2k rows is 2 cos(π k dt/T) times that over k rows, root mean square, of a sine
+    of period T; it is less where k is so small that noise decides, and beyond a fraction of T. The
+    largest k with a ratio of at least 1.8 gives T; the shortest T of all measured states counts.
     """
     found = []
     for column in data.measured.T:
         seen = np.flatnonzero(np.isfinite(column))
-        spread = float(np.std(column[seen]))
-        k = 1
-        while len(seen) > 4 * k and spread > 0.0:
-            same = data.firsts[seen[k:]] == data.firsts[seen[:-k]]
-            change = (column[seen[k:]] - column[seen[:-k]])[same]
-            seconds = (data.time[seen[k:]] - data.time[seen[:-k]])[same]
-            if len(change) and float(np.std(change)) > 0.2 * spread:
-                found.append(
-                    2.0 * math.pi * spread * float(np.mean(seconds)) / float(np.std(change))
-                )
+        best, k = 0.0, 1
+        while len(seen) > 8 * k:
+            spans = [_changes(data, column, seen, n) for n in (k, 2 * k)]
+            if min(spans[0][0], spans[1][0]) > 0.0 and spans[1][0] >= RATIO * spans[0][0]:
+                best = spans[0][1]
+            elif best:
                 break
-            k *= 2
+            k = max(k + 1, int(1.25 * k))
+        if best:
+            found.append(math.pi * best / math.acos(0.5 * RATIO))
     return min(found) if found else 40.0 * float(np.median(_steps(data)))
+
+
+def _changes(data: Data, column: Array, seen: Integers, k: int) -> tuple[float, float]:
+    """Return the root mean square change over k measured rows, and how long they take [s]."""
+    same = data.firsts[seen[k:]] == data.firsts[seen[:-k]]
+    change = (column[seen[k:]] - column[seen[:-k]])[same]
+    seconds = (data.time[seen[k:]] - data.time[seen[:-k]])[same]
+    if not len(change):
+        return 0.0, 0.0
+    return float(np.sqrt(np.mean(np.square(change)))), float(np.median(seconds))
 
 
 def _steps(data: Data) -> Array:

@@ -39,13 +39,12 @@ class Predicted(NamedTuple):
     deviations: Array
 
     def mean_squares(self) -> Array:
-        """Return the mean square of each window, in standard deviations."""
+        """Return the mean square of each window with a measurement, in standard deviations."""
         return np.array(
             [
                 float(np.mean(np.square((error / self.deviations)[np.isfinite(change)])))
-                if np.isfinite(change).any()
-                else math.nan
                 for error, change in zip(self.errors, self.changes, strict=True)
+                if np.isfinite(change).any()
             ]
         )
 

@@ -350,7 +350,7 @@ AROUND = 7
 def first_states(data: Data, model: Model, rows: Integers) -> Array:
     """Return first estimates of the initial states of windows, (k, d)."""
     starts, measured = np.zeros((len(rows), model.d)), model.structure.measured
-    rate = {of: i for i, of in model.rates.items()}
+    rate = {of: (j, unit) for j, (of, unit) in model.rates.items()}
     for k, (row, end) in enumerate(rows):
         low = max(int(data.firsts[row]), row - 60)
         near = slice(low, min(int(data.lasts[row]), max(end, row + 60)) + 1)
@@ -365,5 +365,6 @@ def first_states(data: Data, model: Model, rows: Integers) -> Array:
             found = np.polyfit(t[seen] / span, data.measured[near, c][seen], degree)
             starts[k, i] = found[-1]
             if int(i) in rate and degree:
-                starts[k, rate[int(i)]] = found[-2] / span
+                j, unit = rate[int(i)]
+                starts[k, j] = found[-2] / span / unit
     return starts

@@ -180,7 +180,7 @@ def test_units_of_a_state_do_not_matter() -> None:
         ({"width": -1}, "width is -1"),
         ({"hold": "cubic"}, "hold is 'cubic'"),
         ({"window": 1e9}, "window is"),
-        ({"weights": (0.0,)}, "weights is"),
+        ({"weights": (0.0,), "width": 4}, "weights is"),
         ({"workers": 0}, "workers is 0"),
         ({"logs": []}, "no log was given"),
         (
