@@ -108,7 +108,7 @@ def fit(
         If nothing is to be fitted, or the logs do not fit the plant or are too short.
     """
     runs, tests = _logs(plant, logs), [] if validate is None else _logs(plant, validate)
-    _check(plant, width, weights, workers)
+    _check(width, weights, workers)
     plant = _measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
@@ -193,10 +193,16 @@ class _Selection:
 
     def _windows(self, seconds: float, block: int | None = None) -> Windows:
         """Return the windows of one block, or of all."""
-        margin = {"skip": self._latest(), "ahead": 2.0 * self.step}
         chosen = range(len(self.blocks)) if block is None else [block]
         rows = np.concatenate(
-            [windows_of(self.data, *self.blocks[i], seconds, **margin) for i in chosen]
+            [
+                windows_of(
+                    *(self.data, *self.blocks[i], seconds),
+                    skip=self._latest(),
+                    ahead=2.0 * self.step,
+                )
+                for i in chosen
+            ]
         )
         return Windows(rows, first_states(self.data, self.model, rows))
 
@@ -214,7 +220,7 @@ class _Selection:
                 f"expected: give longer runs, or a shorter window."
             )
         every = max(1, len(windows.rows) // MOST_SCANNED)
-        some = Windows(*(np.ascontiguousarray(part[::every]) for part in windows))
+        some = windows.where(np.arange(len(windows.rows)) % every == 0)
         fits = {}
         shifts = [shift for shift in SCANNED if self.delay + shift * self.step >= -2.5 * self.step]
 
@@ -238,8 +244,9 @@ class _Selection:
             found = fits[0]
             if best and fits[best][0] < 0.8 * fits[0][0]:
                 self.notes.append(
-                    f"with the inputs {best:+d} samples later the constants fit {fits[0][0] / fits[best][0]:.1f} "
-                    f"times as well: declare delay=dopt.unknown({abs(best) * self.step:g})"
+                    f"with the inputs {best:+d} samples later the constants fit "
+                    f"{fits[0][0] / fits[best][0]:.1f} times as well: declare a delay of "
+                    f"{self.delay + best * self.step:g} s, or a dopt.unknown one"
                 )
         self.model = self._model(self.delay, free=True)
         self._rescale(found[1], found[2])
@@ -272,8 +279,8 @@ class _Selection:
         keep = [block for block, rows in enumerate(tested) if len(rows)]
         if not keep:
             raise SpecificationError(
-                f"no held-out block has a window of {1.5 * judged:g} s, by which the fit is judged: "
-                f"give longer runs, or a shorter window."
+                f"no held-out block has a window of {1.5 * judged:g} s, but at least one is "
+                f"expected, as they judge the fit: give longer runs, or a shorter window."
             )
         self.blocks = [self.blocks[block] for block in keep]  # the rest is fitted to, always
         self._judged = [tested[block] for block in keep]
@@ -313,8 +320,8 @@ class _Selection:
         error = float(gain.std(ddof=1) / math.sqrt(len(gain))) if len(gain) > 1 else math.inf
         if not gain.mean() > error:
             self.notes.append(
-                f"no network: it predicts held-out blocks better by {gain.mean():.3f} ± {error:.3f} "
-                f"of log-loss only"
+                f"no network: it lowers the loss on held-out blocks by {gain.mean():.3f} ± "
+                f"{error:.3f} only"
             )
             return None
         self._folds["model"] = (model, folds)
@@ -367,7 +374,7 @@ class _Selection:
             low, high = self.blocks[block]
             rows = whole.windows.rows
             others = (rows[:, 1] < low) | (rows[:, 0] > high)
-            windows = Windows(*(np.ascontiguousarray(part[others]) for part in whole.windows))
+            windows = whole.windows.where(others)
             simulator = Simulator(model, self.data)
             found = solve(simulator, windows, whole.p, s, scale=whole.scale[others], tolerance=1e-3)
             return predicted(simulator, found.p, self._judged[block]), found.p
@@ -386,7 +393,7 @@ class _Selection:
         return np.array(scores), [p for _, p in found]
 
     def held_out(self) -> dict[str, list[Predicted]]:
-        """Return predictions of each block over the longest horizon of the report, by what made them."""
+        """Return predictions of each block up to the longest horizon, by what made them."""
         longest = max(HORIZONS) * self.window
         pieces = max(self.data.time[b] - self.data.time[a] for a, b in self.blocks)
         tested = [
@@ -401,7 +408,9 @@ class _Selection:
 
             out[what] = list(self._map(one, range(len(self.blocks))))
         out["linear"] = [
-            linear_predictions(self.data, self.blocks[block], tested[block], self.delay, self.step)
+            linear_predictions(
+                *(self.data, self.data, tested[block], self.delay, self.step), self.blocks[block]
+            )
             for block in range(len(self.blocks))
         ]
         return out
@@ -481,9 +490,10 @@ def _blocks(data: Data, runs: Sequence[Log]) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in itertools.pairwise(cuts) if b > a]
 
 
-def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Array]:
+def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Integers]:
     pieces = np.split(np.arange(len(data.time)), np.unique(data.firsts)[1:])
-    out, at = [], 0
+    out: list[Integers] = []
+    at = 0
     for run in runs:
         n = sum(len(piece.time) > 1 for piece in run.pieces)
         out.append(np.concatenate(pieces[at : at + n]) if n else np.arange(0))
@@ -516,11 +526,9 @@ def _measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
     return dataclasses.replace(plant, measured=measured)
 
 
-def _check(plant: Plant, width: int, weights: Sequence[float], workers: int) -> None:
-    if not isinstance(plant, Plant):
-        raise SpecificationError(f"plant is {plant!r}, but a dopt.Plant is expected: declare one.")
+def _check(width: int, weights: Sequence[float], workers: int) -> None:
     for what, value, least in (("width", width, 0), ("workers", workers, 1)):
-        if not isinstance(value, int) or value < least:
+        if value != int(value) or value < least:
             raise SpecificationError(
                 f"{what} is {value!r}, but a whole number of at least {least} is expected: "
                 f"correct it."

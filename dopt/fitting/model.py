@@ -180,13 +180,14 @@ class Model:
             constants[at] = unknown.at(p[j])
             slopes[j] = unknown.slope(p[j])
         at = self.n_named + self.n_weights
-        delay, lag, lag_slope = self.delay, self.plant.lag, 0.0
+        delay = self.delay
         if self.structure.free_delay:
             delay += self.plant.dt * p[at]
             at += 1
-        if isinstance(lag, Unknown):
-            z = p[at] if self.structure.free_lag else 0.0
-            lag, lag_slope = lag.at(z), lag.slope(z)
+        given = self.plant.lag
+        z = float(p[at]) if self.structure.free_lag else 0.0
+        lag = given.at(z) if isinstance(given, Unknown) else given
+        lag_slope = given.slope(z) if isinstance(given, Unknown) else 0.0
         weights = np.ascontiguousarray(p[self.n_named : self.n_named + self.n_weights])
         sizes = np.ascontiguousarray(self.sizes)
         numbers = (float(delay), float(lag), float(self.plant.dt), float(lag_slope))

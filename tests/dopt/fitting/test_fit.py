@@ -60,14 +60,15 @@ def declared(**changed: object) -> dopt.Plant:
 
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
-    """A fit to a run with drag, whose network the validation wants."""
+    """Return a fit to a run with drag, whose network the validation wants."""
     return dopt.fit(declared(), run(0, drag=0.4), width=6, weights=(10.0, 3.0))
 
 
 def loader() -> ModuleType:
     path = Path(__file__).parents[3] / "docs/example/load_model.py"
     spec = importlib.util.spec_from_file_location("load_model", path)
-    assert spec and spec.loader
+    assert spec
+    assert spec.loader
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -151,7 +152,7 @@ def test_the_environment_goes_as_the_simulation(fitted: Fitted) -> None:
 
 def test_a_given_delay_that_does_not_fit_is_said() -> None:
     found = dopt.fit(declared(delay=0.0), run(3), width=0)
-    assert any("declare delay" in note for note in found.selection.notes)
+    assert any("declare a delay of 0.02 s" in note for note in found.selection.notes)
 
 
 def test_units_of_a_state_do_not_matter() -> None:
@@ -160,8 +161,8 @@ def test_units_of_a_state_do_not_matter() -> None:
         plant = declared(
             known={
                 "angle": f"rate * {unit}",
-                "rate": f"(gain * voltage - damping * rate * {unit} - gravity * sin(angle + offset)) "
-                f"/ {unit}",
+                "rate": f"(gain * voltage - damping * rate * {unit} "
+                f"- gravity * sin(angle + offset)) / {unit}",
             },
             box={"rate": 10.0 / unit},
         )

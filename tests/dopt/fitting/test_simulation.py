@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -50,14 +51,14 @@ def truth(t: Array, u: Array, delay: float, lag: float, x0: Array, c: tuple[floa
         at = int(np.searchsorted(t + delay, s, side="right")) - 1
         return float(u[max(at, 0)])
 
-    def rate(s: float, x: Array, now: float) -> list[float]:
+    def rate(_: float, x: Array, now: float) -> list[float]:
         v = x[2] if lag else now
         force = gain * v - damping * x[1] - gravity * math.sin(x[0] + offset)
         return [x[1], force, (now - x[2]) / lag if lag else 0.0]
 
     switches = sorted({*t, *(t + delay)[(t + delay > t[0]) & (t + delay < t[-1])]})
     x, out = np.array([*x0, held(t[0] + 1e-12)]), {switches[0]: np.array(x0)}
-    for a, b in zip(switches[:-1], switches[1:], strict=True):
+    for a, b in itertools.pairwise(switches):
         now = held(0.5 * (a + b))
         x = solve_ivp(rate, (a, b), x, args=(now,), rtol=1e-10, atol=1e-12).y[:, -1]
         out[b] = x[:2]
