@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -99,7 +100,7 @@ def test_sensitivities_agree_with_differences(width: int, seed: int) -> None:
     t, u = stamps(rng, 60, 0.3), rng.uniform(-2, 2, 60)
     plant = pendulum(delay=dopt.unknown(0.0, spread=0.02), lag=dopt.unknown(0.03))
     layout = Layout(np.array([0.0, 0.0, 0.5]), np.array([1.0, 1.0, 4.0]), np.array([9.0]))
-    how = {
+    how: dict[str, Any] = {
         "longest_step": 0.002,
         "delay": 0.0303,
         "free_delay": True,
@@ -172,7 +173,7 @@ def test_a_fit_finds_constants_delay_and_lag(seed: int) -> None:
 
 
 def test_an_input_that_was_measured_is_interpolated() -> None:
-    t = np.arange(100) * 0.02
+    t: Array = np.arange(100.0) * 0.02
     u = np.sin(3 * t)
     plant = pendulum()
 
@@ -189,7 +190,8 @@ def test_an_input_that_was_measured_is_interpolated() -> None:
 
 
 def test_a_simulation_that_leaves_the_limit_counts_and_fails_nothing() -> None:
-    t, rng = np.arange(100) * 0.02, np.random.default_rng(0)
+    t: Array = np.arange(100.0) * 0.02
+    rng = np.random.default_rng(0)
     plant = pendulum(
         known={"angle": "rate", "rate": "gain * voltage + gravity ** 2 * angle"}, limit=50.0
     )
