@@ -376,7 +376,7 @@ class _Selection:
             others = (rows[:, 1] < low) | (rows[:, 0] > high)
             windows = whole.windows.where(others)
             simulator = Simulator(model, self.data)
-            found = solve(simulator, windows, whole.p, s, scale=whole.scale[others], tolerance=1e-3)
+            found = solve(simulator, windows, whole.p, s, scale=whole.scale[others])
             return predicted(simulator, found.p, self._judged[block]), found.p
 
         found = list(self._map(one, range(len(self.blocks))))

@@ -13,6 +13,7 @@ few of those in a window are independent. A step is taken by the method of Leven
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import numba
@@ -32,6 +33,14 @@ BATCH_ROWS = 1200
 
 ROBUSTNESS = 1.0
 """c of ρ, by the median of ‖e_k‖²."""
+
+FIRST_DAMPING = 1.0
+"""First damping, by the precision of the prior of a parameter."""
+
+LEAST_DAMPING = 1e-6
+
+LARGEST_DAMPING = 1e12
+"""Damping at which no step is short enough: a minimum up to rounding."""
 
 STUCK = 1e12
 """What a window that leaves the limit counts for, by c."""
@@ -231,7 +240,7 @@ def solve(
     *,
     most: int = 30,
     scale: Array | None = None,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
     deviations: Array | float = 1.0,
     say: Any = None,
 ) -> Solution:
@@ -245,42 +254,36 @@ def solve(
         prior = np.sum(precision * (p - model.prior) ** 2)
         return float(robust(squares, scale).sum() / s**2 + prior)
 
-    value, damping, calm, steps = cost(squares, p), 1e-3, 0, 0
+    value, damping, calm, steps = cost(squares, p), FIRST_DAMPING, 0, 0
     converged = False
     while steps < most and not converged:
         steps += 1
         weights = 1.0 / (1.0 + squares / scale)
         linear = simulator.linear(p, windows, weights / s**2)
-        H = linear.normal + np.diag(precision)
-        b = linear.slope - precision * (p - model.prior)
-        D = np.diag(H).copy()
-        while True:
-            try:
-                step = cho_solve(
-                    cho_factor(H + np.diag(damping * D), check_finite=False), b, check_finite=False
-                )
-            except np.linalg.LinAlgError:
-                damping = max(10 * damping, 1e-6)
-                continue
+        H, b = linear.normal + np.diag(precision), linear.slope - precision * (p - model.prior)
+        growth, new = 2.0, math.inf
+        while damping < LARGEST_DAMPING:
+            factor = cho_factor(H + damping * np.eye(model.q), check_finite=False)
+            step = cho_solve(factor, b, check_finite=False)
             trial = p + step
             moved = windows._replace(starts=_moved(windows.starts, linear, step))
             after = simulator.squares(trial, moved)
             new = cost(after, trial)
             if new < value:
                 break
-            damping *= 8.0
-            if damping > 1e8:
-                break
+            damping *= growth
+            growth *= 2.0
         if not new < value:
             converged = True
             break
-        fall = (value - new) / value
-        p, windows, squares, value = trial, moved, after, new
+        fall, foreseen = value - new, float(step @ (b + damping * step))
+        ratio = fall / foreseen if foreseen > 0.0 else 1.0
+        damping = max(damping * max(1.0 / 9.0, 1.0 - (2.0 * ratio - 1.0) ** 3), LEAST_DAMPING)
+        p, windows, squares = trial, moved, after
         if say:
-            say(f"  step {steps}: cost {value:.6g}, fall {fall:.1e}, damping {damping:.0e}")
-        damping = max(damping / 8.0, 1e-9)
-        calm = calm + 1 if fall < tolerance else 0
-        converged = calm >= 2
+            say(f"  step {steps}: cost {new:.6g}, fall {fall / value:.1e}, damping {damping:.0e}")
+        calm = calm + 1 if fall < tolerance * value else 0
+        value, converged = new, calm >= 2
     return Solution(p, windows, squares, scale, steps, converged)
 
 

@@ -47,6 +47,13 @@ COMPLEX_KNOWN = types.void(*[types.complex128[::1]] * 4)
 _DIGEST = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
 
 
+def _inlined(function: CompiledFunction) -> CompiledFunction:
+    """Compile a function into its callers: a call would count references of all arrays."""
+    if PLAIN:
+        return function
+    return numba.njit(error_model="numpy", fastmath=False, inline="always")(function)
+
+
 def _compiled(function: CompiledFunction) -> CompiledFunction:
     if PLAIN:
         return function
@@ -147,7 +154,7 @@ def work_for(d: int, m: int, columns: int, c: int, p: int, w: int) -> Work:
     return Work._make([*vectors, *of_inputs, *matrices, *complexes, *of_network])
 
 
-@_compiled
+@_inlined
 def _network(structure: Structure, values: Values, work: Work, sensitive: bool) -> None:
     """Add the network to f, and where wanted its derivatives to A and P."""
     w, p = structure.width, structure.feature_kinds.shape[0]
@@ -193,7 +200,7 @@ def _network(structure: Structure, values: Values, work: Work, sensitive: bool) 
                     out[first + j * p + i] = slope * phi[i]
 
 
-@_compiled
+@_inlined
 def _rates(structure: Structure, values: Values, work: Work, sensitive: bool) -> None:
     """Write f at the state ``xs`` under v, and where wanted A, B and P."""
     d, m = work.xs.shape[0], work.v.shape[0]
@@ -228,7 +235,7 @@ def _rates(structure: Structure, values: Values, work: Work, sensitive: bool) ->
         _network(structure, values, work, sensitive)
 
 
-@_compiled
+@_inlined
 def _combine(work: Work, through_lag: Matrix, first: int, n_times: int) -> None:
     """Write K = A S + P, with what the delay and the lag change of v added."""
     d, n = work.S.shape
@@ -247,7 +254,7 @@ def _combine(work: Work, through_lag: Matrix, first: int, n_times: int) -> None:
                 K[first + c] += work.B[i, j] * through_lag[j, c]
 
 
-@_compiled
+@_inlined
 def _held(
     values: Values, u: Vector, v: Vector, dv: Matrix, s: float, at: Vector, dat: Matrix
 ) -> None:
@@ -264,7 +271,7 @@ def _held(
         dat[j, 1] = left * dv[j, 1] + (v[j] - u[j]) * left * s / (values.lag * values.lag)
 
 
-@_compiled
+@_inlined
 def _integrate(
     structure: Structure,
     values: Values,
@@ -332,7 +339,7 @@ def _integrate(
         dv[j, 0], dv[j, 1] = dat[j, 0], dat[j, 1]
 
 
-@_compiled
+@_inlined
 def _switched(
     structure: Structure,
     values: Values,
