@@ -19,6 +19,7 @@ from dopt.explorer.arguments import reals, whole
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
+from dopt.spec.scaled import learned_accelerations, scaled
 from dopt.spec.trial import PrequentialTrial, TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import start_variances
@@ -90,13 +91,16 @@ def free_run_error(
     inputs: npt.ArrayLike,
     steps: int = 50,
 ) -> float:
-    """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations.
+    """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations, (N, r).
+
+    All numbers are in the units of the plant.
 
     Where the run has the measured states alone, predictions start from the estimates of a filter,
     the first of them after so many steps as a prediction has, and the error is taken over the
     measured states.
     """
-    system = spec.system
+    found = scaled(spec.system)
+    system = found.system
     y, u = (np.atleast_1d(reals(*run)) for run in (("states", states), ("inputs", inputs)))
     steps = whole("steps", steps)
     rows = _rows_of(system, y)
@@ -104,9 +108,11 @@ def free_run_error(
     n = (len(u) - first) // max(steps, 1)
     _check_shapes(system, y, u, steps, n)
     _check_finite(y, u)
+    y, u = y / found.states[rows], u / found.inputs
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
+    predict = found.scaled_predictions(predict)
     x = y if isinstance(rows, slice) else filtered_states(system, predict, y, u, _variance(spec))
     last = first + n * steps
     cut = u[first:last].reshape(n, steps, system.n_inputs)
@@ -194,7 +200,10 @@ class Explored:
 
     @property
     def parameters(self) -> Array:
-        """Parameters of the model, (q,)."""
+        """Parameters of the model, (q,); of a plant, of the model in scaled numbers.
+
+        They do not depend on the units of the plant (:mod:`dopt.spec.scaled`).
+        """
         return self._state.steps.parameters
 
     @property
@@ -205,12 +214,12 @@ class Explored:
 
         Where the exploration went on from another state, as after a gap, that one is here.
         """
-        return self._state.steps.states[: self.n_steps + 1].copy()
+        return self._state.states[: self.n_steps + 1].copy()
 
     @property
     def inputs(self) -> Array:
         """Inputs that were applied, (t, m)."""
-        return self._state.steps.inputs[: self.n_steps].copy()
+        return self._state.inputs[: self.n_steps].copy()
 
     @property
     def errors(self) -> Array:
@@ -219,7 +228,7 @@ class Explored:
         Where states are measured with noise, they are errors of predicted measurements, in
         standard deviations of the noise.
         """
-        return self._state.steps.errors[: self.n_steps].copy()
+        return self._state.errors[: self.n_steps].copy()
 
     def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike | None = None) -> Array:
         """Return the learned accelerations, (N, r), at states, (N, d), and inputs, (N, m).
@@ -273,8 +282,7 @@ def predict(
             f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
             f"give the input of each state."
         )
-    predicted: Array = spec.model.predict(system, parameters, at, u)
-    return predicted
+    return learned_accelerations(spec, parameters, at, u)
 
 
 def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:

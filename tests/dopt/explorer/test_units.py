@@ -1,0 +1,215 @@
+"""The units of a plant do not matter: recorded runs in several units, for every learner."""
+
+from __future__ import annotations
+
+import functools
+import gzip
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from dopt import LEARNERS, Explorer, Plant
+from dopt.spec.scaled import scaled, scaled_trial
+from dopt.types import Array
+
+RECORDED = Path(os.environ.get("DOPT_DATA", "")) / "disk_train.csv.gz"
+DT = 0.025
+
+
+class Units(NamedTuple):
+    """Factors of the numbers of rates and inputs: 1000 for a rate in mrad/s."""
+
+    rate: float = 1.0
+    input: float = 1.0
+
+
+@functools.cache
+def disk(units: Units, measured: bool) -> Plant:
+    """Return the unbalanced disk, with the constants of its published simulator."""
+    return Plant(
+        states={"angle": "rad", "rate": "rad/s"},
+        inputs={"voltage": "V"},
+        dt=DT,
+        gamma=3.0 * units.input,
+        known={"angle": "rate / factor", "rate": "gain * voltage"},
+        constants={"gain": 28.136 * units.rate / units.input, "factor": units.rate},
+        learned=["rate"],
+        angles=["angle"],
+        box={"rate": 20.0 * units.rate},
+        measured={"angle": 1e-3} if measured else {},
+    )
+
+
+class Run(NamedTuple):
+    """States, (T + 1, 2), and inputs, (T, 1), in rad, rad/s and V."""
+
+    states: Array
+    inputs: Array
+
+
+def simulated() -> Run:
+    """Return a run of a disk with dry friction, whose angles are rounded as by an encoder."""
+    rng = np.random.default_rng(7)
+    inputs = np.repeat(rng.uniform(-3, 3, 200), 4)
+    angles, angle, rate, substeps = [0.0], 0.0, 0.0, 50
+    for u in inputs:
+        for _ in range(substeps):
+            friction = 1.3 * rate + 2.0 * np.tanh(rate)
+            rate += DT / substeps * (28.136 * u - 128.6 * np.sin(angle) - friction)
+            angle += DT / substeps * rate
+        angles.append(round(angle / 0.00314) * 0.00314)
+    return measured(np.array(angles), inputs)
+
+
+def measured(angles: Array, inputs: Array) -> Run:
+    """Return a run of which the angles, (T + 1,), were measured, with their differences."""
+    return Run(np.column_stack([angles, np.gradient(angles, DT)]), inputs[:, None])
+
+
+def recorded() -> Run:
+    """Return a part of the recorded run, whose inputs come one sample late."""
+    with gzip.open(RECORDED, "rt") as lines:
+        u, angles = np.loadtxt(lines, delimiter=",", skiprows=1, max_rows=2802).T
+    return measured(angles[2001:2802], u[2000:2800])
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        simulated,
+        pytest.param(
+            recorded,
+            marks=pytest.mark.skipif(
+                not RECORDED.is_file(), reason="DOPT_DATA names no folder with disk_train.csv.gz"
+            ),
+        ),
+    ],
+)
+def run(request: pytest.FixtureRequest) -> Iterator[Run]:
+    yield request.param()
+
+
+WIDE = {
+    "bounds": {"angle": [-40, 40], "rate": [-60, 60], "voltage": [-3, 2]},
+    "rates": {"voltage": 90},
+}
+
+CASES: dict[str, tuple[bool, dict[str, Any]]] = {
+    "adam": (False, {"policy": "random", "learner": "adam"}),
+    "adam_window": (False, {"learner": "adam_window"}),
+    "adam_window, affine": (False, {"model": "affine", "learner": "adam_window"}),
+    "adam_window, limits": (False, {"learner": "adam_window", "limits": WIDE}),
+    "adam_window, filtered": (True, {"policy": "random", "learner": "adam_window"}),
+    "adam_replay": (False, {"policy": "uniform", "learner": "adam_replay"}),
+    "ekf": (False, {"learner": "ekf"}),
+    "gauss_newton": (False, {"learner": "gauss_newton"}),
+    "gauss_newton, black box": (
+        False, {"policy": "random", "model": "black_box", "learner": "gauss_newton"},
+    ),
+    "gauss_newton, ensemble": (False, {"model": "ensemble", "learner": "gauss_newton"}),
+    "recursive_least_squares": (False, {"model": "rff", "learner": "recursive_least_squares"}),
+    "recursive_least_squares, linear": (
+        False, {"policy": "random", "model": "linear_state", "learner": "recursive_least_squares"},
+    ),
+    "joint_ekf": (
+        True,
+        {"policy": {"name": "d_optimal", "regularization": 3.0}, "learner": "joint_ekf"},
+    ),
+    "joint_ekf, random": (
+        True,
+        {"policy": "random", "learner": {"name": "joint_ekf", "refit_every": 40, "noise": "fitted"}},
+    ),
+    "conditioning": (
+        False, {"policy": "gaussian_process", "model": "gaussian_process", "learner": "conditioning"},
+    ),
+}  # fmt: skip
+
+cases = pytest.mark.parametrize("case", CASES)
+
+
+def test_every_learner_is_among_them() -> None:
+    def name(learner: Any) -> str:
+        return str(learner["name"] if isinstance(learner, dict) else learner)
+
+    assert {name(given["learner"]) for _, given in CASES.values()} == set(LEARNERS)
+
+
+def in_units(limits: dict[str, Any], units: Units) -> dict[str, Any]:
+    factors = {"angle": 1.0, "rate": units.rate, "voltage": units.input}
+    bounds = {k: [end * factors[k] for end in ends] for k, ends in limits["bounds"].items()}
+    return {"bounds": bounds, "rates": {k: v * factors[k] for k, v in limits["rates"].items()}}
+
+
+class Learned(NamedTuple):
+    """What an explorer has learned, with numbers in rad/s and V."""
+
+    parameters: Array
+    errors: Array
+    states: Array
+    answer: Array
+    predicted: Array
+    free_run_error: float
+
+
+def learned(case: str, run: Run, units: Units, steps: int) -> Learned:
+    """Let an explorer learn from the first steps of a run in other units."""
+    is_measured, given = CASES[case]
+    if "limits" in given:
+        given = given | {"limits": in_units(given["limits"], units)}
+    states, inputs = run.states * [1.0, units.rate], run.inputs * units.input
+    told = states[:, :1] if is_measured else states
+    with Explorer(disk(units, is_measured), steps=steps + 1, **given) as one:
+        one.tell(told[0])
+        for x, u in zip(told[1 : steps + 1], inputs, strict=False):
+            assert one.tell(x, applied=u)
+        at = one.predict(states[::40], inputs[::40])
+        return Learned(
+            one.parameters.copy(),
+            one.errors / (1.0 if is_measured else units.rate),
+            one.states / [1.0, units.rate],
+            one.ask(told[steps]) / units.input,
+            at / units.rate,
+            one.free_run_error(told[-301:], inputs[-300:]),
+        )
+
+
+@functools.cache
+def in_its_own(case: str, run: Any, steps: int) -> Learned:
+    return learned(case, run(), Units(), steps)
+
+
+@pytest.mark.parametrize(
+    "units",
+    [Units(8.0), Units(1024.0), Units(0.125), Units(1.0, 8.0), Units(1024.0, 0.125)],
+    ids=str,
+)
+@cases
+def test_powers_of_two_change_no_bit(
+    case: str, units: Units, run: Run, request: pytest.FixtureRequest
+) -> None:
+    expected = in_its_own(case, source(request), 100)
+    for found, known in zip(learned(case, run, units, 100), expected, strict=True):
+        np.testing.assert_array_equal(found, known)
+
+
+@pytest.mark.parametrize(
+    "units", [Units(10.0), Units(1000.0), Units(1.0, 10.0), Units(0.1, 1000.0)], ids=str
+)
+@cases
+def test_other_units_change_hardly_anything(
+    case: str, units: Units, run: Run, request: pytest.FixtureRequest
+) -> None:
+    expected, found = in_its_own(case, source(request), 400), learned(case, run, units, 400)
+    assert found.errors[:100] == pytest.approx(expected.errors[:100], rel=1e-6)
+    assert np.mean(found.errors[:100] ** 2) == pytest.approx(
+        np.mean(expected.errors[:100] ** 2), rel=1e-6
+    )
+    assert found.free_run_error == pytest.approx(expected.free_run_error, rel=0.05)
+
+
+def source(request: pytest.FixtureRequest) -> Any:
+    return request.node.callspec.params["run"]
