@@ -99,8 +99,7 @@ def free_run_error(
     the first of them after so many steps as a prediction has, and the error is taken over the
     measured states.
     """
-    found = scaled(spec.system)
-    system = found.system
+    system = spec.system
     y, u = (np.atleast_1d(reals(*run)) for run in (("states", states), ("inputs", inputs)))
     steps = whole("steps", steps)
     rows = _rows_of(system, y)
@@ -108,12 +107,10 @@ def free_run_error(
     n = (len(u) - first) // max(steps, 1)
     _check_shapes(system, y, u, steps, n)
     _check_finite(y, u)
-    y, u = y / found.states[rows], u / found.inputs
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
-    predict = found.scaled_predictions(predict)
-    x = y if isinstance(rows, slice) else filtered_states(system, predict, y, u, _variance(spec))
+    x = y if isinstance(rows, slice) else _estimated(spec, predict, y, u, rows)
     last = first + n * steps
     cut = u[first:last].reshape(n, steps, system.n_inputs)
     starts, ends = y[first:last:steps], y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
@@ -124,6 +121,20 @@ def free_run_error(
         )
     predicted = forecast_by(system, predict)(x[first:last:steps], cut)
     return relative_error(predicted[..., rows], ends, starts)
+
+
+def _estimated(
+    spec: TrialSpec,
+    predict: Callable[[Array, Array], Array],
+    outputs: Array,
+    inputs: Array,
+    rows: list[int],
+) -> Array:
+    """Return estimates of the states, (T + 1, d), of which some rows were measured."""
+    found, variance = scaled(spec.system), _variance(spec)
+    y, u = found.of_states(outputs, rows), found.of_inputs(inputs)
+    predict = found.scaled_predictions(predict)
+    return found.states * filtered_states(found.system, predict, y, u, variance)
 
 
 def _rows_of(system: System, run: Array) -> slice | list[int]:

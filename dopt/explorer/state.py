@@ -167,7 +167,6 @@ class ExplorerState:
         self.time: float | None = None
         self._rows = list(spec.system.learned_rows)
         self._measured = list(spec.system.measured_states or range(spec.system.n_states))
-        self._units = self._scaled.states[self._measured]
         steps = spec.system.horizon
         self.states = np.full((steps + 1, spec.system.n_states), np.nan)
         self.inputs, self.errors = np.zeros((steps, spec.system.n_inputs)), np.full(steps, np.nan)
@@ -230,7 +229,7 @@ class ExplorerState:
             state = np.zeros(self.spec.system.n_states)
             state[self._measured] = x
             self.states[self.done] = state
-            self.steps.begin(self.done, state / self._scaled.states)
+            self.steps.begin(self.done, self._scaled.of_states(state))
 
     def _warn_of_jumps(self) -> None:
         """Say so once if inputs are asked for other measurements than those told last."""
@@ -243,8 +242,8 @@ class ExplorerState:
 
     def _learn(self, event: Event) -> None:
         t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
-        self.inputs[t], self.steps.inputs[t] = u, u / self._scaled.inputs
-        self.steps.measure(t, x / self._units)
+        self.inputs[t], self.steps.inputs[t] = u, self._scaled.of_inputs(u)
+        self.steps.measure(t, self._scaled.of_states(x, self._measured))
         self._watch_size(t, x, u, event["dt"])
         error = self._error(t, event["dt"])
         finite = self.steps.take_in(t, event["dt"])
@@ -272,7 +271,7 @@ class ExplorerState:
         if self.spec.system.n_measured:
             return np.zeros(len(self._rows))
         system, x, rows = self._scaled.system, self.steps.states[self.done], self._rows
-        change, u = following / self._scaled.states - x, u / self._scaled.inputs
+        change, u = self._scaled.of_states(following) - x, self._scaled.of_inputs(u)
         with np.errstate(all="ignore"):
             known = np.array(system.known(tuple(x), tuple(u), system.parameters), dtype=float)
             seen: Array = change[rows] / dt - known[rows]
@@ -309,7 +308,7 @@ class ExplorerState:
             if t == SIZED_STEPS - 1:
                 sizes = np.sqrt(self._squares / SIZED_STEPS)
                 where = f"over the first {SIZED_STEPS} steps"
-                units = self._scaled.accelerations if self._scaled.system is not system else None
+                units = self._scaled.accelerations if self._scaled.is_scaled else None
                 warn_of_sizes(system, sizes, where, _UNITS, units)
 
     def _compare(self, planned: Array) -> None:

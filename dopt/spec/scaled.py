@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ from dopt.policies import POLICIES, Policy, TaskOptimal
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import ExploredPlant
+from dopt.systems.scales import rounded
 from dopt.types import Array
 
 
@@ -40,11 +42,26 @@ class Scaled:
         What its states are multiplied by, in the units of the plant.
     inputs : float
         What its inputs are multiplied by.
+    is_scaled : bool
+        Whether the numbers are others than those in the units of the system.
     """
 
     system: System
     states: Array
     inputs: float
+    is_scaled: bool
+
+    def of_states(self, states: Array, rows: Sequence[int] | slice = slice(None)) -> Array:
+        """Return some rows of states, (..., n), in scaled numbers."""
+        if not self.is_scaled:
+            return states
+        found = rounded(states / self.states[rows])
+        angles = np.isin(np.arange(len(self.states))[rows], self.system.angle_indices)
+        return np.where(angles, states, found)
+
+    def of_inputs(self, inputs: Array) -> Array:
+        """Return inputs, (..., m), in scaled numbers."""
+        return rounded(inputs / self.inputs) if self.is_scaled else inputs
 
     @property
     def accelerations(self) -> Array:
@@ -65,8 +82,9 @@ class Scaled:
 def scaled(system: System) -> Scaled:
     """Return a system in the numbers that its exploration works with."""
     if isinstance(system, ExploredPlant) and system.scaled:
-        return Scaled(system.in_scales(), np.array(system.plant.scales), float(system.gamma))
-    return Scaled(system, np.ones(system.n_states), 1.0)
+        states, gamma = np.array(system.plant.scales), float(system.gamma)
+        return Scaled(system.in_scales(), states, gamma, is_scaled=True)
+    return Scaled(system, np.ones(system.n_states), 1.0, is_scaled=False)
 
 
 def in_scaled_numbers(spec: TrialSpec) -> TrialSpec:
@@ -86,7 +104,7 @@ def in_scaled_numbers(spec: TrialSpec) -> TrialSpec:
 def scaled_trial(spec: TrialSpec) -> TrialSpec:
     """Return the specification in scaled numbers."""
     found = scaled(spec.system)
-    if found.system is spec.system:
+    if not found.is_scaled:
         return spec
     config = dataclasses.replace(
         spec.config,
@@ -99,19 +117,23 @@ def scaled_trial(spec: TrialSpec) -> TrialSpec:
 
 def _scaled_policy(policy: Policy, found: Scaled) -> Policy:
     if isinstance(policy, TaskOptimal) and policy.goal:
-        return dataclasses.replace(policy, goal=tuple(np.array(policy.goal) / found.states))
+        goal = found.of_states(np.array(policy.goal))
+        return dataclasses.replace(policy, goal=tuple(goal.tolist()))
     return policy
 
 
 def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
     units = dict(zip(names_of(found.system.state_labels), found.states, strict=True))
     units |= dict.fromkeys(names_of(found.system.input_labels), found.inputs)
+
+    def divided(name: str, *numbers: float) -> list[float]:
+        quotients: list[float] = rounded(np.array(numbers) / units[name]).tolist()
+        return quotients
+
     return dataclasses.replace(
         limits,
-        bounds=tuple(
-            (name, low / units[name], high / units[name]) for name, low, high in limits.bounds
-        ),
-        rates=tuple((name, rate / units[name]) for name, rate in limits.rates),
+        bounds=tuple((name, *divided(name, *pair)) for name, *pair in limits.bounds),
+        rates=tuple((name, *divided(name, rate)) for name, rate in limits.rates),
     )
 
 
@@ -124,7 +146,7 @@ def learned_accelerations(
     scaled numbers.
     """
     found = scaled(spec.system)
-    u = None if inputs is None else inputs / found.inputs
-    values = spec.model.predict(found.system, parameters, states / found.states, u)
+    u = None if inputs is None else found.of_inputs(inputs)
+    values = spec.model.predict(found.system, parameters, found.of_states(states), u)
     predicted: Array = values * found.accelerations
     return predicted

@@ -23,7 +23,7 @@ from dopt.systems import elementary
 from dopt.systems.base import Feature
 from dopt.systems.black_box import BlackBox, unknown_accelerations
 from dopt.systems.properties import input_effect
-from dopt.systems.scales import scales, sizes
+from dopt.systems.scales import SPLIT, rounded, scales, sizes
 from dopt.types import Array, Equation
 
 FUNCTIONS = {
@@ -72,7 +72,8 @@ def compiled_text(
     units : mapping of str to float, optional
         What the arguments of some quantities are multiplied by.
     results : sequence of float, optional
-        What the value of each expression is divided by.
+        What the value of each expression is divided by, before it is rounded to 36 bits
+        (:mod:`dopt.systems.scales`).
 
     Raises
     ------
@@ -87,8 +88,9 @@ def compiled_text(
     groups = zip(given, arguments.values(), strict=True)
     unpacked = [f"{', '.join(group)}, = {name}" for name, group in groups if group]
     scaled = [f"{name} = {name} * {unit!r}" for name, unit in (units or {}).items()]
-    if results:
-        texts = [f"({text}) / {unit!r}" for text, unit in zip(texts, results, strict=True)]
+    for i, unit in enumerate(results):
+        scaled += [f"_{i} = ({texts[i]}) / {unit!r}", f"_{i}_split = {SPLIT!r} * _{i}"]
+        texts[i] = f"_{i}_split - (_{i}_split - _{i})"
     lines = [*unpacked, *scaled, f"return ({', '.join(texts)},)"]
     source = "\n    ".join([f"def equation({', '.join(given)}):", *lines])
     namespace: dict[str, Any] = {**FUNCTIONS, "__name__": "expressions"}
@@ -558,6 +560,13 @@ class Plant:
         units = dict(zip(self.states, scales, strict=True))
         axes = [name for name in self.states if name in half_widths]
         measured = [name for name in self.states if name in self.measured]
+
+        def divided(numbers: Mapping[str, float]) -> tuple[float, ...]:
+            if kind is self._class:
+                return tuple(numbers.values())
+            divisors = [units[name] for name in numbers]
+            return tuple(rounded(np.array([*numbers.values()]) / divisors).tolist())
+
         return kind(
             gamma=self.gamma / scale,
             dt=self.dt,
@@ -565,9 +574,9 @@ class Plant:
             state_limit=LIMIT if self.limit is None else self.limit,
             integrator=self.integrator,
             measured_states=tuple([*self.states].index(name) for name in measured),
-            measurement_noise=tuple(_noise(self.measured[name]) / units[name] for name in measured),
+            measurement_noise=divided({name: _noise(self.measured[name]) for name in measured}),
             velocity_cutoff=self.velocity_cutoff,
-            grid_half_widths=tuple(half_widths[name] / units[name] for name in axes),
+            grid_half_widths=divided({name: half_widths[name] for name in axes}),
             grid_points=(GRID_POINTS,) * len(axes),
         )
 
