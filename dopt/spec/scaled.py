@@ -126,14 +126,15 @@ def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
     units = dict(zip(names_of(found.system.state_labels), found.states, strict=True))
     units |= dict.fromkeys(names_of(found.system.input_labels), found.inputs)
 
-    def divided(name: str, *numbers: float) -> list[float]:
-        quotients: list[float] = rounded(np.array(numbers) / units[name]).tolist()
-        return quotients
+    def divided(name: str, number: float) -> float:
+        return float(rounded(np.array(number / units[name])))
 
     return dataclasses.replace(
         limits,
-        bounds=tuple((name, *divided(name, *pair)) for name, *pair in limits.bounds),
-        rates=tuple((name, *divided(name, rate)) for name, rate in limits.rates),
+        bounds=tuple(
+            (name, divided(name, low), divided(name, high)) for name, low, high in limits.bounds
+        ),
+        rates=tuple((name, divided(name, rate)) for name, rate in limits.rates),
     )
 
 

@@ -13,7 +13,11 @@ import numpy as np
 import pytest
 
 from dopt import LEARNERS, Explorer, Plant
+from dopt.spec.scaled import scaled
+from dopt.systems.black_box import differentiated, rate_factors
+from dopt.systems.scales import STEPS_ACROSS
 from dopt.types import Array
+from tests.dopt.explorer.plants import HOVERCRAFT, steered
 
 RECORDED = Path(os.environ.get("DOPT_DATA", "")) / "disk_train.csv.gz"
 DT = 0.025
@@ -120,10 +124,14 @@ CASES: dict[str, tuple[bool, dict[str, Any]]] = {
     ),
     "joint_ekf, random": (
         True,
-        {"policy": "random", "learner": {"name": "joint_ekf", "refit_every": 40, "noise": "fitted"}},
+        {
+            "policy": "random",
+            "learner": {"name": "joint_ekf", "refit_every": 40, "noise": "fitted"},
+        },
     ),
     "conditioning": (
-        False, {"policy": "gaussian_process", "model": "gaussian_process", "learner": "conditioning"},
+        False,
+        {"policy": "gaussian_process", "model": "gaussian_process", "learner": "conditioning"},
     ),
 }  # fmt: skip
 
@@ -203,3 +211,63 @@ def test_other_units_change_hardly_anything(
     expected, found = in_its_own(case, run, 400), learned(case, run(), units, 400)
     assert found.errors[:100] == pytest.approx(expected.errors[:100], rel=1e-6)
     assert found.free_run_error == pytest.approx(expected.free_run_error, rel=0.05)
+
+
+class TestSizes:
+    """What a state is divided by where the box says nothing of it."""
+
+    def plant(self, **changed: Any) -> Plant:
+        given: dict[str, Any] = {
+            "states": {"place": "m", "speed": "m/s", "level": "V"},
+            "inputs": {"force": "N"},
+            "dt": 0.1,
+            "gamma": 2.0,
+            "known": {"place": "speed", "speed": "force / 4"},
+            "learned": ["level"],
+            "box": {"level": 5.0},
+        }
+        return Plant(**(given | changed))
+
+    def test_it_is_how_far_known_rates_lead(self) -> None:
+        seconds = STEPS_ACROSS * 0.1
+        place, speed, level = self.plant().scales
+        assert speed == pytest.approx(2.0 / 4.0 * seconds)
+        assert 0.9 * speed * seconds < place <= speed * seconds
+        assert level == pytest.approx(5.0 / seconds)
+
+    def test_it_is_what_leads_through_the_box(self) -> None:
+        known = {"place": "speed / 1000", "speed": "0", "level": "force"}
+        plant = self.plant(known=known, learned=["speed"], box={"place": 3.0})
+        seconds = STEPS_ACROSS * 0.1
+        assert plant.scales[1] * seconds == pytest.approx(1000.0 * 3.0 / seconds)
+
+    def test_the_limit_goes_by_it(self) -> None:
+        limits = self.plant().system(5, scaled=True).state_limits
+        assert limits[2] == 5000.0
+        assert (self.plant(limit=7.0).system(5, scaled=True).state_limits == 7.0).all()
+        assert (self.plant().system(5).state_limits == 1e4).all()
+
+
+def test_a_rate_in_other_units_is_found_by_differences() -> None:
+    system = disk(Units(1000.0), True).system(5)
+    assert differentiated(system) == [0, 0]
+    assert rate_factors(system) == pytest.approx([1.0, 1e-3])
+
+
+def test_errors_of_several_units_are_in_these() -> None:
+    """The first error of the hovercraft is that of its accelerations in m/s² and rad/s²."""
+    with Explorer(HOVERCRAFT, policy="random", steps=5) as one:
+        x = np.array([0.5, 0.3, -0.4])
+        u = one.ask(x)
+        expected = (steered(x, u) - x)[[0, 2]] / HOVERCRAFT.dt - [u[0], 2.0 * u[1]]
+        expected -= one.predict(x)[0]
+        one.tell(steered(x, u))
+        assert one.errors[0] == pytest.approx(np.linalg.norm(expected), rel=1e-9)
+        assert np.array_equal(one.states[1], steered(x, u))
+
+
+def test_parts_of_ones_own_are_given_the_units() -> None:
+    coin: dict[str, object] = {"_target_": "tests.dopt.custom_plugins.Coin"}
+    with Explorer(HOVERCRAFT, policy=coin, steps=5) as one:
+        assert not getattr(one.spec.system, "scaled", False)
+        assert not scaled(one.spec.system).is_scaled
