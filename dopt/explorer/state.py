@@ -242,11 +242,12 @@ class ExplorerState:
 
     def _learn(self, event: Event) -> None:
         t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
+        dt = self._scaled.of_seconds(event["dt"])
         self.inputs[t], self.steps.inputs[t] = u, self._scaled.of_inputs(u)
         self.steps.measure(t, self._scaled.of_states(x, self._measured))
-        self._watch_size(t, x, u, event["dt"])
-        error = self._error(t, event["dt"])
-        finite = self.steps.take_in(t, event["dt"])
+        self._watch_size(t, x, u, dt)
+        error = self._error(t, dt)
+        finite = self.steps.take_in(t, dt)
         self.errors[t] = self.steps.errors[t] * self._unit if error is None else error
         estimated = self.steps.states[t + 1] * self._scaled.states
         self.states[t + 1] = estimated if self.spec.system.n_measured else x

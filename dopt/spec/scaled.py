@@ -63,6 +63,10 @@ class Scaled:
         """Return inputs, (..., m), in scaled numbers."""
         return rounded(inputs / self.inputs) if self.is_scaled else inputs
 
+    def of_seconds(self, seconds: float) -> float:
+        """Return a time as scaled numbers are: rounded, and in the same unit."""
+        return float(rounded(np.array(seconds))) if self.is_scaled else seconds
+
     @property
     def accelerations(self) -> Array:
         """What its learned accelerations are multiplied by, (r,), in units of the plant."""
