@@ -16,6 +16,7 @@ from analysis.errors import AnalysisError
 from analysis.style import of_finished
 from dopt.assessment import Plane
 from dopt.limits import VIOLATIONS, limits_from
+from dopt.spec.scaled import learned_accelerations
 from dopt.spec.trial import TrialSpec, is_prequential, stored_trial
 from dopt.systems import System
 from orchestrate.store import ConfigRow, Curves, Reader
@@ -172,7 +173,7 @@ class LearnedModel:
                 f"inputs have {len(u)} rows and states have {len(x)}, but as many are expected: "
                 f"give one input for each state."
             )
-        values = self.spec.model.predict(self.spec.system, self.parameters, x, u)
+        values = learned_accelerations(self.spec, self.parameters, x, u)
         if u is not None:
             values = self._derivative(x, u, values)
         return values[0] if single else values

@@ -34,6 +34,7 @@ from dopt.learning import Learner
 from dopt.models import Model
 from dopt.policies import Policy
 from dopt.spec.config import LARGEST_HORIZON, completed
+from dopt.spec.scaled import in_scaled_numbers
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import Plant
@@ -139,8 +140,9 @@ class Explorer(SavedExplored):
     Parameters
     ----------
     plant : Plant or System
-        The plant; a system, such as one of ``dopt.SYSTEMS`` or an environment of Gymnasium, says by
-        its horizon how many steps there are.
+        The plant, which is explored in numbers that do not depend on its units
+        (:mod:`dopt.spec.scaled`); a system, such as one of ``dopt.SYSTEMS`` or an
+        environment of Gymnasium, says by its horizon how many steps there are.
     policy, model, learner : str, mapping or object
         As in :meth:`dopt.TrialSpec.of_system`.
     limits : mapping, optional
@@ -201,22 +203,30 @@ class Explorer(SavedExplored):
         self._tolerance = within("tolerance", tolerance, 1.0)
         deadline = None if deadline is None else within("deadline", deadline, TIMEOUT_MAX)
         self._fallback = safe_input(spec, fallback)
-        measured_states = system.measured_states or range(system.n_states)
+        scaled = in_scaled_numbers(spec)
+        self._journal = None if journal is None else Journal(journal, fsync, _about(scaled))
+        try:
+            unscaled = self._journal is not None and self._journal.is_unscaled
+            self._begin(spec if unscaled else scaled, deadline)
+        except BaseException:
+            if self._journal is not None:
+                self._journal.close()
+            raise
+
+    def _begin(self, spec: TrialSpec, deadline: float | None) -> None:
+        """Begin an exploration, or go on with that of the journal."""
+        system = spec.system
+        measured_states = list(system.measured_states or range(system.n_states))
         self._angles = [i for i, row in enumerate(measured_states) if row in system.angle_indices]
-        self._limits = np.full(len(measured_states), system.state_limit)
+        self._limits = system.state_limits[measured_states]
         self._limits[self._angles] = np.finfo(float).max
         super().__init__(spec)
         self._plans_each_step = may_remember_plans(spec)
         self._unlearned = UnlearnedStates(spec.system.dt)
         self._told: tuple[Array, float | None] = np.empty(0), None  # the last one
-        self._journal = None if journal is None else Journal(journal, fsync, self._about())
         self._planner = PunctualPlanner(self._state.plan, deadline)
         if self._journal is not None:
-            try:
-                self._resume(self._journal)
-            except BaseException:
-                self._journal.close()
-                raise
+            self._resume(self._journal)
 
     def ask(self, state: npt.ArrayLike, time: float | None = None) -> Array:
         """Return the input u_t, (m,), for a state x_t, (d,), or what was measured of it, (n,).
@@ -406,14 +416,10 @@ class Explorer(SavedExplored):
         if self._planner.wait():
             self._note_plan()
 
-    def _about(self) -> Event:
-        """Return the first line of the journal."""
-        return {"format": FORMAT, "trial": self.spec.to_mapping()}
-
     def _resume(self, journal: Journal) -> None:
         """Replay what the journal holds, or write what it is about."""
         if not journal.events:
-            journal.write(self._about(), durable=True)
+            journal.write(_about(self.spec), durable=True)
             return
         stored, given = completed(journal.events[0]["trial"]), completed(self.spec.to_mapping())
         if stored != given:
@@ -451,3 +457,8 @@ class Explorer(SavedExplored):
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _about(spec: TrialSpec) -> Event:
+    """Return the first line of a journal."""
+    return {"format": FORMAT, "trial": spec.to_mapping()}

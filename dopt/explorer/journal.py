@@ -87,6 +87,12 @@ class Journal:
             self._file.close()
             raise
 
+    @property
+    def is_unscaled(self) -> bool:
+        """Whether it holds an exploration of a plant in its own units, as all once were."""
+        section = self.events[0]["trial"].get("env") if self.events else {"scaled": True}
+        return not (isinstance(section, Mapping) and section.get("scaled"))
+
     def write(self, event: Event, *, durable: bool) -> None:
         """Append an event; one that is not durable may wait for the next one that is.
 

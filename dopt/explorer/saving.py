@@ -19,6 +19,7 @@ from dopt.explorer.arguments import reals, whole
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
+from dopt.spec.scaled import learned_accelerations, scaled
 from dopt.spec.trial import PrequentialTrial, TrialSpec
 from dopt.systems.base import System
 from dopt.systems.black_box import start_variances
@@ -90,7 +91,9 @@ def free_run_error(
     inputs: npt.ArrayLike,
     steps: int = 50,
 ) -> float:
-    """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations.
+    """Return the error of :meth:`Explored.free_run_error` of what predicts accelerations, (N, r).
+
+    All numbers are in the units of the plant.
 
     Where the run has the measured states alone, predictions start from the estimates of a filter,
     the first of them after so many steps as a prediction has, and the error is taken over the
@@ -107,7 +110,7 @@ def free_run_error(
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
-    x = y if isinstance(rows, slice) else filtered_states(system, predict, y, u, _variance(spec))
+    x = y if isinstance(rows, slice) else _estimated(spec, predict, y, u, rows)
     last = first + n * steps
     cut = u[first:last].reshape(n, steps, system.n_inputs)
     starts, ends = y[first:last:steps], y[first + 1 : last + 1].reshape(n, steps, -1).swapaxes(0, 1)
@@ -118,6 +121,20 @@ def free_run_error(
         )
     predicted = forecast_by(system, predict)(x[first:last:steps], cut)
     return relative_error(predicted[..., rows], ends, starts)
+
+
+def _estimated(
+    spec: TrialSpec,
+    predict: Callable[[Array, Array], Array],
+    outputs: Array,
+    inputs: Array,
+    rows: list[int],
+) -> Array:
+    """Return estimates of the states, (T + 1, d), of which some rows were measured."""
+    found, variance = scaled(spec.system), _variance(spec)
+    y, u = found.of_states(outputs, rows), found.of_inputs(inputs)
+    predict = found.scaled_predictions(predict)
+    return found.states * filtered_states(found.system, predict, y, u, variance)
 
 
 def _rows_of(system: System, run: Array) -> slice | list[int]:
@@ -194,7 +211,10 @@ class Explored:
 
     @property
     def parameters(self) -> Array:
-        """Parameters of the model, (q,)."""
+        """Parameters of the model, (q,); of a plant, of the model in scaled numbers.
+
+        They do not depend on the units of the plant (:mod:`dopt.spec.scaled`).
+        """
         return self._state.steps.parameters
 
     @property
@@ -205,12 +225,12 @@ class Explored:
 
         Where the exploration went on from another state, as after a gap, that one is here.
         """
-        return self._state.steps.states[: self.n_steps + 1].copy()
+        return self._state.states[: self.n_steps + 1].copy()
 
     @property
     def inputs(self) -> Array:
         """Inputs that were applied, (t, m)."""
-        return self._state.steps.inputs[: self.n_steps].copy()
+        return self._state.inputs[: self.n_steps].copy()
 
     @property
     def errors(self) -> Array:
@@ -219,7 +239,7 @@ class Explored:
         Where states are measured with noise, they are errors of predicted measurements, in
         standard deviations of the noise.
         """
-        return self._state.steps.errors[: self.n_steps].copy()
+        return self._state.errors[: self.n_steps].copy()
 
     def predict(self, states: npt.ArrayLike, inputs: npt.ArrayLike | None = None) -> Array:
         """Return the learned accelerations, (N, r), at states, (N, d), and inputs, (N, m).
@@ -273,8 +293,7 @@ def predict(
             f"{len(at)} states and {len(u)} inputs were given, but as many of both are expected: "
             f"give the input of each state."
         )
-    predicted: Array = spec.model.predict(system, parameters, at, u)
-    return predicted
+    return learned_accelerations(spec, parameters, at, u)
 
 
 def _rows(what: str, given: npt.ArrayLike, size: int) -> Array:

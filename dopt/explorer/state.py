@@ -13,6 +13,9 @@ event                   meaning
 ``lost``                a state that could not be used, after which the present one is unknown
 ``counted``             something that changes nothing, by the name of its count
 ======================  =====================================================================
+
+Events are in the units of the plant; the steps are taken in scaled numbers
+(:mod:`dopt.spec.scaled`).
 """
 
 from __future__ import annotations
@@ -30,7 +33,9 @@ from dopt.errors import ExplorationError
 from dopt.explorer.journal import Event, is_event
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
+from dopt.spec.scaled import scaled, scaled_trial
 from dopt.spec.trial import TrialSpec
+from dopt.systems.base import next_state
 from dopt.types import Array
 
 # A planner that is waited for until a deadline.
@@ -134,7 +139,11 @@ class ExplorerState:
     spec : TrialSpec
         Plant, policy, model, learner and seed.
     steps : Steps
-        The arrays and the steps of the trial.
+        The arrays and the steps of the trial, in scaled numbers.
+    states, inputs : (T + 1, d), (T, m)
+        States and inputs in the units of the plant; where states are estimated, the estimates.
+    errors : (T,)
+        Errors of predictions (:attr:`dopt.Explorer.errors`).
     done : int
         Steps t that were learned from.
     present : (d,) or None
@@ -150,13 +159,17 @@ class ExplorerState:
     """
 
     def __init__(self, spec: TrialSpec) -> None:
-        self.spec, self.steps = spec, _steps_of(spec)
+        self.spec, self._scaled = spec, scaled(spec.system)
+        self.steps = _steps_of(scaled_trial(spec))
         self.done, self.counts = 0, Counter[str]()
         self.present: Array | None = None
         self.answer: Array | None = None
         self.time: float | None = None
         self._rows = list(spec.system.learned_rows)
         self._measured = list(spec.system.measured_states or range(spec.system.n_states))
+        steps = spec.system.horizon
+        self.states = np.full((steps + 1, spec.system.n_states), np.nan)
+        self.inputs, self.errors = np.zeros((steps, spec.system.n_inputs)), np.full(steps, np.nan)
         self._squares = np.zeros(spec.system.n_learned)
         self._told_of_plans = False
         self.excess = np.zeros(spec.system.horizon)
@@ -206,7 +219,7 @@ class ExplorerState:
     @property
     def planned(self) -> Array:
         """The input that it chose, (m,)."""
-        chosen: Array = self.steps.inputs[self.done].copy()
+        chosen: Array = self.steps.inputs[self.done] * self._scaled.inputs
         return chosen
 
     def _move(self, x: Array, time: float | None) -> None:
@@ -215,7 +228,8 @@ class ExplorerState:
         if not (same and self.spec.system.n_measured):  # then the estimate stays
             state = np.zeros(self.spec.system.n_states)
             state[self._measured] = x
-            self.steps.begin(self.done, state)
+            self.states[self.done] = state
+            self.steps.begin(self.done, self._scaled.of_states(state))
 
     def _warn_of_jumps(self) -> None:
         """Say so once if inputs are asked for other measurements than those told last."""
@@ -228,12 +242,17 @@ class ExplorerState:
 
     def _learn(self, event: Event) -> None:
         t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
-        self.steps.inputs[t] = u
-        self.steps.measure(t, x)
-        self._watch_size(t, x, u, event["dt"])
-        finite = self.steps.take_in(t, event["dt"])
+        dt = self._scaled.of_seconds(event["dt"])
+        self.inputs[t], self.steps.inputs[t] = u, self._scaled.of_inputs(u)
+        self.steps.measure(t, self._scaled.of_states(x, self._measured))
+        self._watch_size(t, x, u, dt)
+        error = self._error(t, dt)
+        finite = self.steps.take_in(t, dt)
+        self.errors[t] = self.steps.errors[t] * self._unit if error is None else error
+        estimated = self.steps.states[t + 1] * self._scaled.states
+        self.states[t + 1] = estimated if self.spec.system.n_measured else x
         if self.spec.limits is not None:
-            reached = self.steps.states[t + 1 : t + 2]
+            reached = self.states[t + 1 : t + 2]
             self.excess[t] = self.spec.limits.excess(self.spec.system, reached)[0]
         self.done += 1
         self.counts["learned"] += 1
@@ -246,27 +265,52 @@ class ExplorerState:
             )
 
     def accelerations(self, following: Array, u: Array, dt: float) -> Array:
-        """Return the accelerations that are observed from x_t to the next state, (r,).
+        """Return the accelerations that are observed from x_t to the next state, (r,), scaled.
 
         Where states are measured with noise they are not: 0 is returned.
         """
         if self.spec.system.n_measured:
             return np.zeros(len(self._rows))
-        system, x, rows = self.spec.system, self.steps.states[self.done], self._rows
+        system, x, rows = self._scaled.system, self.steps.states[self.done], self._rows
+        change, u = self._scaled.of_states(following) - x, self._scaled.of_inputs(u)
         with np.errstate(all="ignore"):
             known = np.array(system.known(tuple(x), tuple(u), system.parameters), dtype=float)
-            seen: Array = (following - x)[rows] / dt - known[rows]
+            seen: Array = change[rows] / dt - known[rows]
         return seen
+
+    @property
+    def _unit(self) -> float:
+        """What an error of a step is multiplied by, if that is one number."""
+        return 1.0 if self.spec.system.n_measured else float(self._scaled.accelerations[0])
+
+    def _error(self, t: int, dt: float) -> float | None:
+        """Return the error of accelerations that have several units; None if they have one."""
+        units = self._scaled.accelerations
+        if self.spec.system.n_measured or (units == units[0]).all():
+            return None
+        x, following = self.steps.states[t : t + 2]
+        u, system, parameters = self.steps.inputs[t], self._scaled.system, self.steps.parameters
+
+        def rate(x: Array) -> Array:
+            known = system.known(tuple(x), tuple(u), system.parameters)
+            flow = np.array(known, dtype=float)
+            flow[self._rows] += self.spec.model.predict(system, parameters, x[None], u[None])[0]
+            return flow
+
+        with np.errstate(all="ignore"):
+            missed = following - next_state(system.integrator, rate, x, dt)
+        return float(np.linalg.norm(units * missed[self._rows] / dt))
 
     def _watch_size(self, t: int, following: Array, u: Array, dt: float) -> None:
         """Warn once where the first accelerations are of another size than a network learns."""
-        measured = self.spec.system.n_measured
+        system, measured = self.spec.system, self.spec.system.n_measured
         if t < SIZED_STEPS and isinstance(self.spec.model, MLP) and not measured:
             self._squares += self.accelerations(following, u, dt) ** 2
             if t == SIZED_STEPS - 1:
                 sizes = np.sqrt(self._squares / SIZED_STEPS)
                 where = f"over the first {SIZED_STEPS} steps"
-                warn_of_sizes(self.spec.system, sizes, where, _UNITS)
+                units = self._scaled.accelerations if self._scaled.is_scaled else None
+                warn_of_sizes(system, sizes, where, _UNITS, units)
 
     def _compare(self, planned: Array) -> None:
         """Say so once if a plan that is replayed is another one than when it was made."""

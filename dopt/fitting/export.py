@@ -140,7 +140,7 @@ def environment(found: Fitted) -> Any:
                 self.state, self._acting = advance(
                     model, p, values.lag, self.state, self._acting, self._asked[row], seconds
                 )
-            inside = bool(np.all(np.abs(self.state) <= plant.limit))
+            inside = bool(np.all(np.abs(self.state) <= model.structure.limit))
             return self.state.copy(), 0.0, not inside, False, {}
 
     return FittedPlant()

@@ -128,7 +128,7 @@ class Model:
             free_delay=free_delay,
             free_lag=free_lag,
             longest_step=longest_step or plant.dt,
-            limit=float(plant.limit),
+            limit=system.state_limit,
         )
         self.sizes = layout.sizes
         self._guesses = np.array([*plant.guesses.values()], float)

@@ -42,7 +42,7 @@ from dopt.spec.compatibility import is_fresh
 from dopt.spec.config import TrialConfig
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
-from dopt.systems.black_box import delay, differentiated
+from dopt.systems.black_box import delay, differentiated, rate_factors
 from dopt.types import Array, Integers, Stack
 
 FORMS_OF_NETWORKS = {
@@ -186,6 +186,7 @@ def sensors_of(config: TrialConfig) -> args.Sensors:
         np.array(system.measured_states, dtype=np.int64),
         np.array(system.measurement_noise, dtype=float) ** 2,
         np.array(differentiated(system) if system.measured_states else [], dtype=np.int64),
+        np.array(rate_factors(system) if system.measured_states else []),
         0.0 if estimates else system.velocity_cutoff,
         delay(system) if system.n_measured and not estimates else 0.0,
         np.zeros(system.n_states),  # the initial state of a simulation is known

@@ -72,7 +72,7 @@ def low_pass(trial: Trial, t: int, dt: float, following: Vector) -> None:
         following[row] = states[row] - sensors.delay * change
     for i in range(following.shape[0]):
         if sensors.positions[i] != i:
-            following[i] = rates[sensors.positions[i]]
+            following[i] = rates[sensors.positions[i]] / sensors.factors[i]
     for j in range(estimate.filtered_input.shape[0]):
         change = share * (trial.record.inputs[t, j] - estimate.filtered_input[j])
         estimate.filtered_input[j] += change
@@ -88,7 +88,7 @@ def start_filters(trial: Trial, x: Vector) -> None:
     for i in range(x.shape[0]):
         position = trial.sensors.positions[i]
         if position != i:
-            filtered[1, position] = x[i]
+            filtered[1, position] = trial.sensors.factors[i] * x[i]
     trial.state.estimate.filtered_input[:] = 0.0
 
 

@@ -262,6 +262,7 @@ class Sensors(NamedTuple):
     measured: Integers  # (n,) indices of the measured states; empty where outputs mix states
     variances: Vector  # (n,) of their noise
     positions: Integers  # (d,) whose difference estimates a state; itself where it is measured
+    factors: Vector  # (d,) the rate of that state in units of the estimated one, 1 where measured
     cutoff: float  # of the low-pass filter, in Hz; 0 where a learner estimates
     delay: float  # steps by which differences come late
     start_variances: Vector  # (d,) of a state from which an exploration goes on

@@ -61,17 +61,24 @@ def warn_of_prior(policy: Policy, model: Model, learner: Learner) -> None:
         )
 
 
-def warn_of_sizes(system: System, sizes: Array, where: str, first: str = "") -> None:
+def warn_of_sizes(
+    system: System, sizes: Array, where: str, first: str = "", units: Array | None = None
+) -> None:
     """Warn of each learned acceleration whose size, (r,), a network does not learn well.
 
-    ``first`` is advice that goes before that on its unit.
+    ``first`` is advice that goes before that on its unit. With ``units``, (r,), sizes are multiples
+    of these, which the box of a plant decides about.
     """
-    for row, size in zip(system.learned_rows, sizes, strict=True):
+    for k, (row, size) in enumerate(zip(system.learned_rows, sizes, strict=True)):
         if size > LARGEST or 0 < size < SMALLEST:
+            unit = 1.0 if units is None else units[k]
+            remedy = "measure that state in a unit"
+            if units is not None:
+                remedy = "declare a half-width of the box of that state"
             warnings.warn(
                 f"The learned acceleration of {system.state_labels[row]} in env '{system.name}' "
-                f"has a root mean square of {size:.3g} {where}, but a network learns one of "
-                f"{SMALLEST:g} to {LARGEST:g} well: {first}measure that state in a unit about "
+                f"has a root mean square of {size * unit:.3g} {where}, but a network learns one of "
+                f"{SMALLEST * unit:g} to {LARGEST * unit:g} well: {first}{remedy} about "
                 f"{size:.1g} times as large.",
                 ScaleWarning,
                 stacklevel=2,

@@ -273,6 +273,11 @@ class System(Validated):
         return np.array([self.parameters])
 
     @property
+    def state_limits(self) -> Array:
+        """Largest magnitude of each state, (d,), of which some may be angles."""
+        return np.full(self.n_states, self.state_limit)
+
+    @property
     def feature_scales(self) -> tuple[float, ...]:
         """Divisor of each feature: the grid's half-width for an identity, 1 otherwise."""
         widths = dict(zip(self.grid_indices, self.grid_half_widths, strict=True))

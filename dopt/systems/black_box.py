@@ -207,21 +207,35 @@ _SEED = 20_261_123
 def differentiated(system: System) -> list[int]:
     """Return for each state the measured one whose difference estimates it, itself if measured.
 
-    It is -1 for a state that is neither measured nor the rate of a measured state, all of which is
-    known.
+    It is -1 for a state that is neither measured nor proportional to the rate of a measured state,
+    all of which is known.
     """
+    return [of for of, _ in _sources(system)]
+
+
+def rate_factors(system: System) -> list[float]:
+    """Return what the rate of a measured state is, in units of the state that it estimates."""
+    return [factor for _, factor in _sources(system)]
+
+
+def _sources(system: System) -> list[tuple[int, float]]:
+    """Return the measured state that estimates each state, -1 without one, and its factor."""
     rng = np.random.default_rng(_SEED)
     states = rng.uniform(-1.0, 1.0, (system.n_states, TRIED))
     inputs = rng.uniform(-1.0, 1.0, (system.n_inputs, TRIED))
     with np.errstate(all="ignore"):
         flow = system.known(tuple(states), tuple(inputs), system.parameters)
         rates = np.stack(np.broadcast_arrays(*flow, states[0])[:-1])
+    kinematic = [i for i in system.measured_states if i not in system.learned_rows]
     found = []
     for index, state in enumerate(states):
-        kinematic = [i for i in system.measured_states if i not in system.learned_rows]
-        of = [i for i in kinematic if np.array_equal(rates[i], state)]
-        measured = index in system.measured_states
-        found.append(index if measured else of[0] if of else -1)
+        factors = {i: float(rates[i][0] / state[0]) for i in kinematic}
+        of = [i for i, c in factors.items() if c and np.allclose(rates[i], c * state, ROUNDING, 0)]
+        of = sorted(of, key=lambda i: factors[i] != 1.0)
+        if index in system.measured_states or not of:
+            found.append((index if index in system.measured_states else -1, 1.0))
+        else:
+            found.append((of[0], factors[of[0]]))
     return found
 
 

@@ -18,11 +18,13 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from dopt.errors import SpecificationError, unknown_name
+from dopt.fields import unvalidated
 from dopt.systems import elementary
 from dopt.systems.base import Feature
 from dopt.systems.black_box import BlackBox, unknown_accelerations
 from dopt.systems.properties import input_effect
-from dopt.types import Equation
+from dopt.systems.scales import SPLIT, rounded, scales, sizes
+from dopt.types import Array, Equation
 
 FUNCTIONS = {
     function.__name__: function
@@ -54,6 +56,8 @@ def compiled_text(
     expressions: Mapping[str, str],
     arguments: Mapping[str, Sequence[str]],
     constants: Mapping[str, float] | None = None,
+    units: Mapping[str, float] | None = None,
+    results: Sequence[float] = (),
 ) -> Equation:
     """Return a function that gives the values of expressions, in their order.
 
@@ -65,6 +69,11 @@ def compiled_text(
         Arguments of the function, each a sequence of named quantities.
     constants : mapping of str to float, optional
         Values of some of the quantities, with which each part has to be finite somewhere.
+    units : mapping of str to float, optional
+        What the arguments of some quantities are multiplied by.
+    results : sequence of float, optional
+        What the value of each expression is divided by, before it is rounded to 36 bits
+        (:mod:`dopt.systems.scales`).
 
     Raises
     ------
@@ -78,7 +87,11 @@ def compiled_text(
     given = [f"_{argument}" for argument in arguments]  # no quantity begins with an underscore
     groups = zip(given, arguments.values(), strict=True)
     unpacked = [f"{', '.join(group)}, = {name}" for name, group in groups if group]
-    lines = [*unpacked, f"return ({', '.join(texts)},)"]
+    scaled = [f"{name} = {name} * {unit!r}" for name, unit in (units or {}).items()]
+    for i, unit in enumerate(results):
+        scaled += [f"_{i} = ({texts[i]}) / {unit!r}", f"_{i}_split = {SPLIT!r} * _{i}"]
+        texts[i] = f"_{i}_split - (_{i}_split - _{i})"
+    lines = [*unpacked, *scaled, f"return ({', '.join(texts)},)"]
     source = "\n    ".join([f"def equation({', '.join(given)}):", *lines])
     namespace: dict[str, Any] = {**FUNCTIONS, "__name__": "expressions"}
     exec(source, namespace)  # of nothing but the expressions that were checked
@@ -332,6 +345,12 @@ _TIMES = ("delay", "lag")
 _ORDERED = ("states", "inputs")
 """Mappings whose order counts, which sections hold as lists of pairs."""
 
+LIMIT = 1e4
+"""Limit of a plant that declares none, where it is explored in its own units."""
+
+LARGEST_SIZE = 1000.0
+"""Limit of a state, in units of its size, of a plant that declares none."""
+
 GRID_POINTS = 8
 """Points to an axis of the evaluation box."""
 
@@ -385,9 +404,9 @@ class Plant:
     velocity_cutoff : float
         Cutoff of the filter of these states and their differences [Hz], with a learner that does
         not estimate states.
-    limit : float
+    limit : float, optional
         Largest magnitude of a state that can be a measurement, except for angles; what is beyond is
-        left out.
+        left out. Without one it is 1,000 times the size of each state, its half-width of the box.
     integrator : {"euler", "rk4"}
         How the model's accelerations are compared with two states: as that at the first one, or
         integrated over the step by the method of Runge and Kutta.
@@ -413,7 +432,7 @@ class Plant:
     box: Mapping[str, float]
     angles: Sequence[str] = ()
     constants: Mapping[str, float | Unknown] = dataclasses.field(default_factory=dict)
-    limit: float = 1e4
+    limit: float | None = None
     integrator: str = "euler"
     measured: Mapping[str, float | Encoder] = dataclasses.field(default_factory=dict)
     velocity_cutoff: float = 2.0
@@ -459,8 +478,8 @@ class Plant:
             )
 
     def _check_numbers(self) -> None:
-        positive = {"dt": self.dt, "gamma": self.gamma, "limit": self.limit}
-        positive["velocity_cutoff"] = self.velocity_cutoff
+        positive = {"dt": self.dt, "gamma": self.gamma, "velocity_cutoff": self.velocity_cutoff}
+        positive |= {} if self.limit is None else {"limit": self.limit}
         measured = {k: v for k, v in self.measured.items() if not isinstance(v, Encoder)}
         for what, named in (("box", self.box), ("measured", measured)):
             positive |= {f"{what}['{name}']": number for name, number in named.items()}
@@ -490,7 +509,8 @@ class Plant:
         """Return the section of a configuration that :meth:`from_section` turns into the plant."""
         ordered = {key: [list(pair) for pair in getattr(self, key).items()] for key in _ORDERED}
         lists = {key: list(getattr(self, key)) for key in _LISTS}
-        numbers = {key: float(getattr(self, key)) for key in ("dt", "gamma", "limit")}
+        numbers = {key: float(getattr(self, key)) for key in ("dt", "gamma")}
+        numbers |= {} if self.limit is None else {"limit": float(self.limit)}
         named = {
             key: {name: _section_of(value) for name, value in getattr(self, key).items()}
             for key in ("box", "constants")
@@ -513,7 +533,8 @@ class Plant:
     @classmethod
     def from_section(cls, section: Mapping[str, Any]) -> ExploredPlant:
         """Return the system that a section describes, which also says how many steps it has."""
-        given = {key: value for key, value in section.items() if key not in ("name", "horizon")}
+        own = ("name", "horizon", "scaled")
+        given = {key: value for key, value in section.items() if key not in own}
         fields = [field.name for field in dataclasses.fields(cls)]
         for key in given:
             if key not in fields:
@@ -523,7 +544,8 @@ class Plant:
             named = given.get(key, {})
             ordered[key] = {name: _from_section(value) for name, value in named.items()}
         ordered |= {key: _from_section(given[key]) for key in _TIMES if key in given}
-        return cls(**(given | ordered)).system(section["horizon"])
+        scaled = bool(section.get("scaled", False))
+        return cls(**(given | ordered)).system(section["horizon"], scaled=scaled)
 
     @classmethod
     def from_mapping(cls, given: Mapping[str, Any]) -> Plant:
@@ -555,22 +577,40 @@ class Plant:
                 f"{{value, factor}} or {{value, spread}}, and encoders as {{counts}}."
             ) from error
 
-    def system(self, horizon: int) -> ExploredPlant:
-        """Return the plant as the system of an exploration of so many steps."""
+    def system(self, horizon: int, *, scaled: bool = False) -> ExploredPlant:
+        """Return the plant as the system of an exploration of so many steps, in its own units.
+
+        ``scaled`` says whether the exploration works with numbers that do not depend on them
+        (:meth:`ExploredPlant.in_scales`).
+        """
+        system = self._system(self._class, (1.0,) * len(self.states), 1.0, horizon)
+        return dataclasses.replace(system, scaled=scaled)
+
+    def _system(
+        self, kind: type[ExploredPlant], scales: Sequence[float], scale: float, horizon: int
+    ) -> ExploredPlant:
+        """Return the system whose states are divided by numbers, (d,), and whose inputs by one."""
         half_widths = dict.fromkeys(self.angles, math.pi) | dict(self.box)
+        units = dict(zip(self.states, scales, strict=True))
         axes = [name for name in self.states if name in half_widths]
-        return self._class(
-            gamma=self.gamma,
+        measured = [name for name in self.states if name in self.measured]
+
+        def divided(numbers: Mapping[str, float]) -> tuple[float, ...]:
+            if kind is self._class:
+                return tuple(numbers.values())
+            divisors = [units[name] for name in numbers]
+            return tuple(rounded(np.array([*numbers.values()]) / divisors).tolist())
+
+        return kind(
+            gamma=self.gamma / scale,
             dt=self.dt,
             horizon=horizon,
-            state_limit=self.limit,
+            state_limit=LIMIT if self.limit is None else self.limit,
             integrator=self.integrator,
-            measured_states=tuple(i for i, name in enumerate(self.states) if name in self.measured),
-            measurement_noise=tuple(
-                _noise(self.measured[name]) for name in self.states if name in self.measured
-            ),
+            measured_states=tuple([*self.states].index(name) for name in measured),
+            measurement_noise=divided({name: _noise(self.measured[name]) for name in measured}),
             velocity_cutoff=self.velocity_cutoff,
-            grid_half_widths=tuple(half_widths[name] for name in axes),
+            grid_half_widths=divided({name: half_widths[name] for name in axes}),
             grid_points=(GRID_POINTS,) * len(axes),
         )
 
@@ -585,6 +625,26 @@ class Plant:
     @functools.cached_property
     def _class(self) -> type[ExploredPlant]:
         """A class of systems with what this plant declares."""
+        return self._class_in({}, ())
+
+    @functools.cached_property
+    def scales(self) -> tuple[float, ...]:
+        """What each state is divided by in scaled numbers (:mod:`dopt.systems.scales`)."""
+        return scales(self.system(1), self._sizes)
+
+    @functools.cached_property
+    def _sizes(self) -> Array:
+        return sizes(self.system(1))
+
+    @functools.cached_property
+    def _scaled_class(self) -> type[ExploredPlant]:
+        """The class of the same systems in scaled numbers."""
+        units = dict(zip(self.states, self.scales, strict=True))
+        return self._class_in(units | dict.fromkeys(self.inputs, float(self.gamma)), self.scales)
+
+    def _class_in(
+        self, units: Mapping[str, float], results: Sequence[float]
+    ) -> type[ExploredPlant]:
         names = list(self.states)
         groups = {"states": names, "inputs": [*self.inputs], "constants": [*self.constants]}
         known = {f"known['{name}'] of a plant": self.known.get(name, "0.0") for name in names}
@@ -601,7 +661,7 @@ class Plant:
             "features": tuple(features),
             "grid_indices": tuple(axes),
             "phase_plane": _phase_plane(axes, names),
-            "known": staticmethod(compiled_text(known, groups, self.guesses)),
+            "known": staticmethod(compiled_text(known, groups, self.guesses, units, results)),
             "accelerations": staticmethod(unknown_accelerations(len(self.learned))),
         }
         return dataclasses.dataclass(frozen=True, kw_only=True)(
@@ -613,7 +673,9 @@ class Plant:
 class ExploredPlant(BlackBox):
     """A plant as the system of an exploration; :class:`Plant` makes a class of its own for each.
 
-    Its accelerations are NaN: they are known from measurements alone.
+    Its accelerations are NaN: they are known from measurements alone. It is in the units of its
+    plant; ``scaled`` says whether its exploration works with :meth:`in_scales`, as all do that
+    began since there are scales.
     """
 
     name: ClassVar[str] = NAME
@@ -622,13 +684,33 @@ class ExploredPlant(BlackBox):
     plant: ClassVar[Plant]
     _constants: ClassVar[tuple[float, ...]] = ()
 
+    scaled: bool = unvalidated(False)
+
+    @property
+    def state_limits(self) -> Array:
+        if not self.scaled or self.plant.limit is not None:
+            return super().state_limits
+        return LARGEST_SIZE * self.plant._sizes
+
+    def in_scales(self) -> ExploredPlant:
+        """Return the system in numbers that do not depend on the units of the plant.
+
+        Its states are divided by :attr:`Plant.scales`, and its inputs by gamma.
+        """
+        plant = self.plant
+        system = plant._system(plant._scaled_class, plant.scales, plant.gamma, self.horizon)
+        return dataclasses.replace(system, state_limit=LIMIT)
+
     @property
     def parameters(self) -> tuple[float, ...]:
         return self._constants
 
     def to_section(self) -> dict[str, object]:
         """Return what identifies the plant and its exploration."""
-        return {**self.plant.to_section(), "horizon": self.horizon}
+        section = {**self.plant.to_section(), "horizon": self.horizon}
+        if self.scaled:
+            return section | {"scaled": True}
+        return section | {"limit": float(self.state_limit)}
 
     def episode(self, seed: int) -> NoReturn:  # noqa: ARG002
         raise SpecificationError(

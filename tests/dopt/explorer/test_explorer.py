@@ -117,7 +117,7 @@ def test_accelerations_of_another_size_are_warned_of_once() -> None:
             explorer.tell([0.0, 100.0 * ((step + 1) % 2)], applied=[0.0])
 
     size = r"rate \[rad/s\].* square of 5e\+03 over the first 50 steps"
-    said = rf"{size}.*known part.*about 5e\+03 times as large"
+    said = rf"{size}.*known part.*half-width of the box .* about 3e\+03 times as large"
     with pytest.warns(ScaleWarning, match=said) as warned:
         explore()
     assert len(warned) == 1

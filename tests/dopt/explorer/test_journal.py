@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ import pytest
 from dopt import Explorer
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.journal import FORMAT, Journal
+from dopt.spec.trial import stored_trial
 from dopt.systems import Pendulum
 from tests.dopt.explorer.plants import HOVERCRAFT, MOTOR, following, steered, without_checksums
 from tests.dopt.explorer.test_explorer import explored
@@ -139,6 +141,35 @@ def test_a_journal_from_before_a_field_was_added_goes_on(journal: Path) -> None:
     assert '"integrator": "euler", ' in text
     journal.write_text(text.replace('"integrator": "euler", ', ""))
     Explorer(system, journal=journal).close()
+
+
+def test_a_journal_from_before_there_were_scales_goes_on_in_units(journal: Path) -> None:
+    """It was written by the version before; what it had learned was read there."""
+    journal.parent.mkdir()
+    shutil.copy(Path(__file__).with_name("unscaled.jsonl"), journal)
+    given: dict[str, Any] = {"steps": 20, "journal": journal, "learner": "gauss_newton"}
+    with Explorer(MOTOR, **given) as explorer:
+        predicted = explorer.predict([[0.3, 1.0], [-2.0, 4.0]])[:, 0]
+        assert predicted == pytest.approx([-2.633545126124428, 3.2165734743615775], rel=1e-9)
+        errors = [0.9610287238574211, 0.3579677133112369]
+        assert explorer.errors[[0, 7]] == pytest.approx(errors, rel=1e-9)
+        before = "fe24e8c0690435ed84ff0e449e019588c6caa623b6856db59eb6b06f54bfc075"
+        assert explorer.spec.trial_key == before
+        explored(explorer, 5, explorer.states[-1])
+        parameters = explorer.parameters
+    with Explorer(MOTOR, **given) as again:
+        assert np.array_equal(again.parameters, parameters)
+        assert again.n_steps == 13
+
+
+def test_a_new_journal_says_that_its_exploration_is_scaled(journal: Path) -> None:
+    with Explorer(MOTOR, steps=9, journal=journal) as explorer:
+        explored(explorer, 4)
+        parameters, key = explorer.parameters, explorer.spec.trial_key
+    assert json.loads(journal.read_text().splitlines()[0])["trial"]["env"]["scaled"] is True
+    with Explorer(MOTOR, steps=9, journal=journal) as again:
+        assert np.array_equal(again.parameters, parameters)
+    assert stored_trial(json.loads(explorer.spec.config_json)).trial_key == key
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,157 @@
+"""Explorations of plants in numbers that do not depend on the units of the plant.
+
+What an explorer is told, answers and stores is in the units that the plant declares. Its steps work
+with states that are divided by their sizes and inputs that are divided by γ
+(:mod:`dopt.systems.scales`), so that learners, priors, differences and plans see these alone; here
+one is turned into the other.
+
+Systems with equations, and explorations that were begun before there were scales, work with the
+numbers they are given.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dopt.control.planning import Accelerations
+from dopt.learning import LEARNERS
+from dopt.limits import Limits, names_of
+from dopt.models import MODELS
+from dopt.policies import POLICIES, Policy, TaskOptimal
+from dopt.spec.trial import TrialSpec
+from dopt.systems.base import System
+from dopt.systems.plant import ExploredPlant
+from dopt.systems.scales import rounded
+from dopt.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A system in scaled numbers.
+
+    Attributes
+    ----------
+    system : System
+        The system itself, or the one whose states and inputs are scaled.
+    states : (d,)
+        What its states are multiplied by, in the units of the plant.
+    inputs : float
+        What its inputs are multiplied by.
+    is_scaled : bool
+        Whether the numbers are others than those in the units of the system.
+    """
+
+    system: System
+    states: Array
+    inputs: float
+    is_scaled: bool
+
+    def of_states(self, states: Array, rows: Sequence[int] | slice = slice(None)) -> Array:
+        """Return some rows of states, (..., n), in scaled numbers."""
+        if not self.is_scaled:
+            return states
+        found = rounded(states / self.states[rows])
+        angles = np.isin(np.arange(len(self.states))[rows], self.system.angle_indices)
+        return np.where(angles, states, found)
+
+    def of_inputs(self, inputs: Array) -> Array:
+        """Return inputs, (..., m), in scaled numbers."""
+        return rounded(inputs / self.inputs) if self.is_scaled else inputs
+
+    def of_seconds(self, seconds: float) -> float:
+        """Return a time as scaled numbers are: rounded, and in the same unit."""
+        return float(rounded(np.array(seconds))) if self.is_scaled else seconds
+
+    @property
+    def accelerations(self) -> Array:
+        """What its learned accelerations are multiplied by, (r,), in units of the plant."""
+        learned: Array = self.states[list(self.system.learned_rows)]
+        return learned
+
+    def scaled_predictions(self, predict: Accelerations) -> Accelerations:
+        """Return a function of scaled numbers for one in the units of the plant."""
+
+        def scaled_predict(states: Array, inputs: Array) -> Array:
+            return predict(states * self.states, inputs * self.inputs) / self.accelerations
+
+        return scaled_predict
+
+
+@functools.lru_cache(maxsize=64)
+def scaled(system: System) -> Scaled:
+    """Return a system in the numbers that its exploration works with."""
+    if isinstance(system, ExploredPlant) and system.scaled:
+        states, gamma = np.array(system.plant.scales), float(system.gamma)
+        return Scaled(system.in_scales(), states, gamma, is_scaled=True)
+    return Scaled(system, np.ones(system.n_states), 1.0, is_scaled=False)
+
+
+def in_scaled_numbers(spec: TrialSpec) -> TrialSpec:
+    """Return the specification of a new exploration.
+
+    That of a plant works with scaled numbers, unless a policy, model or learner is of a user's own
+    class, which is given the numbers of the plant that it was written for.
+    """
+    parts = ((spec.policy, POLICIES), (spec.model, MODELS), (spec.learner, LEARNERS))
+    shipped = all(type(part) in [*registry.values()] for part, registry in parts)
+    if not (shipped and isinstance(spec.system, ExploredPlant)):
+        return spec
+    system = spec.system.plant.system(spec.system.horizon, scaled=True)
+    return TrialSpec(dataclasses.replace(spec.config, system=system), spec.seed)
+
+
+def scaled_trial(spec: TrialSpec) -> TrialSpec:
+    """Return the specification in scaled numbers."""
+    found = scaled(spec.system)
+    if not found.is_scaled:
+        return spec
+    config = dataclasses.replace(
+        spec.config,
+        system=found.system,
+        policy=_scaled_policy(spec.policy, found),
+        limits=spec.limits and _scaled_limits(spec.limits, found),
+    )
+    return TrialSpec(config, spec.seed)
+
+
+def _scaled_policy(policy: Policy, found: Scaled) -> Policy:
+    if isinstance(policy, TaskOptimal) and policy.goal:
+        goal = found.of_states(np.array(policy.goal))
+        return dataclasses.replace(policy, goal=tuple(goal.tolist()))
+    return policy
+
+
+def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
+    units = dict(zip(names_of(found.system.state_labels), found.states, strict=True))
+    units |= dict.fromkeys(names_of(found.system.input_labels), found.inputs)
+
+    def divided(name: str, number: float) -> float:
+        return float(rounded(np.array(number / units[name])))
+
+    return dataclasses.replace(
+        limits,
+        bounds=tuple(
+            (name, divided(name, low), divided(name, high)) for name, low, high in limits.bounds
+        ),
+        rates=tuple((name, divided(name, rate)) for name, rate in limits.rates),
+    )
+
+
+def learned_accelerations(
+    spec: TrialSpec, parameters: Array, states: Array, inputs: Array | None = None
+) -> Array:
+    """Return the accelerations, (N, r), that a model has learned, in the units of the system.
+
+    States, (N, d), and inputs, (N, m), are in its units, too; ``parameters`` are of the model in
+    scaled numbers.
+    """
+    found = scaled(spec.system)
+    u = None if inputs is None else found.of_inputs(inputs)
+    values = spec.model.predict(found.system, parameters, found.of_states(states), u)
+    predicted: Array = values * found.accelerations
+    return predicted
