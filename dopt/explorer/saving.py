@@ -16,6 +16,7 @@ from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.arguments import reals, whole
+from dopt.explorer.flight import InFlight
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
@@ -104,6 +105,7 @@ def free_run_error(
     n = (len(u) - first) // max(steps, 1)
     _check_shapes(system, y, u, steps, n)
     _check_finite(y, u)
+    u = InFlight(system).acted(u)
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
@@ -205,11 +207,11 @@ class Explored:
 
         Where the exploration went on from another state, as after a gap, that one is here.
         """
-        return self._state.steps.states[: self.n_steps + 1].copy()
+        return self._state.states
 
     @property
     def inputs(self) -> Array:
-        """Inputs that were applied, (t, m)."""
+        """Inputs that acted in each step, (t, m): as applied, or late where the plant says so."""
         return self._state.steps.inputs[: self.n_steps].copy()
 
     @property
