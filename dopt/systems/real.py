@@ -389,26 +389,18 @@ def _class(
     """
     d, m, n, rows = shapes
     fractional, lagging, dry = flags
-    late = whole > 0 or fractional or lagging
-    namespace: dict[str, Any] = {"__module__": kind.__module__}
-    suffix = f"{kind.__qualname__}_behind_{whole}_{int(fractional)}_{int(lagging)}_{d}_{m}_{n}"
-    if late:
-        lines = _known_text(d, m, n, whole, fractional, lagging)
-        known = _around(kind.known, f"known_{suffix}", lines)
-        namespace["known"] = staticmethod(known)
-    if (late or dry) and not issubclass(kind, BlackBox):
-        state = f"state[:{d}]" if late else "state"
-        friction = [
-            f" - parameters[{n + 7}] * tanh(state[{row}] / parameters[{n + 8}])" for row in rows
-        ]
-        values = [f"free[{k}]{friction[k] if dry else ''}" for k in range(len(rows))]
-        lines = [
-            "(state, parameters):",
-            f"free = around({state}, parameters[:{n}])",
-            f"return ({', '.join(values)},)",
-        ]
-        accelerations = _around(kind.accelerations, f"accelerations_{suffix}_{int(dry)}", lines)
-        namespace["accelerations"] = staticmethod(accelerations)
+    shape = "_".join(map(str, (whole, *map(int, flags), d, m, n)))
+    lines = _known_text(d, m, n, whole, fractional, lagging)
+    namespace: dict[str, Any] = {
+        "__module__": kind.__module__,
+        "known": staticmethod(_around(kind.known, f"known_of_{kind.__name__}_{shape}", lines)),
+    }
+    if not issubclass(kind, BlackBox):
+        lines = _accelerations_text(
+            n, rows, f":{d}" if whole or fractional or lagging else ":", dry
+        )
+        made = _around(kind.accelerations, f"accelerations_of_{kind.__name__}_{shape}", lines)
+        namespace["accelerations"] = staticmethod(made)
     fields = [
         (name, Any, dataclasses.field(metadata={"validated": False}))
         for name in ("wrapped", "hardware")
@@ -452,6 +444,20 @@ def _known_text(d: int, m: int, n: int, whole: int, fractional: bool, lagging: b
         "(state, inputs, parameters):",
         f"flow = around(state[:{d}], ({', '.join(acting)},), parameters[:{n}])",
         f"return ({', '.join(rates)},)",
+    ]
+
+
+def _accelerations_text(n: int, rows: tuple[int, ...], own: str, dry: bool) -> list[str]:
+    """Return the lines of the accelerations of learned rows, with dry friction or without."""
+    values = [f"free[{k}]" for k in range(len(rows))]
+    if dry:
+        coulomb, rate = f"parameters[{n + 7}]", f"parameters[{n + 8}]"
+        frictions = [f"{coulomb} * tanh(state[{row}] / {rate})" for row in rows]
+        values = [f"{one} - {other}" for one, other in zip(values, frictions, strict=True)]
+    return [
+        "(state, parameters):",
+        f"free = around(state[{own}], parameters[:{n}])",
+        f"return ({', '.join(values)},)",
     ]
 
 
