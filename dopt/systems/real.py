@@ -1,6 +1,6 @@
 """Simulated systems behind real hardware: late, slow and cut inputs, counts and dry friction.
 
-Inputs in flight and actuators are known states behind those of the system, so that policies,
+Inputs in flight and actuators are known states behind the system's own, so that policies,
 models and learners see an ordinary system. With w_k the input of k steps ago, w_0 = u, a delay of
 n + f samples and an actuator of time constant τ,
 
@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from dopt.errors import SpecificationError
+from dopt.errors import IncompatibleError, SpecificationError
 from dopt.fields import Validated, parameter
 from dopt.registry import build, section_of
 from dopt.systems.base import Array, System
@@ -111,14 +111,16 @@ def Real(  # noqa: N802  # it is used as a class
         Simulated system. With a delay or a lag its integrator is 'euler', and the effect of its
         inputs is known.
     delay, lag, counts, coulomb, supply
-        As of :class:`Hardware`. The delay is in samples, unlike that of :class:`dopt.Plant`.
-        Encoders round angles that are in ``measured_states``, all angles if that is empty; the
-        noise that learners reckon with is that of the rounding.
+        As of :class:`Hardware`. The delay is in samples, of :class:`dopt.Plant` in seconds.
+        Encoders round angles that are in ``measured_states``, all angles if that is empty;
+        learners are told the noise of the rounding.
 
     Raises
     ------
     SpecificationError
-        If a value is outside its bound, or the system has not what a setting needs.
+        If a value is outside its bound.
+    IncompatibleError
+        If the system has not what a setting needs.
     """
     hardware = Hardware(delay=delay, lag=lag, counts=counts, coulomb=coulomb, supply=supply)
     return behind(system, hardware)
@@ -188,7 +190,7 @@ def _check(system: System, hardware: Hardware) -> None:
         ),
     ):
         if refused:
-            raise SpecificationError(
+            raise IncompatibleError(
                 f"{what} of env '{system.name}' is set, but {expected} is expected for it: leave "
                 f"it out, or choose another env."
             )
@@ -271,7 +273,7 @@ class _Behind:
         return behind, (self.wrapped, self.hardware)
 
     def to_section(self: Any) -> dict[str, object]:
-        """Return the section of the system, and in it that of its hardware."""
+        """Return the section of the system, with its hardware in it."""
         hardware = {"name": self.hardware.name, **self.hardware.settings}
         return {**section_of(self.wrapped), "plant": hardware}
 

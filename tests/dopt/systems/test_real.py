@@ -176,7 +176,7 @@ def test_values_outside_their_bounds_are_refused(hardware: Any, message: str) ->
     ],
 )
 def test_what_does_not_go_together_is_refused(system: System, hardware: Any, message: str) -> None:
-    with pytest.raises(SpecificationError, match=message):
+    with pytest.raises(IncompatibleError, match=message):
         Real(system, **hardware)
 
 
