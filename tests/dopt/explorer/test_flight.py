@@ -183,3 +183,25 @@ def test_a_policy_that_searches_sees_through_a_delay_with_a_deadline() -> None:
 def test_impossible_numbers_are_refused(more: dict[str, float], message: str) -> None:
     with pytest.raises(SpecificationError, match=message):
         declared(**more)
+
+
+def test_the_torch_path_plans_for_the_same_states() -> None:
+    plant = declared(delay=1.5 * DT, lag=0.02)
+    kernel = explored(plant, Rig(1.5 * DT, 0.02), 15, learner="adam_window")
+    torch = explored(plant, Rig(1.5 * DT, 0.02), 15, learner="adam_window", path="reference")
+    np.testing.assert_allclose(torch.inputs, kernel.inputs, atol=1e-9)
+    np.testing.assert_allclose(torch.states, kernel.states, rtol=1e-6)
+
+
+def test_a_measured_angle_alone_is_enough_behind_a_delay() -> None:
+    def run(plant: Plant) -> float:
+        policy = {"name": "d_optimal", "regularization": 3.0}
+        explorer, rig = Explorer(plant, policy=policy, learner="joint_ekf", steps=300), Rig(2 * DT)
+        rng, y = np.random.default_rng(2), rig.x[:1]
+        for _ in range(300):
+            y = rig.step(explorer.ask(y))[:1] + 0.002 * rng.standard_normal(1)
+            explorer.tell(y)
+        return error(explorer)
+
+    measured = {"angle": 0.002}
+    assert run(declared(measured=measured, delay=2 * DT)) < 0.5 * run(declared(measured=measured))
