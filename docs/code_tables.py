@@ -281,6 +281,7 @@ TABLES |= {
 TABLES |= {
     f"{group}_options": functools.partial(of_group, group)
     for group in (
-        "env", "policy", "model", "learner", "limits", "task", "executor", "store", "experiment"
+        *("env", "policy", "model", "learner", "plant", "limits", "task"),
+        *("executor", "store", "experiment"),
     )
 }  # fmt: skip

@@ -146,6 +146,7 @@ def visited_points(system: System, rng: np.random.Generator) -> tuple[Array, Arr
     Runs with the same first input share their first states, which are then there several times.
     """
     inputs = np.stack(_held(system, rng) + _waves(system), axis=1)
+    inputs = np.clip(inputs, -system.cut_at, system.cut_at)
     visited = simulate(system, inputs).reshape(-1, system.n_states)
     applied = np.concatenate([inputs, np.zeros_like(inputs[:1])]).reshape(-1, system.n_inputs)
     inside = np.all(np.abs(visited) <= system.state_limit, axis=1)

@@ -141,10 +141,11 @@ def _radii(spec: TrialSpec) -> Array:
 
 
 def process_noise(system: System, seed: int) -> Array:
-    """Return w_t of equation 2, (T, d), variance dt σ²."""
-    noise = stream(seed, "noise").standard_normal((system.horizon, system.n_states))
+    """Return w_t of equation 2, (T, d), variance dt σ²; 0 for inputs in flight."""
+    own = system.n_states - system.n_carried
+    noise = stream(seed, "noise").standard_normal((system.horizon, own))
     scaled: Array = np.sqrt(system.dt) * system.noise * noise
-    return scaled
+    return np.pad(scaled, ((0, 0), (0, system.n_carried))) if system.n_carried else scaled
 
 
 def measurement_noise(system: System, seed: int) -> Array:

@@ -86,6 +86,14 @@ class TrialView(ABC):
     def following(self, state: Array, inputs: Array) -> Array:
         """Return the predicted next states, (N, d), for inputs (N, m) at (d,)."""
 
+    def held(self, inputs: Array, steps: int) -> Array:
+        """Return the predicted states, (N, d), after steps in which each input, (N, m), is held."""
+        states = self.following(self.states[-1], inputs)
+        for _ in range(steps - 1):
+            following = (self.following(x, u[None]) for x, u in zip(states, inputs, strict=True))
+            states = np.concatenate(list(following))
+        return states
+
     @abstractmethod
     def input_matrix(self, state: Array) -> Array:
         """Return B = dt ∂f/∂u, (d, m), at a state, (d,)."""

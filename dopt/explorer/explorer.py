@@ -325,6 +325,7 @@ class Explorer(SavedExplored):
         state, dt = self._state, self.spec.system.dt
         elapsed = self._elapsed(now)
         u = state.answer if applied is None else applied
+        u = None if u is None else state.flight.cut(u)
         if elapsed <= 0.0:
             kind = "repeated" if elapsed == 0.0 else "out_of_order"
             self._note({"counted": kind}, durable=False)

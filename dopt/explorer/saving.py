@@ -16,6 +16,7 @@ from dopt.assessment import violations
 from dopt.control.planning import Forecast, forecast_by, relative_error
 from dopt.errors import ExplorationError, SpecificationError
 from dopt.explorer.arguments import reals, whole
+from dopt.explorer.flight import InFlight
 from dopt.explorer.state import ExplorerState
 from dopt.learning import JointKalman
 from dopt.result import Assessment, TrialResult
@@ -107,6 +108,7 @@ def free_run_error(
     n = (len(u) - first) // max(steps, 1)
     _check_shapes(system, y, u, steps, n)
     _check_finite(y, u)
+    u = InFlight(system).acted(u)
     for column, row in enumerate(np.arange(system.n_states)[rows]):
         if row in system.angle_indices:
             y[:, column] = np.unwrap(y[:, column])
@@ -229,7 +231,7 @@ class Explored:
 
     @property
     def inputs(self) -> Array:
-        """Inputs that were applied, (t, m)."""
+        """Inputs that acted in each step, (t, m): as applied, or late where the plant says so."""
         return self._state.inputs[: self.n_steps].copy()
 
     @property

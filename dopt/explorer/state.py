@@ -30,6 +30,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dopt.errors import ExplorationError
+from dopt.explorer.flight import InFlight
 from dopt.explorer.journal import Event, is_event
 from dopt.models import MLP
 from dopt.spec.custom_system import warn_of_sizes
@@ -126,6 +127,8 @@ class Steps(Protocol):
     @property
     def errors(self) -> Array: ...
     def measure(self, t: int, measured: Array) -> None: ...
+    def reached(self, t: int, inputs: Array, seconds: Array) -> Array: ...
+    def note_asked(self, u: Array) -> None: ...
     def plan_input(self, t: int) -> None: ...
     def begin(self, t: int, state: Array) -> None: ...
     def take_in(self, t: int, dt: float) -> bool: ...
@@ -156,6 +159,8 @@ class ExplorerState:
         How far the state that each step led to, or its estimate, is beyond the limits, 0 without.
     counts : Counter of str
         Number of events of each kind (:class:`dopt.Explorer`).
+    flight : InFlight
+        Inputs that were asked and do not act yet.
     """
 
     def __init__(self, spec: TrialSpec) -> None:
@@ -165,6 +170,7 @@ class ExplorerState:
         self.present: Array | None = None
         self.answer: Array | None = None
         self.time: float | None = None
+        self.flight = InFlight(spec.system)
         self._rows = list(spec.system.learned_rows)
         self._measured = list(spec.system.measured_states or range(spec.system.n_states))
         steps = spec.system.horizon
@@ -187,13 +193,19 @@ class ExplorerState:
             x = np.array(event["begin"])
             self.counts["jumps"] += self.present is not None and not np.array_equal(x, self.present)
             self._warn_of_jumps()
+            self._hold_input(event["time"])
             self._move(x, event["time"])
         elif "gap" in event:
             self.counts["gaps"] += 1
+            self._hold_input(event["time"])
             self.present = None  # after a gap the exploration goes on from any state
             self._move(np.array(event["gap"]), event["time"])
         elif "lost" in event:
             self.counts[event["lost"]] += 1
+            if event["lost"] == "resets":
+                self.flight.reset()
+            else:
+                self.flight.hold(self.answer, 0.0)
             self.present = self.answer = self.time = None
         else:
             self.counts[event["counted"]] += 1
@@ -213,14 +225,36 @@ class ExplorerState:
         self.do(event)
 
     def plan(self) -> None:
-        """Let the policy choose an input at the present state."""
-        self.steps.plan_input(self.done)
+        """Let the policy choose an input at the state in which it will begin to act."""
+        ahead = self.flight.ahead()
+        if ahead is None:
+            self.steps.plan_input(self.done)
+            return
+        inputs, seconds = self._scaled.of_inputs(ahead[0]), ahead[1]
+        row = self.steps.states[self.done]
+        present = row.copy()
+        row[:] = self.steps.reached(self.done, inputs, seconds)
+        try:
+            self.steps.plan_input(self.done)
+        finally:
+            row[:] = present
 
     @property
     def planned(self) -> Array:
-        """The input that it chose, (m,)."""
-        chosen: Array = self.steps.inputs[self.done] * self._scaled.inputs
-        return chosen
+        """The input that it chose, (m,), as far as the supply can apply it."""
+        return self.flight.cut(self.steps.inputs[self.done] * self._scaled.inputs)
+
+    def _hold_input(self, time: float | None) -> None:
+        """Let inputs in flight move on to a state that did not follow within about dt.
+
+        Without times, an input that was asked has been held for dt.
+        """
+        elapsed = None if self.present is None else self.spec.system.dt
+        if self.present is not None and self.answer is None:
+            elapsed = 0.0
+        if self.time is not None and time is not None:
+            elapsed = time - self.time
+        self.flight.hold(self.answer, elapsed)
 
     def _move(self, x: Array, time: float | None) -> None:
         same = self.present is not None and np.array_equal(x, self.present)
@@ -241,8 +275,8 @@ class ExplorerState:
             )
 
     def _learn(self, event: Event) -> None:
-        t, x, u = self.done, np.array(event["learn"]), np.array(event["applied"])
-        dt = self._scaled.of_seconds(event["dt"])
+        t, x, asked = self.done, np.array(event["learn"]), np.array(event["applied"])
+        u, dt = self.flight.depart(asked), self._scaled.of_seconds(event["dt"])
         self.inputs[t], self.steps.inputs[t] = u, self._scaled.of_inputs(u)
         self.steps.measure(t, self._scaled.of_states(x, self._measured))
         self._watch_size(t, x, u, dt)
@@ -251,6 +285,8 @@ class ExplorerState:
         self.errors[t] = self.steps.errors[t] * self._unit if error is None else error
         estimated = self.steps.states[t + 1] * self._scaled.states
         self.states[t + 1] = estimated if self.spec.system.n_measured else x
+        if u is not asked:
+            self.steps.note_asked(self._scaled.of_inputs(asked))
         if self.spec.limits is not None:
             reached = self.states[t + 1 : t + 2]
             self.excess[t] = self.spec.limits.excess(self.spec.system, reached)[0]

@@ -101,6 +101,9 @@ def plant_of(system: System) -> args.Plant:
         gamma=system.gamma,
         state_limit=system.state_limit,
         integrator=int(Integrator[system.integrator.upper()]),
+        n_carried=system.n_carried,
+        lead=system.lead_steps,
+        cut_at=system.cut_at,
     )
 
 
@@ -139,7 +142,8 @@ def _search(config: TrialConfig) -> args.Search:
         steps, score = policy.steps(system), score_code(policy)
         candidates = policy.compared_inputs(system)
     elif isinstance(policy, HeldCandidates):
-        steps, candidates = policy.lookahead, policy.compared_inputs(system)
+        steps = policy.lookahead + system.lead_steps
+        candidates = policy.compared_inputs(system)
     states = np.zeros((0, system.n_states))
     if isinstance(policy, TaskOptimal):
         states = task_states(system, policy)
@@ -185,6 +189,7 @@ def sensors_of(config: TrialConfig) -> args.Sensors:
         system.output_rows,
         np.array(system.measured_states, dtype=np.int64),
         np.array(system.measurement_noise, dtype=float) ** 2,
+        np.array(system.output_quanta, dtype=float),
         np.array(differentiated(system) if system.measured_states else [], dtype=np.int64),
         np.array(rate_factors(system) if system.measured_states else []),
         0.0 if estimates else system.velocity_cutoff,

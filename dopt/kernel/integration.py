@@ -140,6 +140,38 @@ def predicted_state(plant: Plant, network: Network, theta: Vector, x: Vector) ->
 
 
 @compiled
+def arrival_state(plant: Plant, network: Network, theta: Vector, x: Vector) -> Vector:
+    """Return the state, (d,), in which an input that is chosen at x begins to act.
+
+    It is predicted with the inputs in flight, and is x itself where inputs act at once.
+    """
+    at = x
+    for _ in range(plant.lead):
+        at = predicted_state(plant, network, theta, at)
+    return at
+
+
+@compiled
+def arrival_columns(plant: Plant, network: Network, theta: Vector, x: Vector) -> Matrix:
+    """Return the change of the state by an input in the step in which it begins to act, (m, d).
+
+    Given is the state in which it does. Where inputs act at once these are
+    :func:`learned_columns`. Elsewhere a change in flight is moved on: the known part is affine in
+    the inputs in flight.
+    """
+    columns = learned_columns(plant, network, theta, x)
+    if plant.lead > 0:
+        still, base, moved = np.zeros(plant.n_inputs), np.empty(x.shape[0]), np.empty(x.shape[0])
+        plant.known(x, still, plant.parameters, base)
+        for _ in range(plant.lead):
+            for j in range(columns.shape[0]):
+                plant.known(x + columns[j], still, plant.parameters, moved)
+                for i in range(x.shape[0]):
+                    columns[j, i] += plant.dt * (moved[i] - base[i])
+    return columns
+
+
+@compiled
 def input_columns(plant: Plant, x: Vector) -> Matrix:
     """Return the rows of Bᵀ = dt (∂known/∂u)ᵀ, (m, d), at a state; the known part is affine."""
     base, u = np.empty(x.shape[0]), np.zeros(plant.n_inputs)

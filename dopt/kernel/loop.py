@@ -94,7 +94,8 @@ def learn_members(trial: Trial, learn: Learn, t: int, target: Vector) -> None:
 def plan_input(trial: Trial, steps: Steps, t: int) -> None:
     """Write u_t, the first of which was drawn before the trial, and the time that it took.
 
-    It is what the policy chooses, unless the limits of the trial demand another one.
+    It is what the policy chooses, unless the limits of the trial demand another one, cut to what
+    the plant can apply.
     """
     start, u = monotonic_microseconds(), trial.record.inputs[t]
     if t > 0:
@@ -102,6 +103,9 @@ def plan_input(trial: Trial, steps: Steps, t: int) -> None:
     else:
         copy_into(trial.randomness.inputs[0], u)
     steps.limit_input(trial, t, u)
+    for j in range(u.shape[0]):
+        if abs(u[j]) > trial.plant.cut_at:
+            u[j] = trial.plant.cut_at if u[j] > 0.0 else -trial.plant.cut_at
     trial.record.plan_us[t] = monotonic_microseconds() - start
 
 
@@ -314,6 +318,17 @@ def write_following(held: HeldTrial, x: Vector, inputs: Matrix, out: Matrix) -> 
     plant, theta = trial.plant, trial.state.theta
     for n in range(inputs.shape[0]):
         next_model_state(plant, trial.network, theta, x, inputs[n], plant.dt, out[n])
+
+
+@called_from_python
+def write_reached(held: HeldTrial, x: Vector, inputs: Matrix, seconds: Vector, out: Vector) -> None:
+    """Write the state, (d,), that the model predicts after inputs, (n, m), held for times, (n,)."""
+    trial, at = trial_in(held), x.copy()
+    copy_into(x, out)
+    for n in range(inputs.shape[0]):
+        copy_into(out, at)
+        theta, u, dt = trial.state.theta, inputs[n], seconds[n]
+        next_model_state(trial.plant, trial.network, theta, at, u, dt, out)
 
 
 @called_from_python

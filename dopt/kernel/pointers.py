@@ -201,9 +201,10 @@ _FURTHER_ARGUMENTS: dict[CompiledFunction, tuple[NumbaType, ...]] = {
     loop.write_jacobian_change: (_ROW, _MATRIX, _STACK),
     loop.write_following: (_ROW, _MATRIX, _MATRIX),
     loop.write_input_matrix: (_ROW, _MATRIX),
+    loop.write_reached: (_ROW, _MATRIX, _ROW, _ROW),
 }
 
-BETWEEN = tuple(step for step in _FURTHER_ARGUMENTS if step not in STEPS)
+BETWEEN = tuple(step for step in _FURTHER_ARGUMENTS if step not in (*STEPS, loop.write_reached))
 """Functions that the interpreter calls where a plan or an update is written in numpy."""
 
 

@@ -15,7 +15,12 @@ import numpy as np
 
 from dopt.algorithm import TIE_MARGIN
 from dopt.kernel.compiler import compilable, compiled, squared
-from dopt.kernel.integration import learned_columns, point_columns, predicted_state
+from dopt.kernel.integration import (
+    arrival_columns,
+    arrival_state,
+    point_columns,
+    predicted_state,
+)
 from dopt.kernel.linear_algebra import factorize, solve_lower
 from dopt.kernel.model import euler_step, model_point
 from dopt.kernel.model_kinds import (
@@ -48,8 +53,9 @@ def plan_d_optimal(trial: Trial, t: int, u: Vector) -> None:
     plant, network, state = trial.plant, trial.network, trial.state
     all_components = trial.algorithm.policy[0] != 0.0
     component, tie = trial.randomness.components[t], trial.randomness.ties[t]
-    center = predicted_state(plant, network, state.theta, trial.record.states[t])
-    columns = point_columns(network, learned_columns(plant, network, state.theta, center))
+    x = arrival_state(plant, network, state.theta, trial.record.states[t])
+    center = predicted_state(plant, network, state.theta, x)
+    columns = point_columns(network, arrival_columns(plant, network, state.theta, center))
     radii: Vector = plant.gamma * trial.randomness.radii[t]
     m, bar = columns.shape[0], model_point(network, center, on_sphere(tie, radii[1]))
     S = np.zeros((1 if m == 1 else 1 + m, 1 + m))
@@ -84,9 +90,10 @@ def on_sphere(direction: Vector, radius: float) -> Vector:
 def plan_uniform(trial: Trial, t: int, u: Vector) -> None:
     """Write the best end point of gradient ascents of Σ_{s≤t} ‖x(u) - x_s‖ on the sphere."""
     plant, states, steps = trial.plant, trial.record.states, int(trial.algorithm.policy[0])
-    x = states[t]
+    x = arrival_state(plant, trial.network, trial.state.theta, states[t])
     center = predicted_state(plant, trial.network, trial.state.theta, x)
-    columns = learned_columns(plant, trial.network, trial.state.theta, x)
+    columns = arrival_columns(plant, trial.network, trial.state.theta, x)
+    columns = np.ascontiguousarray(columns[:, : x.shape[0] - plant.n_carried])
     m = columns.shape[0]
     best_value = -1.0
     tried, gradient = np.empty(m), np.empty(m)

@@ -36,9 +36,13 @@ def has_sensors(sensors: Sensors) -> bool:
 
 @compiled
 def measure(sensors: Sensors, noise: Vector, truth: Vector, outputs: Vector) -> None:
-    """Write the outputs at a state, (n,), given it, (d,), and their noise."""
+    """Write the outputs at a state, (n,), given it, (d,), and their noise, or rounded to counts."""
     for i in range(outputs.shape[0]):
-        outputs[i] = inner(sensors.output_matrix[i], truth) + noise[i]
+        value, quantum = inner(sensors.output_matrix[i], truth), sensors.quanta[i]
+        if quantum > 0.0:
+            outputs[i] = quantum * np.floor(value / quantum + 0.5)
+        else:
+            outputs[i] = value + noise[i]
 
 
 @compiled
@@ -77,6 +81,17 @@ def low_pass(trial: Trial, t: int, dt: float, following: Vector) -> None:
         change = share * (trial.record.inputs[t, j] - estimate.filtered_input[j])
         estimate.filtered_input[j] += change
         estimate.inputs[t, j] = estimate.filtered_input[j] - sensors.delay * change
+    if trial.plant.n_carried > 0:
+        carry(trial.plant, trial.record.states[t], estimate.inputs[t], following)
+
+
+@compiled
+def carry(plant: Plant, x: Vector, u: Vector, following: Vector) -> None:
+    """Write the inputs in flight after a step: filtered, as the input u behind them, (m,)."""
+    rate = np.empty(x.shape[0])
+    plant.known(x, u, plant.parameters, rate)
+    for i in range(x.shape[0] - plant.n_carried, x.shape[0]):
+        following[i] = x[i] + plant.dt * rate[i]
 
 
 @compiled

@@ -226,6 +226,7 @@ class KernelSteps(KernelState):
         self._code = compiled_steps(spec.policy, spec.learner, self.trial, others)
         self._held = self._code.hold(self.trial, self._code.steps)
         self._parts: NumpyParts | None = None
+        self._reached: CompiledFunction | None = None
         if in_numpy:
             self._parts = NumpyParts(spec, self.trial, self._held)
             self._observe = compiled_step(self.trial, observe_next)
@@ -257,6 +258,19 @@ class KernelSteps(KernelState):
         known = not self.spec.system.n_measured
         into = self.record.states[t + 1] if known else self.state.estimate.outputs[t]
         into[:] = measured
+
+    def reached(self, t: int, inputs: Array, seconds: Array) -> Array:
+        """Return the state, (d,), predicted from x_t after inputs (n, m) held for times (n,)."""
+        if self._reached is None:
+            self._reached = compiled_step(self.trial, loop.write_reached)
+        state: Array = np.empty(self.spec.system.n_states)
+        self._reached(self._held, self.record.states[t], inputs, seconds, state)
+        return state
+
+    def note_asked(self, u: Array) -> None:
+        """Let the limits of rates count from an input, (m,), and not from what acted."""
+        if len(self.state.prediction.last_input):
+            self.state.prediction.last_input[:] = u
 
     def plan_input(self, t: int) -> None:
         """Write the input u_t that the policy chooses at x_t."""

@@ -183,6 +183,9 @@ class Plant(NamedTuple):
     gamma: float
     state_limit: float
     integrator: int  # dopt.algorithm.Integrator
+    n_carried: int  # last states, which are inputs in flight and actuators
+    lead: int  # steps after which an input begins to act
+    cut_at: float  # magnitude to which an input is cut
 
 
 class Waves(NamedTuple):
@@ -261,6 +264,7 @@ class Sensors(NamedTuple):
     output_matrix: Matrix  # C, (n, d)
     measured: Integers  # (n,) indices of the measured states; empty where outputs mix states
     variances: Vector  # (n,) of their noise
+    quanta: Vector  # (n,) steps to which outputs are rounded, 0 where they have noise
     positions: Integers  # (d,) whose difference estimates a state; itself where it is measured
     factors: Vector  # (d,) the rate of that state in units of the estimated one, 1 where measured
     cutoff: float  # of the low-pass filter, in Hz; 0 where a learner estimates

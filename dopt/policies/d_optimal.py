@@ -201,8 +201,8 @@ class Gain:
         return float(np.linalg.slogdet(S)[1]), np.array(slopes)
 
     def _following(self, inputs: Array) -> Array:
-        """Return the states, (N, d), that the model predicts under inputs, (N, m)."""
-        return self._view.following(self._view.states[-1], inputs)
+        """Return the states, (N, d), that the model predicts when inputs, (N, m), have acted."""
+        return self._view.held(inputs, 1 + self._view.system.lead_steps)
 
 
 def optimum(gain: Gain, starts: Array, search: GradientDOptimal) -> Array:

@@ -120,6 +120,7 @@ class DisagreementPlan(Planner):
         rng: np.random.Generator,
     ) -> None:
         self._system, self._networks, self._steps = system, networks, policy.lookahead
+        self._steps += system.lead_steps
         self._inputs = policy.compared_inputs(system)
         drawn = [networks.initial_parameters(rng) for _ in range(policy.ensemble - 1)]
         self._others = np.array(drawn)
@@ -288,11 +289,7 @@ class SpaceFillingPlan(Planner):
 
     def _led_to(self, view: TrialView, inputs: Array) -> Array:
         """Return the states, (C, d), after ``lookahead`` predicted steps with inputs, (C, m)."""
-        states = view.following(view.states[-1], inputs)
-        for _ in range(self._policy.lookahead - 1):
-            following = (view.following(x, u[None]) for x, u in zip(states, inputs, strict=True))
-            states = np.concatenate(list(following))
-        return states
+        return view.held(inputs, self._policy.lookahead + view.system.lead_steps)
 
     def _features(self, points: Array) -> Array:
         """Return the features of states with inputs, (N, ·), behind them where they are read."""

@@ -137,9 +137,9 @@ class Search(CandidatePolicy, InformationPolicy):
     def score(self) -> str:
         """Criterion of a plan, one of ``SCORES``."""
 
-    def steps(self, system: System) -> int:  # noqa: ARG002  # a longer plan depends on the system
-        """Return the number of steps H of a plan."""
-        return 1
+    def steps(self, system: System) -> int:
+        """Return the number of steps H of a plan: one in which the input acts."""
+        return 1 + system.lead_steps
 
     def chosen_form(self, n_parameters: int, n_rows: int) -> str:  # noqa: ARG002  # one form only
         return "primal"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -9,6 +11,7 @@ import torch
 from dopt.errors import SpecificationError
 from dopt.reference.batch import BatchSteps, Lockstep
 from dopt.spec.trial import TrialSpec
+from dopt.systems.base import next_state
 
 Array = npt.NDArray[np.float64]
 
@@ -72,7 +75,7 @@ class ReferenceSteps:
 
     @torch.no_grad()
     def __init__(self, spec: TrialSpec) -> None:
-        self._batch = BatchSteps([spec])
+        self._spec, self._batch = spec, BatchSteps([spec])
         self.states: Array = self._batch.states[0].numpy()
         self.inputs: Array = self._batch.inputs[0].numpy()
         self.errors: Array = np.full(spec.system.horizon, np.nan)
@@ -90,6 +93,25 @@ class ReferenceSteps:
     def measure(self, t: int, measured: Array) -> None:
         """Write what was measured after step t: x_{t+1}, (d,)."""
         self.states[t + 1] = measured
+
+    def reached(self, t: int, inputs: Array, seconds: Array) -> Array:
+        """Return the state, (d,), predicted from x_t after inputs (n, m) held for times (n,)."""
+        x: Array = self.states[t]
+        integrator = self._spec.system.integrator
+        for u, dt in zip(inputs, seconds, strict=True):
+            x = next_state(integrator, functools.partial(self._rate, u), x, float(dt))
+        return x
+
+    def _rate(self, u: Array, x: Array) -> Array:
+        """Return dx/dt of the model, (d,)."""
+        system, model = self._spec.system, self._spec.model
+        rate = np.array(system.known(tuple(x), tuple(u), system.parameters), dtype=float)
+        learned = model.predict(system, self.parameters, x[None], u[None])[0]
+        rate[list(system.learned_rows)] += learned
+        return rate
+
+    def note_asked(self, u: Array) -> None:
+        """Limits, which count rates from this input, are not enforced here."""
 
     @torch.no_grad()
     def plan_input(self, t: int) -> None:

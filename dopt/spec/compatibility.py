@@ -148,6 +148,7 @@ def check_reference(
         ("policy.information 'fresh'", not is_fresh(policy)),
         ("states that are measured with noise", not system.n_measured),
         ("limits", not enforced),
+        ("plant 'real'", system.wrapped is None),
         ("env.restarts", not getattr(system, "restarts", False)),
     ):
         if not runs:
@@ -190,7 +191,8 @@ def _check_sensors(system: System, learner: Learner) -> None:
         if not learner.estimates_states:
             raise mismatch("env.output_matrix", "learner 'joint_ekf'", f"learner '{learner.name}'")
         return
-    unknown = [i for i, position in enumerate(differentiated(system)) if position < 0]
+    own = differentiated(system)[: system.n_states - system.n_carried]
+    unknown = [i for i, position in enumerate(own) if position < 0]
     if unknown and not learner.estimates_states:
         names = ", ".join(system.state_labels[i] for i in unknown)
         expected = (
@@ -276,6 +278,9 @@ def _check_inputs(system: System, policy: Policy, model: Model, learner: Learner
             expected = f"a model that learns the effect of the inputs, {_choice('', readers)[1:]}"
             raise mismatch(f"env '{system.name}'", expected, f"model '{model.name}'")
         return
+    if system.n_carried:  # the model would read the input that departs, and not what acts
+        expected = "a model of the state alone, such as 'mlp'"
+        raise mismatch("plant.delay or plant.lag", expected, f"model '{model.name}'")
     for part in (policy, learner):
         if not part.reads_inputs:
             expected = "a model of the state alone, such as 'mlp'"

@@ -135,6 +135,8 @@ class TrialConfig:
         if self.task is not None:
             if isinstance(self.system, BlackBox):
                 raise mismatch("a task", "a system with equations", f"env '{self.system.name}'")
+            if self.system.wrapped is not None:
+                raise mismatch("a task", "plant 'ideal'", "plant 'real'")
             object.__setattr__(self, "task", self.task.resolved(self.system))
         self._check_runnable()
         if self.limits is not None:
@@ -145,6 +147,8 @@ class TrialConfig:
             check_system(self.system)
             warn_of_scale(self.system, self.model)
         self.policy.check(self.system)
+        if isinstance(self.policy, TaskPolicy) and self.system.wrapped is not None:
+            raise mismatch(f"policy '{self.policy.name}'", "plant 'ideal'", "plant 'real'")
         if isinstance(self.policy, TaskPolicy) and not self.task and self.system.name not in GOALS:
             expected = "a section task with a goal, or a system with a control task of its own"
             given = f"env '{self.system.name}' without a task"

@@ -42,8 +42,8 @@ _LOSS = "env.loss"
 _ALWAYS = (_LOSS, "limits.name", "limits.enforced")
 """Settings that a label always names where they are unusual, so that trials are not confused."""
 
-_NAMED = ("limits.bounds.", "limits.rates.")
-"""Settings that have no default: each stands under a name of the system."""
+_NAMED = ("limits.bounds.", "limits.rates.", "env.plant.")
+"""Settings that have no default, or are there only where they differ from it."""
 
 _FORMATS = {
     "env.gamma": "γ={}",
@@ -152,6 +152,7 @@ def usual_values(config: Mapping[str, object]) -> dict[str, object]:
     usual |= {"model.name": model, "learner.name": learner}
     usual |= {"task.name": None, "limits.name": None, _LOSS: None}
     usual |= {path: None for path in flatten(config) if path.startswith(_NAMED)}
+    usual["env.plant.name"] = "real"  # its settings say more
     parts = [classes[key] for key in SECTIONS]
     if None not in parts:
         usual["path"] = default_path(parts)

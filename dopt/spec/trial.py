@@ -33,7 +33,7 @@ from dopt.systems import System, system_from_mapping
 LARGEST_SEED = 2**63 - 1
 """Fits into a column of every database."""
 
-_KEYS = (*SECTIONS, "task", "limits", "path", "seed")
+_KEYS = (*SECTIONS, "plant", "task", "limits", "path", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,8 +70,9 @@ class TrialSpec(Validated):
             Sections ``env``, ``policy``, ``model`` and ``learner``, each with a ``name`` and the
             fields that differ from their defaults, the ``seed`` and the execution ``path``; without
             one, it is the kernel where that knows all parts, and the reference elsewhere. A
-            section ``task`` with a name other than "none" says how the trial is assessed, and a
-            section ``limits`` what its states and inputs heed (:class:`dopt.limits.Limits`).
+            section ``task`` with a name other than "none" says how the trial is assessed, a
+            section ``limits`` what its states and inputs heed (:class:`dopt.limits.Limits`), and a
+            section ``plant`` what hardware the system is behind (:func:`dopt.systems.Real`).
 
         Raises
         ------
@@ -84,7 +85,10 @@ class TrialSpec(Validated):
             if key not in _KEYS:
                 raise unknown_name("configuration key", key, _KEYS)
         sections = {key: _section(given, key) for key in SECTIONS}
-        return cls._of_parts(system_from_mapping(sections["env"]), sections, given)
+        env = sections["env"]
+        if given.get("plant") is not None:
+            env = {**env, "plant": _section(given, "plant")}
+        return cls._of_parts(system_from_mapping(env), sections, given)
 
     @classmethod
     def _of_parts(
@@ -293,6 +297,7 @@ def _section(given: Mapping[str, object], key: str) -> Mapping[str, object]:
 
 
 _EXAMPLES = {"env": "pendulum", "policy": "d_optimal", "model": "mlp", "learner": "adam_window"}
+_EXAMPLES["plant"] = "real"
 
 
 MARK = {"loss": "prequential"}

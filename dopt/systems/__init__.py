@@ -26,6 +26,7 @@ from dopt.systems.pendulum import (
 )
 from dopt.systems.planar import Car, MovingStar
 from dopt.systems.quadrotor import Drone, Quadrotor
+from dopt.systems.real import Real, real_from_mapping
 
 SYSTEMS: dict[str, type[System]] = {
     system.name: system
@@ -59,7 +60,13 @@ NAMED_SYSTEMS: dict[str, type[System]] = {**SYSTEMS, **SIMULATORS}
 
 
 def system_from_mapping(section: Mapping[str, object]) -> System:
-    """Return the system that a configuration section describes: ``name`` plus its fields."""
+    """Return the system that a configuration section describes: ``name`` plus its fields.
+
+    An entry ``plant`` describes hardware around it (:func:`dopt.systems.Real`).
+    """
+    if isinstance(hardware := section.get("plant"), Mapping):
+        own = {key: value for key, value in section.items() if key != "plant"}
+        return real_from_mapping(system_from_mapping(own), hardware)
     if section.get("name") == plant.NAME and TARGET not in section:
         return plant.Plant.from_section(section)
     return build("env", NAMED_SYSTEMS, section)
@@ -83,6 +90,7 @@ __all__ = [
     "Pendulum",
     "PendulumUnknownGain",
     "Quadrotor",
+    "Real",
     "System",
     "UnbalancedDisk",
     "VanDerPol",

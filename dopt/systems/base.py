@@ -136,6 +136,10 @@ class System(Validated):
     (:class:`dopt.learning.JointKalman`), or else by a low-pass filter of ``velocity_cutoff`` [Hz]
     and differences (:mod:`dopt.systems.black_box`). Outputs that mix states are given by
     ``output_matrix``, the numbers of C row by row; then a learner has to estimate the states.
+
+    Behind real hardware (:func:`dopt.systems.Real`) the last ``n_carried`` states are inputs in
+    flight and actuators, an input begins to act ``lead_steps`` steps after it was chosen, its
+    magnitude is cut to ``cut_at``, and ``wrapped`` is the system itself.
     """
 
     section: ClassVar[str] = "env"
@@ -153,6 +157,10 @@ class System(Validated):
     grid_indices: ClassVar[tuple[int, ...]]
     low_discrepancy: ClassVar[bool] = False
     equilibrium: ClassVar[tuple[float, ...] | None] = None
+    n_carried: ClassVar[int] = 0
+    lead_steps: ClassVar[int] = 0
+    cut_at: ClassVar[float] = math.inf
+    wrapped: ClassVar[System | None] = None
 
     gamma: float = parameter(1.0, bound="positive")
     dt: float = parameter(0.02, "s", "positive")
@@ -252,6 +260,11 @@ class System(Validated):
         if self.output_matrix:
             return np.array(self.output_matrix).reshape(-1, self.n_states)
         return np.eye(self.n_states)[list(self.measured_states)]
+
+    @property
+    def output_quanta(self) -> tuple[float, ...]:
+        """Step to which each output is rounded in place of noise, (n,); 0 where it has noise."""
+        return (0.0,) * self.n_measured
 
     @property
     def n_learned(self) -> int:

@@ -243,9 +243,10 @@ def start_variances(system: System) -> Array:
     """Return the variances of a state from which an exploration of a plant begins or goes on, (d,).
 
     The measured states are known up to their noise, and the others, which are taken for 0, up to
-    the half-widths of the box, or 1.
+    the half-widths of the box, or 1. Inputs in flight are known.
     """
     deviations = np.ones(system.n_states)
+    deviations[system.n_states - system.n_carried :] = 0.0
     deviations[list(system.grid_indices)] = system.grid_half_widths
     deviations[list(system.measured_states)] = system.measurement_noise
     return deviations**2
@@ -253,7 +254,8 @@ def start_variances(system: System) -> Array:
 
 def delay(system: System) -> float:
     """Return by how many steps differences come after what they are the rates of."""
-    if all(state == of for state, of in enumerate(differentiated(system))):
+    own = differentiated(system)[: system.n_states - system.n_carried]
+    if all(state == of for state, of in enumerate(own)):
         return 0.0
     simulated = system.integrator == "euler" and not isinstance(system, BlackBox)
     return 1.0 if simulated else 0.5

@@ -23,6 +23,7 @@ from dopt.systems import elementary
 from dopt.systems.base import Feature
 from dopt.systems.black_box import BlackBox, unknown_accelerations
 from dopt.systems.properties import input_effect
+from dopt.systems.real import LONGEST_DELAY, Flight
 from dopt.systems.scales import SPLIT, rounded, scales, sizes
 from dopt.types import Array, Equation
 
@@ -411,7 +412,8 @@ class Plant:
         How the model's accelerations are compared with two states: as that at the first one, or
         integrated over the step by the method of Runge and Kutta.
     delay : float or Unknown
-        Time from an input to its effect [s], fractions of a step included.
+        Time from an input to its effect [s], fractions of a step included. An exploration plans
+        for the state in which its input will arrive, and learns from what acts.
     lag : float or Unknown
         Time constant of the actuator, which follows an input as a filter of first order [s].
     supply : float
@@ -497,6 +499,8 @@ class Plant:
             first = given.value if isinstance(given, Unknown) else given
             if not _is_number(first) or first < 0:
                 raise _unlike(what, given, "a number of seconds, at least 0, or dopt.unknown()")
+            if what == "delay" and first > LONGEST_DELAY * self.dt:
+                raise _unlike(what, given, f"at most {LONGEST_DELAY:g} times dt")
         if not (_is_number(self.supply) or self.supply == math.inf) or self.supply <= 0:
             raise _unlike("supply", self.supply, "a positive number")
 
@@ -614,6 +618,14 @@ class Plant:
             grid_points=(GRID_POINTS,) * len(axes),
         )
 
+    def flight(self) -> Flight:
+        """Return the inputs on their way to the plant: none yet, after zeros."""
+        delay, lag = (
+            float(one.value if isinstance(one, Unknown) else one) for one in (self.delay, self.lag)
+        )
+        samples = round(delay / self.dt, 9)  # of 0.3 s by 0.1 s, 3
+        return Flight(samples, lag, self.dt, len(self.inputs))
+
     @property
     def guesses(self) -> dict[str, float]:
         """The constants, each unknown one by its first guess."""
@@ -661,6 +673,7 @@ class Plant:
             "features": tuple(features),
             "grid_indices": tuple(axes),
             "phase_plane": _phase_plane(axes, names),
+            "cut_at": float(self.supply) / (float(self.gamma) if units else 1.0),
             "known": staticmethod(compiled_text(known, groups, self.guesses, units, results)),
             "accelerations": staticmethod(unknown_accelerations(len(self.learned))),
         }

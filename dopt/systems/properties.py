@@ -54,8 +54,10 @@ def jacobians(system: System, state: npt.ArrayLike, inputs: npt.ArrayLike) -> tu
 def eigenmode(system: System) -> Eigenmode | None:
     """Return the least damped oscillation about the stable equilibrium, None when none exists.
 
-    Of modes that are equally damped, the slowest: rounding must not choose.
+    Of modes that are equally damped, the slowest: rounding must not choose. Hardware around the
+    system has no part in it.
     """
+    system = system.wrapped or system
     if system.equilibrium is None:
         return None
     A, B = jacobians(system, system.equilibrium, np.zeros(system.n_inputs))

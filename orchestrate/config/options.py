@@ -106,6 +106,7 @@ def _section(name: str, cls: type) -> dict[str, object]:
 
 KNOWN = (
     "env",
+    "plant",
     "policy",
     "model",
     "learner",

@@ -68,6 +68,11 @@ LOCAL = ("env.horizon=5", "executor=local", "launch.workers=1")
         (["width=${wdth}"], "'wdth' not found"),
         (["env=[1"], "cannot read the override 'env=\\[1'"),
         (["env=quadrotor", "policy=periodic"], "eigenmode"),
+        (["plant=real", "plant.delay=-1"], "plant.delay is -1.0 samples"),
+        (["plant=real", "plant.counts=0"], "plant.counts is 0.0"),
+        (["plant.delay=1"], "setting of plant 'delay' is unknown"),
+        (["plant=reel"], "plant 'reel' is unknown: did you mean 'real'"),
+        (["plant=real", "plant.delay=1", "model=affine"], "goes with a model of the state alone"),
         (["executor=rey"], "executor 'rey' is unknown.* did you mean 'ray'"),
         (["launch.retry=fail"], "launch.retry 'fail' is unknown.* did you mean 'failed'"),
         (["launch.workers=0"], "launch.workers is 0, but null or a whole number above 0"),
@@ -184,6 +189,25 @@ def test_a_grid_runs_once_and_the_default_is_a_hundred_seeds(command_line: Comma
     assert "0 of 700 already done, 700 to run" in output
     assert "700 of 700 done, 0 failed" in output
     assert "700 of 700 already done, nothing to run" in command_line(*grid)[1]
+
+
+def test_every_policy_runs_behind_real_hardware(command_line: Command, tmp_path: Path) -> None:
+    policies = "glob(*),glob(baseline/*),beyond/exact,beyond/gradient,beyond/max,beyond/episodic"
+    small = ("plant=ideal,real", "plant.delay=0,1.5", "plant.supply=1", "env.grid_points=[2,2]")
+    for policy in policies.split(","):
+        code, output, errors = command_line(
+            *("-m", "env=pendulum", f"policy={policy}", *small, "seed=0"),
+            *("env.horizon=50", "executor=inprocess"),
+        )
+        assert code == 0, errors + output
+        assert re.search("\\b0 failed.*\\b0 diverged", output)
+    with sqlite3.connect(tmp_path / "results/results.db") as connection:
+        sql = "SELECT group_concat(label, ';') FROM config WHERE policy = 'd_optimal'"
+        [labels] = connection.execute(sql).fetchone()
+    grid = "D-optimal, grid_points=[2, 2], horizon 50"
+    assert set(labels.split(";")) == {
+        *(grid, f"{grid}, supply=1", f"{grid}, delay=1.5, supply=1"),
+    }
 
 
 def test_a_failed_trial_says_how_to_run_it_again(

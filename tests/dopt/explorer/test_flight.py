@@ -1,0 +1,207 @@
+"""Explorations of plants whose inputs come late, slowly or cut."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dopt import Explorer, Plant, unknown
+from dopt.errors import SpecificationError
+from dopt.systems import Pendulum, Real
+from dopt.systems.real import Flight
+from dopt.types import Array
+from tests.dopt.explorer.plants import MOTOR, following, motor_acceleration
+
+DT = MOTOR.dt
+
+
+class Rig:
+    """The motor behind a delay [s], a lag [s] and a supply [V], and what acted in each step."""
+
+    def __init__(self, delay: float = 0.0, lag: float = 0.0, supply: float = math.inf) -> None:
+        self._flight, self._supply = Flight(round(delay / DT, 9), lag, DT, 1), supply
+        self.x = np.array([0.1, 0.0])
+        self.acted: list[Array] = []
+
+    def step(self, u: Array) -> Array:
+        self.acted.append(self._flight.depart(np.clip(u, -self._supply, self._supply)))
+        self.x = following(self.x, self.acted[-1])
+        return self.x
+
+
+def declared(**more: Any) -> Plant:
+    return dataclasses.replace(MOTOR, **more)
+
+
+def explored(plant: Plant, rig: Rig, steps: int = 250, **more: Any) -> Explorer:
+    explorer = Explorer(plant, **{"steps": 300, "learner": "gauss_newton", **more})
+    for _ in range(steps):
+        explorer.tell(rig.step(explorer.ask(rig.x)))
+    return explorer
+
+
+def error(explorer: Explorer) -> float:
+    states = np.random.default_rng(0).uniform([-math.pi, -10], [math.pi, 10], (200, 2))
+    true = np.array([motor_acceleration(x) for x in states])
+    return float(np.sqrt(np.mean((explorer.predict(states)[:, 0] - true) ** 2)))
+
+
+@pytest.mark.parametrize(
+    "rig",
+    [{"delay": DT}, {"delay": 1.7 * DT}, {"delay": 2 * DT, "lag": 0.03, "supply": 5.0}],
+    ids=str,
+)
+def test_what_is_declared_is_recovered_as_without_it(rig: dict[str, float]) -> None:
+    explorer = explored(declared(**rig), known := Rig(**rig))
+    np.testing.assert_allclose(explorer.inputs, known.acted, atol=1e-12)
+    assert np.abs(explorer.inputs).max() <= rig.get("supply", 6.0) + 1e-12
+    assert error(explorer) < 0.5
+    assert error(explored(MOTOR, Rig(**rig))) > 5.0
+
+
+def test_the_first_guess_of_an_unknown_delay_is_taken() -> None:
+    one = explored(declared(delay=unknown(DT, spread=0.01)), Rig(DT), 50)
+    other = explored(declared(delay=DT), Rig(DT), 50)
+    np.testing.assert_array_equal(one.parameters, other.parameters)
+
+
+@pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
+def test_the_plan_is_that_of_a_simulated_system_behind_the_same_delay(policy: str) -> None:
+    """Both plan for the state that the model predicts two steps ahead."""
+    pendulum = Pendulum(horizon=60, grid_points=(4, 4))
+    plant = Plant(
+        states={"angle": "rad", "rate": "rad/s"},
+        inputs={"torque": "N m"},
+        dt=pendulum.dt,
+        gamma=pendulum.gamma,
+        known={"angle": "rate", "rate": "3 * torque"},
+        learned=["rate"],
+        angles=["angle"],
+        box={"rate": 8.0},
+        delay=2 * pendulum.dt,
+    )
+    real = Explorer(Real(pendulum, delay=2), policy=policy)
+    own = Explorer(plant, steps=60, policy=policy)
+    x = np.zeros(4)
+    for _ in range(50):
+        u = real.ask(x)
+        np.testing.assert_allclose(own.ask(x[:2]), u)
+        rate = pendulum.derivative(x[:2], x[3:4])
+        x = np.array([*(x[:2] + pendulum.dt * rate), u[0], x[2]])
+        real.tell(x)
+        own.tell(x[:2])
+    np.testing.assert_allclose(own.errors, real.errors, rtol=1e-6)
+
+
+def test_a_journal_gives_the_same_exploration_bit_for_bit(tmp_path: Path) -> None:
+    plant = declared(delay=1.5 * DT, lag=0.02, supply=5.0)
+
+    def half(path: Path, first: int, last: int) -> Explorer:
+        explorer = Explorer(plant, steps=60, journal=path, fsync=False, learner="gauss_newton")
+        rng, x = np.random.default_rng(1), np.array([0.1, 0.0])
+        for t in range(last):
+            force = np.array([rng.uniform(-9, 9)])
+            noise = rng.standard_normal(2)
+            if t >= first:
+                time = t * DT + (0.05 if t > 12 else 0.0)
+                explorer.ask(x, time=time)
+                applied = force if t % 3 == 0 else None
+                late = 0.05 if t == 12 else 0.0  # a gap
+                explorer.tell(x + 0.01 * noise, applied=applied, time=time + DT + late)
+            x = x + 0.01 * noise
+            if t == 20 and t >= first:
+                explorer.reset()
+        explorer.close()
+        return explorer
+
+    whole = half(tmp_path / "whole.jsonl", 0, 40)
+    half(tmp_path / "cut.jsonl", 0, 25)
+    resumed = half(tmp_path / "cut.jsonl", 25, 40)
+    for name in ("states", "inputs", "errors", "parameters"):
+        np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
+    assert whole.counts == resumed.counts
+    assert whole.counts["gaps"] == whole.counts["resets"] == 1
+
+
+def asked(explorer: Explorer, u: float, x: Array, time: float | None = None) -> bool:
+    """Tell a state that followed an input, and return whether it was learned from."""
+    return explorer.tell(x, applied=[u], time=time)
+
+
+def test_in_a_gap_the_last_input_is_held() -> None:
+    explorer = Explorer(declared(delay=2 * DT), policy="random", steps=20)
+    explorer.ask([0.0, 0.0], time=0.0)
+    for k in range(1, 5):
+        assert asked(explorer, float(k), np.array([0.01 * k, 0.1]), k * DT)
+        explorer.ask(np.array([0.01 * k, 0.1]), time=k * DT)
+    np.testing.assert_allclose(explorer.inputs[:, 0], [0.0, 0.0, 1.0, 2.0])
+    answer = explorer.ask(np.array([0.04, 0.1]))[0]
+    assert not explorer.tell(np.array([0.06, 0.1]), time=5 * DT + 0.015)  # a gap of 1.75 dt
+    assert asked(explorer, 9.0, np.array([0.07, 0.1]), 6 * DT + 0.015)
+    assert explorer.inputs[-1, 0] == pytest.approx(answer)  # held for two steps
+    explorer.reset()
+    explorer.ask([0.0, 0.0], time=0.0)
+    assert asked(explorer, 1.0, np.array([0.0, 0.1]), DT)
+    assert explorer.inputs[-1, 0] == 0.0
+
+
+def test_a_free_run_is_told_what_acted() -> None:
+    rig = Rig(delay=2 * DT, lag=0.03)
+    explorer = explored(declared(delay=2 * DT, lag=0.03), rig)
+    rng, x, sent = np.random.default_rng(5), [rig.x], []
+    held = [np.zeros(1)] * 30 + [rng.uniform(-6, 6, 1) for _ in range(20) for _ in range(10)]
+    for u in held:
+        sent.append(u)
+        x.append(rig.step(u))
+    late = explorer.free_run_error(np.array(x)[29:], np.array(sent)[29:], 10)
+    without = explored(MOTOR, Rig()).free_run_error(np.array(x)[29:], np.array(sent)[29:], 10)
+    assert late < 0.2 * without
+
+
+def test_a_policy_that_searches_sees_through_a_delay_with_a_deadline() -> None:
+    plant = declared(delay=DT, lag=0.01)
+    explorer = explored(plant, Rig(DT, 0.01), 60, policy="exact", deadline=60.0)
+    assert explorer.counts["missed"] == 0
+    assert explorer.counts["learned"] == 60
+    explorer.close()
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"delay": -0.1}, "'delay' of a plant is -0.1"),
+        ({"delay": 1e6 * DT}, "at most 100 times dt is expected"),
+        ({"lag": math.inf}, "'lag' of a plant is inf"),
+        ({"supply": 0.0}, "'supply' of a plant is 0.0"),
+    ],
+)
+def test_impossible_numbers_are_refused(more: dict[str, float], message: str) -> None:
+    with pytest.raises(SpecificationError, match=message):
+        declared(**more)
+
+
+def test_the_torch_path_plans_for_the_same_states() -> None:
+    plant = declared(delay=1.5 * DT, lag=0.02)
+    kernel = explored(plant, Rig(1.5 * DT, 0.02), 15, learner="adam_window")
+    torch = explored(plant, Rig(1.5 * DT, 0.02), 15, learner="adam_window", path="reference")
+    np.testing.assert_allclose(torch.inputs, kernel.inputs, atol=1e-9)
+    np.testing.assert_allclose(torch.states, kernel.states, rtol=1e-6)
+
+
+def test_a_measured_angle_alone_is_enough_behind_a_delay() -> None:
+    def run(plant: Plant) -> float:
+        policy = {"name": "d_optimal", "regularization": 3.0}
+        explorer, rig = Explorer(plant, policy=policy, learner="joint_ekf", steps=300), Rig(2 * DT)
+        rng, y = np.random.default_rng(2), rig.x[:1]
+        for _ in range(300):
+            y = rig.step(explorer.ask(y))[:1] + 0.002 * rng.standard_normal(1)
+            explorer.tell(y)
+        return error(explorer)
+
+    measured = {"angle": 0.002}
+    assert run(declared(measured=measured, delay=2 * DT)) < 0.5 * run(declared(measured=measured))
