@@ -248,7 +248,7 @@ class Unknown:
     def at(self, z: float) -> float:
         """Return the number z standard deviations above the guess."""
         if self.factor:
-            return self.value * math.exp(math.log(self.factor) * z)
+            return self.value * math.exp(min(math.log(self.factor) * z, 300.0))  # steps overshoot
         return self.value + self.spread * z
 
     def slope(self, z: float) -> float:
