@@ -17,7 +17,7 @@ from typing import Any
 
 import pandas as pd
 
-from analysis import report
+from analysis import fit_report, report
 from analysis.data.matching import REFERENCE, Filter, read_condition
 from analysis.data.samples import DivergenceRule
 from analysis.data.selection import Selection, select
@@ -152,6 +152,9 @@ def parser() -> Parser:
     recorded = commands.add_parser("log", help=log_report.HELP, description=log_report.HELP)
     log_report.add_arguments(recorded)
     recorded.set_defaults(alone=log_report.run)
+    fitted = commands.add_parser("fit", help=fit_report.HELP, description=fit_report.HELP)
+    fit_report.add_arguments(fitted)
+    fitted.set_defaults(alone=fit_report.run)
     _add_serve(commands)
     return top
 

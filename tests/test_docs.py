@@ -238,9 +238,12 @@ def test_every_command_of_the_analysis_works(
 ) -> None:
     extra = {"animate": ("--frames", "2")}
     extra |= dict.fromkeys(("summary", "compare", "aggregate", "report"), ())
-    extra["calibration"] = ()
+    extra |= dict.fromkeys(("calibration", "log"), ())
     if command.words[0] == "calibration":
         monkeypatch.setenv("DOPT_DB", narrow_database)
+    if command.words[0] == "log":
+        rows = (f"{10 * k},{k * k // 50 % 4096},{k % 7 - 3}\n" for k in range(400))
+        Path("run.csv").write_text("t,th,u\n" + "".join(rows))
     if command.words[0] == "serve":  # which does not end; its own tests start it
         assert cli.parser().read(command.words)
     else:

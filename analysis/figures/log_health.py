@@ -28,7 +28,7 @@ def save(log: Log, health: Health, target: Path, title: str) -> None:
     with styled():
         figure, axes = sheet(len(signals) + 1, 1, 0.85, 0.9, TEXT_WIDTH)
         figure.set_layout_engine(None)  # its solver takes a second
-        figure.subplots_adjust(left=0.11, right=0.98, top=0.95, bottom=0.07, hspace=0.35)
+        figure.subplots_adjust(left=0.11, right=0.98, top=0.95, bottom=0.11, hspace=0.4)
         for panel, signal in zip(axes[:-1, 0], signals, strict=True):
             _draw_signal(panel, log, signal, health)
         axes[-2, 0].set_xlabel("time [s]")

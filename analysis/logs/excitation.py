@@ -22,7 +22,7 @@ LAGS = np.arange(-3, 9)
 """Samples by which the effect may come after the input."""
 
 WINDOWS = (2, 4, 8, 16, 32)
-"""Samples p to each side of the polynomials; the one that tells most is taken."""
+"""Samples p to each side of the polynomials; the one in which most is explained is taken."""
 
 MOST_ROWS = 100_000
 """Rows that are examined, the first ones of a longer log."""
@@ -33,14 +33,20 @@ FOLLOWS = 0.005
 TOLD_APART = 1.15
 """Factor by which the next lags leave more unexplained, where a delay is told apart."""
 
-STEADY = 4.0
-"""Effect by its standard error, below which an input has no effect."""
+OWN = 0.2
+"""Share of an input's variance that the state leaves open, above which it varies on its own."""
+
+STEADY = 4.5
+"""Effect by its standard error, below which none is told apart."""
 
 FEEDBACK = 0.05
 """Share of what an input's past leaves open that measurements explain, above which there is one."""
 
 PREDICTED = 0.9999
 """Share of an input that its past tells, above which feedback is not told apart."""
+
+Response = tuple[float, int, Vector]
+"""Steadiness, state and explained shares (lags,) of an input in one window."""
 
 _BLOCKS = 16
 _PAST = 10  # samples of an input's past
@@ -57,13 +63,13 @@ class Effect:
         The input, and the position on which it shows most.
     explained : (lags,) array
         Share of the motion that the state leaves open that the input explains, by :data:`LAGS`.
-    open : float
-        Share of the input's variance that the state leaves open.
     steadiness : float
         The effect at the best lag by its standard error over blocks of the log.
     delays : tuple of int, optional
         First and last lag that fit about as well as the best [samples]; None where more than
         three do.
+    open : float
+        Share of the input's variance that the state at the same time leaves open.
     feedback : float
         Share of what the input's own past leaves open that the measurements explain.
     predicted : float
@@ -73,9 +79,9 @@ class Effect:
     input: str
     state: str
     explained: Vector
-    open: float
     steadiness: float
     delays: tuple[int, int] | None
+    open: float
     feedback: float
     predicted: float
 
@@ -85,9 +91,14 @@ class Effect:
         return self.open < FOLLOWS
 
     @property
+    def has_effect(self) -> bool:
+        """Whether an effect on the motion is told apart."""
+        return not self.follows_state and self.steadiness >= STEADY
+
+    @property
     def explains_nothing(self) -> bool:
-        """Whether the motion says nothing of this input."""
-        return self.follows_state or self.steadiness < STEADY
+        """Whether it follows the state, or varies on its own without an effect on the motion."""
+        return self.follows_state or (self.open > OWN and not self.has_effect)
 
     @property
     def closed_loop(self) -> bool:
@@ -108,19 +119,22 @@ def effects(log: Log) -> list[Effect]:
             one for p in WINDOWS if (one := _best_response(pieces, are_rates, j, p)) is not None
         ]
         if tried:
-            steadiness, i, explained, share = max(tried, key=lambda one: one[0])
-            seen = (name, log.states[i], explained, share, steadiness)
-            found.append(Effect(*seen, _delays(tried), *_feedback(pieces, j)))
+            steady = [one for one in tried if one[0] >= STEADY]
+            most = max(steady or tried, key=lambda one: one[2].max() if steady else one[0])
+            steadiness, i, explained = most
+            law = _law(pieces, j)
+            delays = None if law[0] < FOLLOWS else _delays(tried)
+            found.append(Effect(name, log.states[i], explained, steadiness, delays, *law))
     return found
 
 
-def _delays(tried: Sequence[tuple[float, int, Vector, float]]) -> tuple[int, int] | None:
+def _delays(tried: Sequence[Response]) -> tuple[int, int] | None:
     """Return the lags of the narrowest window that tells them apart: wide ones blur them."""
-    for steadiness, _, explained, share in tried:
+    for steadiness, _, explained in tried:
         left = 1.0 - explained
         alike = np.flatnonzero(left <= TOLD_APART * left.min())
         inner = alike[0] > 0 and alike[-1] < len(LAGS) - 1
-        if steadiness > STEADY and share >= FOLLOWS and inner and np.ptp(alike) <= 2:
+        if steadiness > STEADY and inner and np.ptp(alike) <= 2:
             return int(LAGS[alike[0]]), int(LAGS[alike[-1]])
     return None
 
@@ -165,8 +179,8 @@ def _filtered(values: Array, weight: Vector) -> Array:
 
 def _best_response(
     pieces: Sequence[Piece], are_rates: Sequence[bool], j: int, p: int
-) -> tuple[float, int, Vector, float] | None:
-    """Return steadiness, state, explained shares by lag and open share of one input."""
+) -> Response | None:
+    """Return steadiness, state and explained shares by lag of one input."""
     only_rates = all(are_rates)
     used = [i for i, rate in enumerate(are_rates) if only_rates or not rate]
     rows = [
@@ -186,19 +200,20 @@ def _best_response(
     power = (x_left**2).sum(axis=0)
     total = float(((x - x.mean(axis=0)) ** 2).sum(axis=0).mean())
     if total == 0 or power.min() <= 1e-14 * total:
-        return None if total == 0 else (np.inf, used[0], np.zeros(len(LAGS)), 0.0)
+        return None if total == 0 else (0.0, used[0], np.zeros(len(LAGS)))
     left = motion - basis @ (basis.T @ motion)
     unexplained = np.maximum((left**2).sum(axis=0), 1e-300)
     explained = (x_left.T @ left) ** 2 / power[:, None] / unexplained  # (lags, states)
     lag, place = np.unravel_index(int(explained.argmax()), explained.shape)
     steadiness = _steadiness(x_left[:, lag], left[:, place])
-    share = float(power.mean()) / total
-    return steadiness, used[int(place)], explained[:, place], share
+    return steadiness, used[int(place)], explained[:, place]
 
 
 def _alike(two: Array) -> bool:
     """Return whether two inputs, (rows, 2), are the same apart from noise."""
-    return bool((np.ptp(two, axis=0) == 0).any() or abs(np.corrcoef(two.T)[0, 1]) > 0.9)
+    one, other = two.T
+    still = np.ptp(one) == 0 or np.ptp(other) == 0
+    return bool(still or abs(np.corrcoef(one, other)[0, 1]) > 0.9)
 
 
 def _rows(
@@ -253,21 +268,22 @@ def _steadiness(x: Vector, motion: Vector) -> float:
     return abs(slope) / max(error, 1e-300)
 
 
-def _feedback(pieces: Sequence[Piece], j: int) -> tuple[float, float]:
-    """Return what the measurements add to an input's past, and what the past tells."""
+def _law(pieces: Sequence[Piece], j: int) -> tuple[float, float, float]:
+    """Return what the state leaves open of an input, what it adds to its past, and the past."""
     rows = [_causal(piece, j) for piece in pieces if len(piece.time) > 4 * _PAST]
     if not rows:
-        return 0.0, 0.0
+        return 1.0, 0.0, 0.0
     now, past, seen = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     if len(now) < 4 * (past.shape[1] + seen.shape[1]):
-        return 0.0, 0.0
+        return 1.0, 0.0, 0.0
     total = float(((now - now.mean()) ** 2).sum())
     alone, n_alone = _left(past, now)
     both, n_both = _left(np.column_stack([past, seen]), now)
+    left = _left(np.column_stack([past[:, 0], seen]), now)[0] / total
     if alone <= 1e-12 * total:
-        return 0.0, 1.0
+        return left, 0.0, 1.0
     ratio = (both / (len(now) - n_both)) / (alone / (len(now) - n_alone))
-    return max(0.0, 1.0 - ratio), 1.0 - alone / total
+    return left, max(0.0, 1.0 - ratio), 1.0 - alone / total
 
 
 def _causal(piece: Piece, j: int) -> tuple[Vector, Array, Array]:

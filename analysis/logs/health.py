@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.logs.excitation import Effect, effects, rates
-from dopt.log import TURN, Log
+from dopt.log import Log
+from dopt.log_columns import TURN
 from dopt.types import Array, Booleans, Vector
 
 PERIODS = (1.0, TURN, 360.0, *(1000.0 * k for k in (1, 2, 2.4, 4, 8, 10)), *2.0 ** np.arange(8, 17))
@@ -173,4 +174,4 @@ def _wrap_period(parts: Sequence[Vector], span: float) -> float:
     rest = steps[steps <= 0.5 * span]
     if not jumps.size or not rest.size or rest.max() > 0.3 * span or jumps.size > 0.2 * steps.size:
         return math.nan
-    return min(PERIODS, key=lambda period: abs(math.log(span / period)))
+    return float(min(PERIODS, key=lambda period: abs(math.log(span / period))))

@@ -15,7 +15,8 @@ from analysis.logs.excitation import MOST_ROWS, Effect
 from analysis.logs.health import Health, Signal, examine
 from analysis.logs.tables import is_flag, log_of, read_table
 from analysis.style import number
-from dopt.log import TURN, Log
+from dopt.log import Log
+from dopt.log_columns import TURN
 from orchestrate.program import UsageError, path, positive, tell
 
 HELP = "how healthy a recorded run is: sampling, noise, limits, delay, feedback, units"
@@ -48,13 +49,13 @@ def run(options: argparse.Namespace) -> int:
     table = read_table(options.file).rename(columns=str)
     log = log_of(
         table,
-        _names("--states", options.states),
-        _names("--inputs", options.inputs),
+        names_of("--states", options.states),
+        names_of("--inputs", options.inputs),
         time=options.time,
         dt=options.dt,
         gap=options.gap,
-        angles=tuple(_names("--angles", options.angles) or ()),
-        units=_names("--units", options.units),
+        angles=tuple(names_of("--angles", options.angles) or ()),
+        units=names_of("--units", options.units),
     )
     health, file = examine(log), Path(options.file)
     guessed = " (named like inputs: --inputs says otherwise)" * (options.inputs is None)
@@ -68,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _names(option: str, text: str | None) -> dict[str, str] | None:
+def names_of(option: str, text: str | None) -> dict[str, str] | None:
     """Return the columns that an option names, by state or input."""
     if text is None:
         return None
@@ -168,13 +169,15 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
         )
     elif effect.explains_nothing:
         yield (
-            f"{effect.input}: this input explains nothing here: its effect on {effect.state} is "
-            f"{effect.steadiness:.1f} standard errors; motor off, or the wrong column?"
+            f"{effect.input}: this input explains nothing here: it varies on its own, but its "
+            f"effect is {effect.steadiness:.1f} standard errors; motor off, or the wrong column?"
         )
+    elif not effect.has_effect:
+        yield f"{effect.input}: effect not told apart: the state tells {told:.0f} % of this input"
     else:
         yield (
-            f"{pair}: explains {100 * effect.explained.max():.0f} % of the acceleration that the "
-            f"state leaves open ({effect.steadiness:.0f} standard errors)"
+            f"{pair}: explains {100 * effect.explained.max():.0f} % of the acceleration that "
+            f"the state leaves open ({effect.steadiness:.0f} standard errors)"
         )
     if effect.delays is None:
         yield f"{pair}: delay not told apart"
@@ -183,7 +186,7 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
         samples = f"{first}" if first == last else f"{first} to {last}"
         step = number(1e3 * health.step)
         about = "; about, as noise is fed back" * effect.closed_loop
-        yield f"{pair}: suspected delay: {samples} samples of {step} ms{about}"
+        yield f"{pair}: suspected delay: {samples} sample{'s' * (last != 1)} of {step} ms{about}"
     if effect.follows_state:
         yield f"{effect.input}: closed loop, a function of the state"
     elif effect.closed_loop:

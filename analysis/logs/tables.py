@@ -13,7 +13,8 @@ import pandas as pd
 
 from analysis.errors import AnalysisError
 from dopt.errors import given_path, install_command
-from dopt.log import CLOCKS, Log
+from dopt.log import Log
+from dopt.log_columns import CLOCKS
 
 INPUTS = re.compile(
     r"^u\d*$|input|volt|torque|^tau|current|pwm|force|throttle|command|(^|_)cmd($|_|\d)",
@@ -48,7 +49,7 @@ def read_table(path: str | os.PathLike[str]) -> pd.DataFrame:
         raise AnalysisError(f"{file} is no file, but the file of a log is expected: correct it.")
     try:
         table = _READERS[ending](file)
-    except (ValueError, EOFError) as error:  # of each of the libraries
+    except (ValueError, EOFError, OSError) as error:  # of each of the libraries
         raise AnalysisError(
             f"{file} cannot be read ({error}), but a table by its ending {ending} is expected: "
             f"export it again."
@@ -87,6 +88,7 @@ def log_of(
     **options: Any,
 ) -> Log:
     """Return a log of a table, with the columns that are named like inputs for those."""
+    table = table.rename(columns=str)
     inputs = _guessed_inputs(table) if inputs is None else inputs
     if not inputs:
         raise AnalysisError(
@@ -94,11 +96,14 @@ def log_of(
             f"torque, tau1, ...), but at least one input is expected: name it (inputs=, --inputs)."
         )
     if states is None:
-        time = options.get("time")
-        taken = [*(inputs.values() if isinstance(inputs, Mapping) else inputs), time]
-        names = [one for one in table if one not in taken and str(one).lower() not in CLOCKS]
-        like_inputs = set(_like_inputs(table))
-        states = [one for one in names if not is_flag(table[one]) and one not in like_inputs]
+        named = inputs.values() if isinstance(inputs, Mapping) else inputs
+        taken = {*named, options["time"]} if isinstance(options.get("time"), str) else {*named}
+        states = [
+            one
+            for one in table
+            if one not in taken and one.lower() not in CLOCKS
+            if not is_flag(table[one]) and not INPUTS.search(one)
+        ]
     return Log(table, states=states, inputs=inputs, **options)
 
 
@@ -107,13 +112,9 @@ def is_flag(values: pd.Series[Any]) -> bool:
     return bool(values.dtype.kind in "biu" and values.isin([-1, 0, 1]).all())
 
 
-def _like_inputs(table: pd.DataFrame) -> list[str]:
-    return [one for one in table if INPUTS.search(str(one)) and not is_flag(table[one])]
-
-
 def _guessed_inputs(table: pd.DataFrame) -> list[str]:
     """Return columns named like inputs; of commanded and measured ones the measured."""
-    found = _like_inputs(table)
+    found = [str(one) for one in table if INPUTS.search(str(one))]
     measured = [one for one in found if _MEASURED.search(str(one))]
     rest = [one for one in found if one not in measured]
     return measured if measured and all(_COMMANDED.search(str(one)) for one in rest) else found
@@ -128,11 +129,14 @@ def _csv(file: Path) -> pd.DataFrame:
 
 def _mat(file: Path) -> pd.DataFrame:
     from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
 
     try:
         found = loadmat(file, simplify_cells=True)
     except NotImplementedError:  # of version 7.3
         return _hdf5(file)
+    except MatReadError as error:
+        raise ValueError(error) from error
     return _of_variables(file, {k: v for k, v in found.items() if not k.startswith("__")})
 
 

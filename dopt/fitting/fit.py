@@ -1,30 +1,32 @@
-"""A plant fitted to logs: windows, delay, network and weight of the prior chosen by validation.
+"""A plant fitted to logs: windows, delay, network and weight of the data chosen by validation.
 
-1. The unknown constants are fitted to short windows, with the delay tried from two samples too early
-   to three too late where it is unknown, and then to longer ones. Which length of windows
-   predicts held-out blocks best is kept.
-2. A network is added, with the weight of the data against the prior in stages; it is kept only where it
+1. The unknown constants are fitted to short windows, with each delay from two samples too early to
+   three too late, and then to longer ones. The length of windows that predicts held-out blocks best
+   is kept.
+2. A network is added, with growing weight of the data against the prior. It is kept only where it
    predicts the held-out blocks better than the constants alone by more than one standard error.
 3. What was chosen is fitted to all logs. Standard errors of the constants come from the fit without
    a network, with each window as one cluster: the residuals inside are one curve.
 
-Blocks are logs, or equal parts of fewer logs. A held-out window is predicted from an initial state that
-is fitted to its first third.
+Blocks are logs, or equal parts of fewer than three logs. A held-out window is predicted from an
+initial state that is fitted to what comes before it, half a window long.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from dopt.errors import SpecificationError
-from dopt.fitting.fitted import Estimate, Fitted, Predicted, Selection, predicted
+from dopt.fitting.fitted import Estimate, Fitted, Selection
 from dopt.fitting.model import Layout, Model, data_of, measured_names
+from dopt.fitting.predictions import HORIZONS, Predicted, linear_predictions, predicted
 from dopt.fitting.problem import Simulator, Solution, Windows, first_states, solve, windows_of
 from dopt.fitting.simulation import Data
 from dopt.log import Log
@@ -103,7 +105,7 @@ def fit(
     _check(plant, width, weights, workers)
     plant = _measuring(plant, runs)
     data = data_of(plant, runs, hold)
-    work = _Selection(plant, data, _blocks(data, runs, hold), workers, progress or (lambda _: None))
+    work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
     lengths = work.lengths(window)
     work.scan_delay(lengths[0])
     work.choose_window(lengths)
@@ -111,7 +113,7 @@ def fit(
     chosen = physics
     if width and (found := work.choose_network(width, weights, seed)) is not None:
         chosen = work.finish(*found)
-    return Fitted(plant, hold, work.data, chosen, physics, work.held_out, work.selection(), tests)
+    return Fitted(plant, hold, work.data, chosen, physics, work.held_out(), work.selection(), tests)
 
 
 class _Selection:
@@ -136,7 +138,7 @@ class _Selection:
         self.scan: dict[float, float] = {}
         self.window = math.nan
         self._typical: float | None = None
-        self.held_out: list[Predicted] = []
+        self._folds: dict[str, tuple[Model, list[Array]]] = {}
 
     def _model(self, delay: float, *, free: bool) -> Model:
         return Model(
@@ -178,7 +180,7 @@ class _Selection:
         margin = {"skip": self._latest(), "ahead": 2.0 * self.step}
         chosen = range(len(self.blocks)) if block is None else [block]
         rows = np.concatenate(
-            [windows_of(self.data, self.model, *self.blocks[i], seconds, **margin) for i in chosen]
+            [windows_of(self.data, *self.blocks[i], seconds, **margin) for i in chosen]
         )
         return Windows(rows, first_states(self.data, self.model, rows))
 
@@ -256,11 +258,12 @@ class _Selection:
             windows = self._windows(length)
             whole = solve(Simulator(self.model, self.data), windows, p, 1.0)
             p = whole.p
-            scores, held_out = self._validate(self.model, whole, 1.0)
+            scores, folds = self._validate(self.model, whole, 1.0)
             self._note(f"constants, windows of {length:.3g} s", scores)
             if scores.mean() < best:
                 best, self.window = float(scores.mean()), length
-                self.solution, self._scores, self.held_out = whole, scores, held_out
+                self.solution, self._scores = whole, scores
+                self._folds["physics alone"] = self._folds["model"] = (self.model, folds)
 
     def choose_network(
         self, width: int, weights: Sequence[float], seed: int
@@ -276,12 +279,12 @@ class _Selection:
             start = solve(
                 *(Simulator(model, self.data), start.windows, start.p, s), scale=start.scale
             )
-            scores, held_out = self._validate(model, start, s)
+            scores, folds = self._validate(model, start, s)
             self._note(f"and {width} units, s = {weight:g}", scores)
             if scores.mean() >= best[0]:
                 break
-            best = float(scores.mean()), (start, s, scores, held_out)
-        start, s, scores, held_out = best[1]
+            best = float(scores.mean()), (start, s, scores, folds)
+        start, s, scores, folds = best[1]
         gain = self._scores - scores
         error = float(gain.std(ddof=1) / math.sqrt(len(gain))) if len(gain) > 1 else math.inf
         if not gain.mean() > error:
@@ -290,7 +293,7 @@ class _Selection:
                 f"of log-loss only"
             )
             return None
-        self.held_out = held_out
+        self._folds["model"] = (model, folds)
         return model, start, s
 
     def _layout(self) -> Layout:
@@ -314,10 +317,11 @@ class _Selection:
         sizes = np.sqrt(np.median(flow[:, self.model.structure.learned] ** 2, axis=0)) / 2.0
         return Layout(centers, scales, np.maximum(sizes, 1e-300))
 
-    def _tested(self, seconds: float, block: int) -> Integers:
+    def _tested(self, seconds: float, block: int, horizon: float | None = None) -> Integers:
         """Return first row, last row of the history, and last row of held-out predictions."""
+        horizon = seconds if horizon is None else horizon
         rows = windows_of(
-            *(self.data, self.model, *self.blocks[block], 1.5 * seconds),
+            *(self.data, *self.blocks[block], 0.5 * seconds + horizon),
             skip=self._latest(),
             ahead=2.0 * self.step,
         )
@@ -329,23 +333,23 @@ class _Selection:
         ]
         return np.array([(a, h, b) for (a, b), h in zip(rows, history, strict=True)]).reshape(-1, 3)
 
-    def _validate(self, model: Model, whole: Solution, s: float) -> tuple[Array, list[Predicted]]:
-        """Return for each block how a fit to the others predicts it, and the predictions.
+    def _validate(self, model: Model, whole: Solution, s: float) -> tuple[Array, list[Array]]:
+        """Return for each block how a fit to the others predicts it, and its parameters.
 
         Each fit begins from the fit to all blocks, which shortens it.
         """
 
-        def one(block: int) -> Predicted:
+        def one(block: int) -> tuple[Predicted, Array]:
             low, high = self.blocks[block]
             rows = whole.windows.rows
             others = (rows[:, 1] < low) | (rows[:, 0] > high)
             windows = Windows(*(np.ascontiguousarray(part[others]) for part in whole.windows))
             simulator = Simulator(model, self.data)
             found = solve(simulator, windows, whole.p, s, scale=whole.scale[others], tolerance=1e-3)
-            return predicted(simulator, found.p, self._judged[block])
+            return predicted(simulator, found.p, self._judged[block]), found.p
 
         found = list(self._map(one, range(len(self.blocks))))
-        shares = [each.mean_squares() for each in found]
+        shares = [each.mean_squares() for each, _ in found]
         if self._typical is None:
             known = [share for each in shares for share in each if np.isfinite(share)]
             self._typical = max(float(np.median(known)), 1e-300) if known else 1.0
@@ -358,7 +362,28 @@ class _Selection:
             )
             for each in shares
         ]
-        return np.array(scores), found
+        return np.array(scores), [p for _, p in found]
+
+    def held_out(self) -> dict[str, list[Predicted]]:
+        """Return predictions of each block over the longest horizon of the report, by what made them."""
+        longest = max(HORIZONS) * self.window
+        pieces = max(self.data.time[b] - self.data.time[a] for a, b in self.blocks)
+        tested = [
+            self._tested(self.window, block, min(longest, 0.5 * pieces))
+            for block in range(len(self.blocks))
+        ]
+        out: dict[str, list[Predicted]] = {}
+        for what, (model, folds) in self._folds.items():
+
+            def one(block: int, model: Model = model, folds: list[Array] = folds) -> Predicted:
+                return predicted(Simulator(model, self.data), folds[block], tested[block])
+
+            out[what] = list(self._map(one, range(len(self.blocks))))
+        out["linear"] = [
+            linear_predictions(self.data, self.blocks[block], tested[block], self.delay, self.step)
+            for block in range(len(self.blocks))
+        ]
+        return out
 
     def _map(self, function: Callable[[int], Any], over: Iterable[int]) -> Iterable[Any]:
         with ThreadPoolExecutor(self.workers) as pool:
@@ -414,7 +439,7 @@ def _steps(data: Data) -> Array:
     return steps if len(steps) else np.ones(1)
 
 
-def _blocks(data: Data, runs: Sequence[Log], hold: str) -> list[tuple[int, int]]:
+def _blocks(data: Data, runs: Sequence[Log]) -> list[tuple[int, int]]:
     """Return first and last rows of the blocks: logs, or equal parts of fewer than three."""
     N = len(data.time)
     cuts = np.linspace(0, N, BLOCKS + 1).astype(int)
@@ -423,7 +448,7 @@ def _blocks(data: Data, runs: Sequence[Log], hold: str) -> list[tuple[int, int]]
         ends = np.cumsum([0, *sizes])
         parts = min(len(runs), BLOCKS + 1)
         cuts = ends[np.linspace(0, len(runs), parts + 1).round().astype(int)]
-    return [(int(a), int(b) - 1) for a, b in zip(cuts[:-1], cuts[1:], strict=True) if b > a]
+    return [(int(a), int(b) - 1) for a, b in itertools.pairwise(cuts) if b > a]
 
 
 def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Array]:
@@ -453,7 +478,9 @@ def _measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
         if all(name in run.states for run in runs):
             at = [run.states.index(name) for run in runs]
             columns = [
-                piece.measured[:, i] for run, i in zip(runs, at, strict=True) for piece in run.pieces
+                piece.measured[:, i]
+                for run, i in zip(runs, at, strict=True)
+                for piece in run.pieces
             ]
             measured[name] = max(1e-3 * float(np.nanstd(np.concatenate(columns))), 1e-300)
     return dataclasses.replace(plant, measured=measured)

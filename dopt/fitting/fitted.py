@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,11 +13,15 @@ import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model, data_of, measured_names
+from dopt.fitting.predictions import HORIZONS, Predicted, horizon_errors, predicted
 from dopt.fitting.problem import Simulator, Solution, Windows, first_states, windows_of
 from dopt.fitting.simulation import Data
 from dopt.log import Log
-from dopt.systems.plant import Plant
+from dopt.systems.plant import Plant, Unknown
 from dopt.types import Array, Integers
+
+USEFUL = 0.5
+"""Largest error of a model that is worth using, by the changes themselves."""
 
 
 class Estimate(NamedTuple):
@@ -36,72 +40,6 @@ class Selection(NamedTuple):
     window: float  # length that was chosen [s]
     delays: dict[float, float]  # delay [s]: residual of short windows in first deviations
     notes: tuple[str, ...]
-
-
-class Predicted(NamedTuple):
-    """Predictions of windows after a history: errors in the units of the measured states.
-
-    Attributes
-    ----------
-    seconds : list of (rows,)
-        Times after the history.
-    errors : list of (rows, n)
-        Measured less predicted; NaN where nothing was measured, inf where a simulation diverged.
-    changes : list of (rows, n)
-        Measured less the last measurement of the history.
-    deviations : (n,)
-    """
-
-    seconds: list[Array]
-    errors: list[Array]
-    changes: list[Array]
-    deviations: Array
-
-    def mean_squares(self) -> Array:
-        """Return the mean square of each window, in standard deviations."""
-        return np.array(
-            [
-                float(np.mean(np.square((error / self.deviations)[np.isfinite(change)])))
-                if np.isfinite(change).any()
-                else math.nan
-                for error, change in zip(self.errors, self.changes, strict=True)
-            ]
-        )
-
-    def at(self, horizon: float) -> tuple[Array, Array]:
-        """Return errors and changes, (windows, n), at the last measurement up to a time."""
-        errors, changes = [], []
-        for seconds, error, change in zip(self.seconds, self.errors, self.changes, strict=True):
-            inside = np.flatnonzero(
-                (seconds <= horizon * (1 + 1e-9)) & np.isfinite(change).all(axis=1)
-            )
-            if len(inside) and seconds[inside[-1]] >= 0.8 * horizon:
-                errors.append(error[inside[-1]])
-                changes.append(change[inside[-1]])
-        n = len(self.deviations)
-        return np.array(errors).reshape(-1, n), np.array(changes).reshape(-1, n)
-
-
-def predicted(simulator: Simulator, p: Array, rows: Integers) -> Predicted:
-    """Predict windows, (k, 3): first row, last row of the history, last row."""
-    data, model = simulator.data, simulator.model
-    history = np.ascontiguousarray(rows[:, :2])
-    windows = Windows(history, first_states(data, model, history))
-    windows = simulator.settled(p, windows) if len(rows) else windows
-    seconds, errors, changes = [], [], []
-    measured = model.structure.measured
-    for (first, middle, last), start in zip(rows, windows.starts, strict=True):
-        states = simulator.states(p, first, last, start)[middle + 1 - first :, measured]
-        seen = data.measured[middle + 1 : last + 1]
-        before = data.measured[first : middle + 1]
-        newest = [column[np.isfinite(column)][-1:] for column in before.T]
-        reference = np.array([value[0] if len(value) else math.nan for value in newest])
-        error = seen - states
-        error[np.isnan(states)] = np.inf
-        seconds.append(data.time[middle + 1 : last + 1] - data.time[middle])
-        errors.append(error)
-        changes.append(seen - reference)
-    return Predicted(seconds, errors, changes, data.deviations)
 
 
 class Simulation(NamedTuple):
@@ -141,13 +79,13 @@ class Fitted:
         data: Data,
         chosen: Estimate,
         physics: Estimate,
-        held_out: Sequence[Predicted],
+        held_out: Mapping[str, list[Predicted]],
         selection: Selection,
         tests: Sequence[Log],
     ) -> None:
         self.plant, self.hold, self.selection, self.tests = plant, hold, selection, list(tests)
         self._data, self._chosen, self._physics = data, chosen, physics
-        self._held_out = list(held_out)
+        self._held_out = dict(held_out)
         self.has_network = chosen is not physics
 
     @functools.cached_property
@@ -159,6 +97,18 @@ class Fitted:
             name: (value, float(error))
             for (name, value), error in zip(values.items(), deviations, strict=True)
         }
+
+    @property
+    def given(self) -> dict[str, float]:
+        """Constants that were not fitted, and the delay and the lag where they were given."""
+        plant = self.plant
+        known = {name: v for name, v in plant.constants.items() if not isinstance(v, Unknown)}
+        known |= {
+            name: value
+            for name, value in (("delay", plant.delay), ("lag", plant.lag))
+            if not isinstance(value, Unknown) and value and name not in plant.constants
+        }
+        return {name: float(value) for name, value in known.items()}
 
     @property
     def delay(self) -> float:
@@ -209,7 +159,7 @@ class Fitted:
                 f"level is {level!r}, but a share between 0 and 1 is expected: give for instance 0.9."
             )
         data, z = self._with(run), float(norm.ppf(0.5 + 0.5 * level))
-        model, solution, s, covariance = self._chosen
+        model, solution, _, covariance = self._chosen
         simulator = Simulator(model, data)
         seconds = 0.5 * self.selection.window if history is None else float(history)
         out = []
@@ -224,7 +174,10 @@ class Fitted:
             by_start = S[:, measured, model.q :] @ inverse
             by_p = S[:, measured, : model.q] - by_start @ linear.C[0]
             variance = np.einsum("tnq,qr,tnr->tn", by_p, covariance, by_p)
-            variance += np.square(by_start).sum(axis=2) + np.square(data.deviations)
+            variance += np.square(by_start).sum(axis=2)
+            variance += np.square(
+                self.errors_ahead(data.time[first : last + 1] - data.time[middle])
+            )
             half, seen = (
                 z * np.sqrt(variance),
                 np.isfinite(data.measured[first : last + 1]).any(axis=1),
@@ -241,6 +194,157 @@ class Fitted:
             )
         return out
 
+    def errors_ahead(self, seconds: Array) -> Array:
+        """Return the root mean square errors of held-out predictions so far ahead, (N, n).
+
+        Before the first horizon they are the noise, and beyond the last one they stay.
+        """
+        rows = horizon_errors(self._held_out["model"], self.horizons)
+        times = [0.0, *(row[0].horizon for row in rows)]
+        noise = self._data.deviations
+        out = np.empty((len(seconds), len(noise)))
+        for c, deviation in enumerate(noise):
+            found = [deviation, *(max(row[c].rms, deviation) for row in rows)]
+            out[:, c] = np.interp(seconds, times, found)
+        return out
+
+    @property
+    def horizons(self) -> list[float]:
+        """Times ahead of which the report has errors [s]."""
+        return [share * self.selection.window for share in HORIZONS]
+
+    def errors(self) -> list[dict[str, Any]]:
+        """Return the errors of predictions, one row for each horizon, state and model.
+
+        They are taken on the runs for validation, or on held-out blocks without such runs.
+        """
+        found = self._tested() if self.tests else self._held_out
+        names = measured_names(self.plant)
+        return [
+            {"state": name, "model": what, **error._asdict()}
+            for what, predictions in found.items()
+            for row in horizon_errors(predictions, self.horizons)
+            for name, error in zip(names, row, strict=True)
+        ]
+
+    def _tested(self) -> dict[str, list[Predicted]]:
+        data = data_of(self.plant, self.tests, self.hold, self._data.deviations)
+        rows = self._windows(data, max(self.horizons))
+        models = {"model": self._chosen, "physics alone": self._physics}
+        return {
+            what: [predicted(Simulator(each.model, data), each.solution.p, rows)]
+            for what, each in models.items()
+        }
+
+    def _windows(self, data: Data, horizon: float) -> Integers:
+        """Return windows of a history and a horizon, (k, 3), one after the other."""
+        history = 0.5 * self.selection.window
+        rows = windows_of(
+            *(data, 0, len(data.time) - 1, history + horizon),
+            skip=self._latest(),
+            ahead=2.0 * self.plant.dt,
+        )
+        ends = data.time[rows[:, 0]] + history
+        middles = [
+            first + int(np.searchsorted(data.time[first : last + 1], end))
+            for (first, last), end in zip(rows, ends, strict=True)
+        ]
+        return np.array(
+            [(a, h, b) for (a, b), h in zip(rows, middles, strict=True)], np.int64
+        ).reshape(-1, 3)
+
+    def coverage(self, level: float = 0.9) -> dict[str, float]:
+        """Return the share of held-out measurements within the bounds of predictions at a level.
+
+        The bounds come from the errors of the other blocks.
+        """
+        from scipy.stats import norm
+
+        z, parts = float(norm.ppf(0.5 + 0.5 * level)), self._held_out["model"]
+        inside: list[Array] = []
+        for i, part in enumerate(parts):
+            rows = horizon_errors([each for j, each in enumerate(parts) if j != i], self.horizons)
+            times = [0.0, *(row[0].horizon for row in rows)]
+            for seconds, error, change in zip(part.seconds, part.errors, part.changes, strict=True):
+                for c, deviation in enumerate(self._data.deviations):
+                    found = [deviation, *(max(row[c].rms, deviation) for row in rows)]
+                    bound = z * np.interp(seconds, times, found)
+                    held = (np.abs(error[:, c]) <= bound)[np.isfinite(change[:, c])]
+                    inside.append(np.column_stack([np.full(len(held), c), held]))
+        both = np.concatenate(inside) if inside else np.zeros((0, 2))
+        return {
+            name: float(both[both[:, 0] == c, 1].mean()) if (both[:, 0] == c).any() else math.nan
+            for c, name in enumerate(measured_names(self.plant))
+        }
+
+    def whiteness(self) -> dict[str, tuple[float, float]]:
+        """Return two correlations of the residuals of each measured state.
+
+        The first is with the residual one row before, the second the largest one with one of the last
+        ten inputs; 0 of a model that leaves nothing but white noise.
+        """
+        model, solution, _, _ = self._chosen
+        simulator, data = Simulator(model, self._data), self._data
+        out = {}
+        for c, name in enumerate(measured_names(self.plant)):
+            now, before, rows = [], [], []
+            for (first, last), start in zip(*solution.windows, strict=True):
+                at = np.arange(first, last + 1)
+                states = simulator.states(solution.p, first, last, start)
+                error = data.measured[at, c] - states[:, model.structure.measured[c]]
+                at, error = at[np.isfinite(error)], error[np.isfinite(error)]
+                now.append(error[1:])
+                before.append(error[:-1])
+                rows.append(at[1:])
+            r, at = np.concatenate(now), np.concatenate(rows)
+            inputs = [
+                _correlation(r, data.inputs[np.maximum(at - lag, data.firsts[at]), j])
+                for lag in range(10)
+                for j in range(data.inputs.shape[1])
+            ]
+            out[name] = _correlation(r, np.concatenate(before)), max(inputs, key=abs)
+        return out
+
+    def verdict(self) -> str:
+        """Return in a sentence how far ahead the model is worth using."""
+        rows = [row for row in self.errors() if row["model"] == "model"]
+        good = [
+            horizon
+            for horizon in sorted({row["horizon"] for row in rows})
+            if all(
+                row["rms"] < USEFUL * row["nothing_changes"]
+                for row in rows
+                if row["horizon"] <= horizon
+            )
+        ]
+        if not good:
+            return "Do not use this model: it predicts no better than that nothing changes."
+        if len(good) < len({row["horizon"] for row in rows}):
+            return f"Do not use this model beyond {good[-1]:.2g} s."
+        return f"Useful up to {good[-1]:.2g} s, the longest time that was tried."
+
+    def report(self) -> str:
+        """Return what was found, line by line, with units."""
+        return report_of(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write the model as arrays (.npz), which :func:`dopt.load_fit` and NumPy alone read."""
+        from dopt.fitting.export import save
+
+        save(self, path)
+
+    def to_torch(self) -> Any:
+        """Return dx/dt as a module of PyTorch, whose parameters are constants and weights."""
+        from dopt.fitting.export import to_torch
+
+        return to_torch(self)
+
+    def environment(self) -> Any:
+        """Return the plant as an environment of Gymnasium that begins at states of the logs."""
+        from dopt.fitting.export import environment
+
+        return environment(self)
+
     def _with(self, run: Any) -> Data:
         log = run if isinstance(run, Log) else Log.for_plant(run, self.plant)
         return data_of(self.plant, [log], self.hold, self._data.deviations)
@@ -250,7 +354,7 @@ class Fitted:
         out = []
         for first in np.unique(data.firsts):
             last, begin = int(data.lasts[first]), int(first)
-            while begin < last and data.time[begin] - data.time[first] < self._latest(data):
+            while begin < last and data.time[begin] - data.time[first] < self._latest():
                 begin += 1
             middle = begin + int(
                 np.searchsorted(data.time[begin : last + 1], data.time[begin] + history)
@@ -264,7 +368,7 @@ class Fitted:
             )
         return np.array(out, np.int64)
 
-    def _latest(self, data: Data) -> float:
+    def _latest(self) -> float:
         values = self._chosen.model.values(self._chosen.solution.p)
         return max(values.delay, 0.0) + 3.0 * values.lag
 
@@ -278,3 +382,50 @@ class Fitted:
         squares = [np.mean(np.square(column[~np.isnan(column)])) for column in errors.T]
         names = measured_names(self.plant)
         return {name: float(np.sqrt(each)) for name, each in zip(names, squares, strict=True)}
+
+
+def _correlation(a: Array, b: Array) -> float:
+    if len(a) < 3 or a.std() == 0.0 or b.std() == 0.0:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def report_of(found: Fitted) -> str:
+    """Return the report of a fit."""
+    plant, selection = found.plant, found.selection
+    units = {name: plant.states[name] for name in plant.states}
+    lines = ["Constants (standard errors: windows as clusters, without a network)"]
+    for name, (value, error) in found.constants.items():
+        unit = " s" if name in ("delay", "lag") and name not in plant.constants else ""
+        lines.append(f"  {name:<12} {value:.5g} ± {error:.2g}{unit}")
+    lines += [f"  {name:<12} {value:.5g} (given)" for name, value in found.given.items()]
+    lines.append("")
+    lines.append("Held-out loss of what was tried (mean over blocks, standard error)")
+    lines += [f"  {what:<36} {loss:.4f} ± {error:.4f}" for what, loss, error in selection.table]
+    network = "with a network" if found.has_network else "constants alone"
+    lines.append(f"  chosen: {network}, windows of {selection.window:.3g} s")
+    lines += [f"  note: {note}" for note in selection.notes]
+    lines.append("")
+    where = "runs for validation" if found.tests else "held-out blocks"
+    lines.append(f"Error of predictions on {where} (root mean square; median)")
+    rows = found.errors()
+    for name in found.noise:
+        lines.append(f"  {name} [{units[name]}]")
+        for horizon in sorted({row["horizon"] for row in rows}):
+            here = [row for row in rows if row["state"] == name and row["horizon"] == horizon]
+            models = ", ".join(f"{row['model']} {row['rms']:.3g}" for row in here)
+            first = here[0]
+            lines.append(
+                f"    {horizon:.3g} s: {models}, nothing changes {first['nothing_changes']:.3g}; "
+                f"median {first['median']:.3g}"
+            )
+    lines.append("")
+    for name, share in found.coverage().items():
+        lines.append(f"Bounds of 90 % hold {100 * share:.0f} % of held-out {name}.")
+    for name, (own, other) in found.whiteness().items():
+        lines.append(
+            f"Residuals of {name}: correlation {own:.2f} with the row before, {other:.2f} with an "
+            f"earlier input (0: white)."
+        )
+    lines.append(found.verdict())
+    return "\n".join(lines)

@@ -2,18 +2,17 @@
 
 What is minimised over the parameters p and the initial states is
 
-    Σ_k ρ(‖e_k‖²) / s² + ‖(p - p₀)/σ‖²
+    Σ_k ρ(‖e_k‖²) / s² + ‖p - p₀‖²
 
 with e_k the residuals of window k in standard deviations, ρ(r) = c log(1 + r/c) the loss of Cauchy
-(windows that nothing fits count little), and s the factor by which the residuals are larger than
-their deviations say: they are smooth curves, so that a window has few that are independent. A step is
-taken by the method of Levenberg and Marquardt.
+(windows that nothing fits count little), p in standard deviations of its prior, and s the factor
+by which the residuals count as larger than their deviations say: they are smooth curves, so that
+few of those in a window are independent. A step is taken by the method of Levenberg and Marquardt.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numba
@@ -316,7 +315,7 @@ def _kind(value: Any) -> Any:
 
 
 def windows_of(
-    data: Data, model: Model, first: int, last: int, seconds: float, *, skip: float, ahead: float
+    data: Data, first: int, last: int, seconds: float, *, skip: float, ahead: float
 ) -> Integers:
     """Return windows of so many seconds, (k, 2), one after the other within some rows.
 

@@ -1,11 +1,11 @@
 """Simulation of windows of a log in compiled code, with forward sensitivities.
 
-The derivative of the state is f(x, v) = known(x, v; c) + E A N(φ(x)), with v what acts of the inputs,
-c the constants, N a network of one layer of tanh units, and A the sizes of its outputs. An input that
-is recorded at time T acts from T + D on, held until the next one; an actuator of first order follows
-it, dv/dt = (u - v)/τ, which is integrated exactly. The state is integrated by the method of Runge and
-Kutta of fourth order, from one switch of the input to the next, and its derivatives with respect to
-parameters and initial state with it:
+The derivative of the state is f(x, v) = known(x, v; c) + E A N(φ(x)), with v what acts of the
+inputs, c the constants, N a network of one layer of tanh units, and A the sizes of its outputs. An
+input that is recorded at time T acts from T + D on, held until the next one; an actuator of first
+order follows it, dv/dt = (u - v)/τ, which is integrated exactly. The state is integrated by the
+method of Runge and Kutta of fourth order, from one switch of the input to the next, and with it
+its derivatives by the parameters and the initial state:
 
 ======  ======================================================================  =========
 symbol  meaning                                                                 shape
@@ -16,9 +16,9 @@ e       measured less simulated, each divided by its standard deviation         
 R, X    ∂(C x)/∂p and ∂(C x)/∂x₀, divided likewise                              rows × q, d
 ======  ======================================================================  =========
 
-Where a switch of the input comes later by dD, the state moves by (f before - f after) dD. The initial
-state of every window is free: with X = Q T, Q orthonormal, its best change for a change δ of the
-parameters is T⁻¹ Qᵀ(e - R δ), and what is left of the problem has the rows (I - Q Qᵀ) R and
+Where a switch of the input comes later by dD, the state moves by (f before - f after) dD. The
+initial state of every window is free: with X = Q T, Q orthonormal, its best change for a change δ
+of the parameters is T⁻¹ Qᵀ(e - R δ), and what is left of the problem has the rows (I - Q Qᵀ) R and
 (I - Q Qᵀ) e.
 
 References: H. Bock, "Numerical treatment of inverse problems in chemical reaction kinetics" (1981),
@@ -123,7 +123,7 @@ class Work(NamedTuple):
     S: Matrix  # (d, q + d)
     Ss: Matrix
     K: Matrix
-    sum_K: Matrix
+    sums: Matrix
     zx: types.Array
     zv: types.Array
     zc: types.Array
@@ -286,7 +286,7 @@ def _integrate(
     """Move x and S, and v with its derivatives, by a time during which u is held."""
     d, n = work.S.shape
     m = u.shape[0]
-    steps = max(1, int(math.ceil(seconds / structure.longest_step - 1e-9)))
+    steps = max(1, math.ceil(seconds / structure.longest_step - 1e-9))
     h = seconds / steps
     q = n - d
     n_times = int(structure.free_delay) + int(structure.free_lag) if q > 0 else 0
@@ -321,7 +321,7 @@ def _integrate(
             for i in range(d):
                 work.sum_f[i] = weight * work.f[i] + (work.sum_f[i] if stage else 0.0)
                 if sensitive:
-                    K, total = work.K[i], work.sum_K[i]
+                    K, total = work.K[i], work.sums[i]
                     if stage == 0:
                         for c in range(n):
                             total[c] = weight * K[c]
@@ -331,7 +331,7 @@ def _integrate(
         for i in range(d):
             work.x[i] += h * work.sum_f[i]
             if sensitive:
-                S, total = work.S[i], work.sum_K[i]
+                S, total = work.S[i], work.sums[i]
                 for c in range(n):
                     S[c] += h * total[c]
     _held(values, u, v, dv, seconds, work.v, dat)
@@ -501,8 +501,9 @@ def write_window(
     C: Matrix,
     g: Vector,
 ) -> float:
-    """Write the rows (I - Q Qᵀ) R and (I - Q Qᵀ) e of one window, times its weight, T, C = Qᵀ R and
-    g = Qᵀ e; return ‖e‖² without the weight.
+    """Write the rows (I - Q Qᵀ) R and (I - Q Qᵀ) e of one window, times its weight.
+
+    Also written are T, C = Qᵀ R and g = Qᵀ e; ‖e‖² without the weight is returned.
     """
     n, d = structure.measured.shape[0], states.shape[1]
     total, at = 0.0, 0

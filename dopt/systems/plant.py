@@ -525,6 +525,36 @@ class Plant:
         ordered |= {key: _from_section(given[key]) for key in _TIMES if key in given}
         return cls(**(given | ordered)).system(section["horizon"])
 
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, Any]) -> Plant:
+        """Return the plant that a mapping of its arguments describes, such as a YAML file.
+
+        An unknown number is ``{value, factor}`` or ``{value, spread}``, an encoder ``{counts}``.
+
+        Raises
+        ------
+        SpecificationError
+            If an argument is missing, has another name, or is not as described.
+        """
+        fields = dataclasses.fields(cls)
+        for field in fields:
+            needed = field.default is field.default_factory is dataclasses.MISSING
+            if needed and field.name not in given:
+                raise SpecificationError(
+                    f"a plant has no {field.name}, but it is expected: give it, as in the "
+                    f"documentation of dopt.Plant."
+                )
+        for what in ("states", "inputs", "constants", "measured"):
+            if not isinstance(given.get(what, {}), Mapping):
+                raise _unlike(what, given[what], "a mapping of names")
+        try:
+            return cls.from_section({**given, "horizon": 1}).plant
+        except TypeError as error:
+            raise SpecificationError(
+                f"the arguments of a plant do not fit ({error}): give unknown numbers as "
+                f"{{value, factor}} or {{value, spread}}, and encoders as {{counts}}."
+            ) from error
+
     def system(self, horizon: int) -> ExploredPlant:
         """Return the plant as the system of an exploration of so many steps."""
         half_widths = dict.fromkeys(self.angles, math.pi) | dict(self.box)

@@ -1,0 +1,410 @@
+"""Recorded runs from files, and the report of their health: of made-up truth and of real plants."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+from scipy.io import savemat
+
+import analysis
+from analysis import cli
+from analysis.errors import AnalysisError
+from analysis.logs.excitation import MOST_ROWS, Effect, effects
+from analysis.logs.health import Health, examine, quantum
+from analysis.logs.report import lines
+from analysis.logs.tables import log_of, read_table
+from dopt.errors import SpecificationError
+from dopt.log import Log
+
+DATA = os.environ.get("DOPT_DATA", "")
+DT = 0.01
+SEEDS = range(4)
+Array = npt.NDArray[Any]
+
+real = pytest.mark.skipif(not DATA, reason="DOPT_DATA is not set: no recorded runs of real plants")
+
+
+# Made-up plants
+
+
+def held(rng: np.random.Generator, n: int) -> Array:
+    return np.repeat(rng.uniform(-3, 3, n // 10), 10)
+
+
+def smooth(rng: np.random.Generator, n: int) -> Array:
+    found = np.convolve(rng.normal(size=n + 200), np.exp(-np.arange(201) / 20.0), "valid")
+    return found / found.std()
+
+
+def motor(
+    u: Array, *, delay: int = 0, force: Array | None = None, step: float = 0.003, rate: bool = False
+) -> Array:
+    """Return the measured angle, or rate, of θ'' = 40 u - 5 θ' - 8 sin θ + force."""
+    angle, speed, found = 0.0, 0.0, []
+    for k in range(len(u)):
+        found.append(speed if rate else angle)
+        a = 40 * u[max(k - delay, 0)] - 5 * speed - 8 * np.sin(angle)
+        a += 0.0 if force is None else force[k]
+        angle, speed = angle + DT * speed + 0.5 * DT**2 * a, speed + DT * a
+    return np.round(np.array(found) / step) * step
+
+
+def one_effect(y: Array, u: Array, name: str = "th") -> Effect:
+    [found] = effects(Log({name: y, "u": u}, states=[name], inputs=["u"], dt=DT))
+    return found
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_a_delay_is_found_in_open_loop(seed: int, delay: int) -> None:
+    rng = np.random.default_rng(seed)
+    for u in (held(rng, 2000), smooth(rng, 2000), rng.normal(size=2000)):
+        effect = one_effect(motor(u, delay=delay), u)
+        assert effect.delays == (delay, delay)
+        assert not effect.closed_loop
+        assert effect.has_effect
+    effect = one_effect(motor(u, delay=delay, rate=True, step=0.01), u, "rate")
+    assert effect.delays == (delay, delay)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_an_input_without_effect_is_said_to_explain_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for u in (held(rng, 2000), smooth(rng, 2000)):
+        moved = motor(0 * u, force=100 * smooth(rng, 2000))
+        effect = one_effect(moved, u)
+        assert effect.explains_nothing
+        assert effect.delays is None
+        assert not one_effect(motor(u), u).explains_nothing
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_an_arm_that_is_moved_by_hand_is_said_to_explain_nothing(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    angle = motor(np.zeros(3000), force=300 * smooth(rng, 3000))
+    u = np.round(2.0 * np.sin(angle) / 0.01) * 0.01
+    effect = one_effect(angle, u)
+    assert effect.follows_state
+    assert effect.explains_nothing
+    assert effect.closed_loop
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_feedback_is_found_although_a_test_signal_is_added(seed: int) -> None:
+    signal = 0.3 * smooth(np.random.default_rng(seed), 3000)
+    angle, speed, seen, u = 0.0, 0.0, [0.0], []
+    for k in range(3000):
+        seen.append(round(angle / 0.003) * 0.003)
+        u.append(-2 * seen[-1] - 5 * (seen[-1] - seen[-2]) + signal[k])
+        a = 40 * u[-1] - 5 * speed + 8 * np.sin(angle)
+        angle, speed = angle + DT * speed + 0.5 * DT**2 * a, speed + DT * a
+    effect = one_effect(np.array(seen[1:]), np.array(u))
+    assert effect.closed_loop
+    assert not effect.explains_nothing
+
+
+def test_gaps_and_missing_values_do_no_harm() -> None:
+    u = held(np.random.default_rng(0), 3000)
+    y, t = motor(u, delay=2), np.arange(3000) * DT
+    y[::97] = np.nan
+    t[1000:] += 7.0
+    log = Log({"t": t, "th": y, "u": u}, states=["th"], inputs=["u"])
+    [effect] = examine(log).effects
+    assert effect.delays == (2, 2)
+    short = Log({"t": t[:20], "th": y[:20], "u": u[:20]}, states=["th"], inputs=["u"])
+    assert examine(short).effects == ()
+
+
+# Signals
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("step", [np.pi / 1000, 0.00038147, 0.1, 1.0])
+def test_a_quantum_survives_rounding_unused_levels_and_offsets(seed: int, step: float) -> None:
+    rng = np.random.default_rng(seed)
+    counts = np.round(rng.normal(0, 300, 4000)).astype(int)
+    counts = counts[(counts % 7 != 3) | (counts > 100)]
+    levels = np.unique([float(f"{value:.9g}") for value in (counts + 0.5) * step])
+    assert quantum(levels) == pytest.approx(step, rel=1e-4)
+    assert np.isnan(quantum(np.unique(rng.normal(size=4000))))
+    assert np.isnan(quantum(np.unique([float(f"{one:.9g}") for one in rng.normal(size=4000)])))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_noise_is_measured_and_at_least_of_the_quantum(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t = np.arange(5000) * DT
+    for sigma, step in ((0.02, 1e-3), (1e-6, 0.01)):
+        y = np.round((np.sin(3 * t) + rng.normal(0, sigma, 5000)) / step) * step
+        health = examine(Log({"t": t, "th": y, "u": t}, states=["th"], inputs=["u"]))
+        truth = max(sigma, step / np.sqrt(12))
+        assert health.states[0].noise == pytest.approx(truth, rel=0.25)
+
+
+def test_saturation_is_seen_and_a_switched_input_is_none() -> None:
+    rng = np.random.default_rng(0)
+    wild = smooth(rng, 4000)
+    t = np.arange(4000) * DT
+    inputs = {"clipped": np.clip(wild, -9, 1.5), "free": wild, "switched": np.sign(wild)}
+    log = Log({"t": t, "th": t, **inputs}, states=["th"], inputs=list(inputs))
+    clipped, free, switched = examine(log).inputs
+    assert clipped.at_high == int((wild >= 1.5).sum())
+    assert (clipped.at_low, free.at_low, free.at_high) == (0, 0, 0)
+    assert (switched.at_low, switched.at_high, switched.levels) == (0, 0, 2)
+
+
+# What the report says
+
+
+def report(columns: dict[str, Any], **options: Any) -> str:
+    table = pd.DataFrame(columns)
+    log = log_of(table, **options)
+    return "\n".join(lines(log, examine(log), table))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_likely_mistakes_of_units_are_said(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    u = held(rng, 3000)
+    angle, t = motor(u, step=1e-4), np.arange(3000) * DT
+    degrees = np.degrees(angle)
+    counts = np.round(angle / (2 * np.pi) * 4096).astype(int)
+    for column, words in (
+        (np.round(degrees % 360, 1), "th: wraps about every 360: an angle in deg?"),
+        (counts % 4096, "th: wraps about every 4096: an angle in counts/4096?"),
+        (angle % (2 * np.pi), "th: wraps about every 6.28319: an angle in rad?"),
+        (counts, "th: whole numbers"),
+        (np.round(5 * degrees, 1), "turns if it is an angle in radians; degrees?"),
+    ):
+        assert words in report({"t": t, "th": column, "u": u})
+    for scale, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
+        assert f"--units t={unit}" in report({"t": t * scale, "th": angle, "u": u})
+    clean = report({"t": t, "th": angle, "u": u})
+    assert "?" not in clean
+    assert f"every {1e3 * DT:.1f} ms" in clean
+
+
+def test_columns_that_are_named_like_inputs_are_and_flags_are_not_states() -> None:
+    t = np.arange(50.0) * DT
+    base = {"Time": t, "th": t, "ok": np.ones(50, dtype=bool)}
+    for names, wanted in (
+        (("u",), ("u",)),
+        (("motor_voltage", "valve_cmd"), ("motor_voltage", "valve_cmd")),
+        (("tau_con1", "tau_meas1"), ("tau_meas1",)),
+    ):
+        log = log_of(pd.DataFrame({**base, **dict.fromkeys(names, t)}))
+        assert (log.states, log.inputs) == (("th",), wanted)
+    with pytest.raises(AnalysisError, match=r"none of the columns Time, th, ok .*--inputs"):
+        log_of(pd.DataFrame(base))
+    with pytest.raises(SpecificationError, match="or the time between two rows as dt"):
+        log_of(pd.DataFrame({"th": t, "u": t}))
+
+
+# Files
+
+
+def frame() -> pd.DataFrame:
+    t = np.arange(100) * DT
+    return pd.DataFrame({"t": t, "th": np.sin(t), "u": np.cos(t)})
+
+
+def write_hdf5(path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, values in frame().items():
+            file[f"run/{name}"] = values.to_numpy()
+        file["run/mass"] = 2.0
+
+
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "run.csv": lambda path: frame().to_csv(path, index=False),
+    "run.csv.gz": lambda path: frame().to_csv(path, index=False),
+    "run.parquet": lambda path: frame().to_parquet(path),
+    "run.mat": lambda path: savemat(path, {**frame().to_dict("list"), "mass": 2.0}),
+    "struct.mat": lambda path: savemat(path, {"run": frame().to_dict("list")}),
+    "run.h5": write_hdf5,
+    "new.mat": write_hdf5,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_log_is_read_from_every_kind_of_file(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    WRITERS[name](path)
+    if name == "new.mat":  # MATLAB writes 512 bytes of its own in front
+        path.write_bytes(
+            b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + bytes(384) + path.read_bytes()
+        )
+    before = "run." if name in ("struct.mat", "run.h5", "new.mat") else ""
+    log = analysis.read_log(
+        path,
+        states={"th": f"{before}th"},
+        inputs={"u": f"{before}u"},
+        time=f"{before}t",
+    )
+    np.testing.assert_allclose(log.pieces[0].measured[:, 0], frame().th, atol=1e-15)
+    np.testing.assert_allclose(log.pieces[0].time, frame().t, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("run.txt", b"", r"ends with .txt, but a log is read from .csv"),
+        ("none.csv", None, "is no file"),
+        ("run.csv", b"t;th;u\n0;1,5;2\n", "separated by ';'"),
+        ("run.csv", b"t,th,u\n", "has no rows"),
+        ("run.csv", b"", "cannot be read"),
+        ("run.csv.gz", b"no gzip", "cannot be read"),
+        ("run.parquet", b"no parquet", "cannot be read"),
+        ("run.mat", b"no mat file", "cannot be read"),
+        ("run.h5", b"no hdf5", "cannot be read"),
+    ],
+)
+def test_a_file_that_is_no_log_is_answered_by_a_sentence(
+    name: str, content: bytes | None, words: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(AnalysisError, match=words) as raised:
+        read_table(tmp_path / name)
+    assert "expected" in str(raised.value) or "convert it" in str(raised.value)
+
+
+def test_what_a_file_holds_is_said_if_it_is_no_table(tmp_path: Path) -> None:
+    savemat(tmp_path / "mixed.mat", {"a": np.zeros(5), "b": np.zeros(7), "c": np.zeros(9)})
+    with pytest.raises(AnalysisError, match=r"holds a \(5,\), b \(7,\), c \(9,\)"):
+        read_table(tmp_path / "mixed.mat")
+
+
+def test_a_missing_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run.h5").write_bytes(b"")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(AnalysisError, match=r"needs the library h5py: .*\[logs\]"):
+        read_table(tmp_path / "run.h5")
+
+
+# The command
+
+
+def test_the_command_prints_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    u = held(np.random.default_rng(0), 2000)
+    u[1000] = np.nan
+    counts = np.round(motor(np.nan_to_num(u), step=1e-4) / (2 * np.pi) * 2000).astype(int)
+    table = pd.DataFrame({"ms": 10 * np.arange(2000), "enc": counts % 2000, "u": u})
+    table.to_csv("run.csv", index=False)
+    words = ["--states", "th=enc", "--time", "ms", "--units", "ms=ms,th=counts/2000"]
+    assert cli.main(["log", "run.csv", *words, "--angles", "th"]) == 0
+    said = capsys.readouterr().out
+    assert "1,999 rows, 2 pieces" in said
+    assert "steps of 0.00314159 (2,000 a turn)" in said
+    assert "suspected delay: 0 samples" in said
+    assert "pieces end there: row 1000" in said
+    assert Path("figures/run.png").stat().st_size > 10_000
+    assert cli.main(["log", "run.csv", *words, "--inputs", "u=", "--out", "a.pdf"]) == 2
+    assert "--inputs is 'u=', but names" in capsys.readouterr().err
+    assert cli.main(["log", "none.csv"]) == 2
+
+
+# Recorded runs of real plants (their sources and licences: README.md in the folder of DOPT_DATA)
+
+
+@cache
+def recorded(name: str) -> tuple[Health, str]:
+    """Return the health of a real log and the report on it."""
+    table = read_table(Path(DATA) / f"{name}.csv.gz")
+    log = log_of(table, **({"dt": 0.025} if name == "disk_train" else {}))
+    health = examine(log)
+    return health, "\n".join(lines(log, health, table))
+
+
+MOVED = ("disk_train", *(f"pendulum_{one}" for one in ("sysid", "sac", "ddp", "ilqr")))
+QUBE = tuple(f"qube_0{k}" for k in range(6))
+DOUBLE = tuple(f"double_pendulum_0{k}" for k in range(4))
+
+
+@real
+@pytest.mark.parametrize("name", [*MOVED, *QUBE, *DOUBLE])
+def test_real_inputs_with_an_effect_are_not_called_useless(name: str) -> None:
+    health, text = recorded(name)
+    assert not any(effect.explains_nothing for effect in health.effects)
+    assert "explains nothing" not in text
+    assert "?" not in text
+
+
+@real
+def test_the_disk_answers_one_sample_late_in_open_loop() -> None:
+    health, text = recorded("disk_train")
+    assert health.states[0].quantum == pytest.approx(np.pi / 1000, rel=1e-4)
+    assert "(2,000 a turn)" in text
+    assert "suspected delay: 1 sample of 25.0 ms" in text
+    assert "u: open loop" in text
+
+
+@real
+@pytest.mark.parametrize("name", QUBE)
+def test_the_servo_is_in_closed_loop_with_an_encoder_of_2048_counts(name: str) -> None:
+    health, text = recorded(name)
+    assert text.count("(2,048 a turn)") == 2
+    [effect] = health.effects
+    assert effect.closed_loop
+    assert effect.delays is not None
+    assert effect.delays[0] <= 0 <= effect.delays[1] <= 1
+    assert "saturation: a flag" in text
+
+
+@real
+@pytest.mark.parametrize("name", MOVED[1:])
+def test_the_pendulum_is_in_closed_loop_without_a_delay_that_can_be_told(name: str) -> None:
+    [effect] = recorded(name)[0].effects
+    assert effect.closed_loop
+    assert effect.delays is None
+
+
+@real
+def test_the_arm_under_gravity_compensation_was_moved_by_hand() -> None:
+    text = recorded("pendulum_gravity")[1]
+    assert "torque: this input explains nothing here" in text
+    assert "R² = 1.000" in text
+
+
+@real
+def test_the_failure_stands_in_stiction() -> None:
+    health, text = recorded("pendulum_pd_failure")
+    assert health.resting.mean() > 0.6
+    assert "nothing moves in 70 % of the log" in text
+    assert "nothing moves" not in recorded("qube_00")[1]
+
+
+@real
+@pytest.mark.parametrize("name", DOUBLE)
+def test_the_double_pendulum_has_encoders_and_no_pieces_at_jitter(name: str) -> None:
+    health, text = recorded(name)
+    quanta = [one.quantum for one in health.states[:2]]
+    np.testing.assert_allclose(quanta, 12.5 / 2**15, rtol=1e-3)
+    assert "1 piece without gaps" in text
+
+
+@real
+def test_the_numbers_of_30_000_rows_take_less_than_a_second() -> None:
+    """Four seconds are what the command may take with its start; imports and ink are the rest."""
+    table = read_table(Path(DATA) / "pendulum_gravity.csv.gz")
+    assert len(table) == 30_000 < MOST_ROWS
+    spent = []
+    for _ in range(3):
+        start = time.process_time()
+        examine(log_of(table))
+        spent.append(time.process_time() - start)
+    assert min(spent) < 1.0

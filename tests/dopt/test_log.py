@@ -1,0 +1,300 @@
+"""Logs: what each fault of a recorded run means."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import pytest
+
+import dopt
+from dopt.errors import SpecificationError
+from dopt.log import Log
+from tests.paths import ROOT
+
+N = 200
+T = np.arange(N) * 0.01
+TURN = 2 * np.pi
+
+
+def table(**columns: npt.ArrayLike) -> dict[str, Any]:
+    return {"t": T, "th": 0.3 * np.sin(9 * T), "u": np.cos(5 * T)} | columns
+
+
+def log(data: Any = None, **options: Any) -> Log:
+    return Log(table() if data is None else data, **{"states": ["th"], "inputs": ["u"]} | options)
+
+
+def said(found: Log, words: str) -> bool:
+    return any(words in note for note in found.notes)
+
+
+def motor(**more: Any) -> dopt.Plant:
+    given = {
+        "states": {"angle": "rad", "rate": "rad/s"},
+        "inputs": {"v": "V"},
+        "dt": 0.01,
+        "gamma": 6.0,
+        "known": {"angle": "rate", "rate": "40*v"},
+        "learned": ["rate"],
+        "angles": ["angle"],
+        "box": {"rate": 30.0},
+    }
+    return dopt.Plant(**(given | more))
+
+
+# What a clean table is
+
+
+def test_a_clean_table_is_one_piece_without_notes() -> None:
+    found = log()
+    [piece] = found.pieces
+    assert found.notes == ()
+    assert (found.states, found.inputs, found.n_rows) == (("th",), ("u",), N)
+    np.testing.assert_array_equal(piece.time, T)
+    np.testing.assert_array_equal(piece.measured[:, 0], table()["th"])
+    np.testing.assert_array_equal(piece.inputs[:, 0], table()["u"])
+    assert {part.dtype for part in piece} == {np.dtype(np.float64)}
+
+
+def test_frames_mappings_and_arrays_are_the_same_log() -> None:
+    columns = table()
+    array = np.column_stack(list(columns.values()))
+    frame = pd.DataFrame(columns, index=np.arange(N)[::-1])
+    for found in (log(frame), log(array, columns=list(columns)), log(frame.astype("Float64"))):
+        for part, same in zip(found.pieces[0], log().pieces[0], strict=True):
+            np.testing.assert_array_equal(part, same)
+
+
+def test_names_may_differ_from_columns_and_their_order_is_kept() -> None:
+    found = log(
+        table(om=9 * T), states={"rate": "om", "angle": "th"}, inputs={"voltage": "u"}, time="t"
+    )
+    assert found.states == ("rate", "angle")
+    np.testing.assert_array_equal(found.pieces[0].measured[:, 0], 9 * T)
+
+
+def test_the_input_is_not_shifted_and_nothing_is_resampled() -> None:
+    jittered = T + np.random.default_rng(0).uniform(-0.004, 0.004, N)
+    found = log(table(t=jittered))
+    np.testing.assert_allclose(np.diff(found.pieces[0].time), np.diff(jittered), atol=1e-12)
+    assert len(found.pieces) == 1
+
+
+# Stamps
+
+
+@pytest.mark.parametrize(
+    ("stamps", "options"),
+    [
+        (T * 1e3, {"units": {"t": "ms"}}),
+        ((T * 1e6).round().astype(np.int64), {"units": {"time": "us"}}),
+        ((T * 1e9).round().astype(np.int64) + 1_700_000_000_123_456_789, {"units": {"t": "ns"}}),
+        (T + 1.7e9, {}),
+        (np.datetime64("2026-01-01") + (T * 1e6).round().astype("timedelta64[us]"), {}),
+        (pd.date_range("2026-01-01", periods=N, freq="10ms", tz="Europe/Paris"), {}),
+        ([f"2026-01-01 00:00:0{k // 100}.{k % 100:02d}" for k in range(N)], {}),
+        ([f"{one:.2f}" for one in T], {}),
+    ],
+)
+def test_stamps_of_every_kind_are_seconds_from_the_first(stamps: Any, options: Any) -> None:
+    found = log(pd.DataFrame(table(t=stamps)), **options)
+    np.testing.assert_allclose(found.pieces[0].time, T, atol=3e-7)
+
+
+def test_a_counter_of_microseconds_that_begins_again_goes_on() -> None:
+    ticks = ((T * 1e6).round().astype(np.uint64) + 2**32 - 1_000_000).astype(np.uint32)
+    for stamps, unit in ((ticks, "us"), (ticks.astype(np.int64), "us"), (ticks / 1e6, "s")):
+        found = log(table(t=stamps), units={"t": unit})
+        [piece] = found.pieces
+        np.testing.assert_allclose(piece.time, T, atol=1e-9)
+        assert said(found, "begins again after 4294.97 s at row 100")
+
+
+def test_rows_without_stamps_are_dt_apart() -> None:
+    found = log({"th": T, "u": T}, dt=0.5)
+    np.testing.assert_array_equal(found.pieces[0].time, 0.5 * np.arange(N))
+    assert said(log(dt=0.5), "Column 't' is not used")
+
+
+def test_a_repeated_stamp_leaves_out_the_later_row() -> None:
+    rows = np.sort(np.r_[0:N, 50, 50, 120])
+    found = log({name: values[rows] for name, values in table(k=np.arange(N)).items()})
+    np.testing.assert_array_equal(found.pieces[0].time, T)
+    assert said(found, "repeated, left out: 3 rows, first row 51")
+
+
+def test_a_row_out_of_order_is_left_out_and_a_restarted_clock_begins_a_piece() -> None:
+    swapped = np.r_[0:50, 51, 50, 52:N]
+    found = log({name: values[swapped] for name, values in table().items()})
+    assert found.n_rows == N - 1
+    assert said(found, "Out of order, left out: row 51")
+    restarted = log(table(t=np.r_[T[:80], T[: N - 80]]))
+    assert [len(piece.time) for piece in restarted.pieces] == [80, N - 80]
+    assert said(restarted, "runs backwards, new pieces begin: row 80")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_gap_begins_a_piece_and_jitter_does_not(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    steps = rng.choice([0.001, 0.005, 0.02], N, p=[0.2, 0.7, 0.1])
+    steps[[60, 150]] = 0.5
+    found = log(table(t=np.cumsum(steps)))
+    assert [len(piece.time) for piece in found.pieces] == [60, 90, 50]
+    assert said(found, "2 rows, first row 60")
+    assert len(log(table(t=np.cumsum(steps)), gap=1.0).pieces) == 1
+
+
+# Values
+
+
+def test_a_missing_measurement_stays_and_a_missing_input_ends_a_piece() -> None:
+    th, u, t = table()["th"].copy(), table()["u"].copy(), T.copy()
+    th[[7, 8]], u[100], t[150] = (np.nan, np.inf), np.nan, np.nan
+    found = log(table(th=th, u=u, t=t))
+    assert [len(piece.time) for piece in found.pieces] == [100, 49, 49]
+    assert np.isnan(found.pieces[0].measured[[7, 8], 0]).all()
+    assert said(found, "'th' is missing in 2 rows")
+    assert said(found, "Without time or input, not used, pieces end there: 2 rows, first row 100")
+
+
+def test_whole_numbers_truth_values_and_masked_arrays_are_numbers() -> None:
+    masked = np.ma.masked_equal(np.arange(N, dtype=np.int16) % 50, 3)
+    found = log(table(th=masked, u=T > 1))
+    assert np.isnan(found.pieces[0].measured[3, 0])
+    assert set(found.pieces[0].inputs[:, 0]) == {0.0, 1.0}
+    objects = np.array([None, *table()["th"][1:]], dtype=object)
+    assert np.isnan(log(table(th=objects)).pieces[0].measured[0, 0])
+
+
+@pytest.mark.parametrize("span", [2.9, 20.0])
+@pytest.mark.parametrize(("low", "high", "unit"), [(-np.pi, np.pi, "rad"), (0, 360, "deg")])
+def test_an_angle_within_a_turn_is_unwrapped(
+    span: float, low: float, high: float, unit: str
+) -> None:
+    angle = span * np.sin(4 * T) + 1
+    raw = (angle / TURN * (high - low) - low) % (high - low) + low
+    found = log(table(th=raw), angles=["th"], units={"th": unit})
+    got = found.pieces[0].measured[:, 0]
+    np.testing.assert_allclose(got - got[0], angle - angle[0], atol=1e-9)
+    assert said(found, "unwrapped")
+
+
+def test_counts_become_radians_and_counters_go_on() -> None:
+    angle = 30.0 * np.sin(2 * T)
+    counts = np.round(angle / TURN * 4096).astype(np.int64)
+    for raw in (counts % 4096, (counts * 16).astype(np.int16)):
+        per_turn = 4096 if raw.max() < 5000 else 4096 * 16
+        found = log(table(th=raw), angles=["th"], units={"th": f"counts/{per_turn}"})
+        got = found.pieces[0].measured[:, 0]
+        np.testing.assert_allclose(got - got[0], angle - angle[0], atol=TURN / 4096)
+    kept = log(table(th=counts), angles=["th"], units={"th": "counts/4096"})
+    assert said(kept, "counts turns")
+
+
+def test_missing_values_and_gaps_do_not_disturb_the_unwrapping() -> None:
+    angle = 12.0 * T
+    raw = angle % TURN
+    raw[[40, 41]] = np.nan
+    t = T + 5.0 * (np.arange(N) >= 120)
+    found = log(table(th=raw, t=t), angles="th")
+    for piece, rows in zip(found.pieces, (slice(0, 120), slice(120, N)), strict=True):
+        got = piece.measured[:, 0]
+        there = np.isfinite(got)
+        np.testing.assert_allclose(np.diff(got[there]), np.diff(angle[rows][there]), atol=1e-9)
+
+
+# Plants
+
+
+def test_the_log_of_a_plant_has_its_names_angles_and_step() -> None:
+    data = {"th": 12.0 * T % TURN, "v": T}
+    found = Log.for_plant(data, motor(), columns={"angle": "th"})
+    assert (found.states, found.inputs) == (("angle",), ("v",))
+    np.testing.assert_allclose(found.pieces[0].measured[:, 0], 12.0 * T, atol=1e-9)
+    assert found.step == pytest.approx(0.01)
+    assert said(found, "the plant's dt of 0.01 s")
+    assert said(found, "left to the fit: rate")
+    measured = motor(measured={"angle": 0.01})
+    array = np.column_stack([T, T, T])
+    assert Log.for_plant(array, measured, columns=["t", "angle", "v"]).states == ("angle",)
+
+
+def test_a_column_that_a_plant_needs_is_asked_for() -> None:
+    both = motor(measured={"angle": 0.01, "rate": 0.1})
+    for data, plant, words in (
+        ({"angle": T, "v": T}, both, "'rate', but no such column is there"),
+        ({"angle": T, "volt": T}, motor(), "'v', but no such column is there: choose one of"),
+        ({"th": T, "v": T}, motor(), "none is named like a state"),
+    ):
+        with pytest.raises(SpecificationError, match=words):
+            Log.for_plant(data, plant)
+    with pytest.raises(SpecificationError, match="'columns' of a log 'agle'"):
+        Log.for_plant({"angle": T, "v": T}, motor(), columns={"agle": "th"})
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "words"),
+    [
+        ({}, {"states": ["theta"]}, "'theta', but no such column is there: did you mean 'th'"),
+        ({}, {"states": []}, r"states of a log are \[\]"),
+        ({}, {"angles": ["thh"]}, "did you mean 'th'"),
+        ({}, {"time": "stamp"}, "column in 'time' of a log 'stamp' is unknown"),
+        ({}, {"time": "t", "dt": 0.1}, "one of the two is expected"),
+        ({}, {"dt": -1.0, "time": None}, "dt of a log is -1.0"),
+        ({}, {"gap": 0.0}, "gap of a log is 0.0"),
+        ({}, {"units": {"th": "degrees"}}, "counts a turn"),
+        ({}, {"units": {"speed": "deg"}}, "column in 'units' of a log 'speed'"),
+        ({"time": T}, {}, "t and time are called time"),
+        ({"th": T[1:]}, {}, r"th \(199,\)"),
+        ({"th": ["1,5"] * N}, {}, "'1,5' in row 0.*decimal point"),
+        ({"th": ["1.5"] * 9 + ["bad"] * (N - 9)}, {}, "'bad' in row 9"),
+        ({"th": T + 1j}, {}, "complex128"),
+        ({"th": T * np.nan}, {}, "no value at all"),
+        ({"u": np.where(np.arange(N) % 2, T, np.nan)}, {}, "ffill"),
+        ({"t": np.floor(T)}, {}, "198 of 200 rows of a log repeat"),
+        ({"t": (T + 1.7e9).astype(np.float32)}, {}, "float32.*read them as float64"),
+    ],
+)
+def test_a_fault_is_answered_by_a_sentence(
+    columns: dict[str, Any], options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(SpecificationError, match=words) as raised:
+        log(table(**columns), **options)
+    text = str(raised.value)
+    assert "expected" in text or "unknown" in text or "choose one of" in text.lower()
+    assert text.endswith(".")
+
+
+def test_other_data_is_refused() -> None:
+    for data, options in ((T, {}), (np.zeros((5, 2)), {"columns": ["t"]}), ("run.csv", {})):
+        with pytest.raises(SpecificationError, match="expected"):
+            log(data, **options)
+
+
+# Where it runs
+
+
+def test_a_log_needs_numpy_alone_and_no_unix() -> None:
+    program = (
+        "import json, sys\n"
+        "for name in ('fcntl', 'resource', 'pwd'): sys.modules[name] = None\n"
+        "import dopt\n"
+        "log = dopt.Log({'t': [0, 1, 2], 'a': [1, 2, 3], 'u': [0, 0, 1]}, states=['a'], "
+        "inputs=['u'])\n"
+        "assert log.n_rows == 3\n"
+        "print(json.dumps([one for one in sys.modules if sys.modules[one]]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    loaded = {name.partition(".")[0] for name in json.loads(done.stdout)}
+    assert not loaded & {"pandas", "scipy", "numba", "torch", "sqlalchemy", "matplotlib"}
