@@ -78,12 +78,29 @@ def compiled_text(
     given = [f"_{argument}" for argument in arguments]  # no quantity begins with an underscore
     groups = zip(given, arguments.values(), strict=True)
     unpacked = [f"{', '.join(group)}, = {name}" for name, group in groups if group]
-    lines = [*unpacked, f"return ({', '.join(texts)},)"]
+    shared = _Shared()
+    results = [ast.unparse(shared.visit(ast.parse(text, mode="eval").body)) for text in texts]
+    steps = [f"{name} = {text}" for text, name in shared.names.items()]
+    lines = [*unpacked, *steps, f"return ({', '.join(results)},)"]
     source = "\n    ".join([f"def equation({', '.join(given)}):", *lines])
     namespace: dict[str, Any] = {**FUNCTIONS, "__name__": "expressions"}
     exec(source, namespace)  # of nothing but the expressions that were checked
     equation: Equation = namespace["equation"]
     return equation
+
+
+class _Shared(ast.NodeTransformer):
+    """Gives each operation a name, the same to equal ones, so that each is done once."""
+
+    def __init__(self) -> None:
+        self.names: dict[str, str] = {}
+
+    def visit(self, node: ast.AST) -> Any:
+        found = self.generic_visit(node)
+        if not isinstance(found, ast.BinOp | ast.Call):
+            return found
+        name = self.names.setdefault(ast.unparse(found), f"_{len(self.names)}")
+        return ast.Name(name)
 
 
 def _check_finite(tree: ast.expr, what: str, values: Mapping[str, Any]) -> None:

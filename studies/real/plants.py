@@ -153,3 +153,63 @@ MODEL_2_PLANT = dataclasses.replace(
     constants=MODEL_2,
     delay=0.0,
 )
+"""model_2.0 with the friction of its authors."""
+
+
+def _rotary() -> dict[str, str]:
+    """Return the equations of a rotary pendulum, its angle 0 upright, by the inertia of the arm.
+
+    ``b`` is the inertia of the pendulum, ``c`` couples it with the arm, and ``g`` is its weight;
+    ``cable`` and ``rest`` are the spring of the cable and where it pulls to.
+    """
+    s, c = "sin(pendulum)", "cos(pendulum)"
+    arm = (
+        "(gain * voltage - d1 * arm_rate - c1 * tanh(arm_rate / 0.2) - cable * (arm - rest)"
+        f" - 2 * b * {s} * {c} * arm_rate * pendulum_rate"
+        f" + c * {s} * pendulum_rate * pendulum_rate)"
+    )
+    hanging = (
+        f"(b * {s} * {c} * arm_rate * arm_rate + g * {s} - d2 * pendulum_rate"
+        " - c2 * tanh(pendulum_rate / 0.2))"
+    )
+    m11, m12 = f"(1 + b * {s} * {s})", f"(c * {c})"
+    det = f"({m11} * b - {m12} * {m12})"
+    return {
+        "arm": "arm_rate",
+        "pendulum": "pendulum_rate",
+        "arm_rate": f"({arm} * b - {m12} * {hanging}) / {det}",
+        "pendulum_rate": f"({m11} * {hanging} - {m12} * {arm}) / {det}",
+    }
+
+
+def _quanser() -> dict[str, float]:
+    """Return the constants of the equations from those that Quanser gives for the QUBE-Servo."""
+    R, k, Mr, Lr, mp, Lp, Dr, Dp = 8.4, 0.042, 0.095, 0.085, 0.024, 0.129, 0.0015, 0.0005
+    inertia = Mr * Lr**2 / 12 + mp * Lr**2
+    own = {"gain": k / R, "d1": Dr + k * k / R, "b": mp * Lp**2 / 12 + mp * (Lp / 2) ** 2}
+    own |= {"c": mp * Lr * Lp / 2, "g": mp * G * Lp / 2, "d2": Dp}
+    return {name: value / inertia for name, value in own.items()}
+
+
+QUANSER = _quanser()
+"""R 8.4 Ω, k .042, arm .095 kg and .085 m, pendulum .024 kg and .129 m, friction .0015, .0005."""
+
+QUBE = Plant(
+    states={"arm": "rad", "pendulum": "rad", "arm_rate": "rad/s", "pendulum_rate": "rad/s"},
+    inputs={"voltage": "V"},
+    dt=0.002,
+    gamma=10.0,
+    known=_rotary(),
+    constants={
+        **{name: unknown(value) for name, value in QUANSER.items()},
+        "c1": unknown(0.1 * QUANSER["d1"], factor=3.0),
+        "c2": unknown(0.05 * QUANSER["d2"], factor=3.0),
+        "cable": unknown(0.5, spread=2.0),
+        "rest": unknown(0.0, spread=0.3),
+    },
+    learned=["arm_rate", "pendulum_rate"],
+    angles=["arm", "pendulum"],
+    box={"arm_rate": 10.0, "pendulum_rate": 10.0},
+    measured={"arm": encoder(2048), "pendulum": encoder(2048)},
+)
+"""Quanser QUBE-Servo that balances; ten constants."""
