@@ -7,9 +7,7 @@ published numbers, so that both are simulated alike.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
-from typing import Any
 
 from dopt.systems.plant import Plant, encoder, unknown
 
@@ -147,9 +145,7 @@ DOUBLE_PENDULUM = Plant(
 
 MODEL_2_PLANT = dataclasses.replace(
     DOUBLE_PENDULUM,
-    known=_two_joints(
-        friction=f"({_ARCTAN})".replace("{x}", "(100 * {v})"), bias=False
-    ),
+    known=_two_joints(friction=f"({_ARCTAN})".replace("{x}", "(100 * {v})"), bias=False),
     constants=MODEL_2,
     delay=0.0,
 )
