@@ -1,4 +1,4 @@
-"""``python -m analysis fit PLANT LOG…``: fit a plant to recorded runs, report, picture and model."""
+"""``python -m analysis fit PLANT LOG…``: a fit to recorded runs, its report, picture and model."""
 
 from __future__ import annotations
 
@@ -80,12 +80,14 @@ def read_plant(file: str) -> Plant:
     SpecificationError
         If the plant is not as :class:`dopt.Plant` says.
     """
-    import yaml
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import YAMLError  # type: ignore[import-untyped]
 
     source = given_path(file, "the file of a plant", AnalysisError)
     try:
-        section: Any = yaml.safe_load(source.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
+        section: Any = OmegaConf.to_container(OmegaConf.load(source), resolve=True)
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException) as error:
         raise AnalysisError(
             f"{source} cannot be read ({error}), but the arguments of dopt.Plant in YAML are "
             f"expected: correct it."

@@ -43,7 +43,7 @@ class Piece(NamedTuple):
     measured : (N, n) array
         Measured states, NaN where a value is missing. Angles are unwrapped.
     inputs : (N, m) array
-        Inputs; that of row k is held from ``time[k]`` to ``time[k + 1]``.
+        Inputs; the input of row k is held from ``time[k]`` to ``time[k + 1]``.
     """
 
     time: Array
@@ -181,11 +181,10 @@ class Log:
         **options
             ``gap`` and ``units`` of :class:`Log`.
         """
-        renamed = columns if isinstance(columns, Mapping) else {}
-        table = columns_of(data, None if renamed else columns)  # type: ignore[arg-type]
+        renamed, names = (columns, None) if isinstance(columns, Mapping) else ({}, columns)
+        table, both = columns_of(data, names), {**plant.states, **plant.inputs}
         for name in renamed:
-            if name not in {**plant.states, **plant.inputs}:
-                both = {**plant.states, **plant.inputs}
+            if name not in both:
                 raise unknown_name("state or input in 'columns' of a log", name, both)
         found = {name: renamed.get(name, name) for name in plant.measured or plant.states}
         if not plant.measured:

@@ -114,7 +114,7 @@ def clock_column(
 
 
 def _factor(name: str, unit: str | float, known: Mapping[str, float]) -> float:
-    """Return what a unit is in that of the plant."""
+    """Return the factor from a unit to the one of the plant."""
     if isinstance(unit, int | float | np.number) and math.isfinite(unit) and unit != 0:
         return float(unit)
     text = str(unit).strip()
@@ -200,10 +200,10 @@ def stamps_of(
     unit: str | float,
     notes: list[str],
 ) -> Array:
-    """Return the stamps of all rows [s], NaN where there is none."""
+    """Return the stamps of all rows [s], NaN where one is missing."""
     n_rows = len(next(iter(table.values())))
     if dt is not None:
-        return np.arange(n_rows) * float(dt)
+        return np.arange(n_rows, dtype=np.float64) * dt
     values, name = (_column(time), "time") if clock is None else (table[clock], clock)
     if values.shape != (n_rows,):
         raise SpecificationError(
@@ -215,7 +215,9 @@ def stamps_of(
         there = ~np.isnat(values)
         elapsed = (values - values[there][:1]) if there.any() else values - values
         notes.append(f"Column {name!r} holds dates: times count from the first of them.")
-        return np.where(there, elapsed.astype("timedelta64[ns]").astype(np.int64) * 1e-9, np.nan)
+        seconds: Array = elapsed.astype("timedelta64[ns]").astype(np.float64) * 1e-9
+        seconds[~there] = np.nan
+        return seconds
     _check_resolution(name, values)
     factor = 1.0 if unit == 1.0 else _factor(name, unit, SECONDS)
     if factor != 1.0:

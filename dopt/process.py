@@ -1,4 +1,4 @@
-"""Settings of a process: the cores that it may use, and how often it collects garbage.
+"""Settings of a process: its cores, its locks of files, and how often it collects garbage.
 
 The cores follow its affinity, and the quotas of its control groups. Garbage is collected rarely:
 Python searches for unreachable cycles after every 700 new containers. A program that imports large
@@ -13,6 +13,11 @@ import os
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+fcntl: Any = None  # which Windows lacks; a program of one process does without locks
+with suppress(ModuleNotFoundError):
+    import fcntl
 
 PROC = Path("/proc/self")
 
@@ -24,7 +29,47 @@ def usable_cores() -> int:
     systemd), versions 1 and 2, including the groups around this process's group. A part of a
     core counts for nothing.
     """
-    return max(1, int(min([len(os.sched_getaffinity(0)), *_quotas()])))
+    known = hasattr(os, "sched_getaffinity")
+    cores = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
+    return max(1, int(min([cores, *_quotas()])))
+
+
+def lock_file(file: int, *, wait: bool = True) -> bool:
+    """Lock an open file until it is closed, and return whether no other process holds it.
+
+    Where the system has no such locks nothing is locked, and True is returned.
+
+    Raises
+    ------
+    OSError
+        If its file system has no locks.
+    """
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    return True
+
+
+def lock_stream(stream: Any, *, release: bool) -> bool:
+    """Lock what a stream writes to, at once, and return whether no other process holds it.
+
+    Raises
+    ------
+    OSError, TypeError, ValueError
+        If it is no file.
+    """
+    if fcntl is None:
+        return True
+    try:
+        fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    if release:
+        fcntl.lockf(stream, fcntl.LOCK_UN)
+    return True
 
 
 def _quotas() -> Iterator[float]:

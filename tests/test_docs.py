@@ -244,7 +244,7 @@ def test_every_command_of_the_analysis_works(
     if command.words[0] == "log":
         rows = (f"{10 * k},{k * k // 50 % 4096},{k % 7 - 3}\n" for k in range(400))
         Path("run.csv").write_text("t,th,u\n" + "".join(rows))
-    if command.words[0] == "serve":  # which does not end; its own tests start it
+    if command.words[0] in ("serve", "fit"):  # whose own tests start them
         assert cli.parser().read(command.words)
     else:
         more = extra.get(command.words[0], ("--only", "summary"))

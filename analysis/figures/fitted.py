@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from analysis.figures.panels import TEXT_WIDTH, legend_below, styled
+from analysis.figures.panels import TEXT_WIDTH, legend_below, log_scale, styled
 from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import measured_names
 from dopt.log import Log
@@ -69,11 +69,15 @@ def _errors(found: Fitted, panels: np.ndarray) -> None:
             x = [row["horizon"] for row in here]
             if here and (what != "physics alone" or found.has_network):
                 y = [row["rms"] for row in here]
-                axes.plot(x, y, color=COLOURS[what], marker=".", label=what)
+                label = None if what == "model" else what  # which the run has
+                axes.plot(x, y, color=COLOURS[what], marker=".", label=label)
             if what == "model":
                 y = [row["nothing_changes"] for row in here]
                 axes.plot(x, y, color=COLOURS["nothing changes"], ls=":", label="nothing changes")
-        axes.set(xscale="log", yscale="log", ylabel=f"error [{found.plant.states[name]}]")
+        if own:
+            horizons = [row["horizon"] for row in own]
+            log_scale(axes, 0.9 * min(horizons), 1.1 * max(horizons), "x")
+        axes.set(yscale="log", ylabel=f"error [{found.plant.states[name]}]")
     where = "runs for validation" if found.tests else "held-out blocks"
     panels[0].set(title=f"errors on {where}")
     panels[-1].set(xlabel="time ahead [s]")

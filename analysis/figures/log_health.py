@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,34 +40,43 @@ def save(log: Log, health: Health, target: Path, title: str) -> None:
         _draw_lags(figure.add_axes((0.59, low, 0.39, tall)), health)
         figure.suptitle(title, fontsize=8.5, y=0.99)
         with whole(target) as part:
-            figure.savefig(part, format=target.suffix.lstrip(".") or "png", dpi=130)
+            figure.savefig(part, format=target.suffix[1:], dpi=130)
 
 
 def _draw_signal(panel: Axes, log: Log, signal: Signal, health: Health) -> None:
-    times = np.concatenate([piece.time for piece in log.pieces])
     is_state = signal.name in log.states
     i = (log.states if is_state else log.inputs).index(signal.name)
+    times, values = [], []
     for piece in log.pieces:
-        values = (piece.measured if is_state else piece.inputs)[:, i]
-        shown = _extremes(values)
-        line: dict[str, Any] = {} if is_state else {"drawstyle": "steps-post"}
-        colour = BLUE if is_state else SEQUENCE[2]
-        panel.plot(piece.time[shown], values[shown], color=colour, lw=0.7, **line)
-    for before, after in zip(log.pieces, log.pieces[1:], strict=False):
-        panel.axvspan(before.time[-1], after.time[0], color=VERMILLION, alpha=0.3, lw=0)
+        found = (piece.measured if is_state else piece.inputs)[:, i]
+        shown = _extremes(found, log.n_rows)
+        times.append([*piece.time[shown], piece.time[-1]])
+        values.append([*found[shown], np.nan])  # where the line ends
+    style: dict[str, Any] = {"color": BLUE} if is_state else {"color": SEQUENCE[2]}
+    style |= {} if is_state else {"drawstyle": "steps-post"}
+    panel.plot(np.concatenate(times), np.concatenate(values), lw=0.7, **style)
+    pairs = zip(log.pieces, log.pieces[1:], strict=False)
+    _shade(panel, [(one.time[-1], other.time[0]) for one, other in pairs], VERMILLION)
     for number, level in ((signal.at_low, signal.low), (signal.at_high, signal.high)):
         if number and not is_state:
             panel.axhline(level, **{**GUIDE, "color": VERMILLION})
-    bounds = times[np.linspace(0, len(times) - 1, len(health.resting) + 1).astype(int)]
-    for k in np.flatnonzero(health.resting):
-        panel.axvspan(bounds[k], bounds[k + 1], color=GREY, alpha=0.25, lw=0)
+    every = np.concatenate([piece.time for piece in log.pieces])
+    bounds = every[np.linspace(0, len(every) - 1, len(health.resting) + 1).astype(int)]
+    _shade(panel, [(bounds[k], bounds[k + 1]) for k in np.flatnonzero(health.resting)], GREY)
     panel.set_ylabel(signal.name)
 
 
-def _extremes(values: Any) -> Any:
+def _shade(panel: Axes, spans: Sequence[tuple[float, float]], colour: str) -> None:
+    """Shade stretches of time over the height of a panel."""
+    bars = [(start, end - start) for start, end in spans]
+    over = panel.get_xaxis_transform()
+    panel.broken_barh(bars, (0, 1), transform=over, color=colour, alpha=0.25, lw=0)
+
+
+def _extremes(values: Any, n_rows: int) -> Any:
     """Return places of the smallest and largest value of each of many stretches, in order."""
-    size = -(-len(values) // (DRAWN // 2))
-    if size < 3:
+    size = -(-n_rows // (DRAWN // 2))
+    if size < 3 or len(values) < size:
         return np.arange(len(values))
     rows = np.arange(len(values) - len(values) % size).reshape(-1, size)
     known = np.where(np.isfinite(values), values, 0.0)[rows]
@@ -76,7 +86,7 @@ def _extremes(values: Any) -> Any:
 
 def _draw_steps(panel: Axes, log: Log) -> None:
     steps = 1e3 * np.concatenate([np.diff(piece.time) for piece in log.pieces])
-    span = max(float(np.ptp(steps)), 1e-3 * float(steps.max()))
+    span = max(float(np.ptp(steps)), 0.1 * float(steps.max()))
     low = float(steps.min()) - 0.05 * span
     panel.hist(steps, bins=60, range=(low, low + 1.1 * span), color=BLUE, log=True)
     panel.set(xlabel="step [ms]", ylabel="rows")

@@ -45,6 +45,9 @@ FEEDBACK = 0.05
 PREDICTED = 0.9999
 """Share of an input that its past tells, above which feedback is not told apart."""
 
+ROOM = 1.5
+"""Windows side by side for each feature of the state, below which too little is left to tell."""
+
 Response = tuple[float, int, Vector]
 """Steadiness, state and explained shares (lags,) of an input in one window."""
 
@@ -191,11 +194,12 @@ def _best_response(
     if not rows:
         return None
     state, motion, lagged = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    if len(state) < 4 * state.shape[1]:
-        return None
     x = lagged[:, :, j]
     others = [k for k in range(lagged.shape[2]) if k != j and not _alike(lagged[:, 3, [j, k]])]
-    basis = _basis(np.column_stack([state, lagged[:, 3, others]]))
+    features = np.column_stack([state, lagged[:, 3, others]])
+    if len(state) < ROOM * (2 * p + 1) * features.shape[1]:
+        return None
+    basis = _basis(features)
     x_left = x - basis @ (basis.T @ x)
     power = (x_left**2).sum(axis=0)
     total = float(((x - x.mean(axis=0)) ** 2).sum(axis=0).mean())

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from analysis.logs.excitation import MOST_ROWS, Effect
-from analysis.logs.health import Health, Signal, examine
+from analysis.logs.health import FEW, Health, Signal, examine
 from analysis.logs.tables import is_flag, log_of, read_table
 from analysis.style import number
 from dopt.log import Log
@@ -21,8 +21,13 @@ from orchestrate.program import UsageError, path, positive, tell
 
 HELP = "how healthy a recorded run is: sampling, noise, limits, delay, feedback, units"
 
+PICTURES = (".png", ".pdf", ".svg")
+
 RESTS = 0.2
 """Share of a log at rest from which the report says so."""
+
+UNEVEN = 0.05
+"""Share of irregular steps from which the report says that effects do not heed them."""
 
 _MANY_TURNS = 100.0  # radians
 
@@ -46,6 +51,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the report of a log and save its picture."""
+    target = options.out or Path("figures") / f"{Path(options.file).name.split('.')[0]}.png"
+    if target.suffix not in PICTURES:
+        raise UsageError(
+            f"--out is {str(target)!r}, but a name with one of the endings {', '.join(PICTURES)} "
+            f"is expected: give one."
+        )
     table = read_table(options.file).rename(columns=str)
     log = log_of(
         table,
@@ -63,7 +74,6 @@ def run(options: argparse.Namespace) -> int:
         tell(sys.stdout, f"{line}\n")
     from analysis.figures.log_health import save  # Matplotlib: other commands do without it
 
-    target = options.out or Path("figures") / f"{file.name.split('.')[0]}.png"
     save(log, health, target, file.name)
     tell(sys.stdout, f"picture: {target}\n")
     return 0
@@ -93,8 +103,15 @@ def lines(log: Log, health: Health, table: pd.DataFrame) -> Iterator[str]:
         yield from _units(one)
     for one in health.inputs:
         yield f"{one.name}: {_signal(one)}{_limits(one)}"
-    for effect in health.effects:
-        yield from _effect(effect, health)
+    wrapped = [one.name for one in health.states if not math.isnan(one.period)]
+    if wrapped:
+        yield f"effects of the inputs: not judged while {', '.join(wrapped)} wraps"
+    else:
+        yield from (line for effect in health.effects for line in _effect(effect, health))
+    if health.effects and health.irregular > UNEVEN:
+        yield "effects of the inputs: as if all steps were of the median length"
+    unseen = {*log.inputs} - {effect.input for effect in health.effects}
+    yield from (f"{name}: constant, or too few rows to see its effect" for name in sorted(unseen))
     yield from _rest(log, health)
     if log.n_rows > MOST_ROWS:
         yield f"effects of the inputs: of the first {MOST_ROWS:,} rows"
@@ -121,8 +138,8 @@ def _sampling(log: Log, health: Health) -> str:
 
 def _signal(one: Signal) -> str:
     text = f"{number(one.low)} to {number(one.high)}"
-    if one.levels < 6:
-        return f"{text}, {one.levels} levels"
+    if one.levels < FEW:
+        return f"{text}, {one.levels} level{'s' * (one.levels > 1)}"
     if math.isnan(one.quantum):
         return f"{text}, no steps"
     turn = TURN / one.quantum
@@ -188,7 +205,7 @@ def _effect(effect: Effect, health: Health) -> Iterator[str]:
         about = "; about, as noise is fed back" * effect.closed_loop
         yield f"{pair}: suspected delay: {samples} sample{'s' * (last != 1)} of {step} ms{about}"
     if effect.follows_state:
-        yield f"{effect.input}: closed loop, a function of the state"
+        yield f"{effect.input}: closed loop, or as regular as the motion: a function of the state"
     elif effect.closed_loop:
         yield (
             f"{effect.input}: closed loop: measurements explain {100 * effect.feedback:.0f} % of "
@@ -213,7 +230,7 @@ def _rest(log: Log, health: Health) -> Iterator[str]:
     )
     yield (
         f"rest: nothing moves in {100 * rests.mean():.0f} % of the log, in {longest} % of it on "
-        f"end, with {acts} there: dry friction, or it is held; little is learned there"
+        f"end, with {acts} there: dry friction, held or without power; little is learned there"
     )
 
 

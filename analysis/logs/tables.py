@@ -100,7 +100,7 @@ def log_of(
         taken = {*named, options["time"]} if isinstance(options.get("time"), str) else {*named}
         states = [
             one
-            for one in table
+            for one in map(str, table)
             if one not in taken and one.lower() not in CLOCKS
             if not is_flag(table[one]) and not INPUTS.search(one)
         ]

@@ -7,15 +7,12 @@ FUNCTIONS |= {"magnitude": np.abs, "where": np.where, "__builtins__": {}}
 
 
 def load(path):
-    """Return derivative(x, u) and step(x, u, seconds); u is the input that acts, after the delay."""
+    """Return derivative(x, u) and step(x, u, seconds), u the input that acts."""
     m = np.load(path)
     codes = [compile(text, "known", "eval") for text in m["known"].tolist()]
     constants = dict(zip(m["constant_names"].tolist(), m["constants"], strict=True))
-    names, kinds, at = (
-        [*m["states"].tolist(), *m["inputs"].tolist()],
-        m["feature_kinds"],
-        m["feature_indices"],
-    )
+    names = [*m["states"].tolist(), *m["inputs"].tolist()]
+    kinds, at = m["feature_kinds"], m["feature_indices"]
 
     def derivative(x, u):
         given = {**FUNCTIONS, **constants, **dict(zip(names, [*x, *u], strict=True))}

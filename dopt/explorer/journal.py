@@ -13,7 +13,6 @@ the line with which a program that writes them has gone on.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import gc
 import json
 import math
@@ -27,6 +26,7 @@ from typing import Any
 
 from dopt.errors import ExplorationError, SpecificationError, given_path
 from dopt.explorer.arguments import finite, seconds, within
+from dopt.process import lock_file
 
 FORMAT = 2
 """Version of the lines."""
@@ -163,11 +163,7 @@ def _lock(file: int, path: Path) -> None:
 
 def _locked(file: int) -> bool:
     """Lock a file, and return whether that was possible at once."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+    return lock_file(file, wait=False)
 
 
 def _read(path: Path, beginning: bytes) -> tuple[int, int, list[dict[str, Any]]]:

@@ -117,8 +117,7 @@ def environment(found: Fitted) -> Any:
     starts = found._chosen.solution.windows.starts
     bound = min(plant.gamma, plant.supply)
 
-    class FittedPlant(gymnasium.Env[Array, Array]):
-        metadata = {"render_modes": []}  # noqa: RUF012  # Gymnasium's own form
+    class FittedPlant(gymnasium.Env):  # type: ignore[misc]  # of a library that may lack
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (model.d,), np.float64)
         action_space = gymnasium.spaces.Box(-bound, bound, (model.m,), np.float64)
 
@@ -162,10 +161,12 @@ def advance(
     """Return the state and what acts after a time under an input that is held."""
 
     def acts(s: float) -> Array:
-        return u if lag <= 0.0 else u + (v - u) * math.exp(-s / lag)
+        reached: Array = u if lag <= 0.0 else u + (v - u) * math.exp(-s / lag)
+        return reached
 
     def rate(state: Array, s: float) -> Array:
-        return model.derivative(p, state[None], acts(s)[None])[0]
+        flow: Array = model.derivative(p, state[None], acts(s)[None])[0]
+        return flow
 
     steps = max(1, math.ceil(seconds / model.structure.longest_step - 1e-9))
     h = seconds / steps

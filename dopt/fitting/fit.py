@@ -51,6 +51,12 @@ SCANNED = (-2, -1, 0, 1, 2, 3)
 MOST_VALIDATED = 200
 """Held-out windows of a block that are predicted."""
 
+RATIO = 1.8
+"""Least ratio of the changes over 2k and k rows at which k is short beside the period."""
+
+MOST_LOSS = 1e12
+"""Largest mean square of a held-out window, by the typical one, that counts."""
+
 MOST_SCANNED = 150
 """Windows over which delays are tried."""
 
@@ -102,7 +108,7 @@ def fit(
         If nothing is to be fitted, or the logs do not fit the plant or are too short.
     """
     runs, tests = _logs(plant, logs), [] if validate is None else _logs(plant, validate)
-    _check(plant, width, weights, workers)
+    _check(width, weights, workers)
     plant = _measuring(plant, runs)
     data = data_of(plant, runs, hold)
     work = _Selection(plant, data, _blocks(data, runs), workers, progress or (lambda _: None))
@@ -163,6 +169,7 @@ class _Selection:
             return [float(window)]
         least = FEWEST_ROWS * self.step
         tried = sorted({max(share * self.scale, least) for share in LENGTHS})
+        longest = min(longest, self._longest_block())
         fitting = [length for length in tried if 4.0 * length <= longest]
         if not fitting and longest <= 2.0 * least:
             raise SpecificationError(
@@ -175,12 +182,27 @@ class _Selection:
         firsts = np.unique(self.data.firsts)
         return [(int(first), int(self.data.lasts[first])) for first in firsts]
 
+    def _longest_block(self) -> float:
+        """Return the longest time of a block without a gap [s]."""
+        data, spans = self.data, []
+        for first, last in self.blocks:
+            for begin in np.unique(data.firsts[first : last + 1]):
+                ends = max(first, int(begin)), min(last, int(data.lasts[begin]))
+                spans.append(float(data.time[ends[1]] - data.time[ends[0]]))
+        return max(spans)
+
     def _windows(self, seconds: float, block: int | None = None) -> Windows:
         """Return the windows of one block, or of all."""
-        margin = {"skip": self._latest(), "ahead": 2.0 * self.step}
         chosen = range(len(self.blocks)) if block is None else [block]
         rows = np.concatenate(
-            [windows_of(self.data, *self.blocks[i], seconds, **margin) for i in chosen]
+            [
+                windows_of(
+                    *(self.data, *self.blocks[i], seconds),
+                    skip=self._latest(),
+                    ahead=2.0 * self.step,
+                )
+                for i in chosen
+            ]
         )
         return Windows(rows, first_states(self.data, self.model, rows))
 
@@ -198,7 +220,7 @@ class _Selection:
                 f"expected: give longer runs, or a shorter window."
             )
         every = max(1, len(windows.rows) // MOST_SCANNED)
-        some = Windows(*(np.ascontiguousarray(part[::every]) for part in windows))
+        some = windows.where(np.arange(len(windows.rows)) % every == 0)
         fits = {}
         shifts = [shift for shift in SCANNED if self.delay + shift * self.step >= -2.5 * self.step]
 
@@ -222,8 +244,9 @@ class _Selection:
             found = fits[0]
             if best and fits[best][0] < 0.8 * fits[0][0]:
                 self.notes.append(
-                    f"with the inputs {best:+d} samples later the constants fit {fits[0][0] / fits[best][0]:.1f} "
-                    f"times as well: declare delay=dopt.unknown({abs(best) * self.step:g})"
+                    f"with the inputs {best:+d} samples later the constants fit "
+                    f"{fits[0][0] / fits[best][0]:.1f} times as well: declare a delay of "
+                    f"{self.delay + best * self.step:g} s, or a dopt.unknown one"
                 )
         self.model = self._model(self.delay, free=True)
         self._rescale(found[1], found[2])
@@ -252,7 +275,15 @@ class _Selection:
     def choose_window(self, lengths: list[float]) -> None:
         """Fit the constants to windows of each length, and keep the one that predicts best."""
         judged = lengths[len(lengths) // 2]
-        self._judged = [self._tested(judged, block) for block in range(len(self.blocks))]
+        tested = [self._tested(judged, block) for block in range(len(self.blocks))]
+        keep = [block for block, rows in enumerate(tested) if len(rows)]
+        if not keep:
+            raise SpecificationError(
+                f"no held-out block has a window of {1.5 * judged:g} s, but at least one is "
+                f"expected, as they judge the fit: give longer runs, or a shorter window."
+            )
+        self.blocks = [self.blocks[block] for block in keep]  # the rest is fitted to, always
+        self._judged = [tested[block] for block in keep]
         best, p = math.inf, self.solution.p
         for length in lengths:
             windows = self._windows(length)
@@ -289,8 +320,8 @@ class _Selection:
         error = float(gain.std(ddof=1) / math.sqrt(len(gain))) if len(gain) > 1 else math.inf
         if not gain.mean() > error:
             self.notes.append(
-                f"no network: it predicts held-out blocks better by {gain.mean():.3f} ± {error:.3f} "
-                f"of log-loss only"
+                f"no network: it lowers the loss on held-out blocks by {gain.mean():.3f} ± "
+                f"{error:.3f} only"
             )
             return None
         self._folds["model"] = (model, folds)
@@ -343,7 +374,7 @@ class _Selection:
             low, high = self.blocks[block]
             rows = whole.windows.rows
             others = (rows[:, 1] < low) | (rows[:, 0] > high)
-            windows = Windows(*(np.ascontiguousarray(part[others]) for part in whole.windows))
+            windows = whole.windows.where(others)
             simulator = Simulator(model, self.data)
             found = solve(simulator, windows, whole.p, s, scale=whole.scale[others], tolerance=1e-3)
             return predicted(simulator, found.p, self._judged[block]), found.p
@@ -353,19 +384,16 @@ class _Selection:
         if self._typical is None:
             known = [share for each in shares for share in each if np.isfinite(share)]
             self._typical = max(float(np.median(known)), 1e-300) if known else 1.0
-        worst = math.log1p(1e12)
         scores = [
-            float(
-                np.mean(
-                    np.minimum(np.log1p(np.nan_to_num(each, nan=np.inf) / self._typical), worst)
-                )
-            )
+            float(np.mean(np.log1p(np.minimum(each / self._typical, MOST_LOSS))))
+            if len(each)
+            else math.nan
             for each in shares
         ]
         return np.array(scores), [p for _, p in found]
 
     def held_out(self) -> dict[str, list[Predicted]]:
-        """Return predictions of each block over the longest horizon of the report, by what made them."""
+        """Return predictions of each block up to the longest horizon, by what made them."""
         longest = max(HORIZONS) * self.window
         pieces = max(self.data.time[b] - self.data.time[a] for a, b in self.blocks)
         tested = [
@@ -380,7 +408,9 @@ class _Selection:
 
             out[what] = list(self._map(one, range(len(self.blocks))))
         out["linear"] = [
-            linear_predictions(self.data, self.blocks[block], tested[block], self.delay, self.step)
+            linear_predictions(
+                *(self.data, self.data, tested[block], self.delay, self.step), self.blocks[block]
+            )
             for block in range(len(self.blocks))
         ]
         return out
@@ -408,27 +438,36 @@ class _Selection:
 
 
 def time_scale(data: Data) -> float:
-    """Return the time in which what is measured changes by as much as it does at all [s].
+    """Return the shortest period that dominates what is measured [s].
 
-    It is 2π std(y)/std(dy/dt) with differences over so many rows that they are larger than the
-    noise, the shortest over the measured states.
+    The change over 2k rows is 2 cos(π k dt/T) times that over k rows, root mean square, of a sine
+    of period T; it is less where k is so small that noise decides, and beyond a fraction of T. The
+    largest k with a ratio of at least 1.8 gives T; the shortest T of all measured states counts.
     """
     found = []
     for column in data.measured.T:
         seen = np.flatnonzero(np.isfinite(column))
-        spread = float(np.std(column[seen]))
-        k = 1
-        while len(seen) > 4 * k and spread > 0.0:
-            same = data.firsts[seen[k:]] == data.firsts[seen[:-k]]
-            change = (column[seen[k:]] - column[seen[:-k]])[same]
-            seconds = (data.time[seen[k:]] - data.time[seen[:-k]])[same]
-            if len(change) and float(np.std(change)) > 0.2 * spread:
-                found.append(
-                    2.0 * math.pi * spread * float(np.mean(seconds)) / float(np.std(change))
-                )
+        best, k = 0.0, 1
+        while len(seen) > 8 * k:
+            spans = [_changes(data, column, seen, n) for n in (k, 2 * k)]
+            if min(spans[0][0], spans[1][0]) > 0.0 and spans[1][0] >= RATIO * spans[0][0]:
+                best = spans[0][1]
+            elif best:
                 break
-            k *= 2
+            k = max(k + 1, int(1.25 * k))
+        if best:
+            found.append(math.pi * best / math.acos(0.5 * RATIO))
     return min(found) if found else 40.0 * float(np.median(_steps(data)))
+
+
+def _changes(data: Data, column: Array, seen: Integers, k: int) -> tuple[float, float]:
+    """Return the root mean square change over k measured rows, and how long they take [s]."""
+    same = data.firsts[seen[k:]] == data.firsts[seen[:-k]]
+    change = (column[seen[k:]] - column[seen[:-k]])[same]
+    seconds = (data.time[seen[k:]] - data.time[seen[:-k]])[same]
+    if not len(change):
+        return 0.0, 0.0
+    return float(np.sqrt(np.mean(np.square(change)))), float(np.median(seconds))
 
 
 def _steps(data: Data) -> Array:
@@ -451,9 +490,10 @@ def _blocks(data: Data, runs: Sequence[Log]) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in itertools.pairwise(cuts) if b > a]
 
 
-def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Array]:
+def _rows_of_logs(data: Data, runs: Sequence[Log]) -> list[Integers]:
     pieces = np.split(np.arange(len(data.time)), np.unique(data.firsts)[1:])
-    out, at = [], 0
+    out: list[Integers] = []
+    at = 0
     for run in runs:
         n = sum(len(piece.time) > 1 for piece in run.pieces)
         out.append(np.concatenate(pieces[at : at + n]) if n else np.arange(0))
@@ -486,11 +526,9 @@ def _measuring(plant: Plant, runs: Sequence[Log]) -> Plant:
     return dataclasses.replace(plant, measured=measured)
 
 
-def _check(plant: Plant, width: int, weights: Sequence[float], workers: int) -> None:
-    if not isinstance(plant, Plant):
-        raise SpecificationError(f"plant is {plant!r}, but a dopt.Plant is expected: declare one.")
+def _check(width: int, weights: Sequence[float], workers: int) -> None:
     for what, value, least in (("width", width, 0), ("workers", workers, 1)):
-        if not isinstance(value, int) or value < least:
+        if value != int(value) or value < least:
             raise SpecificationError(
                 f"{what} is {value!r}, but a whole number of at least {least} is expected: "
                 f"correct it."

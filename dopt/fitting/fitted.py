@@ -13,7 +13,13 @@ import numpy.typing as npt
 
 from dopt.errors import SpecificationError
 from dopt.fitting.model import Model, data_of, measured_names
-from dopt.fitting.predictions import HORIZONS, Predicted, horizon_errors, predicted
+from dopt.fitting.predictions import (
+    HORIZONS,
+    Predicted,
+    horizon_errors,
+    linear_predictions,
+    predicted,
+)
 from dopt.fitting.problem import Simulator, Solution, Windows, first_states, windows_of
 from dopt.fitting.simulation import Data
 from dopt.log import Log
@@ -156,7 +162,8 @@ class Fitted:
 
         if not 0 < level < 1:
             raise SpecificationError(
-                f"level is {level!r}, but a share between 0 and 1 is expected: give for instance 0.9."
+                f"level is {level!r}, but a share between 0 and 1 is expected: give for instance "
+                f"0.9."
             )
         data, z = self._with(run), float(norm.ppf(0.5 + 0.5 * level))
         model, solution, _, covariance = self._chosen
@@ -231,10 +238,13 @@ class Fitted:
         data = data_of(self.plant, self.tests, self.hold, self._data.deviations)
         rows = self._windows(data, max(self.horizons))
         models = {"model": self._chosen, "physics alone": self._physics}
-        return {
+        found = {
             what: [predicted(Simulator(each.model, data), each.solution.p, rows)]
             for what, each in models.items()
         }
+        step = float(np.median(np.diff(self.tests[0].pieces[0].time)))
+        found["linear"] = [linear_predictions(self._data, data, rows, self.delay, step)]
+        return found
 
     def _windows(self, data: Data, horizon: float) -> Integers:
         """Return windows of a history and a horizon, (k, 3), one after the other."""
@@ -280,8 +290,8 @@ class Fitted:
     def whiteness(self) -> dict[str, tuple[float, float]]:
         """Return two correlations of the residuals of each measured state.
 
-        The first is with the residual one row before, the second the largest one with one of the last
-        ten inputs; 0 of a model that leaves nothing but white noise.
+        The first is with the residual one row before, the second the largest one with one of the
+        last ten inputs; 0 of a model that leaves nothing but white noise.
         """
         model, solution, _, _ = self._chosen
         simulator, data = Simulator(model, self._data), self._data

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numba
@@ -16,7 +16,6 @@ from dopt.kernel.compiler import compilable
 from dopt.kernel.equations import KNOWN, as_tuple
 from dopt.kernel.plain import PLAIN
 from dopt.log import Log, Piece
-from dopt.systems.black_box import differentiated
 from dopt.systems.plant import Encoder, Plant, Unknown, compiled_text
 from dopt.types import Array, CompiledFunction, Equation
 
@@ -181,13 +180,14 @@ class Model:
             constants[at] = unknown.at(p[j])
             slopes[j] = unknown.slope(p[j])
         at = self.n_named + self.n_weights
-        delay, lag, lag_slope = self.delay, self.plant.lag, 0.0
+        delay = self.delay
         if self.structure.free_delay:
             delay += self.plant.dt * p[at]
             at += 1
-        if isinstance(lag, Unknown):
-            z = p[at] if self.structure.free_lag else 0.0
-            lag, lag_slope = lag.at(z), lag.slope(z)
+        given = self.plant.lag
+        z = float(p[at]) if self.structure.free_lag else 0.0
+        lag = given.at(z) if isinstance(given, Unknown) else given
+        lag_slope = given.slope(z) if isinstance(given, Unknown) else 0.0
         weights = np.ascontiguousarray(p[self.n_named : self.n_named + self.n_weights])
         sizes = np.ascontiguousarray(self.sizes)
         numbers = (float(delay), float(lag), float(self.plant.dt), float(lag_slope))
@@ -243,17 +243,23 @@ def measured_names(plant: Plant) -> tuple[str, ...]:
     return tuple(name for name in plant.states if name in plant.measured) or tuple(plant.states)
 
 
-def rates_of(plant: Plant, measured: Sequence[int]) -> dict[int, int]:
-    """Return which state is the rate of which measured one."""
-    noise = {name: plant.measured.get(name, 1.0) for name in measured_names(plant)}
-    found = differentiated(_with(plant, noise).system(1))
-    return {i: of for i, of in enumerate(found) if of >= 0 and i not in measured}
-
-
-def _with(plant: Plant, measured: Mapping[str, float | Encoder]) -> Plant:
-    import dataclasses
-
-    return dataclasses.replace(plant, measured=measured)
+def rates_of(plant: Plant, measured: Sequence[int]) -> dict[int, tuple[int, float]]:
+    """Return of which measured state another one is the rate, and in how many of its units."""
+    states, system = (
+        np.random.default_rng(0).uniform(0.5, 1.5, (len(plant.states), 8)),
+        plant.system(1),
+    )
+    inputs = np.ones((len(plant.inputs), 8))
+    with np.errstate(all="ignore"):
+        flow = system.known(tuple(states), tuple(inputs), system.parameters)
+        rates = np.stack(np.broadcast_arrays(*flow, states[0])[:-1])
+    found: dict[int, tuple[int, float]] = {}
+    for j in range(len(states)):
+        for i in measured:
+            ratio = rates[i] / states[j]
+            if j not in measured and np.ptp(ratio) <= 1e-9 * abs(ratio[0]) and ratio[0] != 0.0:
+                found[j] = (i, float(ratio[0]))
+    return found
 
 
 def data_of(plant: Plant, logs: Sequence[Log], hold: str, deviations: Array | None = None) -> Data:

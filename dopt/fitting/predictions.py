@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,13 +39,12 @@ class Predicted(NamedTuple):
     deviations: Array
 
     def mean_squares(self) -> Array:
-        """Return the mean square of each window, in standard deviations."""
+        """Return the mean square of each window with a measurement, in standard deviations."""
         return np.array(
             [
                 float(np.mean(np.square((error / self.deviations)[np.isfinite(change)])))
-                if np.isfinite(change).any()
-                else math.nan
                 for error, change in zip(self.errors, self.changes, strict=True)
+                if np.isfinite(change).any()
             ]
         )
 
@@ -117,46 +116,65 @@ def horizon_errors(
     return out
 
 
+class _Rows(NamedTuple):
+    """Measured rows of data, in units of their spread."""
+
+    at: Integers  # (N,) their rows in the data
+    outputs: Array  # (N, n)
+    inputs: Array  # (N, m)
+    late: int  # rows from an input to its effect
+
+    def regressors(self, k: Integers) -> Array:
+        """Return earlier outputs, the newest first, earlier inputs, and 1."""
+        past = [self.outputs[k - 1 - i] for i in range(ORDER)]
+        return np.concatenate([*past, *self.before(k), np.ones((len(k), 1))], axis=1)
+
+    def before(self, k: Any) -> list[Array]:
+        """Return the inputs that count at rows k, the newest first."""
+        return [self.inputs[k - 1 - self.late - i] for i in range(ORDER)]
+
+
 def linear_predictions(
-    data: Data, block: tuple[int, int], rows: Integers, delay: float, step: float
+    train: Data,
+    data: Data,
+    rows: Integers,
+    delay: float,
+    step: float,
+    without: tuple[int, int] | None = None,
 ) -> Predicted:
-    """Predict windows, (k, 3), by a linear model (ARX) that was fitted to the other rows.
+    """Predict windows of data, (k, 3), by a linear model (ARX) that is fitted to other data.
 
-    Its outputs depend on ``ORDER`` earlier outputs and as many inputs, from the delay on. It takes rows
-    for equally spaced.
+    Its outputs depend on ``ORDER`` earlier outputs and as many inputs, from the delay on. It takes
+    rows for equally spaced. ``without`` are first and last rows that it is not fitted to.
     """
-    seen = np.flatnonzero(np.isfinite(data.measured).all(axis=1))
-    y, u, first = data.measured[seen], data.inputs[seen], data.firsts[seen]
+    level, scale = np.nanmean(train.measured, axis=0), np.nanstd(train.measured, axis=0)
+    scale, size = np.maximum(scale, 1e-300), np.maximum(np.abs(train.inputs).max(axis=0), 1e-300)
     late = max(0, round(delay / step))
-    depth = ORDER + late
-    at = np.arange(depth, len(seen))
-    at = at[first[at] == first[at - depth]]
-    other = (seen[at] < block[0]) | (seen[at - depth] > block[1])
-    seconds, errors, changes = [], [], []
-    if not other.any():
-        return Predicted(seconds, errors, changes, data.deviations)
-    scale, level = np.maximum(y.std(axis=0), 1e-300), y.mean(axis=0)
-    size = np.maximum(np.abs(u).max(axis=0), 1e-300)
-    z, v = (y - level) / scale, u / size
 
-    def regressors(k: Array) -> Array:
-        past = [z[k - 1 - i] for i in range(ORDER)] + [v[k - 1 - late - i] for i in range(ORDER)]
-        return np.concatenate([*past, np.ones((len(k), 1))], axis=1)
+    def of(each: Data) -> _Rows:
+        seen = np.flatnonzero(np.isfinite(each.measured).all(axis=1))
+        return _Rows(seen, (each.measured[seen] - level) / scale, each.inputs[seen] / size, late)
 
-    used = at[other]
-    theta = np.linalg.lstsq(regressors(used), z[used], rcond=None)[0]
+    known, found, depth = of(train), of(data), ORDER + late
+    k = np.arange(depth, len(known.at))
+    k = k[train.firsts[known.at[k]] == train.firsts[known.at[k - depth]]]
+    if without is not None:
+        k = k[(known.at[k] < without[0]) | (known.at[k - depth] > without[1])]
+    out = Predicted([], [], [], data.deviations)
+    if not len(k):
+        return out
+    theta = np.linalg.lstsq(known.regressors(k), known.outputs[k], rcond=None)[0]
     for begin, middle, last in rows:
-        ahead = np.flatnonzero((seen > middle) & (seen <= last))
-        before = np.flatnonzero((seen >= begin) & (seen <= middle))
+        ahead = np.flatnonzero((found.at > middle) & (found.at <= last))
+        before = np.flatnonzero((found.at >= begin) & (found.at <= middle))
         if len(before) < depth + 1 or not len(ahead):
             continue
-        real = z[ahead].copy()
-        path = list(z[before[-ORDER:]][::-1])  # the newest first
-        for k in ahead:
-            past = [v[k - 1 - late - i] for i in range(ORDER)]
-            path.insert(0, np.concatenate([*path[:ORDER], *past, [1.0]]) @ theta)
-        predicted_ = np.clip(np.array(path[: len(ahead)])[::-1], -1e9, 1e9)
-        seconds.append(data.time[seen[ahead]] - data.time[middle])
-        errors.append((real - predicted_) * scale)
-        changes.append((real - z[before[-1]]) * scale)
-    return Predicted(seconds, errors, changes, data.deviations)
+        path = list(found.outputs[before[-ORDER:]][::-1])  # the newest first
+        for row in ahead:
+            regressors = np.concatenate([*path[:ORDER], *found.before(row), [1.0]])
+            path.insert(0, np.clip(regressors @ theta, -1e9, 1e9))
+        simulated = np.array(path[: len(ahead)])[::-1]
+        out.seconds.append(data.time[found.at[ahead]] - data.time[middle])
+        out.errors.append((found.outputs[ahead] - simulated) * scale)
+        out.changes.append((found.outputs[ahead] - found.outputs[before[-1]]) * scale)
+    return out

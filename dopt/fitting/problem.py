@@ -25,7 +25,7 @@ from dopt.fitting.model import Model
 from dopt.fitting.simulation import COMPLEX_KNOWN, Data, Structure, Values
 from dopt.kernel.equations import KNOWN
 from dopt.kernel.plain import PLAIN
-from dopt.types import Array, Integers
+from dopt.types import Array, Booleans, Integers
 
 BATCH_ROWS = 1200
 """Rows that are multiplied at once: as many as stay in the processor's cache."""
@@ -55,10 +55,17 @@ class Windows(NamedTuple):
     rows: Integers  # (k, 2)
     starts: Array  # (k, d)
 
+    def where(self, wanted: Booleans) -> Windows:
+        """Return some of the windows."""
+        return Windows(
+            np.ascontiguousarray(self.rows[wanted]), np.ascontiguousarray(self.starts[wanted])
+        )
+
     def counts(self, data: Data) -> Array:
         """Return how many numbers were measured in each."""
         seen = np.concatenate([[0], np.cumsum(np.isfinite(data.measured).sum(axis=1))])
-        return (seen[self.rows[:, 1] + 1] - seen[self.rows[:, 0]]).astype(float)
+        counts: Array = (seen[self.rows[:, 1] + 1] - seen[self.rows[:, 0]]).astype(float)
+        return counts
 
 
 class Simulator:
@@ -350,7 +357,7 @@ AROUND = 7
 def first_states(data: Data, model: Model, rows: Integers) -> Array:
     """Return first estimates of the initial states of windows, (k, d)."""
     starts, measured = np.zeros((len(rows), model.d)), model.structure.measured
-    rate = {of: i for i, of in model.rates.items()}
+    rate = {of: (j, unit) for j, (of, unit) in model.rates.items()}
     for k, (row, end) in enumerate(rows):
         low = max(int(data.firsts[row]), row - 60)
         near = slice(low, min(int(data.lasts[row]), max(end, row + 60)) + 1)
@@ -365,5 +372,6 @@ def first_states(data: Data, model: Model, rows: Integers) -> Array:
             found = np.polyfit(t[seen] / span, data.measured[near, c][seen], degree)
             starts[k, i] = found[-1]
             if int(i) in rate and degree:
-                starts[k, rate[int(i)]] = found[-2] / span
+                j, unit = rate[int(i)]
+                starts[k, j] = found[-2] / span / unit
     return starts

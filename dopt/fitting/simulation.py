@@ -142,17 +142,9 @@ def work_for(d: int, m: int, columns: int, c: int, p: int, w: int) -> Work:
     vectors = [np.zeros(d) for _ in range(5)]
     matrices = [np.zeros((d, n)) for _ in range(5)]
     complexes = [np.zeros(size, np.complex128) for size in (d, m, c, d)]
-    return Work(
-        *vectors,
-        np.zeros(m),
-        np.zeros((d, d)),
-        np.zeros((d, m)),
-        *matrices,
-        *complexes,
-        np.zeros(p),
-        np.zeros(p),
-        np.zeros(w),
-    )
+    of_inputs = (np.zeros(m), np.zeros((d, d)), np.zeros((d, m)))
+    of_network = (np.zeros(p), np.zeros(p), np.zeros(w))
+    return Work._make([*vectors, *of_inputs, *matrices, *complexes, *of_network])
 
 
 @_compiled
@@ -386,7 +378,7 @@ def acting_input(data: Data, row: int, delay: float, tolerance: float) -> int:
             low = middle
         else:
             high = middle - 1
-    return low
+    return int(low)
 
 
 @_compiled

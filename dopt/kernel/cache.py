@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import fcntl
 import hashlib
 import logging
 import os
-import pwd
 import shutil
 import subprocess
 import sys
@@ -28,7 +26,7 @@ import llvmlite.binding
 
 from dopt.errors import UnusableEnvironmentError, given_path
 from dopt.kernel.plain import PLAIN
-from dopt.process import usable_cores
+from dopt.process import lock_file, lock_stream, usable_cores
 
 CACHE_VARIABLE = "DOPT_CACHE"
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -111,7 +109,9 @@ def _roots() -> list[Path]:
     if given:
         return [given_path(given, CACHE_VARIABLE).absolute()]
     homes = [os.environ.get("HOME")]
-    with contextlib.suppress(KeyError):  # a container may run under a number without a name
+    with contextlib.suppress(KeyError, ImportError):  # a number without a name, or no such users
+        import pwd
+
         homes.append(pwd.getpwuid(os.getuid()).pw_dir)
     return [Path(home, ".cache") for home in homes if home]
 
@@ -217,7 +217,7 @@ def one_compiler_at_a_time(what: str) -> Iterator[None]:
         if not is_complete(what):
             with contextlib.suppress(OSError):  # not every file system has locks
                 lock = held.enter_context((CACHE_FOLDER / f"{name}.lock").open("w"))
-                fcntl.flock(lock, fcntl.LOCK_EX)
+                lock_file(lock.fileno())
         before, there = len(_used), is_complete(what)
         if not there:
             _log.warning("compiling the kernel, %s: %s", for_whom(), name)
@@ -307,11 +307,8 @@ def compile_missing(names: Sequence[str]) -> None:
 def _said(text: str, *, last: bool) -> bool:
     """Say it, unless another process does on the same standard error, as workers of a launch."""
     try:
-        fcntl.lockf(sys.stderr, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if last:
-            fcntl.lockf(sys.stderr, fcntl.LOCK_UN)
-    except BlockingIOError:
-        return False
+        if not lock_stream(sys.stderr, release=last):
+            return False
     except (OSError, TypeError, ValueError):  # no file, as in a notebook
         pass
     if _on_terminal():

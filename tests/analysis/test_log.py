@@ -186,7 +186,9 @@ def test_likely_mistakes_of_units_are_said(seed: int) -> None:
         (counts, "th: whole numbers"),
         (np.round(5 * degrees, 1), "turns if it is an angle in radians; degrees?"),
     ):
-        assert words in report({"t": t, "th": column, "u": u})
+        text = report({"t": t, "th": column, "u": u})
+        assert words in text
+        assert "explains nothing" not in text
     for scale, unit in ((1e3, "ms"), (1e6, "us"), (1e9, "ns")):
         assert f"--units t={unit}" in report({"t": t * scale, "th": angle, "u": u})
     clean = report({"t": t, "th": angle, "u": u})
@@ -316,6 +318,8 @@ def test_the_command_prints_and_draws(
     assert cli.main(["log", "run.csv", *words, "--inputs", "u=", "--out", "a.pdf"]) == 2
     assert "--inputs is 'u=', but names" in capsys.readouterr().err
     assert cli.main(["log", "none.csv"]) == 2
+    assert cli.main(["log", "run.csv", "--out", "a.xyz"]) == 2
+    assert "endings .png, .pdf, .svg" in capsys.readouterr().err
 
 
 # Recorded runs of real plants (their sources and licences: README.md in the folder of DOPT_DATA)

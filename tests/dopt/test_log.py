@@ -221,6 +221,7 @@ def test_the_log_of_a_plant_has_its_names_angles_and_step() -> None:
     assert said(found, "the plant's dt of 0.01 s")
     assert said(found, "left to the fit: rate")
     measured = motor(measured={"angle": 0.01})
+    assert Log.for_plant({"angle": T, "v": T}, motor(), columns={}).states == ("angle",)
     array = np.column_stack([T, T, T])
     assert Log.for_plant(array, measured, columns=["t", "angle", "v"]).states == ("angle",)
 
