@@ -77,7 +77,7 @@ LEADERBOARD |= {"damping": 0.1, "coulomb": 0.093}
 
 def _two_joints(*, friction: str, bias: bool) -> dict[str, str]:
     """Return the equations of a double pendulum, angle 2 from link 1, both 0 when hanging."""
-    slow = [f"b{i} * rate{i} + c{i} * {friction.format(v=f'rate{i}')}" for i in (1, 2)]
+    slow = [f"(b{i} * rate{i} + c{i} * {friction.format(v=f'rate{i}')})" for i in (1, 2)]
     h = "a3 * sin(angle2)"
     far = "g2 * sin(angle1 + angle2)"
     r1 = f"(torque1 - g1 * sin(angle1) - {far} + {h} * (2 * rate1 + rate2) * rate2 - {slow[0]}"
