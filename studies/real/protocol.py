@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from dopt.fitting.fit import fit
+from dopt.fitting.fitted import Fitted
 from dopt.fitting.model import Model, data_of
 from dopt.fitting.predictions import predicted
 from dopt.fitting.problem import Simulator
@@ -123,19 +124,17 @@ def judged(case: Case, name: str, given: Sequence[Log], left_out: Log, workers: 
     fitted = fit(case.plant, given, workers=workers, **case.options)
     own, alone = fitted._chosen, fitted._physics
     data = data_of(case.plant, [left_out], fitted.hold, fitted._data.deviations)
-    model, p = alone.model, alone.solution.p
-    if case.reference is not None:
-        model = Model(case.reference)
-        p = model.prior
     rows = windows(case, data)
-    both = [
-        _errors(case, Simulator(*which, data), p, rows)
-        for which, p in (((own.model,), own.solution.p), ((model,), p))
-    ]
-    return Fold(name, *both, _stretches(case, data, rows), _described(fitted))
+    ours = _errors(case, Simulator(own.model, data), own.solution.p, rows)
+    if case.reference is None:
+        theirs = _errors(case, Simulator(alone.model, data), alone.solution.p, rows)
+    else:
+        published = Model(case.reference)
+        theirs = _errors(case, Simulator(published, data), published.prior, rows)
+    return Fold(name, ours, theirs, _stretches(case, data, rows), _described(fitted))
 
 
-def _described(fitted: Any) -> str:
+def _described(fitted: Fitted) -> str:
     constants = ", ".join(f"{name} {value:.4g}" for name, (value, _) in fitted.constants.items())
     network = "with" if fitted.has_network else "without"
     return f"windows of {fitted.selection.window:.3g} s, {network} a network, {constants}"
@@ -161,7 +160,7 @@ def windows(case: Case, data: Data) -> Integers:
     seen = np.flatnonzero(np.isfinite(data.measured).all(axis=1))
 
     def row(seconds: float) -> int:
-        return int(seen[min(np.searchsorted(time[seen], seconds - 1e-9), len(seen) - 1)])
+        return int(seen[min(int(np.searchsorted(time[seen], seconds - 1e-9)), len(seen) - 1)])
 
     if not case.horizons:
         return np.array([[row(SKIPPED), row(case.history), last]], np.int64)
