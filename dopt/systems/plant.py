@@ -88,16 +88,33 @@ def compiled_text(
     given = [f"_{argument}" for argument in arguments]  # no quantity begins with an underscore
     groups = zip(given, arguments.values(), strict=True)
     unpacked = [f"{', '.join(group)}, = {name}" for name, group in groups if group]
-    scaled = [f"{name} = {name} * {unit!r}" for name, unit in (units or {}).items()]
+    shared = _Shared()
+    texts = [ast.unparse(shared.visit(ast.parse(text, mode="eval").body)) for text in texts]
+    steps = [f"{name} = {name} * {unit!r}" for name, unit in (units or {}).items()]
+    steps += [f"{name} = {text}" for text, name in shared.names.items()]
     for i, unit in enumerate(results):
-        scaled += [f"_{i} = ({texts[i]}) / {unit!r}", f"_{i}_split = {SPLIT!r} * _{i}"]
+        steps += [f"_{i} = ({texts[i]}) / {unit!r}", f"_{i}_split = {SPLIT!r} * _{i}"]
         texts[i] = f"_{i}_split - (_{i}_split - _{i})"
-    lines = [*unpacked, *scaled, f"return ({', '.join(texts)},)"]
+    lines = [*unpacked, *steps, f"return ({', '.join(texts)},)"]
     source = "\n    ".join([f"def equation({', '.join(given)}):", *lines])
     namespace: dict[str, Any] = {**FUNCTIONS, "__name__": "expressions"}
     exec(source, namespace)  # of nothing but the expressions that were checked
     equation: Equation = namespace["equation"]
     return equation
+
+
+class _Shared(ast.NodeTransformer):
+    """Gives each operation a name, the same to equal ones, so that each is done once."""
+
+    def __init__(self) -> None:
+        self.names: dict[str, str] = {}
+
+    def visit(self, node: ast.AST) -> Any:
+        found = self.generic_visit(node)
+        if not isinstance(found, ast.BinOp | ast.Call):
+            return found
+        name = self.names.setdefault(ast.unparse(found), f"_{len(self.names)}")
+        return ast.Name(name)
 
 
 def _check_finite(tree: ast.expr, what: str, values: Mapping[str, Any]) -> None:
@@ -262,7 +279,7 @@ class Unknown:
     def at(self, z: float) -> float:
         """Return the number z standard deviations above the guess."""
         if self.factor:
-            return self.value * math.exp(math.log(self.factor) * z)
+            return self.value * math.exp(min(math.log(self.factor) * z, 300.0))  # steps overshoot
         return self.value + self.spread * z
 
     def slope(self, z: float) -> float:

@@ -1,0 +1,1 @@
+"""Published numbers on recorded runs of real plants."""
