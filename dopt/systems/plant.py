@@ -93,8 +93,8 @@ def compiled_text(
     steps = [f"{name} = {name} * {unit!r}" for name, unit in (units or {}).items()]
     steps += [f"{name} = {text}" for text, name in shared.names.items()]
     for i, unit in enumerate(results):
-        steps += [f"_{i} = ({texts[i]}) / {unit!r}", f"_{i}_split = {SPLIT!r} * _{i}"]
-        texts[i] = f"_{i}_split - (_{i}_split - _{i})"
+        steps += [f"_out{i} = ({texts[i]}) / {unit!r}", f"_split{i} = {SPLIT!r} * _out{i}"]
+        texts[i] = f"_split{i} - (_split{i} - _out{i})"
     lines = [*unpacked, *steps, f"return ({', '.join(texts)},)"]
     source = "\n    ".join([f"def equation({', '.join(given)}):", *lines])
     namespace: dict[str, Any] = {**FUNCTIONS, "__name__": "expressions"}
