@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,7 +27,7 @@ from dopt.policies import POLICIES, Policy, TaskOptimal
 from dopt.spec.trial import TrialSpec
 from dopt.systems.base import System
 from dopt.systems.plant import ExploredPlant
-from dopt.systems.scales import rounded
+from dopt.systems.scales import SPLIT, rounded
 from dopt.types import Array
 
 
@@ -55,9 +56,14 @@ class Scaled:
         """Return some rows of states, (..., n), in scaled numbers."""
         if not self.is_scaled:
             return states
-        found = rounded(states / self.states[rows])
-        angles = np.isin(np.arange(len(self.states))[rows], self.system.angle_indices)
-        return np.where(angles, states, found)
+        found: Array = rounded(states / self.states[rows], self._splits[rows])
+        return found
+
+    @functools.cached_property
+    def _splits(self) -> Array:
+        splits = np.full(len(self.states), SPLIT)
+        splits[list(self.system.angle_indices)] = 0.0
+        return splits
 
     def of_inputs(self, inputs: Array) -> Array:
         """Return inputs, (..., m), in scaled numbers."""
@@ -65,9 +71,9 @@ class Scaled:
 
     def of_seconds(self, seconds: float) -> float:
         """Return a time as scaled numbers are: rounded, and in the same unit."""
-        return float(rounded(np.array(seconds))) if self.is_scaled else seconds
+        return float(rounded(seconds)) if self.is_scaled else seconds
 
-    @property
+    @functools.cached_property
     def accelerations(self) -> Array:
         """What its learned accelerations are multiplied by, (r,), in units of the plant."""
         learned: Array = self.states[list(self.system.learned_rows)]
@@ -131,7 +137,7 @@ def _scaled_limits(limits: Limits, found: Scaled) -> Limits:
     units |= dict.fromkeys(names_of(found.system.input_labels), found.inputs)
 
     def divided(name: str, number: float) -> float:
-        return float(rounded(np.array(number / units[name])))
+        return float(rounded(number / units[name])) if math.isfinite(number) else number
 
     return dataclasses.replace(
         limits,

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from dopt.systems.base import Array, System
+from dopt.types import Scalar
 
 STEPS_ACROSS = 250
 """Steps in which a learned acceleration of 1 leads from the middle of the box to its side."""
@@ -35,12 +36,10 @@ Reference: T. Dekker, "A floating-point technique for extending the available pr
 _SEED = 20_261_128
 
 
-def rounded(values: Array) -> Array:
-    """Return numbers rounded to 36 bits."""
-    with np.errstate(all="ignore"):
-        product = SPLIT * values
-        nearest: Array = product - (product - values)
-    return np.where(np.isfinite(nearest), nearest, values)
+def rounded(values: Scalar, split: Scalar = SPLIT) -> Scalar:
+    """Return numbers rounded to 36 bits, or as they are where ``split`` is 0."""
+    product = split * values
+    return product - (product - values)
 
 
 def scales(system: System, sizes: Array) -> tuple[float, ...]:
