@@ -25,13 +25,13 @@ SAVES = {"orchestrate.runner.saving"}
 
 ONLY_IN = {
     "hydra": ("orchestrate/config/",),
-    "omegaconf": ("orchestrate/config/",),
+    "omegaconf": ("orchestrate/config/", "analysis/fit_report.py"),
     "ray": ("orchestrate/executors/ray/",),
     "sqlalchemy": ("orchestrate/store/",),
     "psycopg": ("orchestrate/store/",),
-    "torch": ("dopt/reference/", "orchestrate/executors/lockstep.py"),
-    "numba": ("dopt/kernel/",),
-    "gymnasium": ("dopt/gymnasium.py",),
+    "torch": ("dopt/reference/", "dopt/fitting/export.py", "orchestrate/executors/lockstep.py"),
+    "numba": ("dopt/kernel/", "dopt/fitting/"),
+    "gymnasium": ("dopt/gymnasium.py", "dopt/fitting/export.py"),
     "mujoco": ("dopt/systems/mujoco.py",),
     "matplotlib": (
         "analysis/figures/",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +13,8 @@ from dopt.errors import SpecificationError
 from dopt.fitting.model import Model
 from dopt.types import Array
 
-if TYPE_CHECKING:
-    from dopt.fitting.fitted import Fitted
 
-
-def save(found: Fitted, path: str | Path) -> None:
+def save(found: Any, path: str | Path) -> None:
     """Write a model as named arrays: texts of the known part, constants, network, delay and lag.
 
     ``docs/example/load_model.py`` reads it with NumPy alone.
@@ -52,7 +49,7 @@ def save(found: Fitted, path: str | Path) -> None:
     )
 
 
-def to_torch(found: Fitted) -> Any:
+def to_torch(found: Any) -> Any:
     """Return a module that gives dx/dt, (..., d), at x, (..., d), and u, (..., m), which acts."""
     import torch
 
@@ -97,7 +94,7 @@ def to_torch(found: Fitted) -> Any:
     return FittedDynamics()
 
 
-def environment(found: Fitted) -> Any:
+def environment(found: Any) -> Any:
     """Return the fitted plant as an environment of Gymnasium.
 
     The observation is the state, the action the input that is asked for, which is cut to the

@@ -1,4 +1,4 @@
-"""What a fit has found: constants with errors, simulations with intervals, and a report."""
+"""Result of a fit: constants with errors, simulations with bounds, and a report."""
 
 from __future__ import annotations
 

@@ -72,8 +72,12 @@ def test_the_first_guess_of_an_unknown_delay_is_taken() -> None:
 
 @pytest.mark.parametrize("policy", ["d_optimal", "uniform"])
 def test_the_plan_is_that_of_a_simulated_system_behind_the_same_delay(policy: str) -> None:
-    """Both plan for the state that the model predicts two steps ahead."""
-    pendulum = Pendulum(horizon=60, grid_points=(4, 4))
+    """Both plan for the state that the model predicts two steps ahead.
+
+    The box and gamma are such that the scaled numbers of the plant are its own.
+    """
+    widths = (math.pi, 5.0)
+    pendulum = Pendulum(horizon=60, grid_points=(4, 4), grid_half_widths=widths, gamma=1.0)
     plant = Plant(
         states={"angle": "rad", "rate": "rad/s"},
         inputs={"torque": "N m"},
@@ -82,7 +86,7 @@ def test_the_plan_is_that_of_a_simulated_system_behind_the_same_delay(policy: st
         known={"angle": "rate", "rate": "3 * torque"},
         learned=["rate"],
         angles=["angle"],
-        box={"rate": 8.0},
+        box={"rate": 5.0},
         delay=2 * pendulum.dt,
     )
     real = Explorer(Real(pendulum, delay=2), policy=policy)
