@@ -60,6 +60,9 @@ MOST_LOSS = 1e12
 MOST_SCANNED = 150
 """Windows over which delays are tried."""
 
+ROWS_SCANNED = 8000
+"""Rows of these windows."""
+
 
 def fit(
     plant: Plant,
@@ -219,7 +222,8 @@ class _Selection:
                 f"the logs have {len(windows.rows)} windows of {seconds:g} s, but at least 2 are "
                 f"expected: give longer runs, or a shorter window."
             )
-        every = max(1, len(windows.rows) // MOST_SCANNED)
+        total = int(np.diff(windows.rows, axis=1).sum())
+        every = max(1, len(windows.rows) // MOST_SCANNED, total // ROWS_SCANNED)
         some = windows.where(np.arange(len(windows.rows)) % every == 0)
         fits = {}
         shifts = [shift for shift in SCANNED if self.delay + shift * self.step >= -2.5 * self.step]

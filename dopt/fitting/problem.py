@@ -86,12 +86,18 @@ class Simulator:
         self._dull, self._sharp = model.work(0), model.work(model.q + model.d)
         self._starts = model.work(model.d)
         self.channels = len(model.structure.measured)
+        self._times: tuple[float, ...] = ()
+        self._filtered: tuple[Array, Array]
 
     def filtered(self, values: Values) -> tuple[Array, Array]:
-        N, m = self.data.inputs.shape
-        v, dv = np.empty((N, m)), np.empty((N, m, 2))
-        call(simulation.filter_inputs, self.data, values, self.tolerance, v, dv)
-        return v, dv
+        """Return what acts of all inputs; the same as before while delay and lag are the same."""
+        times = (values.delay, values.lag, values.lag_slope)
+        if times != self._times:
+            N, m = self.data.inputs.shape
+            v, dv = np.empty((N, m)), np.empty((N, m, 2))
+            call(simulation.filter_inputs, self.data, values, self.tolerance, v, dv)
+            self._times, self._filtered = times, (v, dv)
+        return self._filtered
 
     def squares(self, p: Array, windows: Windows) -> Array:
         values = self.model.values(p)
