@@ -99,7 +99,7 @@ _DESIGN |= {"r1": 0.3, "r2": 0.18377686083653508}
 
 
 def _model_2(d: Mapping[str, float]) -> dict[str, float]:
-    """Return the constants of the equations from those of model_2.0 of design_A.0."""
+    """Return the constants of the equations from the parameters of model_2.0 of design_A.0."""
     return {
         "a1": d["I1"] + d["I2"] + d["m2"] * d["l1"] ** 2 + (d["gear"] ** 2 + 1) * d["Ir"],
         "a2": d["I2"] - d["gear"] * d["Ir"],

@@ -120,7 +120,7 @@ def folds(
 
 
 def judged(case: Case, name: str, given: Sequence[Log], left_out: Log, workers: int) -> Fold:
-    """Fit a plant to logs, and return its errors and those of the reference on another one."""
+    """Fit a plant to logs, and return the errors on another one, also of the reference."""
     fitted = fit(case.plant, given, workers=workers, **case.options)
     own, alone = fitted._chosen, fitted._physics
     data = data_of(case.plant, [left_out], fitted.hold, fitted._data.deviations)

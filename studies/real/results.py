@@ -11,6 +11,7 @@ import pandas as pd
 
 from analysis.style import within
 from analysis.tables.rendering import TextTable
+from studies.real.data import SOURCES
 from studies.real.protocol import Array, Fold
 
 DRAWS = 2000
@@ -44,7 +45,7 @@ class Question:
     places : (int, int)
         Which horizon and which measured state.
     at_most : float
-        Bound that is to be kept; NaN where there is none.
+        Bound that is to be kept; NaN without one.
     of_ratio : bool
         Whether the bound is one of the ratio to the reference, and not of the error.
     """
@@ -114,4 +115,9 @@ def table(found: pd.DataFrame) -> TextTable:
         ]
         for row in found.fillna({"bound": "", "kept": ""}).to_dict("records")
     ]
-    return TextTable(["plant", "error", "here [rad]", "reference [rad]", "ratio", "bound"], lines)
+    named = {plant.split(",")[0] for plant in found.plant}
+    sources = [
+        f"{name}: {one.short}, {one.licence}" for name, one in SOURCES.items() if name in named
+    ]
+    head = ["plant", "error", "here [rad]", "reference [rad]", "ratio", "bound"]
+    return TextTable(head, lines, f"Runs of {'; '.join(sources)}.")
